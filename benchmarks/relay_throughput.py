@@ -30,8 +30,8 @@ from appliance.channel.messages import (
     UpstreamFound,
     UpstreamWanted,
 )
-from appliance.configuration.settings import RecorderRules
 from appliance.features.recorder.rings import RecorderRings
+from appliance.features.recorder.settings import RecorderRules
 from tests.support.relay_driver import LOOPBACK, ChannelPeer, RelayProcess, call, free_port
 from tests.support.stated import stated
 from tests.support.waiting import eventually

@@ -29,7 +29,6 @@ from appliance.api.routes import (
 from appliance.api.routes.contract import contract_of
 from appliance.api.routes.contract_page import PATH, page_of
 from appliance.base.validation_messages import meant, refusal
-from appliance.features.recorder import recording_routes
 from appliance.features.table import FEATURES
 
 _MOST_SHOWN = 5
@@ -66,7 +65,6 @@ def build_app(services: Services) -> FastAPI:
         host_routes,
         enrol,
         monitor_routes,
-        recording_routes,
         audit_summary,  # before /v1/audit/{record_id}
         audit,
     ):

@@ -1,9 +1,12 @@
-"""Name the authors of revisions and records, also those that are not people."""
+"""Name the authors of revisions and records, also those that are not people, and those who are charged."""
 
 DISK = "disk"
 """The author of a change that was read from the disk, at a start or by a signal to the appliance."""
 UNCONFIRMED = "not confirmed in time"
 """The author of an automatic rollback. No token has this name or that of `DISK`."""
+
+ROBOT, APPLIANCE, UNKNOWN = "robot", "appliance", "unknown hosts"
+"""An act is charged to these, or to a host or network as the policy names it."""
 
 
 def actor(who: str) -> str:

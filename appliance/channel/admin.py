@@ -41,7 +41,6 @@ from appliance.channel.answers import (
 )
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.channel.rest_operation import Operation, Versioned, parameter, rest, rows
-from appliance.features.recorder import recording_answers
 
 A = TypeVar("A")
 
@@ -58,7 +57,6 @@ _WITHIN = ("confirm_within",)
 _LOADED = (*_WITHIN, "force", "shadow", "hold")
 _NO_REVISION = {404: "There is no such revision."}
 _NO_MONITOR = {404: "There is no such monitor, or revision."}
-_NO_RECORDING = {404: "There is no such recording, or the flight recorder is off."}
 _NO_HOST = {404: "There is no such host."}
 _CHARON_SECONDS = 45.0  # charon may have to be started first
 
@@ -81,15 +79,6 @@ OneMonitor = Annotated[
     str, parameter("name of the monitor", min_length=1, max_length=256, examples=["censor"])
 ]
 SomeMonitors = Annotated[list[OneMonitor], parameter(name="name", min_length=1, max_length=1000)]
-RecordingId = Annotated[
-    str,
-    parameter(
-        "id of the recording",
-        name="recording_id",
-        pattern="^[0-9a-f]{20}$",
-        examples=["18ea0bb9b11c1024196c"],
-    ),
-]
 OneHost = Annotated[
     str,
     parameter("name of the host", min_length=1, max_length=63, pattern=bodies.HOST_NAME, examples=["ocu-1"]),
@@ -101,7 +90,7 @@ class AdminRequest(msgspec.Struct, Generic[A], frozen=True, tag_field="verb", fo
 
 
 class WaitingRequest(AdminRequest[A], Generic[A], frozen=True):
-    """A request that waits for charon, the signer, the recorder or a topic's messages: others go past it."""
+    """A request that waits for another process, such as charon, or for a topic's messages: others go past it."""
 
 
 def verb_of(request: AdminRequest[Any]) -> str:
@@ -448,63 +437,6 @@ class MonitorResume(AdminRequest[monitor_answers.Switched], frozen=True, tag="mo
 
     names: SomeMonitors
     expected: str | None = None
-
-
-@rest("viewer", "GET", "/v1/recordings", name="recordings", problems=_NO_RECORDING)
-class RecordingsWanted(WaitingRequest[recording_answers.Recordings], frozen=True, tag="recordings"):
-    """All recordings that are kept, the oldest first."""
-
-
-@rest("viewer", "GET", "/v1/recordings/{recording_id}", name="recording", problems=_NO_RECORDING)
-class RecordingWanted(WaitingRequest[recording_answers.Recording], frozen=True, tag="recording"):
-    """Why a recording was made, and what it has."""
-
-    id: RecordingId
-
-
-@rest(
-    "operator", "POST", "/v1/recordings", name="record_now", body=bodies.NewRecording, status=201,
-    good="The recording is being made.", problems=_NO_RECORDING,
-)  # fmt: skip
-class RecordNow(WaitingRequest[recording_answers.RecordingBegun], frozen=True, tag="record now"):
-    """Record the last seconds, and the next ones, of what the robot says."""
-
-    before: float | None = None  # seconds before now; None: as configured
-    after: float | None = None
-    note: str = ""
-
-
-@rest("investigator", "GET", "/v1/recordings/{recording_id}/bag")
-class RecordingFetch(WaitingRequest[recording_answers.Recording], frozen=True, tag="recording fetch"):
-    """Record who fetches the messages of a recording."""
-
-    id: RecordingId
-
-
-@rest("investigator", "GET", "/v1/recordings/{recording_id}/messages", ("topics",))
-class RecordingRead(WaitingRequest[recording_answers.Recording], frozen=True, tag="recording read"):
-    """Record who reads messages of a recording, of these topics (none: of all)."""
-
-    id: RecordingId
-    topics: Annotated[list[str], parameter(name="topic")] = []
-
-
-@rest(
-    "investigator", "POST", "/v1/recordings/memory", name="recording_of_memory", body=bodies.MemorySpan,
-    problems=_NO_RECORDING,
-)  # fmt: skip
-class RecordingOfMemory(WaitingRequest[recording_answers.Recording], frozen=True, tag="recording memory"):
-    """Make a recording of the data in memory, which can be fetched for ten minutes, or until the next such request."""
-
-    since: int | None = None  # nanoseconds since the epoch; None: all that there is
-    until: int | None = None
-
-
-@rest("admin", "DELETE", "/v1/recordings/{recording_id}", name="remove_recording", problems=_NO_RECORDING)
-class RecordingRemove(WaitingRequest[recording_answers.Recording], frozen=True, tag="recording remove"):
-    """Remove a recording; it is recorded who removed it. For admins."""
-
-    id: RecordingId
 
 
 class TokenAdd(AdminRequest[token_answers.NewToken], frozen=True, tag="token add"):

@@ -12,7 +12,7 @@ from typing import Any
 
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
-from appliance.channel.messages import Failed, LinkOpened, Message, Ping, Pong, Ready, RingGiven, Stop
+from appliance.channel.messages import Failed, LinkOpened, MemoryGiven, Message, Ping, Pong, Ready, Stop
 
 
 class Child:
@@ -26,16 +26,16 @@ class Child:
         said: Callable[[Any], None],
         linked: Callable[[], None] = lambda: None,
         lost: Callable[[str], None] = lambda _reason: None,
-        ring_given: Callable[[RingGiven, int], None] = lambda _given, descriptor: os.close(descriptor),
+        memory_given: Callable[[MemoryGiven, int], None] = lambda _given, descriptor: os.close(descriptor),
     ) -> None:
         """Make the channels. `link` is the union of the messages on the link to control.
 
-        `lost(reason)` is called when control closes the link or ends. `ring_given` takes over the descriptor.
+        `lost(reason)` is called when control closes the link or ends. `memory_given` takes over the descriptor.
         """
         self._lifeline = lifeline
         self._link = link
         self._linked = linked
-        self._ring_given = ring_given
+        self._memory_given = memory_given
         self._control = Link(said, lost)
         self.ended = asyncio.Event()
 
@@ -72,8 +72,8 @@ class Child:
             case LinkOpened(role="control"):
                 self._control.attach(Channel(socket.socket(fileno=descriptors[0]), self._link))
                 self._linked()
-            case RingGiven():
-                self._ring_given(message, descriptors[0])
+            case MemoryGiven():
+                self._memory_given(message, descriptors[0])
             case _:
                 for descriptor in descriptors:
                     os.close(descriptor)

@@ -139,21 +139,6 @@ class SwitchMany(Switch, frozen=True, kw_only=True, forbid_unknown_fields=True):
     names: Annotated[list[MonitorName], msgspec.Meta(min_length=1, max_length=1000)]
 
 
-class NewRecording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The wanted recording: seconds before and after now (null: as configured), and why."""
-
-    before: Annotated[Annotated[float, msgspec.Meta(ge=0)] | None, doc("seconds")] = None
-    after: Annotated[Annotated[float, msgspec.Meta(gt=0)] | None, doc("seconds")] = None
-    note: Annotated[str, msgspec.Meta(max_length=300)] = ""
-
-
-class MemorySpan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A span of time: from `since` (null: from the first data) to `until` (null: now)."""
-
-    since: GivenNanoMoment = None
-    until: GivenNanoMoment = None
-
-
 class KitWishes(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The contents of a kit besides the certificate."""
 

@@ -105,18 +105,6 @@ VERBS: Verbs = {
         },
     ),
     "node": Group("Show nodes of the running robot.", {"list": Verb("graph_verbs:list_nodes")}),
-    "record": Group(
-        "Use the flight recorder: messages before and after an event.",
-        {
-            "now": Verb("appliance.features.recorder.record_verbs:now"),
-            "list": Verb("appliance.features.recorder.record_verbs:list_recordings"),
-            "show": Verb("appliance.features.recorder.record_verbs:show"),
-            "timeline": Verb("appliance.features.recorder.record_verbs:show_timeline"),
-            "messages": Verb("appliance.features.recorder.record_verbs:messages"),
-            "fetch": Verb("appliance.features.recorder.record_verbs:fetch"),
-            "remove": Verb("appliance.features.recorder.record_verbs:remove"),
-        },
-    ),
     "sign": Verb("sign:sign"),
     "version": Verb("version:version"),
     "config": Group(

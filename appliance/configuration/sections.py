@@ -87,6 +87,10 @@ class FeatureSection:
         """Return the URL and the address of each receiver on another machine, by key."""
         return {}
 
+    def services(self) -> tuple[str, ...]:
+        """Return the names of the services that nodes may call, without the appliance's own name."""
+        return ()
+
 
 @dataclass(frozen=True)
 class Sections:

@@ -16,13 +16,19 @@ import msgspec
 from pydantic import (
     AfterValidator,
     BeforeValidator,
-    ByteSize,
     Field,
     GetPydanticSchema,
     IPvAnyAddress,
     IPvAnyNetwork,
 )
 
+from appliance.configuration.quantities import (
+    Count,
+    Milliseconds,
+    Seconds,
+    Size,
+    SizeOfMebibytes,
+)
 from appliance.configuration.sections import (
     HOST_NAME,
     S,
@@ -57,16 +63,8 @@ def with_features(place: str) -> Callable[[type[T]], type[T]]:
     return extended
 
 
-# pydantic reads the metadata of these types; msgspec and the users of a setting see only the plain type.
-_BYTES = GetPydanticSchema(lambda _source, handler: handler(ByteSize))
 _NETWORK = GetPydanticSchema(lambda _source, handler: handler(IPvAnyNetwork))
 _ADDRESS = GetPydanticSchema(lambda _source, handler: handler(IPvAnyAddress))
-Seconds = Annotated[float, Field(gt=0, le=86_400 * 365, allow_inf_nan=False)]
-Milliseconds = Annotated[float, Field(ge=1.0, le=1000.0, allow_inf_nan=False)]
-Count = Annotated[int, Field(gt=0)]
-Size = Annotated[int, _BYTES, Field(gt=0)]
-SizeOfMebibytes = Annotated[int, _BYTES, Field(ge=1 << 20)]  # at least 1 MiB
-WithinAnHour = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
 
 
 def _comma_separated(value: object) -> object:
@@ -241,48 +239,6 @@ class Relay:
         default=10.0,
         description="processor time that monitors may take for one message; one that takes longer is a fault",
     )
-
-
-@section
-class RecorderRules:
-    """The flight recorder: messages from before and after an incident. Off by default, because it stores contents."""
-
-    enabled: bool = key(default=False, description="whether anything is recorded")
-    memory: Annotated[int, _BYTES, Field(ge=16 << 20)] = key(
-        default=64 << 20,
-        description="of all relays together, for the last messages received; it survives a relay's crash",
-    )
-    before: WithinAnHour = key(default=60.0, description="seconds before the event")
-    after: WithinAnHour = key(default=10.0, description="seconds after the event")
-    longest: WithinAnHour = key(
-        default=600.0, description="longest recording in seconds, regardless of further events"
-    )
-    topics: list[str] = key(default=["/*"], description="recorded topics: names, `*` matches anything")
-    never: list[str] = key(
-        default=[
-            "sensor_msgs/Image",
-            "sensor_msgs/CompressedImage",
-            "theora_image_transport/Packet",
-            "audio_common_msgs/AudioData",
-            "audio_common_msgs/AudioDataStamped",
-        ],
-        description="names or types that are never recorded; default: cameras and microphones",
-    )
-    triggers: list[Literal["drop", "change", "verdict", "fault", "denial", "alarm", "service"]] = key(
-        default=["drop", "verdict", "fault", "alarm", "service"],
-        description="triggers of a recording, besides an operator; service: a node's call, if the policy lets it",
-    )
-    per_hour: Count = key(
-        default=6, description="recordings that one host may start with one kind of trigger"
-    )
-    disk: Annotated[int, _BYTES, Field(ge=64 << 20)] = key(
-        default=2 << 30, description="of all recordings; one uses at most an eighth of it"
-    )
-    days: Seconds | None = key(default=30.0, description="after which a recording is removed; null: never")
-
-    def __post_init__(self) -> None:
-        if self.longest < self.before + self.after:
-            raise ValueError(f"longest is {self.longest:g}, but before and after together are longer")
 
 
 @section
@@ -614,7 +570,6 @@ class Settings:
     audit: Audit = Audit()
     liveness: LivenessSection = LivenessSection()
     relay: Relay = Relay()
-    recorder: RecorderRules = RecorderRules()
     firewall: FirewallSection = FirewallSection()
     ipsec: Ipsec = Ipsec()
     availability: Availability = Availability()
@@ -667,9 +622,8 @@ class Settings:
 
     @property
     def own_services(self) -> list[str]:
-        """Return the name of the service with which nodes start a recording; empty if it is not enabled."""
-        offered = self.recorder.enabled and "service" in self.recorder.triggers
-        return [f"{self.publish_as}/record_now"] if offered else []
+        """Return the names of the services that features offer to nodes."""
+        return [f"{self.publish_as}/{name}" for kind in SECTIONS for name in self.of(kind).services()]
 
 
 def load_resolved(path: Path) -> Settings:

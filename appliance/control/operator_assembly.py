@@ -21,9 +21,7 @@ from appliance.control.operators.switched_off import SwitchedOffWatch
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
 from appliance.control.rest.rest_certificate import RestCertificate
-from appliance.features.feature import FeatureContext
 from appliance.features.standby.standby_orders import StandbyOrders, StandbySource
-from appliance.features.table import FeatureParts
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment import HostEnrolment, find_endpoint
 from appliance.hosts.rest_address import rest_address
@@ -39,7 +37,6 @@ class Operators:
     tokens: TokenOrders
     ends_of_tokens: StoredDeadlines
     clock: ClockCheck
-    features: FeatureParts
     collected: ForwarderLink
     switched_off: SwitchedOffWatch
     blocks: BlockOrders
@@ -75,7 +72,6 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
     rest = Current[RestLink]()
     tokens = TokenOrders(base.store, trail, ends_of_tokens, lambda: rest().state_tokens())
     clock = ClockCheck(trail, lambda: base.audit.ids.ahead)
-    features = FeatureParts(FeatureContext(settings.sections, trail, base.audit, settings.name))
     pushed_to = settings.fleet.collector if settings.fleet.receipt_key is not None else None
     collected = ForwarderLink(pushed_to, "all", trail, base.receipts.received)
     switched_off = SwitchedOffWatch(
@@ -111,9 +107,9 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         base.policies,
         hosts,
         base.lifeline.surroundings,
-        audit=partial(_audit_state, base, features, collected),
+        audit=partial(_audit_state, base, collected),
         clock=clock.state,
-        recorder=ends.recordings.state,
+        recorder=base.features.recorder,
         queued_deliveries=lambda: ends.enactor.delivery.waiting,
         live=core.revocation.live,
         switched_off=switched_off.rows,
@@ -126,7 +122,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
     orders = StandbyOrders(standby, trail)
     administration = Administration(
         looks,
-        features.methods()
+        base.features.methods()
         + request_methods(
             queries=looks,
             policies=base.policies,
@@ -134,11 +130,10 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
             hosts=hosts,
             certification=certification,
             tokens=tokens,
-            recordings=ends.recordings,
             blocks=blocks,
             standby=orders,
             alarms=AlarmOrders(handled, trail, looks.present),
-            limits=LimitQueries(parts, settings, base.listener_limits, ends.recordings.state),
+            limits=LimitQueries(parts, settings, base.listener_limits, base.features.limits),
         ),
         durable=partial(_durable, base),
         require_room=base.store.database.require_room,
@@ -161,7 +156,6 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         tokens=tokens,
         ends_of_tokens=ends_of_tokens,
         clock=clock,
-        features=features,
         collected=collected,
         switched_off=switched_off,
         blocks=blocks,
@@ -179,12 +173,12 @@ async def _durable(base: Foundation) -> None:
         await base.replication.stored()
 
 
-def _audit_state(base: Foundation, features: FeatureParts, collected: ForwarderLink) -> AuditState:
+def _audit_state(base: Foundation, collected: ForwarderLink) -> AuditState:
     return AuditState(
         *base.audit.lag,
         failed=base.audit.failed,
         on_failure=base.settings.audit.on_audit_failure,
         degraded=base.audit.degraded,
-        forwarding=features.forwarding(),
+        forwarding=base.features.forwarding(),
         collector=collected.status(),
     )

@@ -87,13 +87,11 @@ class SupervisorMessages:
                 self._operators.collected.link.attach(Channel(sock, messages.ForwardingLink))
             case "bundles":
                 self._operators.bundles.link.attach(Channel(sock, messages.BundleLink, longest=16 << 20))
-            case "recorder":
-                self._parts.endpoints.recordings.link.attach(Channel(sock, messages.RecorderLink))
             case _:
                 self._feature_link(role, sock)
 
     def _feature_link(self, role: str, sock: socket.socket) -> None:
-        found = self._operators.features.link(role)
+        found = self._base.features.link(role)
         if found is None:
             _log.error("a link leads to a process unknown to control", role=role)
             sock.close()

@@ -8,31 +8,39 @@ Invariants:
 3. No feature imports `configuration.settings` except in the entry of a process, because the settings import the table.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from appliance.cli.verb_table import Group
 from appliance.configuration.sections import FeatureSection, Sections
-from appliance.supervisor.role import Role
+from appliance.supervisor.role import Role, SharedMemory
 
 if TYPE_CHECKING:
     from appliance.audit.log.log import AuditLog
     from appliance.channel.admin import AdminRequest
-    from appliance.channel.answers.status import ForwardingState
+    from appliance.channel.answers.limit_answers import LimitUse
+    from appliance.channel.answers.status import ForwardingState, RecorderState
     from appliance.channel.link import Link
+    from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
     from appliance.control.operators.request_method import RequestMethod
-    from appliance.telemetry.audit_trail import AuditTrail
+    from appliance.telemetry.audit_trail import AuditTrail, RecordDetails
 
 
 @dataclass(frozen=True)
 class FeatureContext:
-    """Hold the objects of control that parts of features use. `robot` is the robot's name, empty if it has none."""
+    """Hold the objects of control that parts of features use. `robot` is the robot's name, empty if it has none.
+
+    `charged_to(host)` returns the name that is charged for a host's acts. `in_force()` returns the revisions of policy
+    and specifications in force.
+    """
 
     sections: Sections
     trail: "AuditTrail"
     audit: "AuditLog"
     robot: str
+    charged_to: Callable[[str], str]
+    in_force: Callable[[], tuple[int, int]]
 
 
 @dataclass(frozen=True)
@@ -40,13 +48,20 @@ class FeaturePart:
     """The part of control that a feature adds.
 
     `links` are control's ends of the links to the feature's roles, with the messages that control accepts.
-    `methods` answer the feature's `operations`.
+    `methods` answer the feature's `operations`. `limits` returns how much of its resources is used.
+    `details` returns what it adds to the details of a record (`RecordDetails`).
+    `called` answers nodes' calls of its service.
     `forwarding` returns the state of the forwarding of the audit log, or None if none is configured.
+    `recorder` returns the state of the flight recorder, or None if none is configured.
     """
 
     links: "Mapping[str, tuple[Link, Any]]" = field(default_factory=dict)
     forwarding: "Callable[[], ForwardingState | None]" = lambda: None
     methods: "tuple[RequestMethod[Any], ...]" = ()
+    limits: "Callable[[], tuple[LimitUse, ...]]" = lambda: ()
+    details: "RecordDetails" = lambda *_event: {}
+    called: "Callable[[OwnServiceCalled], Awaitable[OwnServiceAnswered]] | None" = None
+    recorder: "Callable[[], RecorderState | None]" = lambda: None
 
 
 @dataclass(frozen=True)
@@ -56,6 +71,8 @@ class Feature:
     `operations` returns the requests of operators' tools; the admin socket, REST and the client follow from their
     rows. `routes` is the function (`module:function`) that returns further routes of the api for its `Services`.
     `verbs` are commands of `rosrv`.
+    `recorded` is the function (`module:function`) that gives `rosrv monitor replay` the recorded messages of a period.
+    `memory` makes the memory that the supervisor shares with this number of relays; None if none is configured.
     """
 
     name: str
@@ -64,4 +81,6 @@ class Feature:
     operations: "Callable[[], tuple[type[AdminRequest[Any]], ...]]" = lambda: ()
     routes: str | None = None
     verbs: Mapping[str, Group] = field(default_factory=dict)
+    recorded: str | None = None
+    memory: Callable[[Sections, int], SharedMemory | None] = lambda _sections, _relays: None
     make: Callable[[FeatureContext], FeaturePart] | None = None

@@ -3,19 +3,36 @@
 To remove a feature, remove its folder, and its import and its row here.
 """
 
+import pkgutil
 from typing import TYPE_CHECKING, Any
 
+from appliance.configuration.sections import Sections
 from appliance.features.evidence.feature import EVIDENCE
 from appliance.features.feature import Feature, FeatureContext
+from appliance.features.recorder.feature import RECORDER
 from appliance.features.standby.feature import STANDBY
 from appliance.features.syslog.feature import SYSLOG
+from appliance.supervisor.role import SharedMemory
 
 if TYPE_CHECKING:
-    from appliance.channel.answers.status import ForwardingState
+    from appliance.audit.log.record import Severity
+    from appliance.channel.answers.limit_answers import LimitUse
+    from appliance.channel.answers.status import ForwardingState, RecorderState
     from appliance.channel.link import Link
+    from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
     from appliance.control.operators.request_method import RequestMethod
 
-FEATURES: tuple[Feature, ...] = (SYSLOG, EVIDENCE, STANDBY)
+FEATURES: tuple[Feature, ...] = (SYSLOG, EVIDENCE, RECORDER, STANDBY)
+
+
+def memories(sections: Sections, relays: int) -> tuple[SharedMemory, ...]:
+    """Make the shared memory of all features. Raises `StartError`, `OSError`."""
+    return tuple(filter(None, (feature.memory(sections, relays) for feature in FEATURES)))
+
+
+def recorded_messages() -> Any:
+    """Return the function that gives the recorded messages of a period, or None if no feature records."""
+    return next((pkgutil.resolve_name(one.recorded) for one in FEATURES if one.recorded is not None), None)
 
 
 class FeatureParts:
@@ -35,3 +52,25 @@ class FeatureParts:
     def forwarding(self) -> "ForwardingState | None":
         """Return the state of the forwarding of the audit log, or None if none is configured."""
         return next(filter(None, (part.forwarding() for part in self._parts)), None)
+
+    def recorder(self) -> "RecorderState | None":
+        """Return the state of the flight recorder, or None if none is configured."""
+        return next(filter(None, (part.recorder() for part in self._parts)), None)
+
+    def limits(self) -> "tuple[LimitUse, ...]":
+        """Return how much of the features' resources is used."""
+        return tuple(use for part in self._parts for use in part.limits())
+
+    def details(
+        self, event: str, decision: str | None, severity: "Severity", host: str | None, now: int
+    ) -> dict[str, str]:
+        """Return what the features add to the details of a record."""
+        details: dict[str, str] = {}
+        for part in self._parts:
+            details |= part.details(event, decision, severity, host, now)
+        return details
+
+    async def called(self, call: "OwnServiceCalled") -> "OwnServiceAnswered":
+        """Answer a node's call of the appliance's own service."""
+        (called,) = filter(None, (part.called for part in self._parts))
+        return await called(call)

@@ -13,10 +13,10 @@ import socket
 from collections.abc import Callable, Iterator, Mapping
 
 from appliance.channel import messages
-from appliance.features.recorder.recorder_ring import RecorderRing
 from appliance.relay.connections.admission import NOTHING, asked_for, bound_name, flaw, missing
 from appliance.relay.connections.incoming_connection import IncomingConnection, RefusedConnection
 from appliance.relay.connections.listening_ports import ListeningPorts
+from appliance.relay.connections.message_sink import MessageSink
 from appliance.relay.connections.monitor_calls import CallGrant, ServiceCalls
 from appliance.relay.connections.named_subscribers import ActionServers
 from appliance.relay.connections.own_service import OwnService
@@ -94,7 +94,7 @@ class DataPlane:
         self._last_rows: list[messages.TopicTraffic] = []
         self._flows = RateLimits(loop.clock)
         self._topic_taps = TopicTaps(self._reporter.send)
-        self._recorded: RecorderRing | None = None
+        self._sink: MessageSink | None = None
         self._tidying: Iterator[None] = iter(())
         loop.after(limits.report_every, self._tick)
 
@@ -106,9 +106,9 @@ class DataPlane:
         self._own_service.control_gone()
         self._monitor_calls.attach(link is not None)
 
-    def record(self, recorded: RecorderRing) -> None:
-        """Record the messages of publishers whose topics are placed from now on."""
-        self._recorded = recorded
+    def copy_to(self, sink: MessageSink) -> None:
+        """Copy to this sink the messages of publishers whose topics are placed from now on."""
+        self._sink = sink
 
     def take(self, message: messages.Message, descriptors: tuple[int, ...]) -> bool:
         """Carry out one message of control; return True if the message must wait for specifications."""
@@ -236,7 +236,7 @@ class DataPlane:
             ),
             make_room=lambda size: self._make_room(host, size),
             refused=self._reporter.send,
-            recorded=self._recorded,
+            sink=self._sink,
             over=self._loop.over,
             servers=self._servers.of,
         )

@@ -6,6 +6,7 @@ without a link, it continues under the existing grants until the supervisor open
 
 import contextlib
 import gc
+import importlib
 import logging
 import resource
 import socket
@@ -14,7 +15,7 @@ from typing import Any
 
 from appliance.channel import messages
 from appliance.channel.channel import Channel
-from appliance.features.recorder.recorder_ring import RecorderRing
+from appliance.relay.connections.message_sink import OpenSink
 from appliance.relay.data_plane import DataPlane
 from appliance.relay.loop import EventLoop
 from appliance.relay.monitors.state_keeper import StateKeeper
@@ -77,8 +78,10 @@ class RelayProcess:
             self._loop.stop()
         elif isinstance(message, messages.LinkOpened) and message.role == "control":
             self._open_control(socket.socket(fileno=descriptors[0]))
-        elif isinstance(message, messages.RingGiven):
-            self._engine.record(RecorderRing(message, descriptors[0], self._engine.interceptor.now))
+        elif isinstance(message, messages.MemoryGiven):
+            module, _colon, function = message.used_by.partition(":")
+            open_sink: OpenSink = getattr(importlib.import_module(module), function)
+            self._engine.copy_to(open_sink(message.terms, descriptors[0], self._engine.interceptor.now))
         elif isinstance(message, messages.StateGiven):
             self._keep_state(message, descriptors[0])
         else:

@@ -1,14 +1,15 @@
 """Define a row of the table of processes (`roles.py`), with the facts that rows need."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from appliance.configuration.sections import DEFAULTS, Sections
 from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
 
 if TYPE_CHECKING:
+    from appliance.channel.messages import MemoryGiven
     from appliance.supervisor.sandbox.private_view import PrivateView
 
 
@@ -45,6 +46,16 @@ class RemoteReceiver(NamedTuple):
     protocol: str  # udp, or a protocol over TCP
     address: str
     port: int
+
+
+class SharedMemory(Protocol):
+    """Memory that the supervisor makes at the start and gives to processes; it survives them."""
+
+    def messages_for(self, role: str, index: int) -> "Iterator[tuple[MemoryGiven, int]]":
+        """Yield the messages and descriptors that a process gets at its start."""
+
+    def close(self) -> None:
+        """Close all descriptors."""
 
 
 @dataclass(frozen=True)

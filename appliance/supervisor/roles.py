@@ -85,8 +85,8 @@ ROLES = (
         "control", "rosrv", "control", "appliance.control.process:main",
         ended_early=100, files=65_536,
         links=(
-            "relay", "signer", "compiler", "api", "charon", *(role.name for role in _OF_FEATURES), "fleet", "recorder",
-            "lease", "bundles",
+            "relay", "signer", "compiler", "api", "charon", *(role.name for role in _OF_FEATURES), "fleet", "lease",
+            "bundles",
         ),
         readable_by="rosrv-api", inputs=lambda facts: facts.control_reads,
         sandbox=lambda facts: SandboxPlan(
@@ -117,7 +117,11 @@ ROLES = (
         "api", "rosrv-api", "api", "appliance.api.process:main",
         ended_early=800, nice=10, files=4096, after="control", listens=True, dispensable=True, stands_by=True,
         sandbox=lambda facts: SandboxPlan(
-            allowlist=True, reads=(str(facts.part("control")), str(facts.part("recordings")))
+            allowlist=True,
+            reads=(
+                str(facts.part("control")),
+                *(str(facts.part(role.part)) for role in _OF_FEATURES if role.readable_by == "rosrv-api"),
+            ),
         ),
     ),
     _ours(
@@ -152,12 +156,6 @@ ROLES = (
             connects=None if facts.collector_port is None else (facts.collector_port,),
         ),
     ),
-    _ours(
-        "recorder", "rosrv-recorder", "recordings", "appliance.features.recorder.process:main",
-        ended_early=500, after="control", dispensable=True, group="rosrv-api", readable_by="rosrv-api",
-        network=False,
-        sandbox=lambda facts: SandboxPlan(allowlist=True, reads=(str(facts.part("control")),)),
-    ),
 )  # fmt: skip
 """The roles in the order of their start."""
 
@@ -167,14 +165,13 @@ def roles_of(
     sections: Sections = DEFAULTS,
     api: bool = True,
     fleet: bool = False,
-    recorder: bool = False,
     lease: bool = False,
     bundles: bool = False,
 ) -> tuple[Role, ...]:
     """Return the roles of an appliance with these parts. Raises `StartError` if a ROS program is missing."""
     require_programs(ROS_PROGRAMS)
     wanted = {
-        "api": api, "fleet": fleet, "recorder": recorder, "lease": lease, "bundles": bundles,
+        "api": api, "fleet": fleet, "lease": lease, "bundles": bundles,
     }  # fmt: skip
     return tuple(role for role in ROLES if wanted.get(role.name, True) and role.configured(sections))
 

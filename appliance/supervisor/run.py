@@ -13,8 +13,8 @@ import structlog
 
 from appliance.configuration.config_sources import plain
 from appliance.configuration.settings import Settings, Unasked
-from appliance.features.recorder.rings import RecorderRings
 from appliance.features.standby.membership import Membership
+from appliance.features.table import memories
 from appliance.network.close_ports import local_port_range
 from appliance.network.firewall.firewall_rules import StandbyAccess
 from appliance.network.firewall.iptables import load_modules
@@ -276,7 +276,7 @@ def _supervise(
             relays=settings.relays,
             isolation=isolation,
             listeners={"api": api} if api is not None else {},
-            rings=RecorderRings(settings.recorder, settings.relays) if settings.recorder.enabled else None,
+            memories=memories(settings.sections, settings.relays),
             memory=MonitorMemory(state.path, settings.relays),
             stands_by=say_standing_by if stands_by is not None else None,
         )

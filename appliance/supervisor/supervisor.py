@@ -30,7 +30,6 @@ import structlog
 
 from appliance.base import clock
 from appliance.channel import messages
-from appliance.features.recorder.rings import RecorderRings
 from appliance.features.standby.lapse_answers import BECOMES_STANDBY, PAUSED, answer_for_control
 from appliance.features.standby.lease_watch import LeaseWatch, RoleChanges
 from appliance.ipsec.charon import PROGRAM as CHARON
@@ -51,7 +50,7 @@ from appliance.supervisor.process_handle import (
     link_processes,
 )
 from appliance.supervisor.process_slot import ProcessSlot
-from appliance.supervisor.role import Facts, Role
+from appliance.supervisor.role import Facts, Role, SharedMemory
 from appliance.supervisor.shutdown import end_all
 from appliance.supervisor.users import account_of
 
@@ -111,7 +110,7 @@ class Supervisor:
         relays: int = 1,
         isolation: NoIsolation | None = None,
         listeners: Mapping[str, socket.socket] | None = None,
-        rings: RecorderRings | None = None,
+        memories: Sequence[SharedMemory] = (),
         memory: MonitorMemory | None = None,
         stands_by: Callable[[], None] | None = None,
     ) -> None:
@@ -119,8 +118,8 @@ class Supervisor:
 
         `stands_by` is given on one of two appliances; it is called once when this appliance could take over.
         Control gets `admin`. `listeners` are the sockets of roles that listen; they stay open while a process restarts,
-        so connections wait. `rings` is the memory of the flight recorder; None: nothing is recorded. `memory` keeps
-        the state of monitors; None: the state is lost when relays die.
+        so connections wait. `memories` are those of features. `memory` keeps the state of monitors; None: the state
+        is lost when relays die.
         """
         self._facts = facts
         self.slots = [
@@ -129,7 +128,7 @@ class Supervisor:
         self.kept = InheritedListeners()
         self.kept.keep(ADMIN, admin.detach())
         self._listeners = dict(listeners or {})
-        self._rings = rings
+        self._memories = memories
         self._memory = memory
         self._ready = ready
         self.is_ready = False
@@ -179,8 +178,8 @@ class Supervisor:
             self.kept.close()
             for listener in self._listeners.values():
                 listener.close()
-            if self._rings is not None:
-                self._rings.close()
+            for shared in self._memories:
+                shared.close()
             if self._memory is not None:
                 self._memory.close()
 
@@ -274,8 +273,9 @@ class Supervisor:
             slot.process.send(
                 messages.SocketRestored(slot.role.name), (self._listeners[slot.role.name].fileno(),)
             )
-        for given, descriptor in self._rings.messages_for(slot.role.name, slot.index) if self._rings else ():
-            slot.process.send(given, (descriptor,))
+        for shared in self._memories:
+            for given, descriptor in shared.messages_for(slot.role.name, slot.index):
+                slot.process.send(given, (descriptor,))
         for state, descriptor in (
             self._memory.messages_for(slot.role.name, slot.index) if self._memory else ()
         ):

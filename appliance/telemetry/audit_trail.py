@@ -24,8 +24,8 @@ class Asker(NamedTuple):
     node: str | None = None
 
 
-Recordings = Callable[[str, str | None, Severity, str | None, int], dict[str, str]]
-"""A function that returns the recording details of an event's record, such as `RecordingPlan.detail`."""
+RecordDetails = Callable[[str, str | None, Severity, str | None, int], dict[str, str]]
+"""A function that returns what features add to the details of a record, by event, decision, severity, host and time."""
 
 
 class AuditTrail:
@@ -37,13 +37,13 @@ class AuditTrail:
     """
 
     def __init__(
-        self, log: AuditLog, *, strict: bool, deny_when_failed: bool, recordings: Recordings
+        self, log: AuditLog, *, strict: bool, deny_when_failed: bool, details: RecordDetails
     ) -> None:
         self._log = log
         self._ids = log.ids
         self.strict = strict
         self._deny_when_failed = deny_when_failed
-        self._recordings = recordings
+        self._details = details
         self.revision = 0
         self.meter = Meter()
 
@@ -101,7 +101,7 @@ class AuditTrail:
             detail["needs"] = decision.needs
         now = clock.wall_ns()
         severity = Severity.INFO if decision.allowed and not decision.would_deny else Severity.WARNING
-        detail |= self._recordings("decision", word, severity, asker.host, now)
+        detail |= self._details("decision", word, severity, asker.host, now)
         unknown = self._marked(asker.host, word, detail)
         record = AuditRecord(
             id=self._ids.next(),
@@ -149,7 +149,7 @@ class AuditTrail:
         host is beyond its quota.
         """
         now, severity = clock.wall_ns(), severity or SEVERITIES.get(event, Severity.INFO)
-        detail = {**(more or {}), **detail, **self._recordings(event, decision, severity, host, now)}
+        detail = {**(more or {}), **detail, **self._details(event, decision, severity, host, now)}
         unknown = self._marked(host, decision, detail)
         return self._log.record(
             AuditRecord(

@@ -14,7 +14,7 @@ class RecordingTrail(AuditTrail):
     """A trail that keeps its records for the test: (event, its reason and other fields)."""
 
     def __init__(self, log: AuditLog) -> None:
-        super().__init__(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
+        super().__init__(log, strict=False, deny_when_failed=False, details=lambda *_: {})
         self.heard: list[tuple[str, dict[str, Any]]] = []
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:

@@ -10,4 +10,7 @@ from tests.support.idle import idle
 
 def idle_parts() -> FeatureParts:
     """Return the parts of all features, with default settings and a log that records nothing."""
-    return FeatureParts(FeatureContext(DEFAULTS, idle(AuditTrail), idle(AuditLog), ""))
+    core = FeatureContext(
+        DEFAULTS, idle(AuditTrail), idle(AuditLog), "", charged_to=lambda host: host, in_force=lambda: (0, 0)
+    )
+    return FeatureParts(core)

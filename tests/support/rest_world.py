@@ -40,7 +40,6 @@ from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
-from appliance.features.recorder.recording_orders import RecordingOrders
 from appliance.features.standby.standby_orders import StandbyOrders
 from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import PortChecks
@@ -151,7 +150,6 @@ class RestWorld:
             hosts=hosts,
             certification=idle(Certification),
             tokens=idle(TokenOrders),
-            recordings=idle(RecordingOrders),
             blocks=idle(BlockOrders),
             standby=idle(StandbyOrders),
             limits=idle(LimitQueries),

@@ -285,11 +285,10 @@ WALL_CLOCK = {
         "features/doors/door_node.py", "features/syslog/log_forwarder.py",
         "forwarding/segment_pusher.py",
         "hosts/checked_ports.py", "hosts/host_table.py", "features/standby/shared_authority.py",
-        "features/recorder/recorder.py", "features/recorder/ring.py", "relay/topic_taps.py",
-        "relay/monitors/interceptor.py",
-        "features/recorder/recorder_ring.py",
+        "features/recorder/recorder.py", "features/recorder/ring.py", "features/recorder/recorder_ring.py",
+        "features/recorder/rings.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",
         "specifications/specification_manager.py", "supervisor/process_handle.py", "supervisor/monitor_memory.py",
-        "features/recorder/rings.py", "supervisor/supervisor.py",
+        "supervisor/supervisor.py",
     ],
     "an end that is a date: of a certificate, a token, a revocation": [
         "api/routes/metrics_route.py", "api/process.py", "cli/selftest/file_checks.py",
@@ -308,10 +307,10 @@ WALL_CLOCK = {
         "base/age_clock.py", "base/clock.py", "base/shipped.py", "control/operators/clock_check.py",
     ],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
-        "api/front/moments.py", "audit/search/filter_options.py", "features/evidence/evidence_verbs.py",
-        "cli/monitor/offline.py", "features/recorder/recorder_input.py", "cli/policy/learn_verb.py",
-        "cli/protect_verb.py",
-        "features/recorder/record_verbs.py", "cli/status_verb.py", "cli/topic_verbs.py",
+        "api/front/moments.py", "audit/search/filter_options.py",
+        "features/evidence/evidence_verbs.py",
+        "cli/monitor/offline.py", "cli/policy/learn_verb.py", "cli/protect_verb.py", "cli/status_verb.py",
+        "cli/topic_verbs.py", "features/recorder/recorder_input.py", "features/recorder/record_verbs.py",
     ],
 }  # fmt: skip
 """The files that read the wall clock, by purpose. Add a file only if it has one of these purposes."""

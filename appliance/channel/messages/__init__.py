@@ -20,5 +20,4 @@ from appliance.channel.messages.message import *
 from appliance.channel.messages.relay_link import *
 from appliance.channel.messages.signer_link import *
 from appliance.channel.messages.tunnels import *
-from appliance.features.recorder.recorder_link import *
 from appliance.features.standby.lease_link import *

@@ -8,7 +8,6 @@ from appliance.channel.answers.status import FirewallState, ProcessInfo
 from appliance.channel.messages.message import Message
 from appliance.channel.messages.signer_link import SignatureMade, SignatureWanted
 from appliance.channel.messages.tunnels import TunnelsEnclosed, TunnelsWanted
-from appliance.features.recorder.recorder_link import RingGiven
 
 
 class Ping(Message):
@@ -186,6 +185,17 @@ class ApplianceStopRequested(Message):
     reason: str
 
 
+class MemoryGiven(Message):
+    """The supervisor gives a process shared memory of a feature, and the feature's `terms` for it.
+
+    `used_by` is the feature's function that a relay calls with them (`module:function`); other processes need none.
+    """
+
+    descriptors: ClassVar[int] = 1
+    terms: dict[str, Any]
+    used_by: str = ""
+
+
 class StateGiven(Message):
     """The supervisor gives a relay shared memory with the state of monitors.
 
@@ -233,7 +243,7 @@ Lifeline = (
     | SocketsRestored | Announced | ProcessesChanged | ClockRead | FirewallReported | ProbeFailed | ProbePassed
     | PolicyReloadRequested | RouteWanted | EndpointWanted | EndpointFound
     | TunnelsWanted | TunnelsEnclosed
-    | RingGiven | StateGiven | RouteFound | LogHeld | CompilerWanted | ApplianceStopRequested
+    | MemoryGiven | StateGiven | RouteFound | LogHeld | CompilerWanted | ApplianceStopRequested
     | SignatureWanted | SignatureMade
     | LeaseHeld | LeaseEnded | Activated | ServicePaused
 )  # fmt: skip

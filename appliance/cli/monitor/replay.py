@@ -7,22 +7,18 @@ from typing import Annotated
 
 import typer
 
-from appliance.audit.log.record_format import rfc3339
 from appliance.channel import admin
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor.monitor_program import MONITOR
-from appliance.cli.output import say_json
-from appliance.features.recorder.recorder_input import Piece, Span, gaps, pieces_of, require_recorded, span_of
-from appliance.features.recorder.recording_answers import OpenRecording
+from appliance.features.table import recorded_messages
 from rosmop.batch.replay_job import Specifications
 from rosmop.form.findings import SpecificationError
 from rosmop.tool.batch_session import RecordingsOptions, batch_session
-from rosmop.tool.monitor_output import BILLION
 from rosmop.tool.options import BagSets, Folders, On, ReportFile, Resume, ShowProgress, Workers
 from rosmop.tool.replay_report import ReplayReport
 from rosmop.tool.run_command import run_batch, run_spans
 from rosmop.tool.specification_input import read_for_recordings, topics_of
-from rosmop.tool.terminal import refused, say
+from rosmop.tool.terminal import refused
 
 
 @speaks
@@ -98,39 +94,13 @@ def replay_monitor(
                 raise typer.Exit(run_batch(session, specifications, report, patterns, margins=margins))
         if workers or on or resume or report_file:
             raise MONITOR.usage_error("--workers, --on, --resume and --report are for bags and MCAP files")
-        span = span_of(since, until)
-        recorded = appliance.ask_or_exit(admin.RecordingsWanted())
-        require_recorded(recorded, _topics(specifications, patterns))
-        with pieces_of(appliance, recorded, span) as pieces, MONITOR.reports():
-            _cover(pieces, span, recorded.in_progress, as_json=appliance.as_json)
-            spans = [(piece.name, piece.bag, piece.span) for piece in pieces]
+        recorded = recorded_messages()
+        if recorded is None:
+            raise MONITOR.usage_error("this appliance has no flight recorder: give --bag FILE or --bags DIR")
+        with recorded(appliance, since, until, _topics(specifications, patterns)) as spans:
             run_spans(specifications, spans, report, patterns, margins=margins)
     except SpecificationError as error:
         raise refused(error.findings) from None
-
-
-def _cover(
-    pieces: Sequence[Piece], span: Span, in_progress: Sequence[OpenRecording], *, as_json: bool
-) -> None:
-    """Print the gaps; messages of a recording that is still being made are not readable yet."""
-    # Without --since, the time before the first piece is not a gap.
-    began = span.since or pieces[0].span.since
-    for gap in gaps([piece.span for piece in pieces], Span(began, span.until)):
-        if as_json:
-            say_json({"kind": "gap", "since": gap.since / BILLION, "until": gap.until / BILLION})
-        else:
-            making = next((one for one in in_progress if one.began <= gap.until), None)
-            until = (
-                ""
-                if making is None
-                else f"; {making.id} is being recorded until {rfc3339(making.ends)} or later"
-            )
-            say(f"{'not recorded' if making is None else 'not readable yet'}: {gap}{until}", "yellow")
-    for name, why_not in dict.fromkeys((piece.name, piece.why_not) for piece in pieces if piece.why_not):
-        if as_json:
-            say_json({"kind": "incomplete", "bag": name, "text": why_not})
-        else:
-            say(f"{name} is incomplete: {why_not}", "yellow")
 
 
 def _specifications(appliance: Appliance, what: str, folders: Sequence[Path]) -> Specifications:

@@ -9,7 +9,6 @@ from appliance.control.assembly.core import Core
 from appliance.control.assembly.foundation import INNER, RVMASTER, Current, Foundation
 from appliance.control.assembly.listener_limits import value_limits
 from appliance.control.monitor_call_gate import MonitorCallGate
-from appliance.features.recorder.recording_orders import RecordingOrders
 from appliance.master import rosout
 from appliance.master.endpoints.delivery import Delivery
 from appliance.master.endpoints.node_api import NodeApiClient
@@ -37,7 +36,6 @@ class Endpoints:
 
     places: NodePorts
     addresses: AdvertisedAddresses
-    recordings: RecordingOrders
     relay: RelayControl
     rosmaster: RosMaster
     faces: ProxyEndpoints
@@ -61,12 +59,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
     )
     nodes = NodeApiClient(core.registry, timeout=settings.limits.node_call_seconds)
     delivery = Delivery(nodes, troubled=core.watchlist.could_not_tell, quota_class=base.quota_class)
-    recordings = RecordingOrders(
-        settings.recorder,
-        base.trail,
-        lambda: messages.RevisionsStated(policies.revision, core.monitors().revision),
-        base.plan,
-    )
+    base.in_force.set(lambda: (policies.revision, core.monitors().revision))
     allocation = Allocation(settings.relays, lambda text: base.store.save_setting(ALLOCATION, text))
     gate = Current[MonitorCallGate]()
     relay = RelayControl(
@@ -80,7 +73,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         monitors=core.monitors,
         broken=core.watchlist.look_at,
         own_header=_header_of_rosout() if settings.monitors_on_rosout else None,
-        own_call=recordings.called,
+        own_call=base.features.called,
         monitor_call=lambda wanted: gate().answer(wanted),
     )
     rosmaster = RosMaster(
@@ -127,7 +120,6 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
             fixed=base.pair.membership.fixed if base.pair is not None else None,
             tunnels=settings.ipsec.pool,
         ),
-        recordings=recordings,
         relay=relay,
         rosmaster=rosmaster,
         faces=faces,

@@ -2,13 +2,12 @@
 
 import asyncio
 import socket
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import structlog
 
-from appliance.audit.log.ids import IdSource
 from appliance.audit.log.log import AuditLog
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.host_authority import HostAuthority, make_host_authority
@@ -20,8 +19,9 @@ from appliance.control.assembly.quota_class import HostQuotaClass, charged_to
 from appliance.control.assembly.robot import robot_addresses
 from appliance.control.links.signer_requests import ReceiptFloor, SignerRequests
 from appliance.control.links.supervisor_link import ControlLifeline
-from appliance.features.recorder.recording_plan import RecordingPlan
+from appliance.features.feature import FeatureContext
 from appliance.features.standby.replication import Pair, Replication, make_replication
+from appliance.features.table import FeatureParts
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHosts
 from appliance.hosts.tunnel_state import Tunnels
@@ -63,8 +63,9 @@ class Current(Generic[T]):
 class Foundation:
     """The durable state, the policy and the listeners.
 
-    `enforcement` gets its value later. `parameters_dirty` is set whenever the mirror of the parameters changes.
-    `pair` and `replication` exist on one of two appliances.
+    `enforcement` gets its value later. So does `in_force`, which returns the revisions of policy and specifications.
+    `parameters_dirty` is set whenever the mirror of the parameters changes. `pair` and `replication` exist on one of
+    two appliances.
     """
 
     settings: Settings
@@ -75,7 +76,8 @@ class Foundation:
     audit: AuditLog
     receipts: ReceiptFloor
     trail: AuditTrail
-    plan: RecordingPlan
+    features: FeatureParts
+    in_force: Current[Callable[[], tuple[int, int]]]
     store: StateStore
     blocks: BlockTable
     table: HostTable
@@ -124,12 +126,24 @@ async def make_foundation(
             receipts=receipts,
         )
     )
-    plan = RecordingPlan(settings.recorder, lambda host: charged_to(policies.current, host), IdSource().next)
+    features, in_force = Current[FeatureParts](), Current[Callable[[], tuple[int, int]]]()
     trail = AuditTrail(
         audit(),
         strict=settings.audit.durability == "strict",
         deny_when_failed=settings.audit.on_audit_failure == "deny",
-        recordings=plan.detail,
+        details=lambda *event: features().details(*event),
+    )
+    features.set(
+        FeatureParts(
+            FeatureContext(
+                settings.sections,
+                trail,
+                audit(),
+                settings.name,
+                charged_to=lambda host: charged_to(policies.current, host),
+                in_force=lambda: in_force()(),  # noqa: PLW0108  it has no value yet
+            )
+        )
     )
     store = StateStore(
         settings.state / "control", failed=lambda reason: _log.error("state is not written", reason=reason)
@@ -170,7 +184,8 @@ async def make_foundation(
         audit=audit(),
         receipts=receipts,
         trail=trail,
-        plan=plan,
+        features=features(),
+        in_force=in_force,
         store=store,
         blocks=blocks,
         table=table,

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from appliance.features.recorder.recording_answers import APPLIANCE, ROBOT, UNKNOWN
+from appliance.base.actors import APPLIANCE, ROBOT, UNKNOWN
 from appliance.policy.host_sets import EVERYONE
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
@@ -51,7 +51,7 @@ class HostQuotaClass:
 
 
 def charged_to(policy: Policy, host: str) -> str:
-    """Return the name to which recordings about a host are charged (see `recorder.recording_plan`)."""
+    """Return the name to which a host's acts are charged."""
     try:
         address = address_of(host)
     except ValueError:

@@ -18,7 +18,6 @@ from appliance.control.errors import SenselessError, UnavailableError, UnknownTh
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.token_orders import TokenRefusedError
-from appliance.features.recorder.recording_orders import RecorderAwayError
 from appliance.features.standby.lease_client import HandOverError
 from appliance.hosts.host_table import (
     HostForbiddenError,
@@ -49,7 +48,6 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     HostForbiddenError: "forbidden",
     HostRefusedError: "refused",
     TokenRefusedError: "refused",
-    RecorderAwayError: "failed",
     UnavailableError: "failed",
     HandOverError: "failed",
     StoreError: "failed",

@@ -2,13 +2,12 @@
 
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from appliance.channel import admin
 from appliance.channel.answers.limit_answers import LimitList, LimitUse
-from appliance.channel.answers.status import RecorderState
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.listener_limits import ListenerLimits
@@ -18,12 +17,12 @@ from appliance.quotas.table import NAMES, RELAY_FRAMES, RELAY_LATCHED, RELAY_QUE
 
 @dataclass(frozen=True)
 class LimitQueries:
-    """The answer to `rosrv limits`; `recorder()` returns the state of the flight recorder."""
+    """The answer to `rosrv limits`; `features()` returns the resources of features."""
 
     parts: Parts
     settings: Settings
     listeners: ListenerLimits
-    recorder: Callable[[], RecorderState | None]
+    features: Callable[[], Iterable[LimitUse]]
 
     async def use(self, _request: admin.LimitsWanted) -> LimitList:
         """Return the resources that hosts can exhaust, with their present use."""
@@ -66,10 +65,7 @@ class LimitQueries:
         kept = None if audit.retention_bytes is None else int(audit.retention_bytes)
         allowed = size + shutil.disk_usage(folder).free if kept is None else kept
         yield LimitUse("bytes of audit records", size, allowed, "audit.retention_bytes, or the disk")
-        recorder = self.recorder()
-        if recorder is not None:
-            disk = int(self.settings.recorder.disk)
-            yield LimitUse("bytes of recordings", recorder.bytes, disk, "recorder.disk")
+        yield from self.features()
 
 
 _MEMORY: dict[str, tuple[str, QuotaRow]] = {

@@ -10,7 +10,6 @@ from appliance.control.operators.limit_use import LimitQueries
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.token_orders import TokenOrders
-from appliance.features.recorder.recording_orders import RecordingOrders
 from appliance.features.standby.standby_orders import StandbyOrders
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment import HostEnrolment
@@ -25,7 +24,6 @@ def request_methods(
     hosts: HostEnrolment,
     certification: Certification,
     tokens: TokenOrders,
-    recordings: RecordingOrders,
     blocks: BlockOrders,
     standby: StandbyOrders,
     limits: LimitQueries,
@@ -87,11 +85,4 @@ def request_methods(
         RequestMethod(admin.TokenAdd, tokens.add, who=True),
         RequestMethod(admin.TokenRotate, tokens.rotate, who=True),
         RequestMethod(admin.TokenRevoke, tokens.revoke, who=True, full_disk=True),
-        RequestMethod(admin.RecordingsWanted, recordings.recordings),
-        RequestMethod(admin.RecordingWanted, recordings.recording),
-        RequestMethod(admin.RecordNow, recordings.now, who=True, full_disk=True),
-        RequestMethod(admin.RecordingFetch, recordings.fetch, who=True),
-        RequestMethod(admin.RecordingRead, recordings.read, who=True),
-        RequestMethod(admin.RecordingOfMemory, recordings.of_memory, who=True, full_disk=True),
-        RequestMethod(admin.RecordingRemove, recordings.remove, who=True, full_disk=True),
     )

@@ -11,13 +11,18 @@ import socket
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from appliance.base.age_clock import AgeClock
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 from appliance.configuration.settings import Settings, load_resolved
+from appliance.features.recorder import recorder_link
 from appliance.features.recorder.recorder import Recorder
+from appliance.features.recorder.recorder_link import RingTerms
 from appliance.features.recorder.recording_store import RecordingStore
+from appliance.features.recorder.settings import RecorderRules
 
 _DAY = 86_400.0
 
@@ -34,10 +39,10 @@ class _Process:
         self._settings = settings
         self._child = Child(
             Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline),
-            messages.RecorderLink,
+            recorder_link.RecorderLink,
             said=self._hear,
-            linked=lambda: self._hear(messages.RecordingsAsked()),
-            ring_given=self._ring_given,
+            linked=lambda: self._hear(recorder_link.RecordingsAsked()),
+            memory_given=self._memory_given,
         )
         self._rings: dict[int, memoryview] = {}
         self._memory = 0
@@ -64,7 +69,7 @@ class _Process:
             recorder.close()
 
     def _make_recorder(self) -> Recorder:
-        settings, rules = self._settings, self._settings.recorder
+        settings, rules = self._settings, self._settings.of(RecorderRules)
         return Recorder(
             rules,
             RecordingStore(
@@ -83,7 +88,8 @@ class _Process:
         self._said.append(message)
         self._wake.set()
 
-    def _ring_given(self, given: messages.RingGiven, descriptor: int) -> None:
+    def _memory_given(self, message: messages.MemoryGiven, descriptor: int) -> None:
+        given = msgspec.convert(message.terms, RingTerms)
         self._rings[given.index] = memoryview(mmap.mmap(descriptor, 0, prot=mmap.PROT_READ))
         self._memory = max(self._memory, given.since)
         os.close(descriptor)

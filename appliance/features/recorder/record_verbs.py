@@ -16,13 +16,13 @@ from appliance.audit.log.record_format import rfc3339
 from appliance.base import clock
 from appliance.base.atomic_files import name_to_make
 from appliance.base.timestamps import parse_timestamp
-from appliance.channel import admin
 from appliance.cli import completion
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import say_json, usage_error
 from appliance.cli.topic_verbs import lines_of
+from appliance.features.recorder import recording_requests
 from appliance.features.recorder.bag_reader import MessagePosition
 from appliance.features.recorder.mcap import as_mcap
 from appliance.features.recorder.recording_answers import RecordedMessages, Recording, Sender, Timeline
@@ -66,7 +66,7 @@ def now(
 
     Example: rosrv record now --after 30s --note "the arm hit the door"
     """
-    request = admin.RecordNow(_seconds("--before", before), _seconds("--after", after), note)
+    request = recording_requests.RecordNow(_seconds("--before", before), _seconds("--after", after), note)
     body = appliance.answer_or_exit(request)
     say(body.id)
     typer.echo(
@@ -81,7 +81,7 @@ def list_recordings(appliance: Appliance) -> None:
 
     Example: rosrv record list
     """
-    body = appliance.ask_or_exit(admin.RecordingsWanted())
+    body = appliance.ask_or_exit(recording_requests.RecordingsWanted())
     rows = body.recordings
     for row in rows:
         if appliance.as_json:
@@ -101,7 +101,7 @@ def show(appliance: Appliance, recording: _Id) -> None:
 
     Example: rosrv record show 1879f3c2a4b5d6e7f012
     """
-    body = appliance.answer_or_exit(admin.RecordingWanted(recording))
+    body = appliance.answer_or_exit(recording_requests.RecordingWanted(recording))
     for line in _described(body, appliance.host_in_words):
         say(line)
 
@@ -125,7 +125,7 @@ def show_timeline(
     """
     way = appliance.way
     if isinstance(way, AdminSocket):
-        body = appliance.ask_or_exit(admin.RecordingWanted(recording))
+        body = appliance.ask_or_exit(recording_requests.RecordingWanted(recording))
         start, end = _moment_given("--since", since), _moment_given("--until", until)
         found = _read(
             lambda: timeline(
@@ -170,13 +170,13 @@ def messages(
     Example: rosrv record messages 1879f3c2a4b5d6e7f012 --topic /cmd_vel
     """
     topics = topic or []
-    body = appliance.ask_or_exit(admin.RecordingWanted(recording))
+    body = appliance.ask_or_exit(recording_requests.RecordingWanted(recording))
     text = body.triggers[0].record if at is None else at
     way = appliance.way
     if isinstance(way, AdminSocket):
         place = text if is_record(text) else MessagePosition.parsed(text) or _moment_given("--at", text)
         assert place is not None  # noqa: S101  it is text
-        appliance.ask_or_exit(admin.RecordingRead(recording, topics))
+        appliance.ask_or_exit(recording_requests.RecordingRead(recording, topics))
         found = _read(lambda: messages_around(body, _bag(way, body), place, topics, neighbours))
     else:
         query = {"at": text, "topic": topics, "neighbours": neighbours}
@@ -219,7 +219,7 @@ def fetch(
     except OSError as error:
         raise usage_error(f"{part}: {error.strerror}") from None
     try:
-        body = appliance.ask_or_exit(admin.RecordingWanted(recording))
+        body = appliance.ask_or_exit(recording_requests.RecordingWanted(recording))
         bag = bag_of(appliance, body.id, part)
         if bag is not part:
             shutil.copyfile(bag, part)
@@ -247,7 +247,7 @@ def remove(appliance: Appliance, recording: _Id) -> None:
 
     Example: rosrv record remove 1879f3c2a4b5d6e7f012
     """
-    body = appliance.answer_or_exit(admin.RecordingRemove(recording))
+    body = appliance.answer_or_exit(recording_requests.RecordingRemove(recording))
     say(f"recording {body.id} is removed")
 
 
@@ -255,7 +255,7 @@ def bag_of(appliance: Appliance, recording: str, part: Path) -> Path:
     """Audit the request; return the bag's path in the state directory. Over REST, fill `part`. Raises `OSError`."""
     way = appliance.way
     if isinstance(way, AdminSocket):
-        return _bag(way, appliance.ask_or_exit(admin.RecordingFetch(recording)))
+        return _bag(way, appliance.ask_or_exit(recording_requests.RecordingFetch(recording)))
     from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
 
     try:

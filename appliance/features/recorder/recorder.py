@@ -25,11 +25,12 @@ from appliance.audit.search.query import Filter
 from appliance.audit.search.search import Follower, export, search
 from appliance.base import clock
 from appliance.channel import messages
-from appliance.configuration.settings import RecorderRules
+from appliance.features.recorder import recorder_link
 from appliance.features.recorder.recording import MOST_TRIGGERS, Progress, RecordingInProgress, load_progress
 from appliance.features.recorder.recording_answers import Recording, Trigger
 from appliance.features.recorder.recording_plan import KEPT, HourlyLimit, recording_owner, span
 from appliance.features.recorder.recording_store import MOST_TEMPORARY, RecordingStore
+from appliance.features.recorder.settings import RecorderRules
 from appliance.features.recorder.triggers import trigger_of
 
 SETTLE_SECONDS = 0.5
@@ -72,7 +73,7 @@ class Recorder:
         self._limit = HourlyLimit(rules.per_hour, store.recordings)
         self._follower: Follower | None = None
         self._making: list[RecordingInProgress] = []
-        self._revisions = messages.RevisionsStated(0, 0)
+        self._revisions = recorder_link.RevisionsStated(0, 0)
         self._asked_for: set[str] = set()  # ids of recordings that wait for the revisions in force
         self._told: dict[tuple[str, str], int] = {}  # when a trigger without a recording was last reported
         self._answers: list[messages.Message] = []
@@ -113,51 +114,53 @@ class Recorder:
 
     def _obey(self, message: Any) -> None:
         match message:
-            case messages.RecordingsAsked():
+            case recorder_link.RecordingsAsked():
                 making = [making.opened for making in self._making]
-                self._answers.append(messages.RecordingsStated(list(self._store.recordings), making))
-                self._answers += [messages.RecordingClosed(found) for found in self._store.unnoted()]
-                self._answers += [messages.RecordingRemoved(0, *removed) for removed in self._store.removed()]
-                self._answers.append(messages.RevisionsWanted())
-            case messages.RevisionsStated():
+                self._answers.append(recorder_link.RecordingsStated(list(self._store.recordings), making))
+                self._answers += [recorder_link.RecordingClosed(found) for found in self._store.unnoted()]
+                self._answers += [
+                    recorder_link.RecordingRemoved(0, *removed) for removed in self._store.removed()
+                ]
+                self._answers.append(recorder_link.RevisionsWanted())
+            case recorder_link.RevisionsStated():
                 self._revisions = message
-            case messages.RecordingNoted(recording_id):
+            case recorder_link.RecordingNoted(recording_id):
                 self._store.note(recording_id)
-            case messages.RecordingRequested():
+            case recorder_link.RecordingRequested():
                 self._order(message)
-            case messages.MemoryWanted():
+            case recorder_link.MemoryWanted():
                 self._record_temporarily(message)
-            case messages.RecordingRemovalWanted(number, recording_id, who):
+            case recorder_link.RecordingRemovalWanted(number, recording_id, who):
                 self._remove(number, recording_id, who)
 
-    def _order(self, wanted: messages.RecordingRequested) -> None:
+    def _order(self, wanted: recorder_link.RecordingRequested) -> None:
         making, why_not = self._record(wanted.trigger, wanted.before, wanted.after)
         if making is None:
-            self._answers.append(messages.RecordingRefused(wanted.number, why_not))
+            self._answers.append(recorder_link.RecordingRefused(wanted.number, why_not))
             if wanted.trigger.what == "service":  # a node may ignore the refusal, so it is also recorded
                 self._missed(wanted.trigger, why_not)
         else:
             progress = making.progress
             self._answers.append(
-                messages.RecordingStarted(wanted.number, progress.id, progress.ends, progress.began)
+                recorder_link.RecordingStarted(wanted.number, progress.id, progress.ends, progress.began)
             )
 
-    def _record_temporarily(self, wanted: messages.MemoryWanted) -> None:
+    def _record_temporarily(self, wanted: recorder_link.MemoryWanted) -> None:
         now = self._clock()
         since = max(self._memory, wanted.since, now - int(self._rules.before * _SECOND))
         until = min(wanted.until, now)
         if since > until:
             reason = f"the memory has the last {self._rules.before:g} seconds, and none of that period"
-            self._answers.append(messages.RecordingRefused(wanted.number, reason, unknown=True))
+            self._answers.append(recorder_link.RecordingRefused(wanted.number, reason, unknown=True))
             return
         if self._store.free < 2 * self._reserve + self._store.largest:
-            self._answers.append(messages.RecordingRefused(wanted.number, "the disk is nearly full"))
+            self._answers.append(recorder_link.RecordingRefused(wanted.number, "the disk is nearly full"))
             return
         progress = Progress(self._ids.next(), self._memory, since, until, [wanted.trigger])
         try:
             if not self._store.has_temporary_room(now):
                 reason = f"{MOST_TEMPORARY} requests came within seconds: try again in half a minute"
-                self._answers.append(messages.RecordingRefused(wanted.number, reason))
+                self._answers.append(recorder_link.RecordingRefused(wanted.number, reason))
                 return
             self._store.mark_temporary(progress.id)
             temporary = self._in_progress(progress)
@@ -169,14 +172,14 @@ class Recorder:
             self._store.publish_temporary(recording)
         except OSError as error:
             self._store.discard_part(progress.id)
-            self._answers.append(messages.RecordingRefused(wanted.number, str(error)))
+            self._answers.append(recorder_link.RecordingRefused(wanted.number, str(error)))
         else:
-            self._answers.append(messages.MemoryLent(wanted.number, recording))
+            self._answers.append(recorder_link.MemoryLent(wanted.number, recording))
 
     def _remove(self, number: int, recording_id: str, who: str) -> None:
         recording = self._store.find(recording_id)
         if recording is None:
-            refused = messages.RecordingRefused(
+            refused = recorder_link.RecordingRefused(
                 number, f"recording {recording_id} does not exist", unknown=True
             )
             self._answers.append(refused)
@@ -184,9 +187,9 @@ class Recorder:
         try:
             self._store.remove(recording, who, "")
         except OSError as error:
-            self._answers.append(messages.RecordingRefused(number, str(error)))
+            self._answers.append(recorder_link.RecordingRefused(number, str(error)))
         else:
-            self._answers.append(messages.RecordingRemoved(number, recording, who, ""))
+            self._answers.append(recorder_link.RecordingRemoved(number, recording, who, ""))
 
     # --- triggers -----------------------------------------------------------------------------------------
 
@@ -242,7 +245,7 @@ class Recorder:
             if len(self._told) > _MOST_TOLD:
                 self._told.clear()
             self._told[kind] = now
-            self._answers.append(messages.RecordingMissed(trigger, why, planned))
+            self._answers.append(recorder_link.RecordingMissed(trigger, why, planned))
 
     def _record(
         self, trigger: Trigger, before: float | None = None, after: float | None = None, planned: str = ""
@@ -291,7 +294,7 @@ class Recorder:
             self._store.discard_part(progress.id)
             return None, str(error)
         self._making.append(making)
-        self._answers += [messages.RecordingOpened(making.opened), messages.RevisionsWanted()]
+        self._answers += [recorder_link.RecordingOpened(making.opened), recorder_link.RevisionsWanted()]
         _log.info("a recording begins", recording=progress.id, trigger=trigger.what, charged_to=charged_to)
         return making, ""
 
@@ -310,7 +313,7 @@ class Recorder:
             making.step()
         elif progress.id not in self._asked_for:
             self._asked_for.add(progress.id)
-            self._answers.append(messages.RevisionsWanted())
+            self._answers.append(recorder_link.RevisionsWanted())
         if self._store.free < self._reserve:
             progress.why_not = "the disk was nearly full"
         if progress.why_not:
@@ -333,7 +336,7 @@ class Recorder:
         recording = making.finish(records, self._revisions)
         self._forget(making)
         self._store.keep(recording)
-        self._answers.append(messages.RecordingClosed(recording))
+        self._answers.append(recorder_link.RecordingClosed(recording))
         _log.info("a recording is closed", recording=recording.id, size=recording.size)
 
     def _give_up(self, making: RecordingInProgress, error: OSError) -> None:
@@ -342,7 +345,7 @@ class Recorder:
         progress = making.progress
         self._store.discard_part(progress.id)
         self._forget(making)
-        self._answers.append(messages.RecordingMissed(progress.triggers[0], str(error), progress.id))
+        self._answers.append(recorder_link.RecordingMissed(progress.triggers[0], str(error), progress.id))
 
     def _forget(self, making: RecordingInProgress) -> None:
         self._making = [other for other in self._making if other is not making]
@@ -390,7 +393,7 @@ class Recorder:
 
     def _remove_for(self, recording: Recording, reason: str) -> None:
         self._store.remove(recording, "", reason)
-        self._answers.append(messages.RecordingRemoved(0, recording, "", reason))
+        self._answers.append(recorder_link.RecordingRemoved(0, recording, "", reason))
 
 
 def _prolong(progress: Progress, trigger: Trigger, after: float | None) -> None:

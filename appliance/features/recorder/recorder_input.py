@@ -10,13 +10,16 @@ from typing import NamedTuple
 from appliance.audit.log.record_format import rfc3339
 from appliance.base import clock
 from appliance.base.timestamps import parse_timestamp
-from appliance.channel import admin
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance
 from appliance.cli.monitor.monitor_program import MONITOR
+from appliance.cli.output import say_json
+from appliance.features.recorder import recording_requests
 from appliance.features.recorder.record_verbs import bag_of
-from appliance.features.recorder.recording_answers import Recording, Recordings
-from rosmop.tool.terminal import refused
+from appliance.features.recorder.recording_answers import OpenRecording, Recording, Recordings
+from appliance.features.recorder.recording_requests import RecordingsWanted
+from rosmop.tool.monitor_output import BILLION
+from rosmop.tool.terminal import refused, say
 
 _SECOND = 1_000_000_000
 
@@ -106,6 +109,46 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[l
         yield pieces
 
 
+@contextmanager
+def recorded_messages(
+    appliance: Appliance, since: str | None, until: str | None, topics: Mapping[str, str]
+) -> Iterator[list[tuple[str, Path, tuple[int, int]]]]:
+    """Give the bags with these topics (name to type) from --since to --until, and print what is missing.
+
+    Each bag has a name, and the period to read. Exits with status 2 for a mistake, 1 if nothing was recorded.
+    """
+    span = span_of(since, until)
+    recorded = appliance.ask_or_exit(RecordingsWanted())
+    require_recorded(recorded, topics)
+    with pieces_of(appliance, recorded, span) as pieces, MONITOR.reports():
+        _cover(pieces, span, recorded.in_progress, as_json=appliance.as_json)
+        yield [(piece.name, piece.bag, piece.span) for piece in pieces]
+
+
+def _cover(
+    pieces: Sequence[Piece], span: Span, in_progress: Sequence[OpenRecording], *, as_json: bool
+) -> None:
+    """Print the gaps; messages of a recording that is still being made are not readable yet."""
+    # Without --since, the time before the first piece is not a gap.
+    began = span.since or pieces[0].span.since
+    for gap in gaps([piece.span for piece in pieces], Span(began, span.until)):
+        if as_json:
+            say_json({"kind": "gap", "since": gap.since / BILLION, "until": gap.until / BILLION})
+        else:
+            making = next((one for one in in_progress if one.began <= gap.until), None)
+            until = (
+                ""
+                if making is None
+                else f"; {making.id} is being recorded until {rfc3339(making.ends)} or later"
+            )
+            say(f"{'not recorded' if making is None else 'not readable yet'}: {gap}{until}", "yellow")
+    for name, why_not in dict.fromkeys((piece.name, piece.why_not) for piece in pieces if piece.why_not):
+        if as_json:
+            say_json({"kind": "incomplete", "bag": name, "text": why_not})
+        else:
+            say(f"{name} is incomplete: {why_not}", "yellow")
+
+
 def gaps(parts: Sequence[Span], span: Span) -> Iterator[Span]:
     """Yield the periods of the span that the ordered parts do not cover."""
     at = span.since
@@ -120,7 +163,7 @@ def gaps(parts: Sequence[Span], span: Span) -> Iterator[Span]:
 def _lent(appliance: Appliance, span: Span) -> Recording | None:
     """Return the recorder's memory of a period as a recording, or None. Exits with status 1 for a rejected request."""
     try:
-        answer = appliance.ask(admin.RecordingOfMemory(*span))
+        answer = appliance.ask(recording_requests.RecordingOfMemory(*span))
     except NotRunningError as error:
         raise MONITOR.usage_error(str(error)) from None
     return None if answer.trouble == "unknown" else appliance.body_or_exit(answer)

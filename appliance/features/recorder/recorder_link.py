@@ -1,6 +1,4 @@
-"""The recorder's links: the supervisor gives relays and recorder shared memory, and control <-> recorder."""
-
-from typing import ClassVar
+"""The recorder's link to control, and the terms of the shared memory that the supervisor gives relays and recorder."""
 
 import msgspec
 
@@ -8,15 +6,14 @@ from appliance.channel.messages.message import Message
 from appliance.features.recorder.recording_answers import OpenRecording, Recording, Trigger
 
 
-class RingGiven(Message):
-    """The supervisor gives relay `index` and the recorder shared memory. The relay stores received messages there.
+class RingTerms(msgspec.Struct, frozen=True):
+    """The terms of the shared memory in which relay `index` stores received messages for the recorder.
 
     The memory was made at `since` (nanoseconds since the epoch). The relay keeps the last `seconds` of each topic whose
     name matches a glob of `topics`, unless its name or type matches a glob of `never`. `sums` lists the known md5sums
     of types that match a glob of `never`. A topic that claims such a type must have its md5sum.
     """
 
-    descriptors: ClassVar[int] = 1
     index: int
     since: int
     seconds: float

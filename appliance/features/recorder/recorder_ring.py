@@ -3,10 +3,13 @@
 import mmap
 import os
 from collections.abc import Callable, Mapping
+from typing import Any
+
+import msgspec
 
 from appliance.base import clock
-from appliance.channel.messages import RingGiven
 from appliance.features.recorder.excluded_topics import fits, left_out_because
+from appliance.features.recorder.recorder_link import RingTerms
 from appliance.features.recorder.ring import LEFT_OUT, RingStream, RingWriter
 from appliance.quotas.table import RECORDER_MEMORY
 
@@ -22,7 +25,7 @@ class RecorderRing:
     same time. If the machine's clock is set, later messages have times by the new setting.
     """
 
-    def __init__(self, given: RingGiven, descriptor: int, now: Callable[[], int]) -> None:
+    def __init__(self, given: RingTerms, descriptor: int, now: Callable[[], int]) -> None:
         bounds = RECORDER_MEMORY.bounds
         # Map its pages at once: otherwise the first message on each page causes a page fault.
         memory = mmap.mmap(descriptor, 0, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)
@@ -69,3 +72,8 @@ class ExcludedStream:
 
     def close(self) -> None:
         self._marked.close()
+
+
+def open_ring(terms: Mapping[str, Any], descriptor: int, now: Callable[[], int]) -> RecorderRing:
+    """Open the memory that the supervisor gave a relay."""
+    return RecorderRing(msgspec.convert(terms, RingTerms), descriptor, now)

@@ -18,9 +18,9 @@ import msgspec
 from appliance.audit.log.record import Severity
 from appliance.audit.log.record_format import LogEntry, as_json
 from appliance.base.atomic_files import write_whole
-from appliance.channel.messages import RevisionsStated
 from appliance.features.recorder.bag_writer import BagMessage, BagWriter
 from appliance.features.recorder.excluded_topics import NAMED
+from appliance.features.recorder.recorder_link import RevisionsStated
 from appliance.features.recorder.recording_answers import (
     OPERATORS,
     LeftOutTopic,

@@ -4,10 +4,11 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
+from appliance.base.actors import APPLIANCE
 from appliance.channel.answers.field_docs import NanoMoment, doc
 
-ROBOT, OPERATORS, APPLIANCE, UNKNOWN = "robot", "operators", "appliance", "unknown hosts"
-"""Recordings are charged to these, or to a host or network as the policy names it."""
+OPERATORS = "operators"
+"""Recordings that operators order are charged to this; others as `charged_to` of control says."""
 
 TriggerKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "service", "order"]
 EventKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "notice"]

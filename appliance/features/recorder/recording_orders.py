@@ -9,12 +9,13 @@ from msgspec.structs import replace
 
 from appliance.audit.log.record_format import rfc3339
 from appliance.base import clock
-from appliance.channel import admin, messages
+from appliance.channel import messages
+from appliance.channel.answers.limit_answers import LimitUse
 from appliance.channel.answers.status import RecorderState
 from appliance.channel.channel import ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
-from appliance.configuration.settings import RecorderRules
-from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
+from appliance.features.recorder import recorder_link, recording_requests
 from appliance.features.recorder.recording_answers import (
     OPERATORS,
     OpenRecording,
@@ -26,21 +27,18 @@ from appliance.features.recorder.recording_answers import (
 )
 from appliance.features.recorder.recording_plan import RecordingPlan
 from appliance.features.recorder.recording_store import MOST_TEMPORARY
+from appliance.features.recorder.settings import RecorderRules
 from appliance.telemetry.audit_trail import AuditTrail
 
 _PATIENCE_SECONDS = 10.0
 _LONGEST_NOTE = 300
 _MOST_TOPICS = 20
 _LONGEST_NAME = 500
-_M = TypeVar("_M", messages.RecordingStarted, messages.RecordingRemoved, messages.MemoryLent)
-
-
-class RecorderAwayError(Exception):
-    """The recorder is not running, or cannot carry out the order."""
+_M = TypeVar("_M", recorder_link.RecordingStarted, recorder_link.RecordingRemoved, recorder_link.MemoryLent)
 
 
 class RecordingOrders:
-    """The link to the recorder. Its methods raise `RecorderAwayError`, `UnknownThingError` and `SenselessError`.
+    """The link to the recorder. Its methods raise `UnavailableError`, `UnknownThingError` and `SenselessError`.
 
     `in_force()` returns the revisions of policy and specifications in force. `plan` finds the recording that covers an
     event.
@@ -50,7 +48,7 @@ class RecordingOrders:
         self,
         rules: RecorderRules,
         trail: AuditTrail,
-        in_force: Callable[[], messages.RevisionsStated],
+        in_force: Callable[[], tuple[int, int]],
         plan: RecordingPlan,
     ) -> None:
         self._rules = rules
@@ -72,7 +70,13 @@ class RecordingOrders:
 
     # --- what operators ask -------------------------------------------------------------------------------
 
-    async def recordings(self, _request: admin.RecordingsWanted) -> Recordings:
+    def limits(self) -> tuple[LimitUse, ...]:
+        """Return how much of the disk recordings use; nothing if the recorder is off."""
+        if (state := self.state()) is None:
+            return ()
+        return (LimitUse("bytes of recordings", state.bytes, int(self._rules.disk), "recorder.disk"),)
+
+    async def recordings(self, _request: recording_requests.RecordingsWanted) -> Recordings:
         """Return the kept recordings, oldest first."""
         self._require()
         rules, kept = self._rules, [self._kept[name] for name in sorted(self._kept)]
@@ -82,11 +86,11 @@ class RecordingOrders:
         ]
         return Recordings(kept, list(rules.topics), list(rules.never), rules.before, in_progress)
 
-    async def recording(self, request: admin.RecordingWanted) -> Recording:
+    async def recording(self, request: recording_requests.RecordingWanted) -> Recording:
         self._require()
         return self._find(request.id)
 
-    async def now(self, request: admin.RecordNow, who: str) -> RecordingBegun:
+    async def now(self, request: recording_requests.RecordNow, who: str) -> RecordingBegun:
         """Begin a recording now, without a trigger."""
         self._require()
         before = self._rules.before if request.before is None else request.before
@@ -113,13 +117,13 @@ class RecordingOrders:
             }
             reason = f"by a call of {call.service}"
             begun = await self._begin("service", reason, text, call.caller_id, span, **caller)
-        except (RecorderAwayError, UnknownThingError) as error:
+        except (UnavailableError, UnknownThingError) as error:
             return messages.OwnServiceAnswered(call.number, False, str(error))
         return messages.OwnServiceAnswered(call.number, True, begun.id)
 
     async def _begin(
         self, what: TriggerKind, reason: str, text: str, who: str, span: tuple[float, float], **caller: Any
-    ) -> messages.RecordingStarted:
+    ) -> recorder_link.RecordingStarted:
         """Record who ordered a recording, then begin it. `span` is the number of seconds before and after now."""
         before, after = span
         record = self._trail.happened(
@@ -128,17 +132,17 @@ class RecordingOrders:
         charged_to = self._plan.charged_to(str(caller["host"])) if "host" in caller else OPERATORS
         trigger = Trigger(clock.wall_ns(), what, record, text[:_LONGEST_NOTE], charged_to)
         begun = await self._ask(
-            lambda number: messages.RecordingRequested(number, trigger, before, after),
-            messages.RecordingStarted,
+            lambda number: recorder_link.RecordingRequested(number, trigger, before, after),
+            recorder_link.RecordingStarted,
         )
         self._plan.opened(charged_to, begun.id, begun.began, begun.ends)
         return begun
 
-    async def fetch(self, request: admin.RecordingFetch, who: str) -> Recording:
+    async def fetch(self, request: recording_requests.RecordingFetch, who: str) -> Recording:
         """Record who fetches a recording. The api reads its messages from the disk."""
         return await self._given_out(request.id, "recording fetched", f"by {who}", who)
 
-    async def read(self, request: admin.RecordingRead, who: str) -> Recording:
+    async def read(self, request: recording_requests.RecordingRead, who: str) -> Recording:
         """Record who reads messages of a recording. Repetitions within a few seconds are only counted."""
         topics = request.topics
         if len(topics) > _MOST_TOPICS or any(len(topic) > _LONGEST_NAME for topic in topics):
@@ -164,10 +168,10 @@ class RecordingOrders:
         )
         failure = await self._trail.durable()
         if failure is not None:
-            raise RecorderAwayError(f"nothing can be fetched while the order cannot be recorded: {failure}")
+            raise UnavailableError(f"nothing can be fetched while the order cannot be recorded: {failure}")
         return recording
 
-    async def of_memory(self, request: admin.RecordingOfMemory, who: str) -> Recording:
+    async def of_memory(self, request: recording_requests.RecordingOfMemory, who: str) -> Recording:
         """Make a temporary recording of the messages in memory."""
         self._require()
         now = clock.wall_ns()
@@ -181,15 +185,16 @@ class RecordingOrders:
         )
         trigger = Trigger(now, "order", record, f"{who}: from the messages in memory", OPERATORS)
         lent = await self._ask(
-            lambda number: messages.MemoryWanted(number, trigger, since, until), messages.MemoryLent
+            lambda number: recorder_link.MemoryWanted(number, trigger, since, until), recorder_link.MemoryLent
         )
         self._lent = dict([*self._lent.items(), (lent.recording.id, lent.recording)][-MOST_TEMPORARY:])
         return lent.recording
 
-    async def remove(self, request: admin.RecordingRemove, who: str) -> Recording:
+    async def remove(self, request: recording_requests.RecordingRemove, who: str) -> Recording:
         self._require()
         removed = await self._ask(
-            lambda number: messages.RecordingRemovalWanted(number, request.id, who), messages.RecordingRemoved
+            lambda number: recorder_link.RecordingRemovalWanted(number, request.id, who),
+            recorder_link.RecordingRemoved,
         )
         return removed.recording
 
@@ -199,7 +204,7 @@ class RecordingOrders:
                 "the flight recorder is off: `recorder: {enabled: true}` in appliance.yaml turns it on"
             )
         if self.link.channel is None:
-            raise RecorderAwayError("the flight recorder is not running now")
+            raise UnavailableError("the flight recorder is not running now")
 
     def _find(self, recording_id: str) -> Recording:
         known = self._kept | self._lent
@@ -215,13 +220,13 @@ class RecordingOrders:
     async def _ask(self, order: Callable[[int], messages.Message], kind: type[_M]) -> _M:
         """Send an order with a new number, and return the recorder's answer. The answer must be of this kind."""
         try:
-            answer: _M | messages.RecordingRefused = await self.link.ask(order, _PATIENCE_SECONDS)
+            answer: _M | recorder_link.RecordingRefused = await self.link.ask(order, _PATIENCE_SECONDS)
         except ChannelClosedError:
-            raise RecorderAwayError("the flight recorder ended before it answered") from None
+            raise UnavailableError("the flight recorder ended before it answered") from None
         except TimeoutError:
-            raise RecorderAwayError("the flight recorder did not answer") from None
-        if isinstance(answer, messages.RecordingRefused):
-            raise (UnknownThingError if answer.unknown else RecorderAwayError)(answer.reason)
+            raise UnavailableError("the flight recorder did not answer") from None
+        if isinstance(answer, recorder_link.RecordingRefused):
+            raise (UnknownThingError if answer.unknown else UnavailableError)(answer.reason)
         assert isinstance(answer, kind)  # noqa: S101  the only other answer to such an order
         return answer
 
@@ -229,27 +234,27 @@ class RecordingOrders:
 
     def _heard(self, message: object) -> None:
         match message:
-            case messages.RecordingsStated(recordings, in_progress):
+            case recorder_link.RecordingsStated(recordings, in_progress):
                 self._kept = {recording.id: recording for recording in recordings}
                 self._open = {recording.id: recording for recording in in_progress}
                 self._plan.stated(recordings, in_progress)
-            case messages.RecordingOpened(recording):
+            case recorder_link.RecordingOpened(recording):
                 self._open[recording.id] = recording
-            case messages.RevisionsWanted():
-                self.link.send(self._in_force())
-            case messages.RecordingClosed(recording):
+            case recorder_link.RevisionsWanted():
+                self.link.send(recorder_link.RevisionsStated(*self._in_force()))
+            case recorder_link.RecordingClosed(recording):
                 self._open.pop(recording.id, None)
                 self._plan.closed(recording)
                 self._closed(recording)
                 self._note(recording.id)
-            case messages.RecordingMissed(trigger, reason, planned):
+            case recorder_link.RecordingMissed(trigger, reason, planned):
                 self._open.pop(planned, None)
                 about = {"what": trigger.what, "record": trigger.record, "charged_to": trigger.charged_to}
                 if planned:
                     about["recording"] = planned
                     self._plan.missed(trigger.charged_to, planned, reason, clock.wall_ns())
                 self._trail.happened("recording missed", reason, more=about)
-            case messages.RecordingRemoved(_number, recording, who, reason):
+            case recorder_link.RecordingRemoved(_number, recording, who, reason):
                 self._kept.pop(recording.id, None)
                 self._trail.happened(
                     "recording removed",
@@ -261,9 +266,9 @@ class RecordingOrders:
                 self._note(recording.id)
                 self.link.answered(message.number, message)
             case (
-                messages.RecordingStarted(number)
-                | messages.MemoryLent(number)
-                | messages.RecordingRefused(number)
+                recorder_link.RecordingStarted(number)
+                | recorder_link.MemoryLent(number)
+                | recorder_link.RecordingRefused(number)
             ):
                 self.link.answered(number, message)
 
@@ -273,7 +278,7 @@ class RecordingOrders:
         async def note() -> None:
             if await self._trail.durable() is None:
                 with suppress(ChannelFullError):
-                    self.link.send(messages.RecordingNoted(recording_id))
+                    self.link.send(recorder_link.RecordingNoted(recording_id))
 
         task = asyncio.ensure_future(note())
         self._notes.add(task)

@@ -24,15 +24,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 from appliance.audit.log.record import Severity
-from appliance.configuration.settings import RecorderRules
-from appliance.features.recorder.recording_answers import (
-    APPLIANCE,
-    OPERATORS,
-    ROBOT,
-    OpenRecording,
-    Recording,
-    TriggerKind,
-)
+from appliance.base.actors import APPLIANCE, ROBOT
+from appliance.features.recorder.recording_answers import OPERATORS, OpenRecording, Recording, TriggerKind
+from appliance.features.recorder.settings import RecorderRules
 from appliance.features.recorder.triggers import kinds_of
 
 KEPT = frozenset({ROBOT, OPERATORS})

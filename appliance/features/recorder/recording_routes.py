@@ -20,7 +20,7 @@ from appliance.api.front.routing import Responses, Routes, file
 from appliance.api.front.services import Services
 from appliance.api.front.streams import StreamResponse, Work, in_thread, peer_of
 from appliance.audit.log.log_database import LogUnreadableError
-from appliance.channel import admin
+from appliance.features.recorder import recording_requests
 from appliance.features.recorder.bag_reader import MessagePosition
 from appliance.features.recorder.mcap import as_mcap
 from appliance.features.recorder.recording_answers import (
@@ -88,7 +88,9 @@ def _add_reading(router: Routes, services: Services) -> None:
     reading = Work("readings of recordings", 1)
 
     async def read(
-        asked: admin.RecordingWanted | admin.RecordingRead, bearer: Bearer, what: _Reading[_T]
+        asked: recording_requests.RecordingWanted | recording_requests.RecordingRead,
+        bearer: Bearer,
+        what: _Reading[_T],
     ) -> _T:
         """Read from the bag of the recording that control returns; only one bag is read at a time."""
         recording = answered(await services.control.ask(asked, bearer))
@@ -119,7 +121,7 @@ def _add_reading(router: Routes, services: Services) -> None:
         """Return the traffic of each topic of a recording, and the events, on one time line; without messages."""
         start, end = _moment(since), _moment(until)
         return await read(
-            admin.RecordingWanted(recording_id),
+            recording_requests.RecordingWanted(recording_id),
             bearer,
             lambda row, bag: timeline(
                 row, bag, start, end, columns, record=record or "", log=services.audit_log
@@ -147,7 +149,7 @@ def _add_reading(router: Routes, services: Services) -> None:
         moment = at if is_record(at) else MessagePosition.parsed(at) or _moment(at)
         assert moment is not None  # noqa: S101  `_moment` returns None only for None
         return await read(
-            admin.RecordingRead(recording_id, topic),
+            recording_requests.RecordingRead(recording_id, topic),
             bearer,
             lambda row, bag: messages_around(row, bag, moment, topic, neighbours),
         )
@@ -155,7 +157,7 @@ def _add_reading(router: Routes, services: Services) -> None:
 
 async def bag_response(services: Services, recording_id: str, bearer: Bearer, *, mcap: bool) -> Response:
     """Answer with the file, after the audit log has recorded which bearer fetches it."""
-    found = answered(await services.control.ask(admin.RecordingFetch(recording_id), bearer))
+    found = answered(await services.control.ask(recording_requests.RecordingFetch(recording_id), bearer))
     try:  # open it before the answer begins: a recording that is then removed is still sent completely
         pieces = await asyncio.to_thread(as_mcap if mcap else _pieces_of, _bag_of(services, found.id))
     except FileNotFoundError:

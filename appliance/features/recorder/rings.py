@@ -10,16 +10,19 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 from pydantic import ByteSize
 
 from appliance.base import clock
-from appliance.channel.messages import RingGiven
-from appliance.configuration.settings import RecorderRules
+from appliance.channel.messages import MemoryGiven
 from appliance.features.recorder.excluded_topics import known_sums
+from appliance.features.recorder.recorder_link import RingTerms
+from appliance.features.recorder.settings import RecorderRules
 from appliance.supervisor.errors import StartError
 
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 _PAGE = 4096
+_USED_BY = "appliance.features.recorder.recorder_ring:open_ring"
 
 
 class RecorderRings:
@@ -33,23 +36,23 @@ class RecorderRings:
             )
         size = int(rules.memory) // relays // _PAGE * _PAGE
         since, sums = clock.wall_ns(), known_sums(rules.never)
-        self._rings: list[tuple[RingGiven, int, int]] = []  # with the writable and the read-only descriptor
+        self._rings: list[tuple[RingTerms, int, int]] = []  # with the writable and the read-only descriptor
         for index in range(relays):
             writable = os.memfd_create(f"rosrv-ring-{index}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
             os.fchmod(writable, 0o600)  # otherwise a reader could open the ring again for writing
             os.posix_fallocate(writable, 0, size)
             fcntl.fcntl(writable, fcntl.F_ADD_SEALS, _SEALS)
             readable = os.open(f"/proc/self/fd/{writable}", os.O_RDONLY | os.O_CLOEXEC)
-            given = RingGiven(index, since, rules.before, list(rules.topics), list(rules.never), sums)
+            given = RingTerms(index, since, rules.before, list(rules.topics), list(rules.never), sums)
             self._rings.append((given, writable, readable))
 
-    def messages_for(self, role: str, index: int) -> Iterator[tuple[RingGiven, int]]:
+    def messages_for(self, role: str, index: int) -> Iterator[tuple[MemoryGiven, int]]:
         """Yield the messages and descriptors that a process gets at its start."""
         for given, writable, readable in self._rings:
             if role == "recorder":
-                yield given, readable
+                yield MemoryGiven(msgspec.to_builtins(given)), readable
             elif role == "relay" and given.index == index:
-                yield given, writable
+                yield MemoryGiven(msgspec.to_builtins(given), _USED_BY), writable
 
     def close(self) -> None:
         """Close all descriptors."""

@@ -9,7 +9,8 @@ from collections.abc import Collection
 from appliance.audit.log.record import AuditRecord, Severity
 from appliance.audit.log.record_format import without_binding
 from appliance.audit.search.equality import equality_of
-from appliance.features.recorder.recording_answers import APPLIANCE, Trigger, TriggerKind
+from appliance.base.actors import APPLIANCE
+from appliance.features.recorder.recording_answers import Trigger, TriggerKind
 
 _BY_EVENT: dict[str, TriggerKind] = {
     "message dropped": "drop",

@@ -29,10 +29,9 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 from appliance.channel.messages import LatchRefused, TopicTraffic
-from appliance.features.recorder.recorder_ring import ExcludedStream, RecorderRing
-from appliance.features.recorder.ring import RingStream
 from appliance.relay.connections.headers import to_subscriber
 from appliance.relay.connections.latched_message import LatchedMessage
+from appliance.relay.connections.message_sink import MessageSink, MessageStream
 from appliance.relay.connections.served_subscribers import ServedSubscribers, TopicSubscriber
 from appliance.relay.connections.startup_replay import APPEARED, StartupReplay
 from appliance.relay.transport.frames import Batch
@@ -133,7 +132,7 @@ class RelayedTopic:
         limited: Callable[[Part, int, int], None],
         make_room: Callable[[int], None],
         refused: Callable[[LatchRefused], None],
-        recorded: RecorderRing | None,
+        sink: MessageSink | None,
         over: Callable[[], bool] = lambda: False,
         servers: Callable[[str], Collection[str]] = lambda _topic: (),
     ) -> None:
@@ -146,7 +145,7 @@ class RelayedTopic:
         self._grace = grace
         self._clock = clock
         self._share = share
-        self._recorder = recorded
+        self._sink = sink
         self.flow = PublicationRateLimit(share, limited)
         self.plain = Version()
         """Changes whenever the pump may have to leave the next frames to Python (see `simple`)."""
@@ -158,7 +157,7 @@ class RelayedTopic:
         self._waiting: dict[TopicSubscriber, None] = {}
         self._monitoring = _Monitoring()
         self._taps: tuple[Callable[[Batch], None], ...] = ()
-        self._recording: RingStream | ExcludedStream | None = None
+        self._stream: MessageStream | None = None
         self._fresh_until = clock() + (APPEARED if fresh else -1)
         self._startup_replay: StartupReplay | None = None
         self._reported = True
@@ -221,7 +220,7 @@ class RelayedTopic:
         """
         if self._latch.is_latching or self._taps or self.flow.limits or len(self._served) > SUBSCRIBERS:
             return None
-        if self._recording is not None or self._startup_replay is not None or self._served.undelivered:
+        if self._stream is not None or self._startup_replay is not None or self._served.undelivered:
             return None
         call = None
         if self._monitoring.through is not None:
@@ -276,9 +275,9 @@ class RelayedTopic:
         self._latch.is_latching = header.get("latching", "0") == "1"
         self._state = TopicState.OPEN
         self.differs()
-        self._end_recording()
-        if self._recorder is not None:
-            self._recording = self._recorder.open(self.topic, self.host, header)
+        self._end_stream()
+        if self._sink is not None:
+            self._stream = self._sink.open(self.topic, self.host, header)
         self._listen()
         if before is not None and _identity(before) != _identity(header):
             for member in self._served.row:
@@ -297,7 +296,7 @@ class RelayedTopic:
 
     def upstream_closed(self) -> None:
         """Forget the upstream's state, but keep the subscribers (see the module docstring)."""
-        self._end_recording()
+        self._end_stream()
         self.hand_out(divided=False)
         self._latch.forget()
         self.flow.forget()
@@ -305,10 +304,10 @@ class RelayedTopic:
         self._forget_startup_replay()
         self._forget_header()
 
-    def _end_recording(self) -> None:
-        if self._recording is not None:
-            self._recording.close()
-            self._recording = None
+    def _end_stream(self) -> None:
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
             self.differs()
 
     def received(self, batch: Batch, since: float) -> Batch | None:
@@ -341,26 +340,26 @@ class RelayedTopic:
         return self._take(rest, rest, since)
 
     def _take(self, batch: Batch, passing: Batch | None, since: float) -> Batch | None:
-        recording = self._recording
-        if recording is None:
+        stream = self._stream
+        if stream is None:
             return None if passing is None else self._admit(passing, since)
-        # Record after subscribers got the batch, to delay nothing; copy it first: monitors may change it in place.
+        # Write after subscribers got the batch, to delay nothing; copy it first: monitors may change it in place.
         whole = batch
-        if self._monitoring.through is not None and recording.keeps:
+        if self._monitoring.through is not None and stream.keeps:
             whole = Batch(memoryview(bytes(batch.view)), batch.messages, batch.last, stride=batch.stride)
             whole.first = batch.first
         passes = 0 if passing is None else passing.messages
         rest = None if passing is None else self._admit(passing, since)
-        if recording is self._recording:
+        if stream is self._stream:
             judged = 0 if passing is None else passing.judged
             taken = passes - (0 if rest is None else rest.messages)
             if rest is None:
                 taken = whole.messages
             elif passes < whole.messages:  # limits have dropped the others
                 dropped = whole.tail(whole.messages - passes)
-                recording.write(dropped.view, dropped.messages, dropped.first)
+                stream.write(dropped.view, dropped.messages, dropped.first)
             head = whole if taken == whole.messages else whole.head(taken)
-            recording.write(head.view, head.messages, head.first, judged)
+            stream.write(head.view, head.messages, head.first, judged)
         return rest
 
     def _admit(self, batch: Batch, since: float, *, divided: bool = True) -> Batch | None:
@@ -381,8 +380,8 @@ class RelayedTopic:
         first = self.counters.following
         self.counters.add(batch.messages, len(batch.view))
         self._reported = False
-        if self._recording is not None:
-            self._recording.write(batch.view, batch.messages, first)
+        if self._stream is not None:
+            self._stream.write(batch.view, batch.messages, first)
         self._pass_on(batch, divided=False)
 
     def _pass_on(self, batch: Batch, *, divided: bool) -> None:
@@ -416,7 +415,7 @@ class RelayedTopic:
 
     def cut_all(self, reason: str) -> None:
         """Cut every subscriber, because the topic is withdrawn."""
-        self._end_recording()
+        self._end_stream()
         for member in self.members:
             member.cut(reason)
 

@@ -19,7 +19,7 @@ NAMES = ("event", "reason", "severity", "host", "category", "resource", "rule", 
 def test_every_report_is_recorded(tmp_path: Path, kind: str) -> None:
     log = open_log(tmp_path / "audit.db")
     records = MonitorRecords(
-        AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {}),
+        AuditTrail(log, strict=False, deny_when_failed=False, details=lambda *_: {}),
         lambda _topic, _data: None,
         [],
     )

@@ -74,16 +74,6 @@ def test_links_are_between_roles_and_go_both_ways() -> None:
             assert role.name in BY_NAME[other].links
 
 
-def test_the_recorder_runs_only_if_configured() -> None:
-    """The recorder has its own user and no network, and reads the audit log; the api reads its recordings."""
-    recorder = BY_NAME["recorder"]
-    assert recorder in roles_of(recorder=True)
-    assert recorder not in roles_of()
-    assert recorder.user not in {role.user for role in ROLES if role is not recorder}
-    assert recorder.group == recorder.readable_by == BY_NAME["api"].user
-    assert (recorder.dispensable, recorder.network, recorder.capabilities) == (True, False, ())
-
-
 def test_the_compiler_has_only_its_link() -> None:
     """The compiler has its own user, but no network, file or right, and starts on demand."""
     compiler = BY_NAME["compiler"]

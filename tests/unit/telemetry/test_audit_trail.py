@@ -9,11 +9,9 @@ from appliance.audit.log.budget import Budget
 from appliance.audit.log.ids import IdSource
 from appliance.audit.log.record import Severity
 from appliance.base import clock
-from appliance.configuration.settings import RecorderRules
-from appliance.features.recorder.recording_plan import RecordingPlan
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import AUDIT_BYTES
-from appliance.telemetry.audit_trail import NOT_RECORDED, AuditTrail, Recordings
+from appliance.telemetry.audit_trail import NOT_RECORDED, AuditTrail, RecordDetails
 
 GUEST, UNKNOWN = "10.0.0.66", "10.9.9.9"
 
@@ -38,13 +36,13 @@ class Log:
         return self.failed
 
 
-def trail(log: Log, *, deny: bool, recordings: Recordings = lambda *_: {}) -> AuditTrail:
+def trail(log: Log, *, deny: bool, details: RecordDetails = lambda *_: {}) -> AuditTrail:
     """Return a trail as control makes it."""
     return AuditTrail(
         log,  # type: ignore[arg-type]  # stands for the log
         strict=True,
         deny_when_failed=deny,
-        recordings=recordings,
+        details=details,
     )
 
 
@@ -102,19 +100,12 @@ def test_events_of_a_host_beyond_its_quota_are_counted() -> None:
     assert GUEST in one.owing(GUEST)
 
 
-def test_the_record_of_a_drop_says_which_recording_has_it() -> None:
-    """This holds for any names of values, and for an alarm; a record that is not a trigger names none."""
+def test_details_of_features_are_added_to_a_record() -> None:
+    """A feature's detail replaces one of the event, whose name an untrusted specification may have chosen."""
     log = Log()
-    rules = RecorderRules(enabled=True, per_hour=1, triggers=["drop", "alarm", "denial"])
-    plan = RecordingPlan(rules, lambda host: host, IdSource().next)
-    one = trail(log, deny=False, recordings=plan.detail)
-    one.happened("message dropped", "too fast", host="10.0.0.9", more={"recording": "forged"})
-    one.happened("message changed", "", host="10.0.0.9")
-    one.happened("monitor fault", "", severity=Severity.ALARM, host="10.0.0.7")
-    drop, change, alarm = (record.detail for record in log.records)
-    assert (len(drop["recording"]), drop["charged_to"]) == (20, "10.0.0.9")
-    assert change == {}
-    assert alarm["charged_to"] == "10.0.0.7"
+    one = trail(log, deny=False, details=lambda event, *_: {"kept": f"in {event}"})
+    one.happened("message dropped", "too fast", host="10.0.0.9", more={"kept": "forged"})
+    assert [record.detail["kept"] for record in log.records] == ["in message dropped"]
 
 
 def test_records_that_the_log_has_yet_to_count_are_not_owed() -> None:

@@ -1,8 +1,7 @@
 """Explanations of records, in lines."""
 
 from appliance.audit.log.record import AuditRecord, RuleReference, Severity
-from appliance.audit.search.why import lines_of
-from appliance.features.recorder.triggers import _BY_EVENT
+from appliance.audit.search.why import _ACTIONS, lines_of
 
 
 def test_a_verdict_is_explained() -> None:
@@ -88,5 +87,5 @@ def test_a_drop_says_whether_it_was_recorded() -> None:
 
 def test_every_monitors_trigger_says_whether_it_was_recorded() -> None:
     """An event of a monitor that may trigger a recording is never silent about it."""
-    for event in _BY_EVENT:
+    for event in _ACTIONS:
         assert any("not recorded: " in line for line in lines_of(AuditRecord(id="1", time=1, event=event)))

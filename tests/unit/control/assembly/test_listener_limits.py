@@ -37,7 +37,7 @@ async def test_an_idle_connection_is_closed_at_every_listener(tmp_path: Path, *,
     settings = dataclasses.replace(given, limits=dataclasses.replace(given.limits, idle_seconds=0.1))
     policy = compile_policy("[Nodes]\ndefault = *\n", file="a.ini")
     log = open_log(tmp_path / "audit.db")
-    trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
+    trail = AuditTrail(log, strict=False, deny_when_failed=False, details=lambda *_: {})
     listener_limits = ListenerLimits(settings, trail, lambda: policy, lambda _host: QuotaClass.NAMED)
 
     async def answer(_request: HttpRequest) -> bytes:
@@ -77,7 +77,7 @@ def everybodys(tmp_path: Path) -> Iterator[ListenerLimits]:
     """Return limits under a policy that names `ROBOT` and admits all others by `*`; one of the others is registered."""
     policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
     log = open_log(tmp_path / "audit.db")
-    trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
+    trail = AuditTrail(log, strict=False, deny_when_failed=False, details=lambda *_: {})
     yield ListenerLimits(
         Settings(),
         trail,
@@ -101,7 +101,7 @@ def test_hosts_of_a_wildcard_leave_a_named_host_its_slot(everybodys: ListenerLim
 def test_registered_hosts_of_a_wildcard_leave_the_robot_its_slots(tmp_path: Path) -> None:
     policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
     log = open_log(tmp_path / "audit.db")
-    trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
+    trail = AuditTrail(log, strict=False, deny_when_failed=False, details=lambda *_: {})
     limits = ListenerLimits(Settings(), trail, lambda: policy, lambda _host: QuotaClass.REGISTERED)
     table = limits.connection_table
     for pool in (table.arriving, table.connected):
@@ -158,7 +158,7 @@ def test_a_blocked_host_is_refused_before_its_request_is_read(tmp_path: Path, te
     )
     blocked = dataclasses.replace(policy, blocks={ROBOT: "blocked by ann: odd"})
     log = open_log(tmp_path / "audit.db")
-    trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
+    trail = AuditTrail(log, strict=False, deny_when_failed=False, details=lambda *_: {})
     limits = ListenerLimits(Settings(), trail, lambda: blocked, lambda _host: QuotaClass.NAMED)
     refusal = limits.refuse(Peer(ROBOT, "10.0.0.1", "10.0.0.9"))
     assert refusal is not None

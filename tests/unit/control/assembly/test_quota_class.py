@@ -4,8 +4,8 @@ import ipaddress
 from dataclasses import replace
 
 from appliance.audit.log.budget import Budget
+from appliance.base.actors import APPLIANCE, ROBOT, UNKNOWN
 from appliance.control.assembly.quota_class import HostQuotaClass, charged_to
-from appliance.features.recorder.recording_answers import APPLIANCE, ROBOT, UNKNOWN
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass
 
@@ -29,7 +29,7 @@ def test_the_class_follows_reloads_and_registrations() -> None:
     assert quota_class(ipaddress.ip_address("127.0.0.1")) is QuotaClass.NAMED
 
 
-def test_recordings_are_charged_by_the_policys_names() -> None:
+def test_acts_are_charged_by_the_policys_names() -> None:
     policy = compile_policy(
         "[Nodes]\n/a = robot 10.0.0.9 10.1.0.0/16\n", file="p.ini", robot=[ipaddress.ip_address("172.17.0.1")]
     )

@@ -17,7 +17,6 @@ from appliance.control.operators.limit_use import LimitQueries
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.token_orders import TokenOrders
-from appliance.features.recorder.recording_orders import RecordingOrders
 from appliance.features.standby.standby_orders import StandbyOrders
 from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import PortChecks
@@ -41,7 +40,6 @@ CLASSES: dict[str, Any] = {
     "hosts": Hosts,
     "certification": Certification,
     "tokens": TokenOrders,
-    "recordings": RecordingOrders,
     "blocks": BlockOrders,
     "standby": StandbyOrders,
     "limits": LimitQueries,
@@ -49,10 +47,11 @@ CLASSES: dict[str, Any] = {
 }
 METHODS = idle_parts().methods() + request_methods(**CLASSES)
 REQUESTS: tuple[type[Any], ...] = tuple(dict.fromkeys([*get_args(AnyRequest), *get_args(RestRequest)]))
-# Exceptions: a record's fields depend on its event, and a child's readiness on its role.
+# Exceptions: a record's fields depend on its event, a child's readiness on its role, a memory's terms on its feature.
 OPEN = {
     (messages.MonitorEvent, "detail"),
     (messages.Ready, "detail"),
+    (messages.MemoryGiven, "terms"),
     (messages.MessageSeen, "fields"),  # a message of any type
     (TopicMessage, "fields"),
 }

@@ -7,7 +7,6 @@ from typing import Any
 
 from appliance.channel.admin import LimitsWanted
 from appliance.channel.answers.limit_answers import LimitUse
-from appliance.channel.answers.status import RecorderState
 from appliance.configuration.config_sources import read
 from appliance.control.operators.limit_use import LimitQueries
 from appliance.quotas.pool import Bounds, Pool, QuotaClass
@@ -31,7 +30,9 @@ def used(state: Path, memory: dict[int, dict[str, int]]) -> dict[str, LimitUse]:
     parts: Any = SimpleNamespace(core=core, endpoints=SimpleNamespace(places=SimpleNamespace(taken=pool)))
     listeners: Any = SimpleNamespace(connection_table=SimpleNamespace(connected=pool))
     settings = read({"state": str(state), "audit": {"retention_bytes": 4 << 20}, "relays": 2})
-    queries = LimitQueries(parts, settings, listeners, lambda: RecorderState(True, 1, 12))
+    queries = LimitQueries(
+        parts, settings, listeners, lambda: (LimitUse("bytes of a feature", 12, 99, "its.setting"),)
+    )
     return {row.resource: row for row in asyncio.run(queries.use(LimitsWanted())).limits}
 
 
@@ -49,11 +50,11 @@ def test_each_resource_has_its_use_and_the_host_with_most(tmp_path: Path) -> Non
     assert (fullest.used, fullest.allowed) == (9, 512 << 20)
     records = rows["bytes of audit records"]
     assert (records.used, records.allowed) == (1024, 4 << 20)
-    assert (rows["bytes of recordings"].used, rows["bytes of recordings"].allowed) == (12, 2 << 30)
+    assert rows["bytes of a feature"].used == 12
 
 
 def test_without_retention_the_disk_is_the_limit(tmp_path: Path) -> None:
-    """The log may grow until the disk is full; a robot without relays and recordings uses nothing."""
+    """The log may grow until the disk is full; a robot without relays uses nothing."""
     (tmp_path / "control").mkdir()
     queries = used(tmp_path, {})
     assert queries["bytes of latched messages, one relay"].used == 0

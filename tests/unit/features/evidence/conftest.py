@@ -93,7 +93,7 @@ class Control:
 
     def __init__(self, log: AuditLog) -> None:
         self.log = log
-        self.trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
+        self.trail = AuditTrail(log, strict=False, deny_when_failed=False, details=lambda *_: {})
         self.orders = EvidenceOrders(log, self.trail, NAMES.robot)
         self.policies: dict[int, str] = {}
         self.specifications: dict[int, dict[str, str]] = {}

@@ -2,8 +2,8 @@
 
 import pytest
 
-from appliance.configuration.settings import RecorderRules
 from appliance.features.recorder.excluded_topics import NAMED, known_sums, left_out_because
+from appliance.features.recorder.settings import RecorderRules
 from roswire.definitions import Definitions
 from roswire.standard import standard_definitions
 

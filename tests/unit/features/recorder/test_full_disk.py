@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from appliance.channel import messages
+from appliance.features.recorder import recorder_link
 from appliance.features.recorder.recording_answers import Recording, Trigger
 from tests.support.small_disk import small_disk
 from tests.unit.features.recorder.test_recorder import SECOND, TEXT, Scene
@@ -28,8 +28,8 @@ def test_each_step_on_a_full_disk(disk: Path, tmp_path: Path, what: str) -> None
     scene = Scene(tmp_path, disk=8 << 20)
     order = Trigger(scene.clock.now, "order", "r", "eve")
 
-    def wanted(number: int) -> messages.RecordingRequested:
-        return messages.RecordingRequested(
+    def wanted(number: int) -> recorder_link.RecordingRequested:
+        return recorder_link.RecordingRequested(
             number, msgspec.structs.replace(order, time=scene.clock.now + SECOND), 5, 1
         )
 
@@ -42,11 +42,13 @@ def test_each_step_on_a_full_disk(disk: Path, tmp_path: Path, what: str) -> None
                 fill(disk, what)
                 if number % 3 == 0:
                     scene.begin_anew()
-            extra = {3: wanted(100), 5: messages.MemoryWanted(101, wanted(0).trigger, 0, 1 << 62)}
-            kept = [messages.RecordingNoted(path.name) for path in disk.iterdir() if len(path.name) == 20]
+            extra = {3: wanted(100), 5: recorder_link.MemoryWanted(101, wanted(0).trigger, 0, 1 << 62)}
+            kept = [
+                recorder_link.RecordingNoted(path.name) for path in disk.iterdir() if len(path.name) == 20
+            ]
             said = scene.later(0.5, *kept, *([extra[step]] if step in extra else []))
-            missed += sum(isinstance(one, messages.RecordingMissed) for one in said)
-            refused += sum(isinstance(one, messages.RecordingRefused) for one in said)
+            missed += sum(isinstance(one, recorder_link.RecordingMissed) for one in said)
+            refused += sum(isinstance(one, recorder_link.RecordingRefused) for one in said)
         for path in disk.glob("filler*"):
             path.unlink()
         scene.later(1)
@@ -55,7 +57,7 @@ def test_each_step_on_a_full_disk(disk: Path, tmp_path: Path, what: str) -> None
                 found = msgspec.json.decode((path / "recording.json").read_bytes(), type=Recording)
                 bag = (path / "recording.bag").read_bytes()
                 assert (len(bag), hashlib.sha256(bag).hexdigest()) == (found.size, found.sha256)
-                scene.later(0, messages.RecordingRemovalWanted(102, path.name, "eve"))
+                scene.later(0, recorder_link.RecordingRemovalWanted(102, path.name, "eve"))
     assert missed
     assert refused
     scene.recorder.step([wanted(200)])

@@ -14,6 +14,7 @@ from rosbags.rosbag1 import Reader
 from rosbags.rosbag2.storage_mcap import McapReader
 
 from appliance.channel import messages
+from appliance.features.recorder import recorder_link
 from appliance.features.recorder.mcap import as_mcap
 from appliance.features.recorder.recording_answers import Recording, Trigger
 from tests.unit.features.recorder.test_recorder import BEGAN, SECOND, Scene
@@ -21,7 +22,7 @@ from tests.unit.features.recorder.test_recorder import BEGAN, SECOND, Scene
 pytestmark = pytest.mark.nightly
 
 _CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.chmod")
-_TOLD = (messages.RecordingClosed, messages.RecordingRemoved)
+_TOLD = (recorder_link.RecordingClosed, recorder_link.RecordingRemoved)
 _KILLED = 9
 
 
@@ -32,17 +33,17 @@ def _life(scene: Scene) -> None:
         return Trigger(scene.clock.now + SECOND, "order", "r", "eve")
 
     orders: dict[int, Callable[[], messages.Message]] = {
-        0: lambda: messages.RecordingRequested(1, order(), 5, 1),
-        3: lambda: messages.MemoryWanted(2, order(), 0, 1 << 62),
-        4: lambda: messages.RecordingRemovalWanted(3, kept[0], "eve"),
-        5: lambda: messages.RecordingRequested(4, order(), 5, 1),
+        0: lambda: recorder_link.RecordingRequested(1, order(), 5, 1),
+        3: lambda: recorder_link.MemoryWanted(2, order(), 0, 1 << 62),
+        4: lambda: recorder_link.RecordingRemovalWanted(3, kept[0], "eve"),
+        5: lambda: recorder_link.RecordingRequested(4, order(), 5, 1),
     }
     kept: list[str] = []
     noted: list[messages.Message] = []
     for number in range(7):
         scene.say()
         answers = scene.later(2, *noted, *([orders[number]()] if number in orders else []))
-        noted = [messages.RecordingNoted(one.recording.id) for one in answers if isinstance(one, _TOLD)]
+        noted = [recorder_link.RecordingNoted(one.recording.id) for one in answers if isinstance(one, _TOLD)]
         kept += [recording.id for recording in scene.closed(answers)]
 
 
@@ -99,9 +100,9 @@ def test_killed_at_each_file_operation(tmp_path: Path, memory: str) -> None:
         scene.recorder = scene.make_recorder()
         told: list[messages.Message] = []
         for seconds in (0, 20, 20):
-            told += scene.later(seconds, messages.RecordingsAsked())
-        stated = [one for one in told if isinstance(one, messages.RecordingsStated)][-1].recordings
-        gone = {one.recording.id for one in told if isinstance(one, messages.RecordingRemoved)}
+            told += scene.later(seconds, recorder_link.RecordingsAsked())
+        stated = [one for one in told if isinstance(one, recorder_link.RecordingsStated)][-1].recordings
+        gone = {one.recording.id for one in told if isinstance(one, recorder_link.RecordingRemoved)}
         if memory == "same" and 1 not in removed:  # events are in a recording until it is removed
             assert gone or "drop" in {trigger.what for found in stated for trigger in found.triggers}, (
                 operation
@@ -117,7 +118,7 @@ def test_killed_at_each_file_operation(tmp_path: Path, memory: str) -> None:
             assert sum(topic.messages for topic in found.topics) == chatter[found.sha256]
         kept.add(len(stated))
         removed.add(len(gone))
-        scene.later(0, *(messages.RecordingNoted(name) for name in names | gone))
+        scene.later(0, *(recorder_link.RecordingNoted(name) for name in names | gone))
         assert {path.name for path in scene.folder.iterdir()} == names, operation
         scene.log.close()
         if not killed:

@@ -13,7 +13,7 @@ import pytest
 from rosbags.rosbag1 import Reader
 
 from appliance.channel import messages
-from appliance.configuration.settings import RecorderRules
+from appliance.features.recorder import recorder_link
 from appliance.features.recorder.excluded_topics import NAMED
 from appliance.features.recorder.recorder import SETTLE_SECONDS, Recorder
 from appliance.features.recorder.recorder_ring import ExcludedStream
@@ -21,6 +21,7 @@ from appliance.features.recorder.recording import RecordingInProgress
 from appliance.features.recorder.recording_answers import Recording, Trigger
 from appliance.features.recorder.recording_store import MOST_TEMPORARY, RecordingStore
 from appliance.features.recorder.ring import LEFT_OUT, SMALLEST, RingWriter
+from appliance.features.recorder.settings import RecorderRules
 from tests.support.audit import decision, settle
 from tests.support.engines import open_log
 from tests.unit.features.recorder.test_ring import HEADER, Clock, frame, opened
@@ -86,7 +87,7 @@ class Scene:
 
     def closed(self, answers: list[messages.Message]) -> list[Recording]:
         """Return the recordings that control received."""
-        return [one.recording for one in answers if isinstance(one, messages.RecordingClosed)]
+        return [one.recording for one in answers if isinstance(one, recorder_link.RecordingClosed)]
 
     def bag(self, recording: Recording) -> list[tuple[str, int, bytes]]:
         """Return the messages in the bag of a recording."""
@@ -118,7 +119,7 @@ def test_before_and_after(scene: Scene) -> None:
     assert not scene.closed(scene.later(4.9))
     scene.say()  # after the recording's end
     [recording] = scene.closed(scene.later(SETTLE_SECONDS + 0.1))
-    assert recording == scene.closed(scene.later(0, messages.RecordingsAsked()))[0]
+    assert recording == scene.closed(scene.later(0, recorder_link.RecordingsAsked()))[0]
     happened = BEGAN + 21 * SECOND
     assert (recording.began, recording.ended) == (happened - 10 * SECOND, happened + 5 * SECOND)
     assert (recording.complete, recording.why_not) == (True, "")
@@ -155,12 +156,12 @@ def test_a_recording_of_the_memory_is_temporary(scene: Scene) -> None:
 
     def asked(since: int, until: int) -> messages.Message:
         order = msgspec.structs.replace(trigger, time=scene.clock.now)
-        [answer] = scene.later(0, messages.MemoryWanted(1, order, since, until))
+        [answer] = scene.later(0, recorder_link.MemoryWanted(1, order, since, until))
         return answer
 
     def lent(since: int, until: int) -> Recording:
         answer = asked(since, until)
-        assert isinstance(answer, messages.MemoryLent), answer
+        assert isinstance(answer, recorder_link.MemoryLent), answer
         return answer.recording
 
     def there() -> set[str]:
@@ -176,17 +177,17 @@ def test_a_recording_of_the_memory_is_temporary(scene: Scene) -> None:
     second = lent(BEGAN + 21 * SECOND, scene.clock.now + SECOND)
     assert (second.ended, len(scene.bag(second))) == (scene.clock.now, 1)
     assert there() == {first.id, second.id}
-    [refused] = scene.later(0, messages.MemoryWanted(2, trigger, 0, BEGAN + 5 * SECOND))
-    assert isinstance(refused, messages.RecordingRefused)
+    [refused] = scene.later(0, recorder_link.MemoryWanted(2, trigger, 0, BEGAN + 5 * SECOND))
+    assert isinstance(refused, recorder_link.RecordingRefused)
     assert (refused.unknown, "the last 10 seconds" in refused.reason) == (True, True)
-    [stated, *_rest] = scene.later(0, messages.RecordingsAsked())
-    assert stated == messages.RecordingsStated([])
+    [stated, *_rest] = scene.later(0, recorder_link.RecordingsAsked())
+    assert stated == recorder_link.RecordingsStated([])
     scene.later(601)
     assert there() == set()
     scene.say()
     several = {lent(0, scene.clock.now).id for _order in range(MOST_TEMPORARY)}
     busy = asked(0, scene.clock.now)  # a recording that a user is about to open stays
-    assert isinstance(busy, messages.RecordingRefused)
+    assert isinstance(busy, recorder_link.RecordingRefused)
     assert (busy.unknown, "half a minute" in busy.reason) == (False, True)
     assert there() == several
     scene.later(31)
@@ -231,12 +232,14 @@ def test_a_flood_of_triggers_does_not_fill_the_disk(tmp_path: Path) -> None:
         scene.happen()
         told += scene.later(0.1) + scene.later(10)
     assert len(scene.closed(told)) == 3
-    [missed] = [answer for answer in told if isinstance(answer, messages.RecordingMissed)]
+    [missed] = [answer for answer in told if isinstance(answer, recorder_link.RecordingMissed)]
     assert "recorder.per_hour" in missed.reason
     scene.happen("monitor fault")
     assert len(scene.closed(scene.later(0.1) + scene.later(10))) == 1
-    order = messages.RecordingRequested(7, Trigger(scene.clock.now, "order", "id", "somebody"), 5, 2)
-    [begun] = [answer for answer in scene.later(0, order) if isinstance(answer, messages.RecordingStarted)]
+    order = recorder_link.RecordingRequested(7, Trigger(scene.clock.now, "order", "id", "somebody"), 5, 2)
+    [begun] = [
+        answer for answer in scene.later(0, order) if isinstance(answer, recorder_link.RecordingStarted)
+    ]
     assert (begun.number, begun.ends) == (7, scene.clock.now + 2 * SECOND)
     assert scene.closed(scene.later(3))[0].id == begun.id
     scene.log.close()
@@ -258,7 +261,7 @@ def test_a_planned_recording_is_made(scene: Scene) -> None:
     scene.happen(detail={"not_recorded": "this hour is used up"})
     answers = scene.later(1) + scene.later(10)
     assert scene.closed(answers) == []
-    [missed] = [answer for answer in answers if isinstance(answer, messages.RecordingMissed)]
+    [missed] = [answer for answer in answers if isinstance(answer, recorder_link.RecordingMissed)]
     assert missed.reason == "this hour is used up"
 
 
@@ -286,7 +289,7 @@ def test_a_recording_that_cannot_be_made_is_reported(tmp_path: Path, monkeypatch
     monkeypatch.setattr(RecordingStore, "free", property(lambda _self: 0))
     for name in ("a" * 20, "b" * 20):
         record = planned(scene, name, "robot")
-        [missed] = [one for one in scene.later(1) if isinstance(one, messages.RecordingMissed)]
+        [missed] = [one for one in scene.later(1) if isinstance(one, recorder_link.RecordingMissed)]
         assert (missed.planned, missed.trigger.record) == (name, record)
         assert missed.reason == "the disk is nearly full"
     scene.log.close()
@@ -297,12 +300,14 @@ def test_a_flood_of_service_calls_does_not_fill_the_disk(tmp_path: Path) -> None
     scene = Scene(tmp_path, per_hour=2)
     told: list[messages.Message] = []
     for number in range(6):
-        call = messages.RecordingRequested(number, Trigger(scene.clock.now, "service", "id", "/arm"), 5, 2)
+        call = recorder_link.RecordingRequested(
+            number, Trigger(scene.clock.now, "service", "id", "/arm"), 5, 2
+        )
         told += scene.later(0, call) + scene.later(3)
-    begun = [answer.number for answer in told if isinstance(answer, messages.RecordingStarted)]
-    refused = [answer for answer in told if isinstance(answer, messages.RecordingRefused)]
+    begun = [answer.number for answer in told if isinstance(answer, recorder_link.RecordingStarted)]
+    refused = [answer for answer in told if isinstance(answer, recorder_link.RecordingRefused)]
     assert (begun, [answer.number for answer in refused]) == ([0, 1], [2, 3, 4, 5])
-    [missed] = [answer for answer in told if isinstance(answer, messages.RecordingMissed)]
+    [missed] = [answer for answer in told if isinstance(answer, recorder_link.RecordingMissed)]
     assert missed.reason == refused[0].reason
     assert "recorder.per_hour" in missed.reason
     assert len(scene.closed(told)) == 2
@@ -409,26 +414,28 @@ def test_a_late_recorder_handles_earlier_triggers(scene: Scene) -> None:
 def test_a_recording_is_reported_until_it_is_noted(scene: Scene) -> None:
     """A recording can be removed by order; an order for an unknown recording is refused."""
     scene.happen()
-    [opened] = [said.recording for said in scene.later(0.1) if isinstance(said, messages.RecordingOpened)]
-    assert messages.RecordingsStated([], [opened]) in scene.later(0, messages.RecordingsAsked())
+    [opened] = [
+        said.recording for said in scene.later(0.1) if isinstance(said, recorder_link.RecordingOpened)
+    ]
+    assert recorder_link.RecordingsStated([], [opened]) in scene.later(0, recorder_link.RecordingsAsked())
     [recording] = scene.closed(scene.later(6))
     assert (opened.id, opened.began, opened.trigger) == (recording.id, recording.began, recording.triggers[0])
-    assert scene.closed(scene.later(0, messages.RecordingsAsked())) == [recording]
-    answers = scene.later(0, messages.RecordingNoted(recording.id), messages.RecordingsAsked())
+    assert scene.closed(scene.later(0, recorder_link.RecordingsAsked())) == [recording]
+    answers = scene.later(0, recorder_link.RecordingNoted(recording.id), recorder_link.RecordingsAsked())
     assert scene.closed(answers) == []
-    assert messages.RecordingsStated([recording]) in answers
-    remove = messages.RecordingRemovalWanted(3, recording.id, "eve")
-    assert scene.later(0, remove) == [messages.RecordingRemoved(3, recording, "eve", "")]
+    assert recorder_link.RecordingsStated([recording]) in answers
+    remove = recorder_link.RecordingRemovalWanted(3, recording.id, "eve")
+    assert scene.later(0, remove) == [recorder_link.RecordingRemoved(3, recording, "eve", "")]
     [refused] = scene.later(0, remove)
-    assert isinstance(refused, messages.RecordingRefused)
+    assert isinstance(refused, recorder_link.RecordingRefused)
     assert refused.unknown
 
 
 def test_revisions_are_the_last_that_control_sent(scene: Scene) -> None:
     """The revisions are read when a recording begins and when it ends."""
     scene.happen()
-    assert messages.RevisionsWanted() in scene.later(0.1)
-    scene.later(0, messages.RevisionsStated(4, 2))
+    assert recorder_link.RevisionsWanted() in scene.later(0.1)
+    scene.later(0, recorder_link.RevisionsStated(4, 2))
     [recording] = scene.closed(scene.later(6))
     assert (recording.policy, recording.monitors) == (4, 2)
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from appliance.base.clock import using, wall_ns
-from appliance.channel.messages import RingGiven
 from appliance.features.recorder.excluded_topics import known_sums
+from appliance.features.recorder.recorder_link import RingTerms
 from appliance.features.recorder.recorder_ring import RecorderRing
 from appliance.features.recorder.ring import SMALLEST
 from appliance.features.recorder.ring_reader import RingReader
@@ -20,7 +20,7 @@ EVER = 0, 1 << 63
 
 def given(descriptor: int, *, never: tuple[str, ...] = (), now: Callable[[], int] = wall_ns) -> RecorderRing:
     """Return the recorder of a relay."""
-    return RecorderRing(RingGiven(0, 1, 60, ["/chat*"], list(never)), os.dup(descriptor), now)
+    return RecorderRing(RingTerms(0, 1, 60, ["/chat*"], list(never)), os.dup(descriptor), now)
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def kept(descriptor: int) -> list[tuple[str, bytes]]:
 
 def test_messages_dropped_by_monitors_are_recorded(memory: int) -> None:
     """Each message is recorded as received, with the publisher's true name and host, for the whole connection."""
-    story = Story(recorded=given(memory))
+    story = Story(sink=given(memory))
     story.topic.monitor(lambda _batch: None, wanted=True)
     member = story.join()
     story.topic.upstream_opened(HEADER)
@@ -76,7 +76,7 @@ def test_excluded_topics_are_not_recorded(memory: int, never: tuple[str, ...]) -
 def test_a_topic_with_the_sum_of_another_type_is_recorded(memory: int) -> None:
     """A guest's string that claims a camera's type is still recorded."""
     sums = known_sums(["sensor_msgs/Image"])
-    recorded = RecorderRing(RingGiven(0, 1, 60, ["/*"], ["sensor_msgs/Image"], sums), os.dup(memory), wall_ns)
+    recorded = RecorderRing(RingTerms(0, 1, 60, ["/*"], ["sensor_msgs/Image"], sums), os.dup(memory), wall_ns)
     header = {"type": "sensor_msgs/Image", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1", "callerid": "/g"}
     stream = recorded.open("/orders", "10.0.0.9", header)
     assert stream is not None
@@ -102,7 +102,7 @@ def test_a_judged_message_has_the_time_of_its_judgement(memory: int) -> None:
 @pytest.mark.parametrize("size", [10, 100_000])
 def test_each_message_is_recorded_once(memory: int, size: int) -> None:
     """This holds for any length, and for messages that monitors publish later on their own topic."""
-    story = Story(recorded=given(memory))
+    story = Story(sink=given(memory))
     member = story.join()
     story.topic.upstream_opened(HEADER)
     story.receive(batch(bytes(size), b"2"))
@@ -113,7 +113,7 @@ def test_each_message_is_recorded_once(memory: int, size: int) -> None:
 
 def test_a_connection_that_ends_within_a_message_is_no_longer_recorded(memory: int) -> None:
     """Delivering a message may end the topic; the remaining bytes then belong to no connection."""
-    story = Story(recorded=given(memory))
+    story = Story(sink=given(memory))
     story.join()
     story.topic.upstream_opened(HEADER)
     story.topic.tap(lambda _batch: story.topic.upstream_closed(), latched=False)

@@ -9,14 +9,16 @@ import msgspec
 import pytest
 
 from appliance.audit.log.ids import IdSource
-from appliance.channel import admin, messages
+from appliance.channel import messages
+from appliance.channel.answers.limit_answers import LimitUse
 from appliance.channel.channel import Channel
-from appliance.configuration.settings import RecorderRules
-from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
+from appliance.features.recorder import recorder_link, recording_requests
 from appliance.features.recorder.recording_answers import OpenRecording, Recording, Trigger
-from appliance.features.recorder.recording_orders import RecorderAwayError, RecordingOrders
+from appliance.features.recorder.recording_orders import RecordingOrders
 from appliance.features.recorder.recording_plan import RecordingPlan
 from appliance.features.recorder.recording_store import MOST_TEMPORARY
+from appliance.features.recorder.settings import RecorderRules
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.memory_channel import memory_link
 
@@ -50,14 +52,14 @@ class Scene:
         self.orders = RecordingOrders(
             RecorderRules(**{"enabled": True} | rules),
             cast(AuditTrail, self.trail),
-            lambda: messages.RevisionsStated(4, 2),
+            lambda: recorder_link.RevisionsStated(4, 2),
             RecordingPlan(RecorderRules(**{"enabled": True} | rules), lambda host: host, IdSource().next),
         )
 
     def attach(self, answer: Callable[[Any], list[messages.Message]]) -> Channel:
         ours, theirs = socket.socketpair()
-        self.orders.link.attach(Channel(ours, messages.RecorderLink))
-        recorder = Channel(theirs, messages.RecorderLink)
+        self.orders.link.attach(Channel(ours, recorder_link.RecorderLink))
+        recorder = Channel(theirs, recorder_link.RecorderLink)
 
         def received(message: Any, _descriptors: tuple[int, ...]) -> None:
             for said in answer(message):
@@ -81,14 +83,15 @@ async def told(scene: Scene, done: Callable[[], bool]) -> None:
 async def test_a_missing_recorder_is_reported() -> None:
     off = Scene(enabled=False)
     assert off.orders.state() is None
+    assert off.orders.limits() == ()
     with pytest.raises(UnknownThingError, match="enabled: true"):
-        await off.orders.recordings(admin.RecordingsWanted())
+        await off.orders.recordings(recording_requests.RecordingsWanted())
     away = Scene()
     state = away.orders.state()
     assert state is not None
     assert not state.running
-    with pytest.raises(RecorderAwayError, match="is not running now"):
-        await away.orders.now(admin.RecordNow(), "eve")
+    with pytest.raises(UnavailableError, match="is not running now"):
+        await away.orders.now(recording_requests.RecordNow(), "eve")
 
 
 @pytest.mark.nightly
@@ -99,8 +102,8 @@ async def test_a_call_of_the_service_is_an_order() -> None:
     def answer(message: Any) -> list[messages.Message]:
         heard.append(message)
         if len(heard) == 1:
-            return [messages.RecordingStarted(message.number, KEPT.id, 5)]
-        return [messages.RecordingRefused(message.number, "this hour has its 6")]
+            return [recorder_link.RecordingStarted(message.number, KEPT.id, 5)]
+        return [recorder_link.RecordingRefused(message.number, "this hour has its 6")]
 
     scene = Scene()
     away = await scene.orders.called(call)
@@ -129,29 +132,31 @@ async def test_a_closed_recording_is_recorded_and_listed() -> None:
         return []
 
     recorder = scene.attach(hear)
-    recorder.send(messages.RevisionsWanted())
-    recorder.send(messages.RecordingClosed(KEPT))
+    recorder.send(recorder_link.RevisionsWanted())
+    recorder.send(recorder_link.RecordingClosed(KEPT))
     await told(scene, lambda: len(heard) == 2)
-    assert heard == [messages.RevisionsStated(4, 2), messages.RecordingNoted(KEPT.id)]
-    assert (await scene.orders.recordings(admin.RecordingsWanted())).recordings == [KEPT]
-    assert await scene.orders.recording(admin.RecordingWanted(KEPT.id)) == KEPT
+    assert heard == [recorder_link.RevisionsStated(4, 2), recorder_link.RecordingNoted(KEPT.id)]
+    assert (await scene.orders.recordings(recording_requests.RecordingsWanted())).recordings == [KEPT]
+    assert await scene.orders.recording(recording_requests.RecordingWanted(KEPT.id)) == KEPT
     [(event, detail)] = scene.trail.events
     assert (event, detail["recording"], detail["sha256"]) == ("recording closed", KEPT.id, "5a")
     assert detail["triggers"] == ["drop r"]
-    recorder.send(messages.RecordingRemoved(0, KEPT, "", "recorder.disk is full"))
+    recorder.send(recorder_link.RecordingRemoved(0, KEPT, "", "recorder.disk is full"))
     await told(scene, lambda: len(scene.trail.events) == 2)
     assert scene.trail.events[1][1]["who"] == "recorder"
     await told(scene, lambda: len(heard) == 3)
-    assert heard[2] == messages.RecordingNoted(KEPT.id)
+    assert heard[2] == recorder_link.RecordingNoted(KEPT.id)
     scene.trail.failure = "no space left on device"
-    recorder.send(messages.RecordingClosed(KEPT))
-    recorder.send(messages.RevisionsWanted())
+    recorder.send(recorder_link.RecordingClosed(KEPT))
+    recorder.send(recorder_link.RevisionsWanted())
     await told(scene, lambda: len(heard) == 4)
-    assert heard[3] == messages.RevisionsStated(4, 2)  # a recording that is not on disk is reported again
-    with pytest.raises(RecorderAwayError, match="cannot be recorded: no space left"):
-        await scene.orders.fetch(admin.RecordingFetch(KEPT.id), "eve")
+    assert heard[3] == recorder_link.RevisionsStated(
+        4, 2
+    )  # a recording that is not on disk is reported again
+    with pytest.raises(UnavailableError, match="cannot be recorded: no space left"):
+        await scene.orders.fetch(recording_requests.RecordingFetch(KEPT.id), "eve")
     with pytest.raises(UnknownThingError, match="no recording"):
-        await scene.orders.fetch(admin.RecordingFetch("other"), "eve")
+        await scene.orders.fetch(recording_requests.RecordingFetch("other"), "eve")
     recorder.close()
 
 
@@ -159,70 +164,71 @@ async def test_a_closed_recording_is_recorded_and_listed() -> None:
 async def test_orders_have_the_name_of_their_operator() -> None:
     def answer(message: Any) -> list[messages.Message]:
         match message:
-            case messages.RecordingRequested(number, trigger, before, after):
+            case recorder_link.RecordingRequested(number, trigger, before, after):
                 assert (trigger.record, trigger.text, before, after) == ("record", "eve: why", 60, 5)
-                return [messages.RecordingStarted(number, KEPT.id, 9)]
-            case messages.RecordingRemovalWanted(number, recording_id, who):
+                return [recorder_link.RecordingStarted(number, KEPT.id, 9)]
+            case recorder_link.RecordingRemovalWanted(number, recording_id, who):
                 if recording_id != KEPT.id:
-                    return [messages.RecordingRefused(number, "there is none", unknown=True)]
-                return [messages.RecordingRemoved(number, KEPT, who, "")]
+                    return [recorder_link.RecordingRefused(number, "there is none", unknown=True)]
+                return [recorder_link.RecordingRemoved(number, KEPT, who, "")]
         return []
 
     scene = Scene()
     recorder = scene.attach(answer)
-    for senseless in (admin.RecordNow(before=601.0), admin.RecordNow(after=0.0)):
+    for senseless in (recording_requests.RecordNow(before=601.0), recording_requests.RecordNow(after=0.0)):
         with pytest.raises(SenselessError):
             await scene.orders.now(senseless, "eve")
     assert not scene.trail.events
-    begun = await scene.orders.now(admin.RecordNow(after=5, note="why"), "eve")
+    begun = await scene.orders.now(recording_requests.RecordNow(after=5, note="why"), "eve")
     assert (begun.id, begun.ends) == (KEPT.id, 9)
     assert scene.trail.events[0][1]["who"] == "eve"
     with pytest.raises(UnknownThingError, match="still being made"):
-        await scene.orders.fetch(admin.RecordingFetch(KEPT.id), "eve")
+        await scene.orders.fetch(recording_requests.RecordingFetch(KEPT.id), "eve")
     with pytest.raises(UnknownThingError, match="no recording"):
-        await scene.orders.fetch(admin.RecordingFetch(""), "eve")
-    assert await scene.orders.remove(admin.RecordingRemove(KEPT.id), "eve") == KEPT
+        await scene.orders.fetch(recording_requests.RecordingFetch(""), "eve")
+    assert await scene.orders.remove(recording_requests.RecordingRemove(KEPT.id), "eve") == KEPT
     assert scene.trail.events[1][1]["who"] == "eve"
     with pytest.raises(UnknownThingError):
-        await scene.orders.remove(admin.RecordingRemove("b" * 20), "eve")
+        await scene.orders.remove(recording_requests.RecordingRemove("b" * 20), "eve")
     recorder.close()
 
 
 async def test_an_open_recording_is_listed(scene: Scene) -> None:
     """Until it is closed, a recording has its end as the plan extends it, and a request for it answers when to ask."""
-    ours, recorder = memory_link(messages.RecorderLink)
+    ours, recorder = memory_link(recorder_link.RecorderLink)
     scene.orders.link.attach(ours)
     opened = OpenRecording(KEPT.id, 1_000, 5 * 10**9, Trigger(1_000, "drop", "record", "so"))
-    recorder.send(messages.RecordingsStated([], [opened]))
+    recorder.send(recorder_link.RecordingsStated([], [opened]))
     await told(scene, lambda: bool(cast(Any, scene.orders.state()).in_progress))
-    assert (await scene.orders.recordings(admin.RecordingsWanted())).in_progress == [opened]
+    assert (await scene.orders.recordings(recording_requests.RecordingsWanted())).in_progress == [opened]
     with pytest.raises(UnknownThingError, match="still being made: ask again after 1970-01-01T00:00:05"):
-        await scene.orders.recording(admin.RecordingWanted(KEPT.id))
-    recorder.send(messages.RecordingClosed(KEPT))
+        await scene.orders.recording(recording_requests.RecordingWanted(KEPT.id))
+    recorder.send(recorder_link.RecordingClosed(KEPT))
     await told(scene, lambda: not cast(Any, scene.orders.state()).in_progress)
-    assert await scene.orders.recording(admin.RecordingWanted(KEPT.id)) == KEPT
+    assert await scene.orders.recording(recording_requests.RecordingWanted(KEPT.id)) == KEPT
 
 
 @pytest.mark.nightly
 async def test_a_fetch_needs_a_record(scene: Scene) -> None:
     """While the audit log cannot be written a fetch is refused."""
     recorder = scene.attach(lambda _message: [])
-    recorder.send(messages.RecordingsStated([KEPT]))
+    recorder.send(recorder_link.RecordingsStated([KEPT]))
     await told(scene, lambda: bool(cast(Any, scene.orders.state()).recordings))
-    assert await scene.orders.fetch(admin.RecordingFetch(KEPT.id), "eve") == KEPT
+    assert scene.orders.limits() == (LimitUse("bytes of recordings", KEPT.size, 2 << 30, "recorder.disk"),)
+    assert await scene.orders.fetch(recording_requests.RecordingFetch(KEPT.id), "eve") == KEPT
     scene.trail.failure = "the disk is full"
-    with pytest.raises(RecorderAwayError, match="cannot be recorded"):
-        await scene.orders.fetch(admin.RecordingFetch(KEPT.id), "eve")
+    with pytest.raises(UnavailableError, match="cannot be recorded"):
+        await scene.orders.fetch(recording_requests.RecordingFetch(KEPT.id), "eve")
     recorder.close()
 
 
 @pytest.mark.nightly
 async def test_an_order_to_a_dying_recorder_fails_at_once(scene: Scene) -> None:
     recorder = scene.attach(lambda _message: [])
-    asked = asyncio.ensure_future(scene.orders.now(admin.RecordNow(), "eve"))
+    asked = asyncio.ensure_future(scene.orders.now(recording_requests.RecordNow(), "eve"))
     await told(scene, lambda: bool(scene.trail.events))
     recorder.close()
-    with pytest.raises(RecorderAwayError, match="before it answered"):
+    with pytest.raises(UnavailableError, match="before it answered"):
         await asyncio.wait_for(asked, 5)
 
 
@@ -231,26 +237,26 @@ async def test_the_memory_can_be_fetched_and_is_not_listed() -> None:
     lent = iter([msgspec.structs.replace(KEPT, id=letter * 20) for letter in "bcdef"])
 
     def answer(message: Any) -> list[messages.Message]:
-        if not isinstance(message, messages.MemoryWanted):
+        if not isinstance(message, recorder_link.MemoryWanted):
             return []
         assert (message.since, message.until > 0, message.trigger.record) == (7, True, "record")
-        return [messages.MemoryLent(message.number, next(lent))]
+        return [recorder_link.MemoryLent(message.number, next(lent))]
 
     scene = Scene()
     recorder = scene.attach(answer)
-    first = await scene.orders.of_memory(admin.RecordingOfMemory(since=7), "eve")
-    assert await scene.orders.fetch(admin.RecordingFetch(first.id), "eve") == first
+    first = await scene.orders.of_memory(recording_requests.RecordingOfMemory(since=7), "eve")
+    assert await scene.orders.fetch(recording_requests.RecordingFetch(first.id), "eve") == first
     assert [(event, detail["who"]) for event, detail in scene.trail.events] == [
         ("recording ordered", "eve"),
         ("recording fetched", "eve"),
     ]
-    known = await scene.orders.recordings(admin.RecordingsWanted())
+    known = await scene.orders.recordings(recording_requests.RecordingsWanted())
     assert (known.recordings, known.topics, known.before) == ([], ["/*"], 60)
     for _other in range(MOST_TEMPORARY):
-        assert await scene.orders.fetch(admin.RecordingFetch(first.id), "eve") == first
-        await scene.orders.of_memory(admin.RecordingOfMemory(since=7), "eve")
+        assert await scene.orders.fetch(recording_requests.RecordingFetch(first.id), "eve") == first
+        await scene.orders.of_memory(recording_requests.RecordingOfMemory(since=7), "eve")
     with pytest.raises(UnknownThingError):
-        await scene.orders.fetch(admin.RecordingFetch(first.id), "eve")
+        await scene.orders.fetch(recording_requests.RecordingFetch(first.id), "eve")
     recorder.close()
 
 
@@ -258,13 +264,13 @@ async def test_the_memory_can_be_fetched_and_is_not_listed() -> None:
 async def test_more_topics_than_a_record_can_name_are_rejected(scene: Scene) -> None:
     """The record of a fetch must name every topic that is read; if the names do not fit, the fetch is rejected."""
     recorder = scene.attach(lambda _message: [])
-    recorder.send(messages.RecordingsStated([KEPT]))
+    recorder.send(recorder_link.RecordingsStated([KEPT]))
     await told(scene, lambda: bool(cast(Any, scene.orders.state()).recordings))
     for topics in ([f"/t{number}" for number in range(21)], ["/" + "t" * 500]):
         with pytest.raises(SenselessError, match="at most 20 topics"):
-            await scene.orders.read(admin.RecordingRead(KEPT.id, topics), "eve")
+            await scene.orders.read(recording_requests.RecordingRead(KEPT.id, topics), "eve")
     assert not scene.trail.events
     longest = "/" + "t" * 499
-    await scene.orders.read(admin.RecordingRead(KEPT.id, [longest]), "eve")
+    await scene.orders.read(recording_requests.RecordingRead(KEPT.id, [longest]), "eve")
     assert scene.trail.events[0][1]["topics"] == [longest]
     recorder.close()

@@ -7,17 +7,12 @@ from typing import Any
 import pytest
 from msgspec import structs
 
+from appliance.audit.log.ids import IdSource
 from appliance.audit.log.record import Severity
-from appliance.configuration.settings import RecorderRules
-from appliance.features.recorder.recording_answers import (
-    OPERATORS,
-    ROBOT,
-    UNKNOWN,
-    OpenRecording,
-    Trigger,
-    TriggerKind,
-)
+from appliance.base.actors import ROBOT, UNKNOWN
+from appliance.features.recorder.recording_answers import OPERATORS, OpenRecording, Trigger, TriggerKind
 from appliance.features.recorder.recording_plan import HourlyLimit, RecordingPlan, span
+from appliance.features.recorder.settings import RecorderRules
 from tests.unit.features.recorder.test_recording_store import SECOND, recording
 
 NOW = 10_000 * SECOND
@@ -156,3 +151,13 @@ def test_recordings_of_an_order_are_prolonged_and_closed_ones_are_not(
     assert again.end_of("going on") == NOW + SECOND
     assert dropped(again, "127.0.0.1", NOW)["recording"] == "going on"
     assert (again.end_of("going on") or 0) > NOW + SECOND
+
+
+def test_the_record_of_a_drop_says_which_recording_has_it() -> None:
+    """An alarm also names its recording; a record that is not a trigger names none."""
+    rules = RecorderRules(enabled=True, per_hour=1, triggers=["drop", "alarm", "denial"])
+    plan = RecordingPlan(rules, lambda host: host, IdSource().next)
+    drop = plan.detail("message dropped", None, Severity.WARNING, "10.0.0.9", 1)
+    assert (len(drop["recording"]), drop["charged_to"]) == (20, "10.0.0.9")
+    assert plan.detail("message changed", None, Severity.INFO, "10.0.0.9", 1) == {}
+    assert plan.detail("monitor fault", None, Severity.ALARM, "10.0.0.7", 1)["charged_to"] == "10.0.0.7"

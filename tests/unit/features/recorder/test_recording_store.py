@@ -5,8 +5,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from appliance.base.actors import ROBOT
 from appliance.base.clock import wall_ns
-from appliance.features.recorder.recording_answers import OPERATORS, ROBOT, Recording, Trigger, TriggerKind
+from appliance.features.recorder.recording_answers import OPERATORS, Recording, Trigger, TriggerKind
 from appliance.features.recorder.recording_store import ABOUT, RecordingStore
 
 MIB = 1 << 20

@@ -5,9 +5,10 @@ from typing import get_args, get_type_hints
 import pytest
 
 from appliance.audit.log.record import AuditRecord, Severity
-from appliance.configuration.settings import RecorderRules
+from appliance.audit.search.why import _ACTIONS
 from appliance.features.recorder.recording_answers import TriggerKind
-from appliance.features.recorder.triggers import trigger_of
+from appliance.features.recorder.settings import RecorderRules
+from appliance.features.recorder.triggers import _BY_EVENT, trigger_of
 
 KINDS: tuple[TriggerKind, ...] = get_args(TriggerKind)
 
@@ -50,3 +51,8 @@ def test_all_kinds_but_orders_can_be_configured() -> None:
     """The configuration uses the same words for kinds as the recordings."""
     configurable = get_args(get_args(get_type_hints(RecorderRules)["triggers"])[0])
     assert set(configurable) == set(KINDS) - {"order"}
+
+
+def test_a_record_of_each_trigger_of_monitors_says_whether_it_was_recorded() -> None:
+    """`audit why` is never silent about an event that may trigger a recording."""
+    assert _BY_EVENT.keys() == _ACTIONS

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.channel.messages import DELAY_BOUNDS, FlowLimit, LatchRefused, TopicTraffic
-from appliance.features.recorder.recorder_ring import RecorderRing
+from appliance.relay.connections.message_sink import MessageSink
 from appliance.relay.connections.named_subscribers import ActionServers
 from appliance.relay.connections.relayed_topic import RelayedTopic, Upstream
 from appliance.relay.transport.frames import Batch
@@ -120,7 +120,7 @@ class Story:
         *,
         memory: int = 1 << 30,
         fresh: bool = True,
-        recorded: RecorderRing | None = None,
+        sink: MessageSink | None = None,
         servers: Callable[[str], Collection[str]] = lambda _topic: (),
     ) -> None:
         self.now = 100.0
@@ -139,7 +139,7 @@ class Story:
             limited=lambda *row: self.limited.append(row),
             make_room=lambda _size: None,
             refused=self.refused.append,
-            recorded=recorded,
+            sink=sink,
             servers=servers,
         )
         self.upstream = RecordedUpstream()

@@ -6,8 +6,8 @@ import os
 import pytest
 from pydantic import ByteSize
 
-from appliance.configuration.settings import RecorderRules
 from appliance.features.recorder.rings import RecorderRings
+from appliance.features.recorder.settings import RecorderRules
 from appliance.supervisor.errors import StartError
 
 MIB = 1 << 20
@@ -17,8 +17,8 @@ def test_a_relay_writes_its_own_part_and_the_recorder_reads_all() -> None:
     """The recorder sees each write; all parts together have the configured size."""
     rings = RecorderRings(RecorderRules(memory=ByteSize(32 * MIB), topics=["/a*"], before=7), 2)
     [(given, written)] = rings.messages_for("relay", 1)
-    assert (given.index, given.seconds, given.topics) == (1, 7, ["/a*"])
-    read = {one.index: descriptor for one, descriptor in rings.messages_for("recorder", 0)}
+    assert [given.terms[name] for name in ("index", "seconds", "topics")] == [1, 7, ["/a*"]]
+    read = {one.terms["index"]: descriptor for one, descriptor in rings.messages_for("recorder", 0)}
     assert [os.fstat(descriptor).st_size for descriptor in read.values()] == [16 * MIB, 16 * MIB]
     mmap.mmap(written, 0)[:5] = b"hello"
     assert os.pread(read[1], 5, 0) == b"hello"

@@ -1,0 +1,99 @@
+"""The requests of operators' tools about recordings."""
+
+from typing import Annotated
+
+import msgspec
+
+from appliance.channel.admin import WaitingRequest
+from appliance.channel.answers.field_docs import doc
+from appliance.channel.rest_bodies import GivenNanoMoment
+from appliance.channel.rest_operation import parameter, rest
+from appliance.features.recorder.recording_answers import Recording, RecordingBegun, Recordings
+
+_NO_RECORDING = {404: "There is no such recording, or the flight recorder is off."}
+RecordingId = Annotated[
+    str,
+    parameter(
+        "id of the recording",
+        name="recording_id",
+        pattern="^[0-9a-f]{20}$",
+        examples=["18ea0bb9b11c1024196c"],
+    ),
+]
+
+
+class NewRecording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The wanted recording: seconds before and after now (null: as configured), and why."""
+
+    before: Annotated[Annotated[float, msgspec.Meta(ge=0)] | None, doc("seconds")] = None
+    after: Annotated[Annotated[float, msgspec.Meta(gt=0)] | None, doc("seconds")] = None
+    note: Annotated[str, msgspec.Meta(max_length=300)] = ""
+
+
+class MemorySpan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A span of time: from `since` (null: from the first data) to `until` (null: now)."""
+
+    since: GivenNanoMoment = None
+    until: GivenNanoMoment = None
+
+
+@rest("viewer", "GET", "/v1/recordings", name="recordings", problems=_NO_RECORDING)
+class RecordingsWanted(WaitingRequest[Recordings], frozen=True, tag="recordings"):
+    """All recordings that are kept, the oldest first."""
+
+
+@rest("viewer", "GET", "/v1/recordings/{recording_id}", name="recording", problems=_NO_RECORDING)
+class RecordingWanted(WaitingRequest[Recording], frozen=True, tag="recording"):
+    """Why a recording was made, and what it has."""
+
+    id: RecordingId
+
+
+@rest(
+    "operator", "POST", "/v1/recordings", name="record_now", body=NewRecording, status=201,
+    good="The recording is being made.", problems=_NO_RECORDING,
+)  # fmt: skip
+class RecordNow(WaitingRequest[RecordingBegun], frozen=True, tag="record now"):
+    """Record the last seconds, and the next ones, of what the robot says."""
+
+    before: float | None = None  # seconds before now; None: as configured
+    after: float | None = None
+    note: str = ""
+
+
+@rest("investigator", "GET", "/v1/recordings/{recording_id}/bag")
+class RecordingFetch(WaitingRequest[Recording], frozen=True, tag="recording fetch"):
+    """Record who fetches the messages of a recording."""
+
+    id: RecordingId
+
+
+@rest("investigator", "GET", "/v1/recordings/{recording_id}/messages", ("topics",))
+class RecordingRead(WaitingRequest[Recording], frozen=True, tag="recording read"):
+    """Record who reads messages of a recording, of these topics (none: of all)."""
+
+    id: RecordingId
+    topics: Annotated[list[str], parameter(name="topic")] = []  # noqa: RUF012  msgspec copies it
+
+
+@rest(
+    "investigator", "POST", "/v1/recordings/memory", name="recording_of_memory", body=MemorySpan,
+    problems=_NO_RECORDING,
+)  # fmt: skip
+class RecordingOfMemory(WaitingRequest[Recording], frozen=True, tag="recording memory"):
+    """Make a recording of the data in memory, which can be fetched for ten minutes, or until the next such request."""
+
+    since: int | None = None  # nanoseconds since the epoch; None: all that there is
+    until: int | None = None
+
+
+@rest("admin", "DELETE", "/v1/recordings/{recording_id}", name="remove_recording", problems=_NO_RECORDING)
+class RecordingRemove(WaitingRequest[Recording], frozen=True, tag="recording remove"):
+    """Remove a recording; it is recorded who removed it. For admins."""
+
+    id: RecordingId
+
+
+REQUESTS = (
+    RecordingsWanted, RecordingWanted, RecordNow, RecordingFetch, RecordingRead, RecordingOfMemory, RecordingRemove,
+)  # fmt: skip

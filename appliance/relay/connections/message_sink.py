@@ -1,0 +1,31 @@
+"""Define what gets a copy of the messages that publishers send, such as memory that the supervisor holds."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+
+class MessageStream(Protocol):
+    """The messages of one connection to a publisher. `keeps`: it needs the frames as the publisher sent them."""
+
+    @property
+    def keeps(self) -> bool: ...
+
+    def write(self, frames: memoryview, messages: int, first: int, judged: int = 0) -> None:
+        """Take frames with this number of messages, of which `first` is the first one's number.
+
+        `judged` is the time by which monitors judged them; 0: now.
+        """
+
+    def close(self) -> None:
+        """Take the end of the connection."""
+
+
+class MessageSink(Protocol):
+    """Gets the messages of all publishers."""
+
+    def open(self, topic: str, host: str, header: Mapping[str, str]) -> MessageStream | None:
+        """Begin a stream for a publisher; return None if the sink does not take its messages."""
+
+
+OpenSink = Callable[[Mapping[str, Any], int, Callable[[], int]], MessageSink]
+"""A function that makes a sink of its terms and a memory's descriptor, with the monitors' clock."""

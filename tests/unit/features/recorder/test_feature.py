@@ -1,0 +1,17 @@
+"""The row of the recorder: its process."""
+
+from appliance.configuration.sections import Sections
+from appliance.features.recorder.settings import RecorderRules
+from appliance.supervisor.roles import ROLES, roles_of
+
+BY_NAME = {role.name: role for role in ROLES}
+
+
+def test_the_recorder_runs_only_if_configured() -> None:
+    """The recorder has its own user and no network, and reads the audit log; the api reads its recordings."""
+    recorder = BY_NAME["recorder"]
+    assert recorder in roles_of(sections=Sections({RecorderRules: RecorderRules(enabled=True)}))
+    assert recorder not in roles_of()
+    assert recorder.user not in {role.user for role in ROLES if role is not recorder}
+    assert recorder.group == recorder.readable_by == BY_NAME["api"].user
+    assert (recorder.dispensable, recorder.network, recorder.capabilities) == (True, False, ())
