@@ -8,11 +8,25 @@ The door announces what its identity may see, and refuses in words: a status wit
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
-from msgspec import UNSET, Meta, Raw, Struct, UnsetType
+from msgspec import UNSET, Raw
 
+from appliance.features.doors.foxglove_frames import (
+    FOXGLOVE_OPERATION,
+    FoxgloveAdvertise,
+    FoxgloveFetchAsset,
+    FoxgloveGetParameters,
+    FoxgloveSetParameters,
+    FoxgloveSubscribe,
+    FoxgloveSubscribeGraph,
+    FoxgloveUnadvertise,
+    FoxgloveUnsubscribe,
+    FoxgloveUnsubscribeGraph,
+    channel_fields,
+    service_fields,
+)
 from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.requests import (
     AdvertiseTopic,
@@ -41,10 +55,6 @@ _SERVICE_CALL = struct.Struct(
 _ASSET_RESPONSE = struct.Struct("<BIBI")  # opcode 4, request, status, length of the error
 _ENCODINGS = ("ros1", "json")
 
-_Number = Annotated[int, Meta(ge=0, le=(1 << 32) - 1)]
-_Name = Annotated[str, Meta(max_length=1024)]
-_Id = Annotated[str, Meta(max_length=1024)] | None
-
 
 @dataclass(frozen=True, slots=True)
 class FoxgloveLimits:
@@ -53,80 +63,6 @@ class FoxgloveLimits:
     subscriptions: int = 1000
     channels: int = 200  # of the client
     calls: int = 100
-
-
-class _Operation(Struct, tag_field="op"):
-    pass
-
-
-class _Subscription(Struct):
-    id: _Number
-    channelId: _Number  # noqa: N815  the protocol's name
-
-
-class _Subscribe(_Operation, tag="subscribe"):
-    subscriptions: list[_Subscription]
-
-
-class _Unsubscribe(_Operation, tag="unsubscribe"):
-    subscriptionIds: list[_Number]  # noqa: N815  the protocol's name
-
-
-class _Channel(Struct):
-    id: _Number
-    topic: _Name
-    encoding: _Name
-    schemaName: _Name  # noqa: N815  the protocol's name
-
-
-class _Advertise(_Operation, tag="advertise"):
-    channels: list[_Channel]
-
-
-class _Unadvertise(_Operation, tag="unadvertise"):
-    channelIds: list[_Number]  # noqa: N815  the protocol's name
-
-
-class _GetParameters(_Operation, tag="getParameters"):
-    parameterNames: list[_Name]  # noqa: N815  the protocol's name
-    id: _Id = None
-
-
-class _Parameter(Struct):
-    name: _Name
-    value: Raw | UnsetType = UNSET
-
-
-class _SetParameters(_Operation, tag="setParameters"):
-    parameters: list[_Parameter]
-    id: _Id = None
-
-
-class _SubscribeGraph(_Operation, tag="subscribeConnectionGraph"):
-    pass
-
-
-class _UnsubscribeGraph(_Operation, tag="unsubscribeConnectionGraph"):
-    pass
-
-
-class _FetchAsset(_Operation, tag="fetchAsset"):
-    requestId: _Number  # noqa: N815  the protocol's name
-    uri: str = ""
-
-
-_Operations = (
-    _Subscribe
-    | _Unsubscribe
-    | _Advertise
-    | _Unadvertise
-    | _GetParameters
-    | _SetParameters
-    | _SubscribeGraph
-    | _UnsubscribeGraph
-    | _FetchAsset
-)
-_DECODER: msgspec.json.Decoder[_Operations] = msgspec.json.Decoder(_Operations)
 
 
 class _FoxgloveError(PeerError):
@@ -142,10 +78,11 @@ class Foxglove:
         self.queue = queue
         self._node = node
         self._limits = limits
-        self._ids: dict[SeenTopic | SeenService, int] = {}  # never used for anything else
+        self._ids: dict[SeenTopic | SeenService, int] = {}  # of what is announced; no number is used twice
+        self._last_id = 0
         self._topics: dict[int, SeenTopic] = {}  # the announced channels
         self._services: dict[int, SeenService] = {}
-        self._subscriptions: dict[int, str] = {}  # the topic, by the client's number
+        self._subscriptions: dict[int, int] = {}  # the channel, by the client's number
         self._by_topic: dict[str, set[int]] = {}
         self._channels: dict[int, tuple[str, str]] = {}  # of the client: topic and encoding
         self._calls: dict[int, tuple[int, int]] = {}  # service and call of the client
@@ -153,15 +90,15 @@ class Foxglove:
         self._graph: dict[str, dict[str, Sequence[str]]] | None = None  # the last one that the client got
         self._seen: DoorSurroundings | None = None
         self._carry_out: dict[type[Any], Callable[[Any], list[DoorRequest]]] = {
-            _Subscribe: self._subscribe,
-            _Unsubscribe: self._unsubscribe,
-            _Advertise: self._advertise,
-            _Unadvertise: self._unadvertise,
-            _GetParameters: self._get_parameters,
-            _SetParameters: self._set_parameters,
-            _SubscribeGraph: self._subscribe_graph,
-            _UnsubscribeGraph: self._unsubscribe_graph,
-            _FetchAsset: self._fetch_asset,
+            FoxgloveSubscribe: self._subscribe,
+            FoxgloveUnsubscribe: self._unsubscribe,
+            FoxgloveAdvertise: self._advertise,
+            FoxgloveUnadvertise: self._unadvertise,
+            FoxgloveGetParameters: self._get_parameters,
+            FoxgloveSetParameters: self._set_parameters,
+            FoxgloveSubscribeGraph: self._subscribe_graph,
+            FoxgloveUnsubscribeGraph: self._unsubscribe_graph,
+            FoxgloveFetchAsset: self._fetch_asset,
         }
         self._tell(
             "serverInfo",
@@ -181,13 +118,13 @@ class Foxglove:
         try:
             if isinstance(frame, bytes):
                 return self._binary(frame)
-            operation = _DECODER.decode(frame)
+            operation = FOXGLOVE_OPERATION.decode(frame)
             return self._carry_out[type(operation)](operation)
         except (PeerError, ValueError, RecursionError) as error:
             self._refuse(f"the operation is refused: {error}")
             return []
 
-    def _subscribe(self, operation: _Subscribe) -> list[DoorRequest]:
+    def _subscribe(self, operation: FoxgloveSubscribe) -> list[DoorRequest]:
         requests: list[DoorRequest] = []
         for one in operation.subscriptions:
             seen = self._topics.get(one.channelId)
@@ -200,20 +137,20 @@ class Foxglove:
                     f"{len(self._subscriptions)} subscriptions; at most {self._limits.subscriptions}"
                 )
             else:
-                self._subscriptions[one.id] = seen.topic
+                self._subscriptions[one.id] = one.channelId
                 self._by_topic.setdefault(seen.topic, set()).add(one.id)
                 self.queue.configure(one.id, depth=None, interval=0.0)
                 requests.append(SubscribeTopic(seen.topic, seen.type))
         return requests
 
-    def _unsubscribe(self, operation: _Unsubscribe) -> list[DoorRequest]:
+    def _unsubscribe(self, operation: FoxgloveUnsubscribe) -> list[DoorRequest]:
         return [request for one in operation.subscriptionIds for request in self._end_subscription(one)]
 
     def _end_subscription(self, number: int) -> list[DoorRequest]:
-        topic = self._subscriptions.pop(number, None)
-        if topic is None:
-            self._refuse(f"there is no subscription {number}")
-            return []
+        channel = self._subscriptions.pop(number, None)
+        if channel is None:
+            return []  # it ended with its channel
+        topic = self._topics[channel].topic
         self.queue.remove(number)
         self._by_topic[topic].discard(number)
         if self._by_topic[topic]:
@@ -221,7 +158,7 @@ class Foxglove:
         del self._by_topic[topic]
         return [UnsubscribeTopic(topic)]
 
-    def _advertise(self, operation: _Advertise) -> list[DoorRequest]:
+    def _advertise(self, operation: FoxgloveAdvertise) -> list[DoorRequest]:
         requests: list[DoorRequest] = []
         for one in operation.channels:
             if one.encoding not in _ENCODINGS:
@@ -238,7 +175,7 @@ class Foxglove:
                 requests.append(AdvertiseTopic(topic, one.schemaName.replace("/msg/", "/"), reply_to=one.id))
         return requests
 
-    def _unadvertise(self, operation: _Unadvertise) -> list[DoorRequest]:
+    def _unadvertise(self, operation: FoxgloveUnadvertise) -> list[DoorRequest]:
         topics = {self._channels.pop(one)[0] for one in operation.channelIds if one in self._channels}
         used = {topic for topic, _encoding in self._channels.values()}
         return [UnadvertiseTopic(topic) for topic in sorted(topics - used)]
@@ -275,10 +212,10 @@ class Foxglove:
         self._calls[self._number] = service, call
         return [CallOfService(seen.service, self._number, frame[start:])]
 
-    def _get_parameters(self, operation: _GetParameters) -> list[DoorRequest]:
+    def _get_parameters(self, operation: FoxgloveGetParameters) -> list[DoorRequest]:
         return [ReadParameters(tuple(operation.parameterNames), operation.id)]
 
-    def _set_parameters(self, operation: _SetParameters) -> list[DoorRequest]:
+    def _set_parameters(self, operation: FoxgloveSetParameters) -> list[DoorRequest]:
         requests: list[DoorRequest] = [
             WriteParameter(one.name, None if one.value is UNSET else one.value, operation.id)
             for one in operation.parameters
@@ -287,17 +224,17 @@ class Foxglove:
             requests.append(ReadParameters(tuple(one.name for one in operation.parameters), operation.id))
         return requests
 
-    def _subscribe_graph(self, _operation: _SubscribeGraph) -> list[DoorRequest]:
+    def _subscribe_graph(self, _operation: FoxgloveSubscribeGraph) -> list[DoorRequest]:
         self._graph = {"publishedTopics": {}, "subscribedTopics": {}, "advertisedServices": {}}
         if self._seen is not None:
             self._send_graph(self._seen)
         return []
 
-    def _unsubscribe_graph(self, _operation: _UnsubscribeGraph) -> list[DoorRequest]:
+    def _unsubscribe_graph(self, _operation: FoxgloveUnsubscribeGraph) -> list[DoorRequest]:
         self._graph = None
         return []
 
-    def _fetch_asset(self, operation: _FetchAsset) -> list[DoorRequest]:
+    def _fetch_asset(self, operation: FoxgloveFetchAsset) -> list[DoorRequest]:
         reason = b"this door has no assets"
         self.queue.reply(_ASSET_RESPONSE.pack(4, operation.requestId, 1, len(reason)) + reason)
         return []
@@ -345,28 +282,41 @@ class Foxglove:
 
     # --- what the door sees ---
 
-    def surroundings(self, seen: DoorSurroundings) -> None:
-        """Announce what is new, and withdraw what is gone. Raises `ViewerStalledError`."""
+    def surroundings(self, seen: DoorSurroundings) -> list[DoorRequest]:
+        """Announce what is new, and withdraw what is gone; return the ends of subscriptions to it.
+
+        Clients end these subscriptions without a frame. Raises `ViewerStalledError`.
+        """
         if seen.denial and (self._seen is None or self._seen.denial != seen.denial):
             self._refuse(seen.denial)
         first, self._seen = self._seen is None, seen
-        topics = {self._id(one): one for one in seen.topics}
-        services = {self._id(one): one for one in seen.services}
+        announced: list[SeenTopic | SeenService] = [*seen.topics, *seen.services]
+        self._ids = {one: self._ids.get(one) or self._new_id() for one in announced}
+        topics = {self._ids[one]: one for one in seen.topics}
+        services = {self._ids[one]: one for one in seen.services}
         if gone := [one for one in self._topics if one not in topics]:
             self._tell("unadvertise", channelIds=gone)
         new = [one for one in topics if one not in self._topics]
         if new or first:
-            self._tell("advertise", channels=[_channel(one, topics[one]) for one in new])
+            self._tell("advertise", channels=[channel_fields(one, topics[one]) for one in new])
         if gone := [one for one in self._services if one not in services]:
             self._tell("unadvertiseServices", serviceIds=gone)
         if new := [one for one in services if one not in self._services]:
-            self._tell("advertiseServices", services=[_service(one, services[one]) for one in new])
+            self._tell("advertiseServices", services=[service_fields(one, services[one]) for one in new])
+        ended = [
+            request
+            for number, channel in [*self._subscriptions.items()]
+            if channel not in topics
+            for request in self._end_subscription(number)
+        ]
         self._topics, self._services = topics, services
         if self._graph is not None:
             self._send_graph(seen)
+        return ended
 
-    def _id(self, seen: SeenTopic | SeenService) -> int:
-        return self._ids.setdefault(seen, len(self._ids) + 1)
+    def _new_id(self) -> int:
+        self._last_id += 1
+        return self._last_id
 
     def _send_graph(self, seen: DoorSurroundings) -> None:
         now: dict[str, dict[str, Sequence[str]]] = {
@@ -412,24 +362,3 @@ class Foxglove:
 
 def _values(encoding: str, data: bytes) -> Raw | bytes:
     return Raw(data) if encoding == "json" else data
-
-
-def _channel(number: int, seen: SeenTopic) -> dict[str, Any]:
-    return {
-        "id": number,
-        "topic": seen.topic,
-        "encoding": "ros1",
-        "schemaName": seen.type,
-        "schema": seen.definition,
-        "schemaEncoding": "ros1msg",
-    }
-
-
-def _service(number: int, seen: SeenService) -> dict[str, Any]:
-    return {
-        "id": number,
-        "name": seen.service,
-        "type": seen.type,
-        "requestSchema": seen.request,
-        "responseSchema": seen.response,
-    }

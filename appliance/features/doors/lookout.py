@@ -70,6 +70,9 @@ class Lookout:
             for name, nodes in self._asked.items()
             if name in graph.publishers or name in graph.services
         }
+        self._service_types = {
+            name: kind for name, kind in self._service_types.items() if name in graph.services
+        }
         for name, nodes, _ask in new:
             self._asked[name] = tuple(nodes)
         await asyncio.gather(*(_quietly(ask(name)) for name, _nodes, ask in new))

@@ -306,8 +306,9 @@ class Rosbridge:
     def parameters(self, _values: Mapping[str, Any], _reply_to: str | None) -> None:
         """Do nothing: this protocol has parameters as services of rosapi."""
 
-    def surroundings(self, _seen: DoorSurroundings) -> None:
+    def surroundings(self, _seen: DoorSurroundings) -> list[DoorRequest]:
         """Do nothing: clients of this protocol call rosapi."""
+        return []
 
     def ask(self, service: str, values: Raw) -> str:
         """Send the client a call of its service, and return the id of the call.

@@ -13,7 +13,6 @@ import asyncio
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from http import HTTPStatus
 from typing import Any, Protocol
 
@@ -74,8 +73,8 @@ class ClientProtocol(Protocol):
     def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
         """Send the values of parameters."""
 
-    def surroundings(self, seen: DoorSurroundings) -> None:
-        """Announce what the door sees; only if `wants_surroundings`."""
+    def surroundings(self, seen: DoorSurroundings) -> Sequence[DoorRequest]:
+        """Announce what the door sees, and return the requests that follow; only if `wants_surroundings`."""
 
     def ask(self, service: str, values: Raw) -> str:
         """Send a call of an offered service, and return its id."""
@@ -197,7 +196,14 @@ class DoorSession:
     async def _watch(self) -> None:
         while True:
             seen = await self._lookout.look()
-            self._tell(partial(self._protocol.surroundings, seen))
+            try:
+                requests = self._protocol.surroundings(seen)
+            except ViewerStalledError as error:
+                self._disconnect(CloseCode.POLICY_VIOLATION, str(error))
+                return
+            self._wake.set()
+            for request in requests:
+                await self._door.carry_out(request, self)
             await asyncio.sleep(_WATCH_SECONDS)
 
     # --- frames of the client ---

@@ -39,7 +39,7 @@ class _Waiting:
 class ViewerQueue(Generic[Key]):
     """The queue of one client; times are those of a monotonic clock, in seconds."""
 
-    def __init__(self, *, message_bytes: int = 16 << 20, reply_bytes: int = 4 << 20) -> None:
+    def __init__(self, *, message_bytes: int = 16 << 20, reply_bytes: int = 16 << 20) -> None:
         self.dropped = 0
         self._most_message_bytes = message_bytes
         self._most_reply_bytes = reply_bytes

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
-from appliance.features.doors.requests import PublishMessage, SubscribeTopic
+from appliance.features.doors.requests import PublishMessage, SubscribeTopic, UnsubscribeTopic
 from appliance.features.doors.surroundings import DoorSurroundings, SeenTopic, VisibleGraph
 from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.definitions import Definitions
@@ -182,7 +182,6 @@ def viewer(**limits: int) -> tuple[Foxglove, ViewerQueue[int]]:
         ('{"op":"subscribe","subscriptions":[{"id":1e99,"channelId":1}]}', "refused"),
         ('{"op":"subscribe","subscriptions":[{"id":4294967296,"channelId":1}]}', "<= 4294967295"),
         ('{"op":"subscribe","subscriptions":[{"id":1,"channelId":9}]}', "the channel 9 is not announced"),
-        ('{"op":"unsubscribe","subscriptionIds":[5]}', "there is no subscription 5"),
         (
             '{"op":"advertise","channels":[{"id":1,"topic":"/a","encoding":"cdr","schemaName":"a/B"}]}',
             "'cdr'",
@@ -221,6 +220,29 @@ def test_an_asset_is_an_error_at_once() -> None:
     foxglove, _queue = viewer()
     foxglove.receive('{"op":"fetchAsset","uri":"package://x/y.stl","requestId":5}')
     assert foxglove.next_frame(0.0) == struct.pack("<BIBI", 4, 5, 1, 23) + b"this door has no assets"
+
+
+def test_a_subscription_ends_with_its_channel() -> None:
+    """The client sends no frame for it, and may subscribe with the same number again."""
+    foxglove, _queue = viewer()
+    subscribe = '{"op":"subscribe","subscriptions":[{"id":5,"channelId":%d}]}'
+    assert foxglove.receive(subscribe % 1) == [SubscribeTopic("/t", "a/B")]
+    gone = DoorSurroundings(VisibleGraph({}, {}, {}, {}), [SeenTopic("/t", "a/C", "int8 y")], [])
+    assert foxglove.surroundings(gone) == [UnsubscribeTopic("/t")]
+    assert foxglove.receive('{"op":"unsubscribe","subscriptionIds":[5]}') == []
+    assert foxglove.receive(subscribe % 2) == [SubscribeTopic("/t", "a/C")]
+
+
+def test_a_channel_that_comes_back_has_a_new_number() -> None:
+    """The door keeps nothing of channels that are gone, however many come and go."""
+    foxglove, _queue = viewer()
+    announced = []
+    for number in range(100):
+        seen = [SeenTopic(f"/t{number % 2}", "a/B", "int8 x")]
+        foxglove.surroundings(DoorSurroundings(VisibleGraph({}, {}, {}, {}), seen, []))
+        while (frame := foxglove.next_frame(0.0)) is not None:
+            announced += [one["id"] for one in json.loads(frame).get("channels", ())]
+    assert announced == [*range(2, 102)]
 
 
 def test_subscriptions_and_channels_are_bounded() -> None:
