@@ -1,0 +1,153 @@
+"""The types of commands and sensors that a preset works with, as rows: where each value of the preset's text is.
+
+A preset in `monitors/guards` is a valid text for one type. For another type, `text_for` replaces the type and the
+pattern of the events on that topic. A value that the type lacks becomes a local variable: zero, or as the row defines
+it.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+_LEGS = ("linear.x", "linear.y", "linear.z", "angular.x", "angular.y", "angular.z")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A message type: the path of each value. `parameters` and `local` replace a value that is made of fields."""
+
+    paths: Mapping[str, str] = field(default_factory=dict)
+    stops: bool = True
+    """Whether a message can stop the robot. If not, a command is dropped and all goals of its action are cancelled."""
+    parameters: str = ""
+    local: str = ""
+
+
+def _twist(before: str = "") -> Row:
+    return Row({axis: before + leg for axis, leg in zip(AXES, _LEGS, strict=True)})
+
+
+def _listed(*paths: str) -> Row:
+    """Return a row whose `values` are these numbers."""
+    names = [f"v{place}" for place in range(len(paths))]
+    return Row(
+        dict(zip(names, paths, strict=True)),
+        parameters=", ".join(f"double {name}" for name in names),
+        local=f"double values[] = {{{', '.join(names)}}};",
+    )
+
+
+VELOCITIES = {
+    "geometry_msgs/Twist": _twist(),
+    "geometry_msgs/TwistStamped": _twist("twist."),
+    "ackermann_msgs/AckermannDrive": Row({"x": "speed"}),
+    "ackermann_msgs/AckermannDriveStamped": Row({"x": "drive.speed"}),
+}
+TRAJECTORY = {"names": "joint_names", "points": "points"}
+GOAL = "control_msgs/FollowJointTrajectoryActionGoal"
+TRAJECTORIES = {
+    "trajectory_msgs/JointTrajectory": Row(TRAJECTORY),
+    GOAL: Row({name: f"goal.trajectory.{path}" for name, path in TRAJECTORY.items()}, stops=False),
+}
+GOALS = {
+    "move_base_msgs/MoveBaseActionGoal": Row({"id": "goal_id.id"}, stops=False),
+    GOAL: Row({"id": "goal_id.id"}, stops=False),
+}
+COMMANDS = VELOCITIES | TRAJECTORIES | {"move_base_msgs/MoveBaseActionGoal": Row(stops=False)}
+RESULTS = {goal.replace("ActionGoal", "ActionResult"): Row({"id": "status.goal_id.id"}) for goal in GOALS}
+
+
+def _pose(before: str) -> Row:
+    return Row({"px": f"{before}position.x", "py": f"{before}position.y", "q": f"{before}orientation"})
+
+
+POSITIONS = {
+    "nav_msgs/Odometry": _pose("pose.pose."),
+    "geometry_msgs/PoseStamped": _pose("pose."),
+    "geometry_msgs/PoseWithCovarianceStamped": _pose("pose.pose."),
+}
+SPEEDS = {
+    "nav_msgs/Odometry": Row({"v": "twist.twist.linear.x"}),
+    "geometry_msgs/TwistStamped": Row({"v": "twist.linear.x"}),
+    "geometry_msgs/TwistWithCovarianceStamped": Row({"v": "twist.twist.linear.x"}),
+}
+SENSORS = {
+    "sensor_msgs/LaserScan": Row({"values": "ranges"}),
+    "sensor_msgs/Range": _listed("range"),
+    "sensor_msgs/NavSatFix": _listed("latitude", "longitude", "altitude"),
+    "sensor_msgs/Imu": _listed(
+        *(f"{what}.{axis}" for what in ("angular_velocity", "linear_acceleration") for axis in "xyz")
+    ),
+    "nav_msgs/Odometry": _listed(
+        *(f"pose.pose.position.{axis}" for axis in "xyz"),
+        *(f"pose.pose.orientation.{axis}" for axis in "xyzw"),
+    ),
+    "sensor_msgs/JointState": Row({"values": "position"}, parameters="double[] values"),
+}
+_SCAN = {
+    "start": "angle_min", "step": "angle_increment", "low": "range_min", "high": "range_max", "ranges": "ranges",
+}  # fmt: skip
+SCANS = {"sensor_msgs/LaserScan": Row(_SCAN)}
+BATTERIES = {"sensor_msgs/BatteryState": Row({"percentage": "percentage"})}
+
+_EVENT = re.compile(
+    r"event (?P<name>\w+)\((?P<parameters>[^)]*)\) (?P<topic>\w+)\s+(?P<type>\w+/\w+)\s+'\{(?P<pattern>[^}]*)\}' \{"
+)
+_SAFE = re.compile(r"safe (?P<type>\w+/\w+) \{ \} on command every 100ms;")
+_COMMAND = re.compile(r"topic command = ([^;]+);")
+_STOP = re.compile(r"\bSTOP;")
+_WIDTH = 110
+
+
+def text_for(text: str, topic: str, kind: str, row: Row) -> str:
+    """Return the text of a preset whose events on this given topic have another type."""
+    for found in reversed([*_EVENT.finditer(text)]):
+        if found["topic"] == topic:
+            header = _header(found, kind, row)
+            end = _end_of(text, found.end())
+            body = text[found.end() : end]
+            if topic == "command" and not row.stops:
+                body = _STOP.sub("DROP;", body)
+            text = text[: found.start()] + header + body + text[end:]
+    if topic != "command" or not _SAFE.search(text):
+        return text
+    return _SAFE.sub(f"safe {kind} {{ }} on command every 100ms;", text) if row.stops else _cancelling(text)
+
+
+def _header(found: "re.Match[str]", kind: str, row: Row) -> str:
+    """Return the head of an event with the fields of a row, and variables for the values that it lacks."""
+    wanted = [one.rsplit(" ", 1) for one in found["parameters"].split(", ") if one]
+    bound = {name: row.paths[name] for _type, name in wanted if name in row.paths}
+    parameters = ", ".join(f"{of} {name}" for of, name in wanted if name in bound)
+    lacking = [name for _type, name in wanted if name not in bound]
+    local = f"double {', '.join(f'{name} = 0' for name in lacking)};" if lacking else ""
+    if row.parameters and wanted:
+        parameters, bound, local = row.parameters, dict(row.paths), row.local
+    pattern = ", ".join(f"{path}:{name}" for name, path in bound.items())
+    head = f"event {found['name']}({parameters}) {found['topic']} {kind}"
+    one_line = f"{head} '{{{pattern}}}' {{"
+    if len(one_line) > _WIDTH:
+        one_line = f"{head}\n            '{{{pattern}}}' {{"
+    return one_line + (f"\n        {local}" if local else "")
+
+
+def _end_of(text: str, start: int) -> int:
+    """Return the place behind the block that begins before `start`."""
+    depth = 1
+    for place in range(start, len(text)):
+        depth += {"{": 1, "}": -1}.get(text[place], 0)
+        if depth == 0:
+            return place + 1
+    raise ValueError("a block does not end")
+
+
+def _cancelling(text: str) -> str:
+    """Return a text that cancels all goals where the preset publishes the safe message."""
+    text = _COMMAND.sub(
+        lambda found: f"{found[0]}\n    topic cancel = {found[1].removesuffix('/goal')}/cancel;", text
+    )
+    text = _SAFE.sub(
+        "actionlib_msgs::GoalID everything;                         // an empty id cancels all goals", text
+    )
+    return _STOP.sub("PUBLISH(cancel, actionlib_msgs/GoalID, everything);", text)

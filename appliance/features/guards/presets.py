@@ -1,0 +1,259 @@
+"""Presets: reviewed texts in `monitors/guards`, their parameters, and the texts that are made from them.
+
+What is made is an ordinary specification. Its first line names the preset, its version, the topics and their types.
+"""
+
+import functools
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from appliance.base.shipped import SHIPPED
+from appliance.base.user_errors import UserError
+from appliance.features.guards import message_types as types
+from appliance.features.guards.message_types import Row, text_for
+
+FOLDER = SHIPPED / "monitors" / "guards"
+
+_GIVEN = re.compile(
+    r"^    (?P<kind>double|int|bool|topic) (?P<name>\w+) = (?P<default>[^ ;]+)"
+    r"(?: (?P<unit>[\w/]+))?(?: in (?P<least>[-\d.]+?)\.\.(?P<most>[-\d.]+))?;[ ]*(?:// (?P<remark>.*))?$",
+    re.MULTILINE,
+)
+_HEAD = re.compile(r"^((?:begin |hold )?)(\w+)\(", re.MULTILINE)
+_FIRST_LINE = re.compile(r"// preset (?P<preset>\w+) (?P<version>\d+):.*\n")
+_NAME = re.compile(r"[A-Za-z_]\w{0,63}")
+_TOPIC = re.compile(r"/[A-Za-z]\w*(?:/[A-Za-z]\w*)*")
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_CORNERS = re.compile(rf"\s*{_NUMBER}\s*,\s*{_NUMBER}(?:\s+{_NUMBER}\s*,\s*{_NUMBER}){{2,99}}\s*")
+_JOINTS = re.compile(rf"\s*[\w/]+:{_NUMBER}\.\.{_NUMBER}(?:\s+[\w/]+:{_NUMBER}\.\.{_NUMBER})*\s*")
+_SPAN = re.compile(r"(\d+(?:\.\d+)?)(ms|s)")
+
+
+class GuardError(UserError):
+    """A guard cannot be made or changed; the message says what to do."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A value of a preset that operators set. `loads`: it is in the text, so another value is another text."""
+
+    name: str
+    kind: str
+    default: str
+    unit: str = ""
+    least: str = ""
+    most: str = ""
+    what: str = ""
+    loads: bool = False
+
+    def checked(self, value: str) -> str:
+        """Return a value as the text has it. Raises `GuardError`."""
+        if self.kind == "bool":
+            if value not in {"true", "false"}:
+                raise GuardError(f"{self.name}={value}: write {self.name}=true or {self.name}=false")
+            return value
+        form = _TABLES.get(self.kind)
+        if form is not None:
+            if not form.fullmatch(value):
+                raise GuardError(f"{self.name}={value}: write it like {self.name}='{self.default}'")
+            return " ".join(value.split())
+        whole = r"[-+]?\d+" if self.kind == "int" else _NUMBER
+        if not re.fullmatch(whole, value):
+            noun = "a whole number" if self.kind == "int" else "a number"
+            raise GuardError(f"{self.name}={value}: give {noun}{f' of {self.unit}' if self.unit else ''}")
+        if not float(self.least) <= float(value) <= float(self.most):
+            unit = f" {self.unit}" if self.unit else ""
+            raise GuardError(
+                f"{self.name}={value} is outside of {self.least}..{self.most}{unit}: give a number in this range"
+            )
+        return value
+
+
+_TABLES = {"corners": _CORNERS, "joints": _JOINTS, "time": _SPAN}
+_POLYGON = Parameter(
+    "polygon", "corners", "-2,-2 2,-2 2,2 -2,2", "m", what="x and y of each corner", loads=True
+)
+_LIMITS = Parameter(
+    "limits",
+    "joints",
+    "elbow:-1.5..1.5",
+    "rad",
+    what="the limits of each joint; default: low and high",
+    loads=True,
+)
+_DEADLINE = Parameter("limit", "time", "120s", what="from a goal to its result", loads=True)
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A preset: the rows of each of its topics that has several types, and the parameters that are in its text."""
+
+    name: str
+    topics: Mapping[str, Mapping[str, Row]]
+    further: tuple[Parameter, ...] = ()
+
+    @functools.cached_property
+    def text(self) -> str:
+        """The reviewed text."""
+        return (FOLDER / f"{self.name}.rv").read_text(encoding="utf-8")
+
+    @property
+    def version(self) -> int:
+        """The version in the first line."""
+        found = _FIRST_LINE.match(self.text)
+        assert found is not None, self.name  # noqa: S101  a test reads every preset
+        return int(found["version"])
+
+    @property
+    def what(self) -> str:
+        """What it does: the second line of the text."""
+        return self.text.split("\n", 2)[1].removeprefix("// ")
+
+    @property
+    def _given(self) -> "list[re.Match[str]]":
+        block, brace, _rest = self.text.partition("\n} {\n")
+        return [*_GIVEN.finditer(block)] if brace else []
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Values that operators set; not the topics."""
+        given = (
+            Parameter(one["name"], one["kind"], one["default"], one["unit"] or "", one["least"] or "",
+                      one["most"] or "", one["remark"] or "")
+            for one in self._given if one["kind"] != "topic"
+        )  # fmt: skip
+        return (*given, *self.further)
+
+    @property
+    def given_topics(self) -> dict[str, str]:
+        """The topics that are given to it, with their defaults."""
+        return {one["name"]: one["default"] for one in self._given if one["kind"] == "topic"}
+
+    def parameter(self, name: str) -> Parameter:
+        """Return a parameter. Raises `GuardError`."""
+        for one in self.parameters:
+            if one.name == name:
+                return one
+        known = ", ".join(one.name for one in self.parameters) or "it has none"
+        raise GuardError(f"{self.name} has no parameter {name!r}; use one of: {known}")
+
+
+_MOVES = {"command": types.VELOCITIES}
+_ANY = {"command": types.COMMANDS}
+
+PRESETS = {
+    one.name: one
+    for one in (
+        Preset("deadman", _MOVES),
+        Preset("speed", _MOVES),
+        Preset("separation", {**_MOVES, "by": types.SCANS}),
+        Preset("fence", {**_MOVES, "by": types.POSITIONS}, (_POLYGON,)),
+        Preset("sensor", {**_ANY, "by": types.SENSORS}),
+        Preset("estop", _ANY),
+        Preset("arm", {**_ANY, "by": types.BATTERIES}),
+        Preset("answer", {"command": types.GOALS, "by": types.RESULTS}, (_DEADLINE,)),
+        Preset("joints", {"command": types.TRAJECTORIES}, (_LIMITS,)),
+        Preset("rate", _MOVES),
+        Preset("agree", {**_MOVES, "by": types.SPEEDS, "other": types.SPEEDS}),
+        Preset("sane", _MOVES),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Guard:
+    """A guard to make: its name, its preset, and for each given topic the topic and the type of its messages."""
+
+    name: str
+    preset: Preset
+    topics: Mapping[str, str] = field(default_factory=dict)
+    types: Mapping[str, str] = field(default_factory=dict)
+    values: Mapping[str, str] = field(default_factory=dict)
+
+
+def preset_named(name: str) -> Preset:
+    """Return a preset. Raises `GuardError`."""
+    if name not in PRESETS:
+        raise GuardError(f"there is no preset {name!r}; use one of: {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
+def text_of(guard: Guard) -> str:
+    """Return the specification of a guard. Raises `GuardError`."""
+    preset = guard.preset
+    if not _NAME.fullmatch(guard.name):
+        raise GuardError(f"{guard.name!r} is not a name of a monitor: use letters, digits and _")
+    text = preset.text
+    for name, topic in guard.topics.items():
+        text = _with_topic(preset, text, name, topic)
+    for name, kind in guard.types.items():
+        rows = preset.topics.get(name, {})
+        if name in preset.topics and kind not in rows:
+            raise GuardError(
+                f"{guard.topics.get(name, name)} has the type {kind}; {preset.name} works with {', '.join(rows)}"
+            )
+        if name in rows or kind in rows:
+            text = text_for(text, name, kind, rows[kind])
+    for name, value in guard.values.items():
+        parameter = preset.parameter(name)
+        text = _with_value(text, parameter, parameter.checked(value))
+    text = _HEAD.sub(rf"\g<1>{guard.name}(", text, count=1)
+    return _FIRST_LINE.sub(_first_line(guard), text, count=1)
+
+
+def preset_of(text: str) -> Preset | None:
+    """Return the preset that a specification was made from; None if it was not."""
+    found = _FIRST_LINE.match(text)
+    return PRESETS.get(found["preset"]) if found else None
+
+
+def with_values(text: str, values: Mapping[str, str]) -> str:
+    """Return the text of a guard with other values. Raises `GuardError`."""
+    preset = preset_of(text)
+    if preset is None:
+        raise GuardError(
+            "it was not made from a preset; change its text, and load it with rosrv monitor load"
+        )
+    for name, value in values.items():
+        parameter = preset.parameter(name)
+        text = _with_value(text, parameter, parameter.checked(value))
+    return text
+
+
+def _first_line(guard: Guard) -> str:
+    topics = ", ".join(
+        f"{name}={topic} {guard.types[name]}" if name in guard.types else f"{name}={topic}"
+        for name, topic in (guard.preset.given_topics | dict(guard.topics)).items()
+    )
+    return f"// preset {guard.preset.name} {guard.preset.version}: {topics}\n"
+
+
+def _with_topic(preset: Preset, text: str, name: str, topic: str) -> str:
+    if name not in preset.given_topics:
+        known = ", ".join(preset.given_topics)
+        raise GuardError(f"no topic {name!r} is given to {preset.name}; there are: {known}")
+    if not _TOPIC.fullmatch(topic):
+        raise GuardError(f"{topic!r} is not the name of a topic; write it like /cmd_vel")
+    return re.sub(rf"(topic {name} = )[^;]+;", rf"\g<1>{topic};", text, count=1)
+
+
+def _with_value(text: str, parameter: Parameter, value: str) -> str:
+    match parameter.kind:
+        case "corners":
+            return re.sub(r"(POLYGON\[\] = \{)[^}]*", rf"\g<1>{', '.join(re.split('[ ,]+', value))}", text)
+        case "time":
+            return re.sub(r"(timeout )\d+(?:\.\d+)?m?s", rf"\g<1>{value}", text)
+        case "joints":
+            rows = [re.split(r":|\.\.", row) for row in value.split()]
+            for table, place in (("NAMES", 0), ("LOW", 1), ("HIGH", 2)):
+                cells = (f'"{row[place]}"' if place == 0 else row[place] for row in rows)
+                text = re.sub(rf"({table}\[\] = \{{)[^}}]*", rf"\g<1>{', '.join(cells)}", text)
+            return text
+    return re.sub(rf"(\n    {parameter.kind} {parameter.name} = )[^ ;]+", rf"\g<1>{value}", text, count=1)
+
+
+def file_of(name: str, folder: Path) -> Path:
+    """Return the file of a guard in a folder of specifications."""
+    return folder / f"{name}.rv"

@@ -1,0 +1,93 @@
+"""Run a preset on its module, and collect all that its command topic gets."""
+
+import functools
+import math
+import random
+from collections.abc import Iterable
+from typing import Any
+
+from appliance.features.guards.presets import PRESETS, Guard, text_of
+from rosmop.check.sources import compiled_from
+from rosmop.fast.build import certified, parts_of
+from rosmop.fast.load import loaded
+from rosmop.run.engine import MonitorSet
+from rosmop.run.outcomes import MessageSender, Outcome
+from rosmop.tests.acting import fields, message
+from roswire.standard import standard_definitions
+
+MS = 10**6
+BEGIN = 1_700_000_000 * 10**9
+TWIST = "geometry_msgs/Twist"
+NODES = ("", "/a", "/b", "/c")
+DEFINITIONS = standard_definitions()
+SPEEDS = (0.0, -0.0, 0.2, -0.2, 0.5, -0.5, 0.5000001, 1.0, -3.0, 1e300, math.inf, -math.inf, math.nan)
+
+
+def twist(*legs: float) -> bytes:
+    """Return a command with these velocities: x, y, z, and around them."""
+    names = [f"{part}__{axis}" for part in ("linear", "angular") for axis in "xyz"]
+    return message(TWIST, **dict(zip(names, legs, strict=False)))
+
+
+def legs_of(data: bytes) -> tuple[float, ...]:
+    """Return the velocities of a command."""
+    read = fields(TWIST, data)
+    return (read.linear.x, read.linear.y, read.linear.z, read.angular.x, read.angular.y, read.angular.z)
+
+
+def same(one: Iterable[float], other: Iterable[float]) -> bool:
+    """Whether numbers are equal; NaN equals NaN."""
+    return all(a == b or (math.isnan(a) and math.isnan(b)) for a, b in zip(one, other, strict=True))
+
+
+@functools.cache
+def _part(text: str) -> bytes:
+    """Return what a relay loads."""
+    [part] = parts_of(certified(compiled_from({"guard.rv": text}, DEFINITIONS)).data, [(("guard",), ())])
+    return part
+
+
+class Guarded:
+    """A guard, and the base behind it: each command that it gets, with its time in milliseconds."""
+
+    def __init__(self, preset: str, types: dict[str, str] | None = None, **values: object) -> None:
+        wanted = {name: str(value).lower() for name, value in values.items()}
+        self.text = text_of(Guard("guard", PRESETS[preset], types=types or {}, values=wanted))
+        compiled, fast = loaded(_part(self.text))
+        self.monitors = MonitorSet.of(compiled, fast=fast)
+        self.monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
+        self.topics = PRESETS[preset].given_topics
+        self.got: list[tuple[int, Any]] = []
+        self.monitors.start(BEGIN - 100 * MS)
+        self.advance(0)
+
+    def advance(self, at: int) -> None:
+        """Let time pass."""
+        for one in self.monitors.advance(BEGIN + at * MS):
+            self._sent(one, (one.time - BEGIN) // MS)
+
+    def tell(self, given: str, data: bytes, at: int, node: str = "/a") -> Outcome:
+        """Send a message on a topic that is given to the guard."""
+        self.advance(at)
+        topic = self.topics[given]
+        outcome = self.monitors.judge(
+            topic, bytearray(data), BEGIN + at * MS, MessageSender(NODES.index(node))
+        )
+        assert not outcome.faults
+        self._sent(outcome, at)
+        if given == "command" and outcome.result != "dropped":
+            self.got.append((at, bytes(outcome.buffer)))
+        return outcome
+
+    def drive(self, data: bytes, at: int, node: str = "/a") -> tuple[float, ...]:
+        """Send a command; return the velocities that the base gets."""
+        outcome = self.tell("command", data, at, node)
+        return () if outcome.result == "dropped" else legs_of(bytes(outcome.buffer))
+
+    def _sent(self, outcome: Outcome, at: int) -> None:
+        self.got += [(at, bytes(one.data)) for one in outcome.sent()]
+
+
+def seeded(seed: int) -> random.Random:
+    """Return a source of the same numbers in every run."""
+    return random.Random(seed)  # noqa: S311  of tests

@@ -1,0 +1,108 @@
+"""Presets are valid texts for each of their types, and their parameters are checked before a text is made."""
+
+from itertools import product
+
+import pytest
+
+from appliance.features.guards.presets import (
+    PRESETS,
+    Guard,
+    GuardError,
+    Preset,
+    preset_of,
+    text_of,
+    with_values,
+)
+from rosmop.check.sources import compiled_from
+from rosmop.fast.build import fast_path_of
+from rosmop.form.compiled import Compiled
+from rosmop.run.engine import MonitorSet
+from tests.unit.features.guards.guarding import DEFINITIONS
+
+INTERPRETED = {"joints", "answer"}
+"""Presets with arrays of messages or slices, which the module leaves to the engine."""
+
+
+def compiled(text: str) -> Compiled:
+    """Return a compiled text, which has no warning."""
+    found = compiled_from({"guard.rv": text}, DEFINITIONS)
+    assert not found.warnings
+    return found
+
+
+@pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
+def test_a_preset_is_valid_as_it_is_and_for_each_of_its_types(preset: Preset) -> None:
+    """Its parameters are those that the language reads; commands are judged by the module."""
+    [code] = compiled(preset.text).specifications
+    given = {one.name: (one.default, one.unit) for one in code.givens}
+    read = {one.name: (one.default, one.unit) for one in preset.parameters if not one.loads}
+    assert {
+        name: (str(default).lower().removesuffix(".0"), unit) for name, (default, unit) in given.items()
+    } == read
+    for kinds in product(*preset.topics.values()):
+        types = dict(zip(preset.topics, kinds, strict=True))
+        if preset.name == "answer" and types["by"] != types["command"].replace("Goal", "Result"):
+            continue
+        made = compiled(text_of(Guard("mine", preset, {"command": "/base/goal"}, types)))
+        assert made.specifications[0].name == "mine"
+        lane = MonitorSet.of(made, fast=fast_path_of(made)).lane("/base/goal")
+        assert (lane is None) == (preset.name in INTERPRETED)
+
+
+def test_a_guard_is_an_ordinary_text_with_its_topics_types_and_values() -> None:
+    """The first line names them; the text leads back to the preset."""
+    types = {"command": "geometry_msgs/TwistStamped", "by": "geometry_msgs/PoseStamped"}
+    text = text_of(
+        Guard("yard", PRESETS["fence"], {"command": "/base/cmd", "by": "/pose"}, types,
+              {"margin": "0.5", "polygon": "0,0 4,0  0,3.5", "worldFrame": "true"})
+    )  # fmt: skip
+    assert text.startswith("// preset fence 1: command=/base/cmd geometry_msgs/TwistStamped, by=/pose")
+    for part in (
+        "topic command = /base/cmd;",
+        "double margin = 0.5 m in 0..20;",
+        "{0, 0, 4, 0, 0, 3.5}",
+        "bool worldFrame = true;",
+        "twist.linear.x:x",
+        "begin yard() given",
+        "'{pose.position.x:px",
+    ):
+        assert part in text
+    assert preset_of(text) is PRESETS["fence"]
+    assert "{1, 1, 2, 1, 2, 2}" in with_values(text, {"polygon": "1,1 2,1 2,2"})
+    [code] = compiled(text).specifications
+    assert {one.topic for one in code.events if one.topic} == {"/base/cmd", "/pose"}
+
+
+WRONG = [
+    ("speed", "base", {}, {}, {"vMax": "51"}, "outside of 0..50 m/s"),
+    ("speed", "base", {}, {}, {"vMax": "nan"}, "give a number of m/s"),
+    ("speed", "base", {}, {}, {"vMax": "1;}"}, "give a number"),
+    ("speed", "base", {}, {}, {"vmax": "1"}, "use one of: vMax"),
+    ("estop", "base", {}, {}, {"twoHands": "1"}, "twoHands=true or twoHands=false"),
+    ("sensor", "base", {}, {}, {"frozen": "1.5"}, "give a whole number"),
+    ("fence", "base", {}, {}, {"polygon": "0,0 1,1"}, "write it like polygon="),
+    ("fence", "base", {}, {}, {"polygon": "0,0 1,1 nan,2"}, "write it like polygon="),
+    ("joints", "base", {}, {}, {"limits": 'a":1..2'}, "write it like limits="),
+    ("answer", "base", {}, {}, {"limit": "5"}, "write it like limit="),
+    ("speed", "a b", {}, {}, {}, "not a name of a monitor"),
+    ("speed", "base", {"command": "cmd"}, {}, {}, "not the name of a topic"),
+    ("speed", "base", {"by": "/odom"}, {}, {}, "no topic 'by' is given to speed"),
+    (
+        "speed",
+        "base",
+        {"command": "/c"},
+        {"command": "std_msgs/Bool"},
+        {},
+        "/c has the type std_msgs/Bool; speed works",
+    ),
+]
+
+
+@pytest.mark.parametrize(("preset", "name", "topics", "types", "values", "why"), WRONG)
+def test_a_guard_that_cannot_be_made_is_refused(  # noqa: PLR0917  a row
+    preset: str, name: str, topics: dict[str, str], types: dict[str, str], values: dict[str, str], why: str
+) -> None:
+    """The error says what to write instead."""
+    with pytest.raises(GuardError) as error:
+        text_of(Guard(name, PRESETS[preset], topics, types, values))
+    assert why in str(error.value)
