@@ -1,4 +1,4 @@
-"""Define the errors of requests that cannot be answered."""
+"""Define the errors of requests that cannot be answered, and of a state that cannot be used."""
 
 
 class UnknownThingError(Exception):
@@ -11,3 +11,7 @@ class SenselessError(Exception):
 
 class UnavailableError(Exception):
     """The appliance cannot do it now; the message gives the reason."""
+
+
+class StateError(Exception):
+    """A file of the state cannot be used; the text names the file, the reason and the remedy."""

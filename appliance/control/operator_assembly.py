@@ -21,7 +21,6 @@ from appliance.control.operators.switched_off import SwitchedOffWatch
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
 from appliance.control.rest.rest_certificate import RestCertificate
-from appliance.features.standby.standby_orders import StandbyOrders, StandbySource
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment import HostEnrolment, find_endpoint
 from appliance.hosts.rest_address import rest_address
@@ -40,13 +39,12 @@ class Operators:
     collected: ForwarderLink
     switched_off: SwitchedOffWatch
     blocks: BlockOrders
-    standby: StandbyOrders
     bundles: BundleGate
     administration: Administration
     rest: RestLink
 
 
-def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Operators:
+def make_operators(base: Foundation, parts: Parts) -> Operators:
     """Make the parts that serve operators. The specifications must already be loaded."""
     settings, trail, ends = base.settings, base.trail, parts.endpoints
     ends_of_tokens = StoredDeadlines(base.store)
@@ -114,12 +112,11 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         live=core.revocation.live,
         switched_off=switched_off.rows,
         blocks=blocks.status,
-        standby=standby.state,
+        standby=base.features.pair,
         bundles=bundles.status,
         handled=handled.marked,
         name=base.settings.name,
     )
-    orders = StandbyOrders(standby, trail)
     administration = Administration(
         looks,
         base.features.methods()
@@ -131,7 +128,6 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
             certification=certification,
             tokens=tokens,
             blocks=blocks,
-            standby=orders,
             alarms=AlarmOrders(handled, trail, looks.present),
             limits=LimitQueries(parts, settings, base.listener_limits, base.features.limits),
         ),
@@ -144,9 +140,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
             tokens,
             trail,
             served=certification.served_by,
-            certified=RestCertificate(
-                base.store, trail, "" if base.pair is None else base.pair.membership.name
-            ).stated,
+            certified=RestCertificate(base.store, trail, base.role.name).stated,
             require_proof=settings.api_require_proof,
         )
     )
@@ -159,7 +153,6 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         collected=collected,
         switched_off=switched_off,
         blocks=blocks,
-        standby=orders,
         bundles=bundles,
         administration=administration,
         rest=rest(),
@@ -167,10 +160,10 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
 
 
 async def _durable(base: Foundation) -> None:
-    """Wait until the records of an order are in the log, and on one of two appliances until its changes are stored."""
+    """Wait until the records of an order are in the log, and until its changes may be answered."""
     await base.trail.durable()
-    if base.replication is not None:
-        await base.replication.stored()
+    if base.role.before_answer is not None:
+        await base.role.before_answer()
 
 
 def _audit_state(base: Foundation, collected: ForwarderLink) -> AuditState:

@@ -1,6 +1,6 @@
 """Run the control process: start its parts, serve until the supervisor stops the process, end the parts.
 
-On one of two appliances, control first stands by until the supervisor activates it (`passive.py`).
+A feature can make control wait before (`StartGate`).
 
 The order of the start:
 
@@ -25,27 +25,16 @@ import uvloop
 from appliance.base.background import run_always
 from appliance.channel import messages
 from appliance.configuration.settings import Settings, load_resolved
+from appliance.control.assembly.active_role import STATE_ERRORS, ActiveRole, StartGate
 from appliance.control.assembly.assembly import Parts, assemble
 from appliance.control.assembly.foundation import INNER, OWN, RVMASTER, Current, Foundation, make_foundation
 from appliance.control.assembly.robot import master_address
-from appliance.control.assembly.stored_times import note_times
 from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.control.operator_assembly import Operators, make_operators
 from appliance.control.operators.admin_socket import AdminServer
 from appliance.control.spare_memory import return_spare_memory
 from appliance.control.supervisor_messages import SupervisorMessages
-from appliance.features.standby.lease_client import LeaseClient
-from appliance.features.standby.membership import LINK_FILE, MembershipError
-from appliance.features.standby.passive import until_activated
-from appliance.features.standby.replication import Pair, answered_when_stored
-from appliance.features.standby.standby_orders import (
-    begin_epoch,
-    service_reports,
-    standby_source,
-    state_copies,
-)
-from appliance.features.standby.takeover_check import STATE_ERRORS
-from appliance.features.standby.takeover_record import TakeoverRecorder
+from appliance.features.table import start_gates
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.registry import Life
@@ -73,24 +62,23 @@ def main(lifeline_fd: int, config_path: Path) -> None:
 
 
 async def _run(settings: Settings, lifeline_fd: int, config: Path) -> None:
-    stopping, tunnels, lease = asyncio.Event(), Current[Tunnels](), LeaseClient()
+    stopping, tunnels = asyncio.Event(), Current[Tunnels]()
+    gate: StartGate = next(iter(start_gates()), StartGate())
     compiler = SpecificationCompiler(lambda: lifeline.say(messages.CompilerWanted()))
     lifeline = ControlLifeline(
         lifeline_fd,
         stopping,
         lambda answer: tunnels().answered(answer) if tunnels else None,
-        compiler.attach,
-        lease.attach,
+        {"compiler": (compiler.attach, messages.CompilerLink), **gate.links},
     )
     lifeline.attach()
     try:
         await lifeline.restored.wait()
-        link = config.with_name(LINK_FILE)
-        pair = await until_activated(link, settings, lifeline, lease, compiler, stopping=stopping)
-        if stopping.is_set():
+        role = await gate.role(config, settings, lifeline, compiler, stopping)
+        if role is None or stopping.is_set():
             return
-        control = await _start(settings, lifeline, compiler, tunnels, pair)
-    except (*STATE_ERRORS, NoPortError, MembershipError) as error:
+        control = await _start(settings, lifeline, compiler, tunnels, role)
+    except (*STATE_ERRORS, NoPortError) as error:
         lifeline.say(messages.Failed(str(error)))
         await stopping.wait()
         return
@@ -103,18 +91,16 @@ async def _start(
     lifeline: ControlLifeline,
     compiler: SpecificationCompiler,
     tunnels: Current[Tunnels],
-    pair: Pair | None,
+    role: ActiveRole,
 ) -> "_Control":
     if settings.monitors is not None:
         compiler.call()  # the compiler starts while the policy is read
     restarted = RVMASTER in lifeline.sockets
-    base = await make_foundation(settings, lifeline, compiler, tunnels, pair, restarted=restarted)
+    base = await make_foundation(settings, lifeline, compiler, tunnels, role, restarted=restarted)
     parts = assemble(base)
-    await parts.monitors.start(restarted=restarted, taken_over=pair is not None)
-    recorder = await begin_epoch(base, parts)
-    control = _Control(
-        base, parts, make_operators(base, parts, standby_source(base, parts, recorder)), recorder
-    )
+    await parts.monitors.start(restarted=restarted, taken_over=role.paired)
+    await base.features.inherit(base, parts)
+    control = _Control(base, parts, make_operators(base, parts))
     await _restore(base, parts)
     await control.serve()
     await parts.reconciler.ready.wait()
@@ -125,10 +111,7 @@ async def _start(
 class _Control:
     """All parts of control, from the first served call to the end."""
 
-    def __init__(
-        self, base: Foundation, parts: Parts, operators: Operators, recorder: TakeoverRecorder | None
-    ) -> None:
-        self._recorder = recorder
+    def __init__(self, base: Foundation, parts: Parts, operators: Operators) -> None:
         self._base = base
         self._parts = parts
         self._operators = operators
@@ -139,7 +122,7 @@ class _Control:
     async def serve(self) -> None:
         base, parts, operators = self._base, self._parts, self._operators
         listener_limits, sockets, inner = base.listener_limits, base.sockets, parts.endpoints.inner
-        calls = answered_when_stored(base.replication, parts.pipeline.handler(parts.table))
+        calls = base.role.answering(parts.pipeline.handler(parts.table))
         await listener_limits.open(sockets[RVMASTER], calls, guarded=True)
         await listener_limits.open(sockets[OWN], parts.pipeline.handler(parts.table, own=True), guarded=False)
         # Do not keep connections alive: at each call, the ROS master queries the kernel about every open connection.
@@ -151,9 +134,9 @@ class _Control:
         if _ADMIN in sockets:
             # Keep a reference, otherwise the garbage collector closes the server.
             self._admin = await AdminServer(operators.administration).start(sockets[_ADMIN].dup())
-        if base.pair is not None and base.pair.api is not None:
-            operators.rest.attach(base.pair.api)
-            operators.certification.served_by(base.pair.tunnels.pin)  # the api has stated it already
+        if base.role.api is not None:
+            operators.rest.attach(base.role.api)
+            operators.certification.served_by(base.role.pin)  # the api has stated it already
         base.lifeline.hear(self._messages.heard)
         work: dict[str, Callable[[], Awaitable[None]]] = {
             "the reconciliation with the ROS master": parts.reconciler.run,
@@ -170,22 +153,8 @@ class _Control:
             "the storage of parameters": self._save_parameters,
             "the tunnels": partial(base.tunnels.run, operators.certification.each_hour),
             "the publications of monitors": partial(parts.publisher.run, parts.reconciler.ready),
+            **base.features.work(),
         }
-        if base.replication is not None:
-            work["the replication"] = base.replication.run
-            if base.pair is not None:
-                work["the readings of the clocks"] = partial(
-                    note_times, base.store, base.pair, base.blocks.age_now
-                )
-                copies = state_copies(base.pair, base.replication, base, parts)
-                work["the copies of monitors' state"] = copies.run
-            work["the orders of the standby"] = partial(
-                operators.standby.obey,
-                base.replication.switchover_wanted,
-                base.replication.sender.refuse_switchover,
-            )
-        if self._recorder is not None:
-            work["the replication of checkpoints"] = self._recorder.follow
         loop = asyncio.get_running_loop()
         self._tasks += [loop.create_task(run_always(what, one)) for what, one in work.items()]
 
@@ -194,10 +163,8 @@ class _Control:
         base, settings = self._base, self._base.settings
         token = await self._operators.tokens.first() if settings.api_address is not None else None
         host = settings.listen_address[0]
-        told = master_address(settings) if host in {"0.0.0.0", "::"} else host  # noqa: S104 - compared only
-        if base.pair is not None:
-            told = base.pair.membership.fixed
-        uri = node_uri(told, base.port(RVMASTER))
+        own = master_address(settings) if host in {"0.0.0.0", "::"} else host  # noqa: S104 - compared only
+        uri = node_uri(base.role.address or own, base.port(RVMASTER))
         base.lifeline.surroundings.master = uri.rstrip("/")
         if not restarted:
             name = {"robot": settings.name} if settings.name else {}
@@ -212,9 +179,6 @@ class _Control:
             "warnings": [str(warning) for warning in base.policies.current.warnings[:_WARNINGS]],
         }
         base.lifeline.say(messages.Ready(detail))
-        if base.pair is not None:
-            reports = run_always("the reports to the lease", service_reports(base, self._parts, base.pair))
-            self._tasks.append(asyncio.get_running_loop().create_task(reports))
 
     async def end(self) -> None:
         base, parts, ends = self._base, self._parts, self._parts.endpoints
@@ -223,8 +187,7 @@ class _Control:
         parts.reminders.close()
         ends.enactor.delivery.close()
         ends.rosmaster.close()
-        if base.replication is not None:
-            base.replication.close()
+        base.role.close()
         await _end_others(_TASKS_SECONDS)  # requests may still write state while they end
         base.trail.happened("appliance stopped", "control ended in an orderly way")
         base.store.save_parameters(parts.core.parameters.tree)

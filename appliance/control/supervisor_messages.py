@@ -106,8 +106,7 @@ class SupervisorMessages:
         def carried(topic: str) -> bool:
             return ends.relay.carries(index, TOPIC, topic)
 
-        pair = self._base.pair
-        if pair is not None and pair.taken_over:
+        if self._base.role.took_over:
             # Every connection ended, and roscpp may have given up: subscribers drop all publishers first.
             for kind, topic, _holders in list(self._parts.core.registry.resources()):
                 if kind is Kind.SUBSCRIPTION and carried(topic):

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from appliance.audit.log.log import AuditLog
     from appliance.channel.admin import AdminRequest
     from appliance.channel.answers.limit_answers import LimitUse
+    from appliance.channel.answers.standby_answers import StandbyState
     from appliance.channel.answers.status import ForwardingState, RecorderState
     from appliance.channel.link import Link
     from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
@@ -50,9 +51,10 @@ class FeaturePart:
     `links` are control's ends of the links to the feature's roles, with the messages that control accepts.
     `methods` answer the feature's `operations`. `limits` returns how much of its resources is used.
     `details` returns what it adds to the details of a record (`RecordDetails`).
-    `called` answers nodes' calls of its service.
+    `called` answers nodes' calls of its service. `work` runs until control ends; its names go into error messages.
     `forwarding` returns the state of the forwarding of the audit log, or None if none is configured.
-    `recorder` returns the state of the flight recorder, or None if none is configured.
+    `recorder` returns the state of the flight recorder, or None if none is configured. `pair` returns the state of this
+    appliance and of the one that can take over, None for a single appliance.
     """
 
     links: "Mapping[str, tuple[Link, Any]]" = field(default_factory=dict)
@@ -62,6 +64,8 @@ class FeaturePart:
     details: "RecordDetails" = lambda *_event: {}
     called: "Callable[[OwnServiceCalled], Awaitable[OwnServiceAnswered]] | None" = None
     recorder: "Callable[[], RecorderState | None]" = lambda: None
+    pair: "Callable[[], StandbyState | None]" = lambda: None
+    work: Mapping[str, Callable[[], Awaitable[None]]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,10 @@ class Feature:
     `verbs` are commands of `rosrv`.
     `recorded` is the function (`module:function`) that gives `rosrv monitor replay` the recorded messages of a period.
     `memory` makes the memory that the supervisor shares with this number of relays; None if none is configured.
+
+    Hooks are named by `module:name`, so that their modules may import what imports the table. `may_start` is a class of
+    `control.assembly.active_role.StartGate`. `inherit(foundation, parts)` returns a `FeaturePart` once control has its
+    parts and may serve, before it serves.
     """
 
     name: str
@@ -84,3 +92,5 @@ class Feature:
     recorded: str | None = None
     memory: Callable[[Sections, int], SharedMemory | None] = lambda _sections, _relays: None
     make: Callable[[FeatureContext], FeaturePart] | None = None
+    may_start: str | None = None
+    inherit: str | None = None

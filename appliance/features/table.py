@@ -4,11 +4,12 @@ To remove a feature, remove its folder, and its import and its row here.
 """
 
 import pkgutil
+from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
 from appliance.configuration.sections import Sections
 from appliance.features.evidence.feature import EVIDENCE
-from appliance.features.feature import Feature, FeatureContext
+from appliance.features.feature import Feature, FeatureContext, FeaturePart
 from appliance.features.recorder.feature import RECORDER
 from appliance.features.standby.feature import STANDBY
 from appliance.features.syslog.feature import SYSLOG
@@ -17,6 +18,7 @@ from appliance.supervisor.role import SharedMemory
 if TYPE_CHECKING:
     from appliance.audit.log.record import Severity
     from appliance.channel.answers.limit_answers import LimitUse
+    from appliance.channel.answers.standby_answers import StandbyState
     from appliance.channel.answers.status import ForwardingState, RecorderState
     from appliance.channel.link import Link
     from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
@@ -40,6 +42,13 @@ class FeatureParts:
 
     def __init__(self, core: FeatureContext) -> None:
         self._parts = [feature.make(core) for feature in FEATURES if feature.make is not None]
+
+    async def inherit(self, foundation: Any, parts: Any) -> None:
+        """Add the parts that need the other parts of control."""
+        for feature in FEATURES:
+            if feature.inherit is not None:
+                part: FeaturePart = await pkgutil.resolve_name(feature.inherit)(foundation, parts)
+                self._parts.append(part)
 
     def link(self, role: str) -> "tuple[Link, Any] | None":
         """Return control's end of the link to a role, with the accepted messages; None for an unknown role."""
@@ -74,3 +83,18 @@ class FeatureParts:
         """Answer a node's call of the appliance's own service."""
         (called,) = filter(None, (part.called for part in self._parts))
         return await called(call)
+
+    def pair(self) -> "StandbyState | None":
+        """Return the state of both appliances, or None for a single appliance."""
+        return next(filter(None, (part.pair() for part in self._parts)), None)
+
+    def work(self) -> dict[str, Callable[[], Awaitable[None]]]:
+        """Return the work that runs until control ends."""
+        return {what: one for part in self._parts for what, one in part.work.items()}
+
+
+def start_gates() -> list[Any]:
+    """Return the gates of the features that decide when control may serve."""
+    return [
+        pkgutil.resolve_name(feature.may_start)() for feature in FEATURES if feature.may_start is not None
+    ]

@@ -17,12 +17,12 @@ from appliance.base.deadlines import Deadlines
 from appliance.channel import admin
 from appliance.channel.answers.host_answers import AuthorityCertificate, KitParts, RevocationList
 from appliance.channel.messages import CertificateMade
-from appliance.features.standby.appliance_table import ApplianceTable
-from appliance.features.standby.shared_authority import SharedAuthority
+from appliance.hosts.appliances import Appliances
 from appliance.hosts.certificate_requests import AuthorityError
 from appliance.hosts.enrolment_tokens import EnrolmentTokens
 from appliance.hosts.host_table import HostForbiddenError, HostRefusedError, HostTable
 from appliance.hosts.rest_address import RestAddress
+from appliance.hosts.stored_authority import StoredAuthority
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.hosts.view import soon
 from appliance.store.state_file import StateStore
@@ -42,11 +42,11 @@ class Certification:
         self,
         store: StateStore,
         trail: AuditTrail,
-        authority: SharedAuthority,
+        authority: StoredAuthority,
         table: HostTable,
         tunnels: Tunnels,
         *,
-        appliances: ApplianceTable,
+        appliances: Appliances,
         master_port: int,
         rest: RestAddress,
         ends: Deadlines,

@@ -19,10 +19,10 @@ from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.link import Link
-from appliance.features.standby.appliance_table import CERTIFICATE_DAYS, ApplianceTable
-from appliance.features.standby.shared_authority import SharedAuthority
+from appliance.hosts.appliances import CERTIFICATE_DAYS, Appliances
 from appliance.hosts.certificate_requests import AuthorityError
 from appliance.hosts.host_table import HostRefusedError, HostTable
+from appliance.hosts.stored_authority import StoredAuthority
 from appliance.policy.model import Address
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -41,7 +41,7 @@ class SignedRevocations:
     It is signed again when it is requested and the table of hosts has changed or a new minute has begun.
     """
 
-    def __init__(self, table: HostTable, authority: SharedAuthority) -> None:
+    def __init__(self, table: HostTable, authority: StoredAuthority) -> None:
         self._table = table
         self._authority = authority
         self._one_at_a_time = asyncio.Lock()
@@ -66,8 +66,8 @@ class Tunnels:
         self,
         table: HostTable,
         trail: AuditTrail,
-        authority: SharedAuthority,
-        appliances: ApplianceTable,
+        authority: StoredAuthority,
+        appliances: Appliances,
         *,
         listen: tuple[str, int],
         say: Callable[[messages.Message], None],

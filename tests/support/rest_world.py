@@ -37,10 +37,10 @@ from appliance.control.operators.alarm_orders import AlarmOrders
 from appliance.control.operators.block_orders import BlockOrders
 from appliance.control.operators.limit_use import LimitQueries
 from appliance.control.operators.queries import Queries
+from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
-from appliance.features.standby.standby_orders import StandbyOrders
 from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import PortChecks
 from appliance.hosts.enrolment import HostEnrolment
@@ -151,13 +151,16 @@ class RestWorld:
             certification=idle(Certification),
             tokens=idle(TokenOrders),
             blocks=idle(BlockOrders),
-            standby=idle(StandbyOrders),
             limits=idle(LimitQueries),
             alarms=idle(AlarmOrders),
         )
         administration = Administration(
             queries,
-            [replace(method, answer=self.carried.out) for method in methods],
+            [
+                *(replace(method, answer=self.carried.out) for method in methods),
+                RequestMethod(admin.StandbyWanted, self.carried.out, order=False),
+                RequestMethod(admin.StandbyPromote, self.carried.out, who=True, order=False),
+            ],
             durable=self.trail.durable,
             require_room=lambda: None,
         )

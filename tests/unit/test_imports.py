@@ -48,7 +48,9 @@ def test_the_appliance_imports_only_public_modules_of_the_language(imports: dict
     }
     assert {imported for _, imported in found if not imported.startswith("tool")} == set(PUBLIC)
     assert all(
-        module.startswith("appliance.cli.") for module, imported in found if imported.startswith("tool")
+        module.startswith(("appliance.cli.", "appliance.features."))
+        for module, imported in found
+        if imported.startswith("tool")
     )
 
 

@@ -299,7 +299,7 @@ WALL_CLOCK = {
         "signing/own_certificate.py",
     ],
     "a span that goes on over restarts of the machine, which has no other clock": [
-        "control/operators/alarm_orders.py", "control/assembly/stored_times.py",
+        "control/operators/alarm_orders.py", "features/standby/stored_times.py",
         "control/operators/switched_off.py", "hosts/self_service.py", "specifications/timed_disables.py",
         "store/revisions.py",
     ],

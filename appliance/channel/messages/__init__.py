@@ -20,4 +20,3 @@ from appliance.channel.messages.message import *
 from appliance.channel.messages.relay_link import *
 from appliance.channel.messages.signer_link import *
 from appliance.channel.messages.tunnels import *
-from appliance.features.standby.lease_link import *

@@ -1,7 +1,6 @@
 """Assemble RVMaster from its core, its endpoints, the specifications and the calls."""
 
 from dataclasses import dataclass
-from functools import partial
 
 from appliance.channel import messages
 from appliance.control.assembly.core import Core, make_core
@@ -9,7 +8,6 @@ from appliance.control.assembly.endpoints import Endpoints, make_endpoints
 from appliance.control.assembly.foundation import INNER, RVMASTER, Foundation
 from appliance.control.assembly.listener_limits import value_limits
 from appliance.control.assembly.monitor_states import published_now
-from appliance.features.standby.replication import each_answered_when_stored
 from appliance.master import rosout
 from appliance.master.calls.call import Table, served
 from appliance.master.calls.call_execution import Execution
@@ -51,8 +49,7 @@ def assemble(base: Foundation) -> Parts:
     ends = make_endpoints(base, core)
     settings = base.settings
     reminders = Reminders(core.registry, core.graph, ends.enactor)
-    if base.replication is not None:
-        base.replication.admission.on_end_of_gap(reminders.begin)
+    base.role.on_end_of_gap(reminders.begin)
     arrivals = Arrivals(
         core.registry,
         core.graph,
@@ -111,7 +108,9 @@ def assemble(base: Foundation) -> Parts:
         port,
     )
     node_table = served(NODE_CALLS.values(), node_calls)
-    ends.handler.set(each_answered_when_stored(base.replication, partial(pipeline.handler, node_table)))
+    ends.handler.set(
+        lambda incarnation: base.role.answering(pipeline.handler(node_table, target=incarnation))
+    )
     return Parts(
         core=core,
         endpoints=ends,
@@ -193,9 +192,7 @@ def _make_calls(
         parameters=registration.parameters,
         redecide_for=ends.enforcement.redecide_for,
         large=offload,
-        large_writes=LargeWrites(
-            offload, base.quota_class, None if base.replication is None else base.replication.stored
-        ),
+        large_writes=LargeWrites(offload, base.quota_class, base.role.before_answer),
     )
     pipeline = Pipeline(
         execution,

@@ -26,7 +26,7 @@ from appliance.specifications.specification_manager import ALLOCATION
 
 _REFUSALS = 2
 _REFUSALS_OF_A_ROBOT = (
-    4  # a further computer whose cable was unplugged refuses until the witness has answered it
+    4  # a further computer whose cable was unplugged refuses until it admits this appliance again
 )
 
 
@@ -117,7 +117,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
             [(ip_network(each.network), ip_address(each.address)) for each in settings.advertise],
             base.lifeline.route_to if settings.isolation == "netns" else None,
             base.sockets[RVMASTER].getsockname()[0],
-            fixed=base.pair.membership.fixed if base.pair is not None else None,
+            fixed=base.role.address,
             tunnels=settings.ipsec.pool,
         ),
         relay=relay,
@@ -135,8 +135,8 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
             nodes=nodes,
             settings=settings.liveness,
             quota_class=base.quota_class,
-            refusals=_REFUSALS if base.replication is None else _REFUSALS_OF_A_ROBOT,
-            shut_out=base.replication.admission.in_doubt if base.replication is not None else lambda: False,
+            refusals=_REFUSALS_OF_A_ROBOT if base.role.paired else _REFUSALS,
+            shut_out=base.role.in_doubt,
         ),
         handler=handler,
     )

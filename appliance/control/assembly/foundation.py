@@ -9,9 +9,11 @@ from typing import Generic, TypeVar
 import structlog
 
 from appliance.audit.log.log import AuditLog
+from appliance.base.age_clock import AgeClock
 from appliance.configuration.settings import Settings
-from appliance.control.assembly.host_authority import HostAuthority, make_host_authority
-from appliance.control.assembly.host_blocks import BlockTable, blocks_at_start
+from appliance.control.assembly.active_role import ActiveRole
+from appliance.control.assembly.host_authority import HostAuthority
+from appliance.control.assembly.host_blocks import BlockTable
 from appliance.control.assembly.listener_limits import ListenerLimits
 from appliance.control.assembly.open_audit import open_audit
 from appliance.control.assembly.policies import Policies
@@ -20,7 +22,6 @@ from appliance.control.assembly.robot import robot_addresses
 from appliance.control.links.signer_requests import ReceiptFloor, SignerRequests
 from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.features.feature import FeatureContext
-from appliance.features.standby.replication import Pair, Replication, make_replication
 from appliance.features.table import FeatureParts
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHosts
@@ -64,8 +65,7 @@ class Foundation:
     """The durable state, the policy and the listeners.
 
     `enforcement` gets its value later. So does `in_force`, which returns the revisions of policy and specifications.
-    `parameters_dirty` is set whenever the mirror of the parameters changes. `pair` and `replication` exist on one of
-    two appliances.
+    `parameters_dirty` is set whenever the mirror of the parameters changes.
     """
 
     settings: Settings
@@ -89,8 +89,7 @@ class Foundation:
     sockets: Mapping[str, socket.socket]
     enforcement: Current[Enforcement]
     parameters_dirty: asyncio.Event
-    pair: Pair | None
-    replication: Replication | None
+    role: ActiveRole
 
     def port(self, name: str) -> int:
         """Return the port of a listener."""
@@ -102,7 +101,7 @@ async def make_foundation(
     lifeline: ControlLifeline,
     compiler: SpecificationCompiler,
     tunnels: Current[Tunnels],
-    pair: Pair | None,
+    role: ActiveRole,
     *,
     restarted: bool,
 ) -> Foundation:
@@ -148,23 +147,21 @@ async def make_foundation(
     store = StateStore(
         settings.state / "control", failed=lambda reason: _log.error("state is not written", reason=reason)
     )
-    replication = make_replication(settings, pair, store)
-    blocks = blocks_at_start(store, pair, settings.state / "control")
+    age = AgeClock(settings.state / "control" / "age")
+    role.inherit(store, age)
+    blocks = BlockTable(store, age)
     # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
     # start the tunnels before the policy.
     table = make_host_table(settings, store)
-    host_authority = make_host_authority(
-        settings, signing.link, store, trail, table, pair=pair, replication=replication
-    )
+    host_authority = role.host_authority(signing.link, store, trail, table)
     tunnels.set(Tunnels(table, trail, *host_authority, listen=settings.listen_address, say=lifeline.say))
-    if pair is not None:
-        pair.tunnels.hand_to(tunnels())
+    role.hand_tunnels_to(tunnels())
     await tunnels().start()
     policies = Policies(
         settings.policy,
         store,
         trail,
-        robot=robot_addresses(settings, pair.membership.witness if pair is not None else None),
+        robot=robot_addresses(settings, role.robot),
         hosts=lambda: tunnels().addresses,
         blocks=lambda: blocks.reasons,
         live=lambda: enforcement().revocation.live(),  # noqa: PLW0108  it is assembled later
@@ -172,7 +169,7 @@ async def make_foundation(
         carried_out=lambda: enforcement().carried_out(),
         site_keys=settings.site_keys,
     )
-    policies.start(restarted=restarted or pair is not None)
+    policies.start(restarted=restarted or role.paired)
     registry = Registry(settings.limits.nodes_per_host)
     quota_class.set(HostQuotaClass(policies.policy, registry.registrations_of))
     return Foundation(
@@ -197,8 +194,7 @@ async def make_foundation(
         sockets=_open_listeners(settings, lifeline),
         enforcement=enforcement,
         parameters_dirty=asyncio.Event(),
-        pair=pair,
-        replication=replication,
+        role=role,
     )
 
 

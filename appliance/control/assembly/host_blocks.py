@@ -4,18 +4,14 @@ Invariants:
 
 1. A block is stored before it takes effect, and survives restarts of control and of the appliance.
 2. A block ends by the age clock (`base/age_clock.py`): changes of the system clock neither end nor extend it.
-   After a takeover by another appliance, `stored_times.py` moves the ends to its age clock.
+   Another appliance that takes the state over moves the ends to its age clock (`ActiveRole.inherit`).
 3. `reasons` is never changed, only replaced. So a policy keeps the blocks with which it was put into force.
 """
 
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
-from pathlib import Path
 
 from appliance.base import clock
-from appliance.base.age_clock import AgeClock
-from appliance.control.assembly.stored_times import adopt_times
-from appliance.features.standby.replication import Pair
 from appliance.policy.model import Address, address_of
 from appliance.store.host_tables import HostBlockRow
 from appliance.store.state_file import StateStore
@@ -92,16 +88,6 @@ class BlockTable:
         note = row.note if len(row.note) <= _NOTE_SHOWN else f"{row.note[: _NOTE_SHOWN - 1]}…"
         about = f": {note}" if note else ""
         return f"blocked by {row.who}{end}{about}; lift it with `rosrv host unblock {row.address}`"
-
-
-def blocks_at_start(store: StateStore, pair: Pair | None, directory: Path) -> BlockTable:
-    """Return the stored blocks, with the age clock of this directory.
-
-    On one of two appliances, first move all times in the state to its clocks.
-    """
-    age = AgeClock(directory / "age")
-    adopt_times(store, pair, age)
-    return BlockTable(store, age)
 
 
 def in_utc(seconds: float) -> str:

@@ -11,15 +11,15 @@ from appliance.policy.model import Address
 _ROUTES = Path("/proc/net/route")
 
 
-def robot_addresses(settings: Settings, witness: str | None = None) -> list[Address]:
+def robot_addresses(settings: Settings, robot: str | None = None) -> list[Address]:
     """Return loopback with `isolation: none`, otherwise the gateway of the default route.
 
-    One of two appliances has the address of the witness, which runs on the robot, instead of the gateway's.
+    One of two appliances knows the address of the `robot`, which replaces the gateway's.
     """
     if settings.isolation == "none":
         return [ipaddress.ip_address("127.0.0.1"), ipaddress.ip_address("::1")]
-    if witness is not None:
-        return [ipaddress.ip_address(witness)]
+    if robot is not None:
+        return [ipaddress.ip_address(robot)]
     gateway = _default_gateway()
     return [gateway] if gateway is not None else []
 

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import os
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import structlog
@@ -43,9 +43,9 @@ class ControlLifeline:
     """Control's end of the lifeline.
 
     `stopping` is set when the supervisor stops control or is gone. `enclosed(answer)` is called when the supervisor has
-    opened or closed tunnels. `compiler(channel)` and `lease(channel)` are called at once for each new link to these
-    processes, because the start of control may wait for them. Other messages are queued until `hear` is called, and
-    passed on in order. On one of two appliances, `activated` is set once this one may serve, in the epoch `epoch`.
+    opened or closed tunnels. `links` has a function for each process that the start of control may wait for, and the
+    messages that control accepts from it: the function is called at once for each new link. Other messages are queued
+    until `hear` is called, and passed on in order. `activated` is set once one of two appliances may serve, in `epoch`.
     """
 
     def __init__(
@@ -53,13 +53,11 @@ class ControlLifeline:
         descriptor: int,
         stopping: asyncio.Event,
         enclosed: Enclosed,
-        compiler: Callable[[Channel], None],
-        lease: Callable[[Channel], None],
+        links: Mapping[str, tuple[Callable[[Channel], None], Any]],
     ) -> None:
         self._stopping = stopping
         self._enclosed = enclosed
-        self._compiler = compiler
-        self._lease = lease
+        self._links = links
         self.activated = asyncio.Event()
         self.epoch: int | None = None
         self.channel = Channel(socket.socket(fileno=descriptor), messages.Lifeline)
@@ -173,10 +171,9 @@ class ControlLifeline:
             case messages.SocketsRestored(_count, announced):
                 self.announced = announced
                 self.restored.set()
-            case messages.LinkOpened(role="compiler"):
-                self._compiler(Channel(socket.socket(fileno=descriptors[0]), messages.CompilerLink))
-            case messages.LinkOpened(role="lease"):
-                self._lease(Channel(socket.socket(fileno=descriptors[0]), messages.LeaseLink))
+            case messages.LinkOpened(role) if role in self._links:
+                attach, accepted = self._links[role]
+                attach(Channel(socket.socket(fileno=descriptors[0]), accepted))
             case messages.Activated(epoch):
                 self.epoch = epoch
                 self.activated.set()

@@ -18,7 +18,6 @@ from appliance.control.errors import SenselessError, UnavailableError, UnknownTh
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.token_orders import TokenRefusedError
-from appliance.features.standby.lease_client import HandOverError
 from appliance.hosts.host_table import (
     HostForbiddenError,
     HostRefusedError,
@@ -49,7 +48,6 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     HostRefusedError: "refused",
     TokenRefusedError: "refused",
     UnavailableError: "failed",
-    HandOverError: "failed",
     StoreError: "failed",
 }
 # Requests that are rejected if the store cannot be written, except rows with `full_disk`: a block or revocation takes

@@ -10,7 +10,6 @@ from appliance.control.operators.limit_use import LimitQueries
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.token_orders import TokenOrders
-from appliance.features.standby.standby_orders import StandbyOrders
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.specifications.specification_manager import SpecificationManager
@@ -25,7 +24,6 @@ def request_methods(
     certification: Certification,
     tokens: TokenOrders,
     blocks: BlockOrders,
-    standby: StandbyOrders,
     limits: LimitQueries,
     alarms: AlarmOrders,
 ) -> tuple[RequestMethod[Any], ...]:
@@ -42,8 +40,6 @@ def request_methods(
         RequestMethod(admin.TopicLook, queries.topic_look, who=True, order=False),
         RequestMethod(admin.MetricsWanted, queries.metrics, order=False),
         RequestMethod(admin.RegistrationsWanted, queries.registrations, order=False),
-        RequestMethod(admin.StandbyWanted, standby.state, order=False),
-        RequestMethod(admin.StandbyPromote, standby.promote, who=True, order=False, full_disk=True),
         RequestMethod(admin.PolicyReload, policies.reload, who=True),
         RequestMethod(admin.PolicyLoad, policies.load, who=True),
         RequestMethod(admin.PolicyRollback, policies.roll_back, who=True),

@@ -13,12 +13,12 @@ import structlog
 from appliance.base import clock
 from appliance.channel.messages import APPLIANCE_NAME, CertificateMade
 from appliance.features.standby.replication_frames import Introduction
-from appliance.features.standby.shared_authority import SharedAuthority
+from appliance.hosts.appliances import CERTIFICATE_DAYS, Appliances
 from appliance.hosts.certificate_requests import AuthorityError
 from appliance.hosts.revoked_certificates import RevokedCertificates
+from appliance.hosts.stored_authority import StoredAuthority
 from appliance.store.host_tables import ApplianceRow, HostTables
 
-CERTIFICATE_DAYS = 90.0
 _RENEWED_DAYS = 60.0  # at least these days are left when the standby takes over
 _INTRODUCTION_SECONDS = 8.0
 _REPLACED_SECONDS = 3600.0  # each replaced key makes the list of revoked certificates longer
@@ -26,10 +26,12 @@ _REPLACED_SECONDS = 3600.0  # each replaced key makes the list of revoked certif
 _log = structlog.get_logger()
 
 
-class ApplianceTable:
-    """Both appliances; `endpoint` is the address at which hosts reach this one, None on a single appliance."""
+class ApplianceTable(Appliances):
+    """Both appliances; `endpoint` is the address at which hosts reach this one."""
 
-    def __init__(self, kept: HostTables, revoked: RevokedCertificates, endpoint: str | None) -> None:
+    paired = True
+
+    def __init__(self, kept: HostTables, revoked: RevokedCertificates, endpoint: str) -> None:
         self._kept = kept
         self._revoked = revoked
         self._endpoint = endpoint
@@ -41,14 +43,6 @@ class ApplianceTable:
         )  # when the other appliance was last replaced, by the monotonic clock
         self._own = ""  # the fingerprint of this appliance's tunnel key
         self._pin = ""
-        if endpoint is None:
-            for row in list(self._rows.values()):
-                self._forget(row)
-
-    @property
-    def paired(self) -> bool:
-        """Whether this is one of two appliances."""
-        return self._endpoint is not None
 
     @property
     def other(self) -> ApplianceRow | None:
@@ -57,7 +51,7 @@ class ApplianceTable:
 
     async def until_introduced(self) -> None:
         """Wait a moment for the other appliance of two: with the first host, it begins to prepare its tunnels."""
-        if self.paired and self.other is None:
+        if self.other is None:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._introduced.wait(), _INTRODUCTION_SECONDS)
 
@@ -79,12 +73,11 @@ class ApplianceTable:
         self.is_served(self._pin)
 
     def certified(self, key: str, made: CertificateMade) -> None:
-        """Store the certificate for this appliance's own key, if it is one of two."""
+        """Store the certificate for this appliance's own key."""
         self._own = key
-        if self._endpoint is not None:
-            self._save(_row(key, self._endpoint, self._pin, made))
+        self._save(_row(key, self._endpoint, self._pin, made))
 
-    async def introduce(self, other: Introduction, authority: SharedAuthority) -> None:
+    async def introduce(self, other: Introduction, authority: StoredAuthority) -> None:
         """Store the other appliance, with a certificate for its key that is valid for long; log a failure.
 
         While an introduction is in progress, further ones are ignored; the standby repeats its own every hour.
@@ -103,7 +96,7 @@ class ApplianceTable:
             self._introduced.set()
 
     async def _certify(
-        self, other: Introduction, authority: SharedAuthority, before: ApplianceRow | None
+        self, other: Introduction, authority: StoredAuthority, before: ApplianceRow | None
     ) -> None:
         now = clock.now()
         if before is None and now < self._replaceable + _REPLACED_SECONDS:

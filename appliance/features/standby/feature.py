@@ -7,6 +7,8 @@ _PLACE = "appliance.features.standby."
 
 STANDBY = Feature(
     "standby",
+    may_start=f"{_PLACE}start_gate:StandbyGate",
+    inherit=f"{_PLACE}service_begin:inherit",
     verbs={
         "standby": Group(
             "Run two appliances, of which one stands by to take over.",

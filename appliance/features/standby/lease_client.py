@@ -9,13 +9,15 @@ from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.link import Link
+from appliance.control.errors import UnavailableError
+from appliance.features.standby import lease_link
 from appliance.features.standby.witness import EXPIRY
 
 _HAND_OVER_SECONDS = 5.0
 _SERVES_SECONDS = 0.5
 
 
-class HandOverError(Exception):
+class HandOverError(UnavailableError):
     """The other appliance cannot take over now; the text has the reason."""
 
 
@@ -23,8 +25,8 @@ class LeaseClient:
     """The last report of the lease."""
 
     def __init__(self) -> None:
-        self.state: messages.LeaseState | None = None
-        self._listeners: list[Callable[[messages.LeaseState], None]] = []
+        self.state: lease_link.LeaseState | None = None
+        self._listeners: list[Callable[[lease_link.LeaseState], None]] = []
         self._present = False
         self._link = Link(self.heard, self._lost)
         self._news = asyncio.Event()
@@ -34,30 +36,34 @@ class LeaseClient:
         """Use a new link."""
         self._link.attach(channel)
         if self._present:
-            self.send(messages.ControlPresent())
+            self.send(lease_link.ControlPresent())
 
     def present(self) -> None:
         """Report that this process stands by or serves."""
         self._present = True
-        self.send(messages.ControlPresent())
+        self.send(lease_link.ControlPresent())
 
     def withdraw(self) -> None:
         """Report that this process stands by, but could not serve."""
         if self._present:
             self._present = False
-            self.send(messages.ControlUnready())
+            self.send(lease_link.ControlUnready())
 
-    async def report_service(self, report: Callable[[], messages.ControlServes]) -> None:
+    async def report_service(self, report: Callable[[], lease_link.ControlServes]) -> None:
         """Report until cancelled that this process serves, or why it cannot: if reports stop, it does not."""
         while True:
             self.send(report())
             await asyncio.sleep(_SERVES_SECONDS)
 
-    def listen(self, changed: Callable[[messages.LeaseState], None]) -> None:
+    def listen(self, changed: Callable[[lease_link.LeaseState], None]) -> None:
         """Call `changed` with the last report, if there is one, and with each later report."""
         self._listeners.append(changed)
         if self.state is not None:
             changed(self.state)
+
+    def see(self, epoch: int) -> None:
+        """Report that this process accepts data of an active appliance with this epoch."""
+        self.send(lease_link.EpochSeen(epoch))
 
     def send(self, message: messages.Message) -> None:
         """Send a message; without a link it is lost, and the next link begins with a new report."""
@@ -95,7 +101,7 @@ class LeaseClient:
             raise HandOverError("a switchover has already begun")
         self._handing_over = asyncio.get_running_loop().create_future()
         try:
-            self.send(messages.HandOverWanted())
+            self.send(lease_link.HandOverWanted())
             async with asyncio.timeout(_HAND_OVER_SECONDS):
                 reason = await self._handing_over
         except TimeoutError:
@@ -108,12 +114,12 @@ class LeaseClient:
     def heard(self, message: Any) -> None:
         """Take a message of the lease."""
         match message:
-            case messages.LeaseState():
+            case lease_link.LeaseState():
                 self.state = message
                 self._news.set()
                 for changed in self._listeners:
                     changed(message)
-            case messages.HandOverAnswered(reason):
+            case lease_link.HandOverAnswered(reason):
                 if self._handing_over is not None and not self._handing_over.done():
                     self._handing_over.set_result(reason)
 

@@ -9,7 +9,6 @@ import socket
 import ssl
 from collections.abc import Awaitable, Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import structlog
@@ -25,7 +24,7 @@ from appliance.control.operators.admin_socket import AdminServer
 from appliance.features.standby.inheritance import CopyAge
 from appliance.features.standby.lease_client import HandOverError, LeaseClient
 from appliance.features.standby.link_certificates import replication_context
-from appliance.features.standby.membership import Membership, load_membership
+from appliance.features.standby.membership import Membership
 from appliance.features.standby.passive_rest import PassiveRest, ReplicatedTokens
 from appliance.features.standby.replica import Replica
 from appliance.features.standby.replica_sync import ReplicaSync
@@ -248,13 +247,13 @@ class PassiveControl:
             return False
         if epoch > self._epoch:
             self._epoch = epoch
-            self._lease.send(messages.EpochSeen(epoch))
+            self._lease.see(epoch)
         self._connected = True
         return True
 
 
 async def until_activated(
-    link: Path,
+    membership: Membership,
     settings: Settings,
     lifeline: ControlLifeline,
     lease: LeaseClient,
@@ -262,13 +261,7 @@ async def until_activated(
     *,
     stopping: asyncio.Event,
 ) -> Pair | None:
-    """Stand by until this appliance is activated or stopped. Return None if it is stopped, or not one of two.
-
-    `link` is the file with the membership. Raises `MembershipError`, `StoreError`, `OSError`.
-    """
-    membership = load_membership(link)
-    if membership is None:
-        return None
+    """Stand by until this appliance is activated, or return None if it is stopped. Raises `StoreError`, `OSError`."""
     taken_over, api, tunnels = not lifeline.activated.is_set(), None, StandbyTunnels()
     away: float | None = None
     copy_age: float | None = None

@@ -24,6 +24,7 @@ from appliance.base.atomic_files import write_whole
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
+from appliance.features.standby import lease_link
 from appliance.features.standby.lease import (
     SILENCE,
     ApplianceLease,
@@ -70,7 +71,7 @@ class LeaseProcess:
         self.supervisor = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
         self.child = Child(
             self.supervisor,
-            messages.LeaseLink,
+            lease_link.LeaseLink,
             said=self.control_said,
             linked=self.control_linked,
             lost=lambda _reason: self.control_linked(),
@@ -78,7 +79,7 @@ class LeaseProcess:
         self.peers = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         # The kernel chooses this port, so that no other host can fill the buffer with forged answers.
         self.asking = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._report = messages.ReplicationReported(0, False, None)
+        self._report = lease_link.ReplicationReported(0, False, None)
         self._present = False
         self._service = ServiceWatch()
         self._permission = 0
@@ -86,7 +87,7 @@ class LeaseProcess:
         self._reported: messages.LeaseHeld | messages.LeaseEnded = messages.LeaseEnded()
         self._answer: WitnessAnswer | None = None
         self._answered: float | None = None
-        self._told: messages.LeaseState | None = None
+        self._told: lease_link.LeaseState | None = None
         self._told_at = 0.0
         self._wake = asyncio.Event()
 
@@ -202,7 +203,7 @@ class LeaseProcess:
         lease, now = self._lease, clock.since_boot()
         active = lease.is_active(now)
         answer = self._answer
-        state = messages.LeaseState(
+        state = lease_link.LeaseState(
             until=lease.valid_until if active else 0.0,
             epoch=lease.epoch,
             alone=active and self._alone and lease.answers_alone,  # not after the order to add the standby
@@ -224,24 +225,24 @@ class LeaseProcess:
         """A new control waits for the standby until it gets a new permission."""
         self._present = False
         self._service.linked()
-        self._report = messages.ReplicationReported(self._permission, False, None)
+        self._report = lease_link.ReplicationReported(self._permission, False, None)
         self._told = None
         self._wake.set()
 
     def control_said(self, message: Any) -> None:
         """Take a message of control."""
         match message:
-            case messages.ReplicationReported():
+            case lease_link.ReplicationReported():
                 self._report = message
-            case messages.EpochSeen(epoch) if epoch <= HIGHEST:
+            case lease_link.EpochSeen(epoch) if epoch <= HIGHEST:
                 self._lease.follow(epoch)
-            case messages.ControlPresent():
+            case lease_link.ControlPresent():
                 self._present = True
-            case messages.ControlUnready():
+            case lease_link.ControlUnready():
                 self._present = False
-            case messages.ControlServes(obstacle, keeps_state):
+            case lease_link.ControlServes(obstacle, keeps_state):
                 self._service.reported(clock.since_boot(), obstacle, keeps_state=keeps_state)
-            case messages.HandOverWanted():
+            case lease_link.HandOverWanted():
                 self._hand_over()
             case _:
                 _log.error("control sent a message that is not for the lease", message=type(message).__name__)
@@ -253,7 +254,7 @@ class LeaseProcess:
             due = self._lease.switch_over(clock.since_boot())
         except LeaseError as error:
             reason, due = str(error), ()
-        self.child.tell(messages.HandOverAnswered(reason))
+        self.child.tell(lease_link.HandOverAnswered(reason))
         self._after(due)
 
 

@@ -19,21 +19,18 @@ import structlog
 
 from appliance.base import clock
 from appliance.base.background import run_always
-from appliance.channel import messages
 from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState, WitnessSeen
 from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings
-from appliance.control.robot_admission import RobotAdmission
+from appliance.features.standby import lease_link
 from appliance.features.standby.lease_client import HandOverError, LeaseClient
 from appliance.features.standby.link_certificates import replication_context
 from appliance.features.standby.membership import Membership
 from appliance.features.standby.replication_frames import Introduction, ReplicationError
 from appliance.features.standby.replication_sender import ReplicationSender
 from appliance.features.standby.replication_transport import ReplicationListener
+from appliance.features.standby.robot_admission import RobotAdmission
 from appliance.features.standby.standby_tunnels import StandbyTunnels
-from appliance.master.graph.registry import Incarnation
-from appliance.rpc.server import Handler, HttpRequest
-from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import Database, StoreError
 
 _REPORT_SECONDS = 0.1
@@ -66,48 +63,9 @@ class Pair(NamedTuple):
     copy_age: float | None = None
 
 
-def make_replication(settings: Settings, pair: Pair | None, store: StateStore) -> "Replication | None":
-    """Return the replication of one of two appliances; make it before the first change."""
-    if pair is None:
-        return None
-    store.note_whole_parameters()
-    return Replication(
-        pair.membership,
-        pair.lease,
-        store.database,
-        pair.epoch,
-        wait=settings.availability.wait,
-        taken_over=pair.taken_over,
-        folder=settings.state / "control",
-    )
-
-
-def answered_when_stored(replication: "Replication | None", handler: Handler) -> Handler:
-    """Return a handler whose answers wait until all earlier changes may be answered."""
-    if replication is None:
-        return handler
-    stored = replication.stored
-
-    async def handle(request: HttpRequest) -> bytes:
-        answer = await handler(request)
-        await stored()
-        return answer
-
-    return handle
-
-
-def each_answered_when_stored(
-    replication: "Replication | None", handler_of: Callable[[Incarnation], Handler]
-) -> Callable[[Incarnation], Handler]:
-    """Return a function that makes the handlers of `handler_of`, each answered when its changes are stored."""
-    if replication is None:
-        return handler_of
-    return lambda incarnation: answered_when_stored(replication, handler_of(incarnation))
-
-
 def state_of(
     membership: Membership,
-    lease: messages.LeaseState | None,
+    lease: lease_link.LeaseState | None,
     *,
     role: Literal["active", "standby"],
     since: float,
@@ -185,7 +143,7 @@ class Replication:
         self._taken_over = taken_over and wait == "standby"
         self._absent = False  # whether the first answers would wait for the other appliance in vain
         self._tasks: set[asyncio.Task[None]] = set()
-        self._reported: messages.ReplicationReported | None = None
+        self._reported: lease_link.ReplicationReported | None = None
         lease.listen(self._lease_changed)
         self.report()
 
@@ -322,7 +280,7 @@ class Replication:
             ) from error
         await self._lease.hand_over()
 
-    def _lease_changed(self, state: messages.LeaseState) -> None:
+    def _lease_changed(self, state: lease_link.LeaseState) -> None:
         if state.answered is not None:
             self.admission.note_answer(state.answered)
         if state.alone and state.permission > self._permission:
@@ -364,7 +322,7 @@ class Replication:
             # A standby that stores a large value is not away: it gets the time that the bytes need.
             waiting = clock.since_boot() - (asyncio.get_running_loop().time() - waiting)
             waiting += lag.bytes / _LEAST_BYTES_A_SECOND
-        report = messages.ReplicationReported(
+        report = lease_link.ReplicationReported(
             permission=self._permission,
             caught_up=lag.caught_up and not self.sender.alone,
             waiting_since=waiting,

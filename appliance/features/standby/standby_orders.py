@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from functools import partial
 from typing import Any, Protocol
 
 import structlog
@@ -10,19 +9,12 @@ import structlog
 from appliance.channel import admin
 from appliance.channel.admin import A
 from appliance.channel.answers.standby_answers import StandbyState
-from appliance.control.assembly.assembly import Parts
-from appliance.control.assembly.foundation import Foundation
 from appliance.control.errors import UnknownThingError
-from appliance.control.service_report import ServiceReport
-from appliance.features.standby.fleet_of_pair import compare_fleets
-from appliance.features.standby.inheritance import StateCopies, inherited_state, keep_state, leave_state
 from appliance.features.standby.lease_client import HandOverError
-from appliance.features.standby.replication import Pair, Replication
-from appliance.features.standby.takeover_record import TakeoverRecorder
+from appliance.features.standby.replication import Replication
 from appliance.telemetry.audit_trail import AuditTrail
 
 _log = structlog.get_logger()
-_SEAL_SECONDS = 0.5  # the robot waits
 _STANDBY = "the standby"
 _SINGLE = "this appliance is not one of two; to add a standby, run `rosrv standby join` on both appliances"
 
@@ -80,52 +72,6 @@ class ActiveAppliance:
         except HandOverError:
             self._staying()
             raise
-
-
-async def begin_epoch(base: Foundation, parts: Parts) -> TakeoverRecorder | None:
-    """Record that this appliance is active, and give its relays the state of the other one's monitors.
-
-    Return None on a single appliance.
-    """
-    pair = base.pair
-    if pair is None:
-        return None
-    name, other = pair.membership.name, pair.membership.other
-    recorder = TakeoverRecorder(
-        base.trail, base.audit, base.store, base.signing.signed, name=name, other=other
-    )
-    await recorder.took_over(pair.epoch)
-    compare_fleets(base.settings.fleet, base.store, base.trail, name=name)
-    parts.monitors.rollout.inherit(*inherited_state(pair, base.store))
-    return recorder
-
-
-def standby_source(base: Foundation, parts: Parts, recorder: TakeoverRecorder | None) -> StandbySource:
-    """Return the source of an appliance in service; `recorder` records its hand-over."""
-    pair, replication, rollout = base.pair, base.replication, parts.monitors.rollout
-    if pair is None or replication is None or recorder is None:
-        return SingleAppliance()
-
-    async def leaving() -> None:
-        await leave_state(pair, base.store, rollout)
-        base.store.save_parameters(parts.core.parameters.tree)
-        try:
-            async with asyncio.timeout(_SEAL_SECONDS):
-                await recorder.handed_over(pair.epoch)
-        except TimeoutError:
-            _log.warning("the log is not sealed before the switchover: the signer does not answer")
-
-    return ActiveAppliance(replication, leaving, partial(keep_state, base.store, rollout))
-
-
-def service_reports(base: Foundation, parts: Parts, pair: Pair) -> Callable[[], Awaitable[None]]:
-    """Return the reports to the lease, of an appliance that serves from now on."""
-    return partial(pair.lease.report_service, ServiceReport(base, parts).now)
-
-
-def state_copies(pair: Pair, replication: Replication, base: Foundation, parts: Parts) -> StateCopies:
-    """Return the copies of the state of monitors for the standby."""
-    return StateCopies(pair, base.store, parts.monitors.rollout, replication.followed)
 
 
 class StandbyOrders:

@@ -19,9 +19,10 @@ from pathlib import Path
 import structlog
 
 from appliance.configuration.settings import Settings
+from appliance.control.assembly.active_role import STATE_ERRORS
 from appliance.control.assembly.foundation import make_host_table, open_listener
 from appliance.control.assembly.policies import kept_policy
-from appliance.control.assembly.policy_gate import PolicyRefusedError, policy_at_start
+from appliance.control.assembly.policy_gate import policy_at_start
 from appliance.control.assembly.robot import robot_addresses
 from appliance.features.standby.link_certificates import replication_context
 from appliance.features.standby.membership import Membership
@@ -33,15 +34,10 @@ from appliance.specifications.specification_files import (
     CheckedSpecifications,
     Sources,
     SpecificationFolder,
-    SpecificationsRefusedError,
 )
 from appliance.specifications.specification_revisions import Check, specifications_at_start
 from appliance.specifications.switches import Switches
 from appliance.store.state_file import MonitorRevisionRow, StateStore
-from appliance.store.writer_thread import StoreError
-
-STATE_ERRORS = (PolicyRefusedError, SpecificationsRefusedError, StoreError, OSError)
-"""The errors of a stored state or an own file that control cannot start with."""
 
 _AGAIN_SECONDS = 15.0
 _ROOM = 4 << 20  # bytes, as for an order (`Database.require_room`)

@@ -49,9 +49,7 @@ from appliance.channel.messages import (
     TunnelsStated,
     TunnelsWanted,
 )
-from appliance.features.standby.appliance_table import ApplianceTable
-from appliance.features.standby.replication_frames import Introduction
-from appliance.features.standby.shared_authority import SharedAuthority
+from appliance.hosts.appliances import Appliances
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.hosts.host_table import (
@@ -62,9 +60,12 @@ from appliance.hosts.host_table import (
 )
 from appliance.hosts.hosts_file import DeclaredHosts
 from appliance.hosts.rest_address import RestAddress
+from appliance.hosts.revoked_certificates import RevokedCertificates
+from appliance.hosts.stored_authority import StoredAuthority
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.ipsec.requests import fingerprint, make_key, signing_request
 from appliance.policy.model import Address
+from appliance.store.host_tables import HostTables
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.audit import RecordingTrail
@@ -84,9 +85,10 @@ class Bench:
         *,
         listen: str = "0.0.0.0",
         pool: str = "10.113.11.0/29",
-        endpoint: str | None = None,
+        kind: type[StoredAuthority] = StoredAuthority,
+        table: Callable[[HostTables, RevokedCertificates], Appliances] = Appliances,
     ) -> None:
-        """With `endpoint`, this is one of two appliances."""
+        """`kind` is the authority, and `table` the appliances that it certifies."""
         self.answer = TunnelsEnclosed("kernel")
         self.asked: list[Message] = []
         self.order: list[str] = []
@@ -96,9 +98,8 @@ class Bench:
         self.authority = NearAuthority(directory)
         self.trail = RecordingTrail(self.log)
         self.table = HostTable(self.store, ipaddress.IPv4Network(pool), DeclaredHosts(self.declared))
-        authority = SharedAuthority(self.authority, self.store.hosts, shared=endpoint is not None)
-        self.shared = authority
-        self.appliances = appliances = ApplianceTable(self.store.hosts, self.table.revoked, endpoint)
+        self.shared = authority = kind(self.authority, self.store.hosts)
+        self.appliances = appliances = table(self.store.hosts, self.table.revoked)
         self.tunnels = Tunnels(
             self.table, self.trail, authority, appliances, listen=(listen, 11311), say=self._said
         )
@@ -220,7 +221,7 @@ def nobody_waits_for_charon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("appliance.hosts.tunnel_state._TAKEN_SECONDS", 0.0)
 
 
-def run(directory: Path, work: Callable[[Bench], Coroutine[Any, Any, None]], **options: str) -> None:
+def run(directory: Path, work: Callable[[Bench], Coroutine[Any, Any, None]], **options: Any) -> None:
     async def inside() -> None:
         bench = Bench(directory, **options)
         try:
@@ -449,55 +450,6 @@ async def test_a_host_renews_itself(bench: Bench) -> None:
         await bench.renewed("a")
     with pytest.raises(HostRefusedError, match="again in"):
         await bench.renew_itself("a", request, key)
-
-
-def test_without_the_authoritys_key_changes_wait(tmp_path: Path) -> None:
-    """On the second of two appliances, new certificates wait, and so does the replacement of one; hosts are revoked."""
-    keys, request = [make_key(), make_key()], request_of("b")
-
-    async def first(bench: Bench) -> None:
-        for name, key in zip("ab", keys, strict=True):
-            await bench.add(name, key=key)
-        await bench.renew_itself("a", request_of("a"), keys[0])
-        await bench.shared.revocations([])
-
-    async def second(bench: Bench) -> None:
-        await bench.tunnels.start()
-        elsewhere = NearAuthority(tmp_path / "elsewhere")
-        bench.authority.stated = elsewhere.stated  # type: ignore[method-assign]  # another key than that of the state
-        for order in (
-            bench.add("c"),
-            bench.renewed("a"),
-            bench.hosts.itself.renew(HostRenewItself("b", request, sign(keys[1], request), "10.113.11.3")),
-        ):
-            with pytest.raises(HostRefusedError, match="new certificates wait") as caught:
-                await order
-            assert caught.value.ours
-        assert bench.store.hosts.revoked() == []
-        await bench.revoke("b")
-        assert [row.name for row in bench.table.enrolled()] == ["a"]
-
-    (tmp_path / "elsewhere").mkdir()
-    run(tmp_path, first, endpoint="192.168.1.20")
-    run(tmp_path, second, endpoint="192.168.1.21")
-
-
-def test_a_kit_of_two_appliances_has_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its address and pin come from the other one's introduction; until then a warning says what to do."""
-    monkeypatch.setattr("appliance.features.standby.appliance_table._INTRODUCTION_SECONDS", 0.01)
-    pin, key = "sha256//" + 43 * "B" + "=", make_key()
-    other = Introduction(signing_request(key, "rosrv-appliance"), fingerprint(key), "192.168.1.21", pin)
-
-    async def work(bench: Bench) -> None:
-        await bench.add("a")
-        kit = await bench.certification.kit("a", None)
-        assert kit.second == ""
-        assert "later, rosrv host kit a" in (kit.warning or "")
-        await bench.appliances.introduce(other, bench.shared)
-        kit = await bench.certification.kit("a", None)
-        assert (kit.second, kit.pin, kit.warning) == ("192.168.1.21", f"sha256//pin;{pin}", None)
-
-    run(tmp_path, work, endpoint="192.168.1.20")
 
 
 def test_renewals_make_a_host_wait_over_restarts(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import pytest
 from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.features.standby import lease_link
 from appliance.features.standby.lease import ClaimPromise, PromiseRequest
 from appliance.features.standby.membership import Membership
 from appliance.features.standby.peer_link import PeerChannel
@@ -84,10 +85,10 @@ class Site:
         """Start the process, with a control that is present."""
         self._thread.start()
         ours, theirs = socket.socketpair()
-        self.control = Channel(ours, messages.LeaseLink)
+        self.control = Channel(ours, lease_link.LeaseLink)
         self.supervisor.send(messages.LinkOpened("control", 0), (theirs.fileno(),))
         theirs.close()
-        self.control.send(messages.ControlPresent())
+        self.control.send(lease_link.ControlPresent())
 
     def serve(self, times: int = 1) -> None:
         """Answer requests as the witness: this number, and those that wait by then."""
@@ -226,11 +227,11 @@ def test_a_smaller_epoch_of_the_witness_grants_nothing(site: Site) -> None:
 def test_it_claims_only_while_control_is_ready(site: Site) -> None:
     """A control that could not serve withdraws its presence; once it could, the lease is claimed."""
     site.start()
-    site.control.send(messages.ControlUnready())
+    site.control.send(lease_link.ControlUnready())
     later = clock.since_boot() + 3 * EXPIRY
     site.until(lambda: clock.since_boot() > later)
     assert not site.held() and site.record.epoch == 1
-    site.control.send(messages.ControlPresent())
+    site.control.send(lease_link.ControlPresent())
     site.until(site.held)
     assert site.record.epoch == 2
 
@@ -242,7 +243,7 @@ def test_a_holder_that_does_not_serve_gives_the_lease_away(site: Site) -> None:
     theirs, able = PeerChannel("b", "a", PEER_KEY), [False]
 
     def given_away() -> bool:
-        site.control.send(messages.ControlServes("the disk is full", keeps_state=True))
+        site.control.send(lease_link.ControlServes("the disk is full", keeps_state=True))
         with contextlib.suppress(TimeoutError):
             asked = theirs.read(site.peer.recv(2048))
             if isinstance(asked, PromiseRequest):

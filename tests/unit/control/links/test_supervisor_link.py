@@ -64,7 +64,7 @@ def answers() -> list[TunnelsEnclosed]:
 @pytest.fixture
 async def ends(answers: list[TunnelsEnclosed]) -> AsyncIterator[tuple[ControlLifeline, Supervisor]]:
     ours, theirs = socket.socketpair()
-    lifeline = ControlLifeline(theirs.detach(), asyncio.Event(), answers.append, print, print)
+    lifeline = ControlLifeline(theirs.detach(), asyncio.Event(), answers.append, {})
     supervisor = Supervisor(ours)
     lifeline.attach()
     yield lifeline, supervisor

@@ -13,8 +13,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from appliance.base import clock
-from appliance.channel import messages
-from appliance.features.standby import replication
+from appliance.features.standby import lease_link, replication
 from appliance.features.standby.lease_client import LeaseClient
 from appliance.features.standby.membership import Membership
 from appliance.features.standby.process import LeaseProcess
@@ -144,7 +143,7 @@ class Pair:
                 self.lease.control_said(self.to_lease.popleft())
             case "to control" if self.to_control:
                 message = self.to_control.popleft()
-                if isinstance(message, messages.LeaseState):
+                if isinstance(message, lease_link.LeaseState):
                     self.client.heard(message)
             case "restart":
                 self.start_control(taken_over=False)

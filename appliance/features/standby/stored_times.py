@@ -34,10 +34,10 @@ class _Reading(msgspec.Struct, frozen=True):
     age: int
 
 
-def adopt_times(store: StateStore, pair: Pair | None, age: Callable[[], int]) -> None:
+def adopt_times(store: StateStore, pair: Pair, age: Callable[[], int]) -> None:
     """Move the times in the state, if the other appliance wrote them. Call this before any part reads them."""
     text = store.settings().get(_SETTING)
-    if pair is None or text is None:
+    if text is None:
         return
     last = msgspec.json.decode(text, type=_Reading)
     if last.appliance == pair.membership.name:

@@ -1,4 +1,4 @@
-"""Tests of `appliance.control.service_report`: what an active appliance reports to its lease."""
+"""Tests of `appliance.features.standby.service_report`: what an active appliance reports to its lease."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from appliance.base import clock
-from appliance.channel.messages import ControlServes
-from appliance.control.service_report import ServiceReport
+from appliance.features.standby.lease_link import ControlServes
+from appliance.features.standby.service_report import ServiceReport
 from tests.support.virtual_clock import VirtualClock
 
 

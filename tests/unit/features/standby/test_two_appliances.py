@@ -2,23 +2,30 @@
 
 import asyncio
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cryptography import x509
 
 from appliance.base.clock import using
+from appliance.channel.admin import HostRenewItself
 from appliance.features.standby import appliance_table
 from appliance.features.standby.appliance_table import ApplianceTable
 from appliance.features.standby.replication_frames import Introduction
 from appliance.features.standby.shared_authority import SharedAuthority
+from appliance.hosts.appliances import Appliances
 from appliance.hosts.certificate_requests import AuthorityError
+from appliance.hosts.enrolment import HostRefusedError
 from appliance.hosts.revoked_certificates import RevokedCertificates
+from appliance.hosts.stored_authority import StoredAuthority
 from appliance.ipsec.requests import fingerprint, make_key, signing_request
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase
 from tests.support.near_authority import NearAuthority
 from tests.support.virtual_clock import VirtualClock
+from tests.unit.hosts.test_enrolment import Bench, request_of, run, sign
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
@@ -46,7 +53,7 @@ def introduction(endpoint: str = SECOND, key: bytes | None = None) -> Introducti
     return Introduction(signing_request(key, "rosrv-appliance"), fingerprint(key), endpoint, PIN)
 
 
-def table(store: StateStore, endpoint: str | None = FIRST) -> ApplianceTable:
+def table(store: StateStore, endpoint: str = FIRST) -> ApplianceTable:
     """Return the table of an appliance that hosts reach at this address."""
     return ApplianceTable(store.hosts, RevokedCertificates(store.hosts), endpoint)
 
@@ -55,10 +62,10 @@ async def test_the_second_appliance_opens_tunnels_and_issues_nothing(
     tmp_path: Path, store: StateStore
 ) -> None:
     """It states the first one's authority and last list, although its own signer has another authority."""
-    first = SharedAuthority(near(tmp_path, "a"), store.hosts, shared=True)
+    first = SharedAuthority(near(tmp_path, "a"), store.hosts)
     certificate, listed = await first.certificate(), await first.revocations([("1f", 1.0)])
     assert await first.obstacle() == first.waits == ""
-    second = SharedAuthority(near(tmp_path, "b"), store.hosts, shared=True)
+    second = SharedAuthority(near(tmp_path, "b"), store.hosts)
     assert await second.certificate() == certificate
     assert await second.revocations([("1f", 1.0), ("2f", 2.0)]) == listed
     with pytest.raises(AuthorityError, match=r"new certificates wait, .*\(rosrv standby promote\)") as caught:
@@ -68,30 +75,22 @@ async def test_the_second_appliance_opens_tunnels_and_issues_nothing(
 
 async def test_the_end_of_the_last_list_is_shown(tmp_path: Path, store: StateStore) -> None:
     """Operators see until when tunnels open without the key: as long as charon accepts the list."""
-    listed = await SharedAuthority(near(tmp_path, "a"), store.hosts, shared=True).revocations([])
+    listed = await SharedAuthority(near(tmp_path, "a"), store.hosts).revocations([])
     end = x509.load_pem_x509_crl(listed).next_update_utc
     assert end is not None
     other = near(tmp_path, "b")
     other.trouble = "ca.key cannot be decrypted"
-    second = SharedAuthority(other, store.hosts, shared=True)
+    second = SharedAuthority(other, store.hosts)
     await second.obstacle()
     assert f"tunnels open until {end:%Y-%m-%d %H:%M}Z" in second.waits
     assert "(ca.key cannot be decrypted)" in second.waits
 
 
-async def test_without_a_list_no_tunnel_opens(tmp_path: Path, store: StateStore) -> None:
-    """A list is never made up: without it a revoked certificate would be accepted."""
-    await SharedAuthority(near(tmp_path, "a"), store.hosts, shared=True).certificate()
-    second = SharedAuthority(near(tmp_path, "b"), store.hosts, shared=True)
-    with pytest.raises(AuthorityError, match="no list of revoked certificates was signed yet"):
-        await second.revocations([])
-
-
 async def test_a_single_appliance_uses_its_own_key(tmp_path: Path, store: StateStore) -> None:
     """An authority that is left in the state, from a pair, does not matter any more."""
-    await SharedAuthority(near(tmp_path, "a"), store.hosts, shared=True).revocations([])
+    await SharedAuthority(near(tmp_path, "a"), store.hosts).revocations([])
     own = near(tmp_path, "b")
-    alone = SharedAuthority(own, store.hosts, shared=False)
+    alone = StoredAuthority(own, store.hosts)
     assert await alone.certificate() == (await own.stated()).certificate
     assert await alone.obstacle() == ""
 
@@ -100,17 +99,23 @@ async def test_another_authority_is_reported_once(tmp_path: Path, store: StateSt
     """Neither the first start nor a restart reports an authority; the first start with another key does."""
     told: list[str] = []
     for name in ("a", "a", "b", "b"):
-        alone = SharedAuthority(
-            near(tmp_path, name), store.hosts, shared=False, replaced=lambda: told.append("new")
-        )
+        alone = StoredAuthority(near(tmp_path, name), store.hosts, replaced=lambda: told.append("new"))
         await alone.certificate()
         await alone.certificate()
     assert told == ["new"]
 
 
+async def test_without_a_list_no_tunnel_opens(tmp_path: Path, store: StateStore) -> None:
+    """A list is never made up: without it a revoked certificate would be accepted."""
+    await SharedAuthority(near(tmp_path, "a"), store.hosts).certificate()
+    second = SharedAuthority(near(tmp_path, "b"), store.hosts)
+    with pytest.raises(AuthorityError, match="no list of revoked certificates was signed yet"):
+        await second.revocations([])
+
+
 async def test_the_standby_finds_its_certificate_in_the_state(tmp_path: Path, store: StateStore) -> None:
     """The active appliance certifies the key of the introduction, once; kits get its address and pin."""
-    authority = SharedAuthority(near(tmp_path, "a"), store.hosts, shared=True)
+    authority = SharedAuthority(near(tmp_path, "a"), store.hosts)
     first, given = table(store), introduction()
     await first.introduce(given, authority)
     certificate = first.certificate(given.key)
@@ -132,7 +137,7 @@ async def test_a_certificate_is_renewed_long_before_its_end(
 ) -> None:
     """An introduction renews a certificate with less than sixty days left; an ended one is not used."""
     authority, first, given = (
-        SharedAuthority(near(tmp_path, "a"), store.hosts, shared=True), table(store), introduction(),
+        SharedAuthority(near(tmp_path, "a"), store.hosts), table(store), introduction(),
     )  # fmt: skip
     monkeypatch.setattr(appliance_table, "CERTIFICATE_DAYS", 59.0)
     await first.introduce(given, authority)
@@ -148,7 +153,7 @@ async def test_a_replaced_appliance_is_revoked(
     tmp_path: Path, store: StateStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A new key makes the earlier one worthless, but not several in an hour: each makes the list longer."""
-    authority, first = SharedAuthority(near(tmp_path, "a"), store.hosts, shared=True), table(store)
+    authority, first = SharedAuthority(near(tmp_path, "a"), store.hosts), table(store)
     stolen, replacement, further = introduction(), introduction(), introduction()
     await first.introduce(stolen, authority)
     await first.introduce(replacement, authority)
@@ -159,14 +164,14 @@ async def test_a_replaced_appliance_is_revoked(
     assert first.certificate(stolen.key) == first.certificate(replacement.key) == b""
     assert first.certificate(further.key)
     assert len(store.hosts.revoked()) == 2
-    table(store, None)
+    Appliances(store.hosts, RevokedCertificates(store.hosts))
     assert store.hosts.appliances() == []
     assert len(store.hosts.revoked()) == 3
 
 
 async def test_an_appliance_with_the_same_address_is_not_taken(tmp_path: Path, store: StateStore) -> None:
     """Hosts could not choose between the two."""
-    authority, first = SharedAuthority(near(tmp_path, "a"), store.hosts, shared=True), table(store)
+    authority, first = SharedAuthority(near(tmp_path, "a"), store.hosts), table(store)
     await first.introduce(introduction(FIRST), authority)
     assert first.other is None
     assert store.hosts.appliances() == []
@@ -175,7 +180,7 @@ async def test_an_appliance_with_the_same_address_is_not_taken(tmp_path: Path, s
 async def test_a_flood_of_introductions_is_one_at_a_time(tmp_path: Path, store: StateStore) -> None:
     """While the authority works on one introduction, others cost nothing."""
     signer, first = near(tmp_path, "a"), table(store)
-    authority, issued = SharedAuthority(signer, store.hosts, shared=True), []
+    authority, issued = SharedAuthority(signer, store.hosts), []
     signer.meanwhile = lambda: issued.append(1)
     await asyncio.gather(*(first.introduce(introduction(), authority) for _ in range(20)))
     assert len(issued) == 1
@@ -193,3 +198,57 @@ async def test_each_appliance_knows_its_own_row(tmp_path: Path, store: StateStor
     second.note_own("0" * 64)
     assert second.other is not None
     assert (second.other.endpoint, second.other.pin) == (FIRST, PIN)
+
+
+def run_as(directory: Path, work: Any, endpoint: str) -> None:
+    """Run the work on one of two appliances, which hosts reach at this address."""
+    run(directory, work, kind=SharedAuthority, table=partial(ApplianceTable, endpoint=endpoint))
+
+
+def test_without_the_authoritys_key_changes_wait(tmp_path: Path) -> None:
+    """On the second of two appliances, new certificates wait, and so does the replacement of one; hosts are revoked."""
+    keys, request = [make_key(), make_key()], request_of("b")
+
+    async def first(bench: Bench) -> None:
+        for name, key in zip("ab", keys, strict=True):
+            await bench.add(name, key=key)
+        await bench.renew_itself("a", request_of("a"), keys[0])
+        await bench.shared.revocations([])
+
+    async def second(bench: Bench) -> None:
+        await bench.tunnels.start()
+        elsewhere = NearAuthority(tmp_path / "elsewhere")
+        bench.authority.stated = elsewhere.stated  # type: ignore[method-assign]  # another key than that of the state
+        for order in (
+            bench.add("c"),
+            bench.renewed("a"),
+            bench.hosts.itself.renew(HostRenewItself("b", request, sign(keys[1], request), "10.113.11.3")),
+        ):
+            with pytest.raises(HostRefusedError, match="new certificates wait") as caught:
+                await order
+            assert caught.value.ours
+        assert bench.store.hosts.revoked() == []
+        await bench.revoke("b")
+        assert [row.name for row in bench.table.enrolled()] == ["a"]
+
+    (tmp_path / "elsewhere").mkdir()
+    run_as(tmp_path, first, "192.168.1.20")
+    run_as(tmp_path, second, "192.168.1.21")
+
+
+def test_a_kit_of_two_appliances_has_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its address and pin come from the other one's introduction; until then a warning says what to do."""
+    monkeypatch.setattr("appliance.features.standby.appliance_table._INTRODUCTION_SECONDS", 0.01)
+    pin, key = "sha256//" + 43 * "B" + "=", make_key()
+    other = Introduction(signing_request(key, "rosrv-appliance"), fingerprint(key), "192.168.1.21", pin)
+
+    async def work(bench: Bench) -> None:
+        await bench.add("a")
+        kit = await bench.certification.kit("a", None)
+        assert kit.second == ""
+        assert "later, rosrv host kit a" in (kit.warning or "")
+        await bench.appliances.introduce(other, bench.shared)
+        kit = await bench.certification.kit("a", None)
+        assert (kit.second, kit.pin, kit.warning) == ("192.168.1.21", f"sha256//pin;{pin}", None)
+
+    run_as(tmp_path, work, "192.168.1.20")

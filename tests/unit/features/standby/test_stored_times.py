@@ -9,12 +9,13 @@ from pathlib import Path
 import pytest
 
 from appliance.base import clock
+from appliance.base.age_clock import AgeClock
 from appliance.base.deadlines import Deadlines
-from appliance.control.assembly.host_blocks import BlockTable, blocks_at_start
-from appliance.control.assembly.stored_times import adopt_times, note_times
+from appliance.control.assembly.host_blocks import BlockTable
 from appliance.features.standby.lease_client import LeaseClient
 from appliance.features.standby.replication import Pair
 from appliance.features.standby.standby_tunnels import StandbyTunnels
+from appliance.features.standby.stored_times import adopt_times, note_times
 from appliance.hosts.enrolment_tokens import EnrolmentTokens
 from appliance.policy.model import address_of
 from appliance.store import host_tables
@@ -60,7 +61,9 @@ class Two:
         folder = self.home / name
         folder.mkdir(exist_ok=True)
         with clock.using(self.clocks[name]):
-            yield blocks_at_start(self.store, self.members[name]._replace(away_seconds=away_seconds), folder)
+            age = AgeClock(folder / "age")
+            adopt_times(self.store, self.members[name]._replace(away_seconds=away_seconds), age)
+            yield BlockTable(self.store, age)
 
     async def note(self, name: str, blocks: BlockTable) -> None:
         blocks.read_clock()
@@ -146,19 +149,6 @@ async def test_without_a_view_of_the_other_appliance_durations_go_on_from_the_la
         left = pair.left(blocks)
         assert left.pop("token") == pytest.approx(-86_400.0 - 600.0)
         assert left == {name: pytest.approx(HOUR - 600.0) for name in left}
-
-
-async def test_a_single_appliance_moves_nothing(two: Callable[[float], Two]) -> None:
-    pair = two(0.0)
-    with pair.active("a") as blocks:
-        blocks.read_clock()
-        pair.begin(blocks)
-        await pair.note("a", blocks)
-    pair.let_pass(600.0)
-    with clock.using(pair.clocks["a"]):
-        before = pair.store.settings()
-        adopt_times(pair.store, None, lambda: 0)
-        assert pair.store.settings() == before
 
 
 MOVED = {"token.expires", "enrolment_token.expires", "host_block.ends"}

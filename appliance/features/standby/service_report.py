@@ -5,10 +5,10 @@ is repaired; they are reported only if they last, because a takeover costs more 
 """
 
 from appliance.base import clock
-from appliance.channel import messages
 from appliance.channel.status_summary import no_relay
 from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.foundation import Foundation
+from appliance.features.standby import lease_link
 
 _REPAIR_SECONDS = 8.0
 
@@ -21,7 +21,7 @@ class ServiceReport:
         self._parts = parts
         self._sound = clock.now()  # when nothing was to be repaired
 
-    def now(self) -> messages.ControlServes:
+    def now(self) -> lease_link.ControlServes:
         failed, monitors = self._base.audit.failed, self._parts.monitors
         obstacle = ""
         if failed is not None and self._base.settings.audit.on_audit_failure == "deny":
@@ -29,7 +29,7 @@ class ServiceReport:
         keeps_state = any(
             owner.holds and monitors.switches.enabled(name) for name, owner in monitors.checked.states.items()
         )
-        return messages.ControlServes(obstacle or self._lasting(), keeps_state)
+        return lease_link.ControlServes(obstacle or self._lasting(), keeps_state)
 
     def _lasting(self) -> str:
         """Return what should have been repaired by now; empty: nothing."""

@@ -1,0 +1,83 @@
+"""Begin the service of an appliance in control: the orders of operators, and the work of the active one of two."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from functools import partial
+
+import structlog
+
+from appliance.channel import admin
+from appliance.control.assembly.assembly import Parts
+from appliance.control.assembly.foundation import Foundation
+from appliance.control.operators.request_method import RequestMethod
+from appliance.features.feature import FeaturePart
+from appliance.features.standby.fleet_of_pair import compare_fleets
+from appliance.features.standby.inheritance import StateCopies, inherited_state, keep_state, leave_state
+from appliance.features.standby.replication import Pair
+from appliance.features.standby.service_report import ServiceReport
+from appliance.features.standby.standby_orders import ActiveAppliance, SingleAppliance, StandbyOrders
+from appliance.features.standby.start_gate import PairedRole
+from appliance.features.standby.stored_times import note_times
+from appliance.features.standby.takeover_record import TakeoverRecorder
+
+_SEAL_SECONDS = 0.5  # the robot waits
+
+_log = structlog.get_logger()
+
+
+async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
+    """Return the part of the standby in control. One of two appliances first begins its epoch (`_begin_epoch`)."""
+    role = base.role
+    if not isinstance(role, PairedRole):
+        return _part(StandbyOrders(SingleAppliance(), base.trail))
+    pair, replication, rollout = role.pair, role.replication, parts.monitors.rollout
+    recorder = await _begin_epoch(base, parts, pair)
+
+    async def leaving() -> None:
+        await leave_state(pair, base.store, rollout)
+        base.store.save_parameters(parts.core.parameters.tree)
+        try:
+            async with asyncio.timeout(_SEAL_SECONDS):
+                await recorder.handed_over(pair.epoch)
+        except TimeoutError:
+            _log.warning("the log is not sealed before the switchover: the signer does not answer")
+
+    async def report_service() -> None:
+        await parts.reconciler.ready.wait()
+        await pair.lease.report_service(ServiceReport(base, parts).now)
+
+    active = ActiveAppliance(replication, leaving, partial(keep_state, base.store, rollout))
+    orders = StandbyOrders(active, base.trail)
+    work: dict[str, Callable[[], Awaitable[None]]] = {
+        "the replication": replication.run,
+        "the readings of the clocks": partial(note_times, base.store, pair, base.blocks.age_now),
+        "the copies of monitors' state": StateCopies(pair, base.store, rollout, replication.followed).run,
+        "the orders of the standby": partial(
+            orders.obey, replication.switchover_wanted, replication.sender.refuse_switchover
+        ),
+        "the replication of checkpoints": recorder.follow,
+        "the reports to the lease": report_service,
+    }
+    return replace(_part(orders), pair=active.state, work=work)
+
+
+def _part(orders: StandbyOrders) -> FeaturePart:
+    return FeaturePart(
+        methods=(
+            RequestMethod(admin.StandbyWanted, orders.state, order=False),
+            RequestMethod(admin.StandbyPromote, orders.promote, who=True, order=False, full_disk=True),
+        )
+    )
+
+
+async def _begin_epoch(base: Foundation, parts: Parts, pair: Pair) -> TakeoverRecorder:
+    """Record that this appliance is active, and give its relays the state of the other one's monitors."""
+    name, other = pair.membership.name, pair.membership.other
+    recorder = TakeoverRecorder(
+        base.trail, base.audit, base.store, base.signing.signed, name=name, other=other
+    )
+    await recorder.took_over(pair.epoch)
+    compare_fleets(base.settings.fleet, base.store, base.trail, name=name)
+    parts.monitors.rollout.inherit(*inherited_state(pair, base.store))
+    return recorder

@@ -1,0 +1,41 @@
+"""The appliances at which hosts open their tunnels. A single appliance is the only one."""
+
+from appliance.channel.messages import CertificateMade
+from appliance.hosts.revoked_certificates import RevokedCertificates
+from appliance.store.host_tables import ApplianceRow, HostTables
+
+CERTIFICATE_DAYS = 90.0
+
+
+class Appliances:
+    """This appliance, and for one of two also the `other` one (`paired`)."""
+
+    paired = False
+
+    def __init__(self, kept: HostTables, revoked: RevokedCertificates) -> None:
+        """Remove and revoke the appliances of the state: this one is single now."""
+        for row in kept.appliances():
+            revoked.add("", row.serial, row.expires)
+            kept.forget_appliance(row.key)
+
+    @property
+    def other(self) -> ApplianceRow | None:
+        """Return the other appliance; None if it has not introduced itself."""
+        return None
+
+    async def until_introduced(self) -> None:
+        """Wait a moment for the other appliance of two."""
+
+    def certificate(self, key: str) -> bytes:
+        """Return the stored valid certificate for an appliance's tunnel key, in PEM; empty if there is none."""
+        del key
+        return b""
+
+    def is_served(self, pin: str) -> None:
+        """Note the pin of this appliance's REST server."""
+
+    def note_own(self, key: str) -> None:
+        """Note which tunnel key is this appliance's own."""
+
+    def certified(self, key: str, made: CertificateMade) -> None:
+        """Take the new certificate for this appliance's own key."""

@@ -1,0 +1,68 @@
+"""Use the authority of hosts' certificates, and store its certificate, so that another authority is noticed."""
+
+from collections.abc import Callable
+
+from appliance.channel.messages import CertificateMade
+from appliance.hosts.certificate_requests import Authority, AuthorityError
+from appliance.store.host_tables import AuthorityRow, HostTables
+
+
+class StoredAuthority:
+    """The authority, by the signer of this appliance. `replaced()` is called if it is another one than before.
+
+    Every method raises `AuthorityError`.
+    """
+
+    def __init__(
+        self, signer: Authority, kept: HostTables, *, replaced: Callable[[], object] = lambda: None
+    ) -> None:
+        self._signer = signer
+        self._kept = kept
+        self._replaced = replaced
+        self._row = kept.authority()
+
+    @property
+    def waits(self) -> str:
+        """Return what cannot be done without the authority's key, and until when tunnels open; empty: nothing."""
+        return ""
+
+    async def certificate(self) -> bytes:
+        """Return the authority's certificate, in PEM."""
+        own = (await self._signer.stated()).certificate
+        kept = self._row
+        if kept is not None and self._keeps(kept, own):
+            return kept.certificate.encode()
+        self._save(AuthorityRow(own.decode(), "", 0.0))
+        if kept is not None:
+            self._replaced()
+        return own
+
+    def _keeps(self, kept: AuthorityRow, own: bytes) -> bool:
+        """Whether the stored authority is used, although the signer has this one."""
+        return kept.certificate == own.decode()
+
+    async def obstacle(self) -> str:
+        """Return why this appliance cannot issue certificates; empty if it can."""
+        await self.certificate()
+        return ""
+
+    async def issue(
+        self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
+    ) -> CertificateMade:
+        """Return a certificate in this name for the key of a signing request; see `Authority.issue`."""
+        await self.require_key()
+        return await self._signer.issue(request, name, days, proof=proof, former=former)
+
+    async def require_key(self) -> None:
+        """Raise `AuthorityError`, with the remedy, if this appliance cannot issue certificates."""
+        if obstacle := await self.obstacle():
+            raise AuthorityError(obstacle)
+
+    async def revocations(self, revoked: list[tuple[str, float]]) -> bytes:
+        """Return the signed list (PEM) of these serial numbers and times."""
+        await self.certificate()
+        return await self._signer.revocations(revoked)
+
+    def _save(self, row: AuthorityRow) -> None:
+        self._row = row
+        self._kept.save_authority(row)
