@@ -11,7 +11,7 @@ from pathlib import Path
 from appliance.backup.contents import BackupError
 from appliance.backup.purge import write_over
 from appliance.base.owner_access import acting_as
-from appliance.features.standby.membership import path_of
+from appliance.features.table import pairing_in
 from appliance.ipsec.certificate_authority import CERTIFICATE_FILE, KEY_FILE
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.state_directory import StateDirectory, foreign
@@ -26,11 +26,7 @@ def rotate_authority(state: Path) -> None:
         if not state.is_dir() or reason is not None:
             raise BackupError(reason or f"the state directory {state} does not exist")
         with closing(StateDirectory(state)):
-            if path_of(state).exists():
-                raise BackupError(
-                    "this appliance is one of two, which share the authority: end the pair first (rosrv standby leave"
-                    " on both), rotate, and join again"
-                )
+            _require_single(state)
             with acting_as(folder.stat().st_uid):  # in a container, root may not use the signer's folder
                 place = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
                 try:
@@ -46,3 +42,12 @@ def rotate_authority(state: Path) -> None:
         raise BackupError(f"{folder} has no authority yet: no host was enrolled") from None
     except OSError as error:
         raise BackupError(f"{folder}: {error.strerror}") from error
+
+
+def _require_single(state: Path) -> None:
+    try:
+        pairing = pairing_in(state)
+    except StartError as error:
+        raise BackupError(str(error)) from error
+    if pairing is not None:
+        raise BackupError(pairing.fixed_authority)

@@ -19,10 +19,11 @@ from appliance.cli.up_inputs import read_inputs
 from appliance.configuration.config_sources import resolve
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.robot import own_address
-from appliance.features.standby.membership import Membership, MembershipError, load_membership, path_of
+from appliance.features.table import pairing_in
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.roles import roles_of
-from appliance.supervisor.run import StandbyStart, run_appliance
+from appliance.supervisor.run import run_appliance
+from appliance.supervisor.service_gate import Pairing
 from appliance.supervisor.supervisor import ControlReady
 
 _MOST_WARNINGS = 10
@@ -105,8 +106,8 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     settings = resolve(config, os.environ, flags)
     setproctitle.setproctitle("rosrv: supervisor")
     configure_logs("supervisor")
-    membership = _membership_in(settings.state)
-    node_ports = read_inputs(settings, None if membership is None else membership.witness)
+    pairing = pairing_in(settings.state)
+    node_ports = read_inputs(settings, None if pairing is None else pairing.robot)
     run_appliance(
         settings,
         roles_of(
@@ -114,32 +115,20 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
             api=settings.api_address is not None,
             fleet=settings.fleet.receipt_key is not None,
             bundles=settings.fleet.bundles.root is not None,
-            lease=membership is not None,
+            paired=pairing is not None,
         ),
         partial(_announce, as_json=as_json),
         node_ports=node_ports,
-        standby=None
-        if membership is None
-        else StandbyStart(membership, partial(_announce_standby, membership, as_json=as_json)),
+        pairing=pairing,
+        waits=partial(_announce_waiting, pairing, as_json=as_json),
     )
 
 
-def _membership_in(state: Path) -> Membership | None:
-    """Return the membership of an appliance that is one of two. Raises `StartError` if it cannot be used."""
-    try:
-        return load_membership(path_of(state))
-    except (MembershipError, OSError) as error:
-        raise StartError(str(error)) from error
-
-
-def _announce_standby(membership: Membership, *, as_json: bool) -> None:
-    event = {"event": "standby", "name": membership.name, "other": membership.other}
-    text = (
-        f"This appliance ({membership.name}) is ready to be active, or to take over from {membership.other}"
-        f" ({membership.other_address}): rosrv standby status"
-    )
+def _announce_waiting(pairing: Pairing | None, *, as_json: bool) -> None:
+    if pairing is None:
+        return
     with contextlib.suppress(OSError):
-        sys.stdout.write(f"{json.dumps(event) if as_json else text}\n")
+        sys.stdout.write(f"{json.dumps(pairing.event) if as_json else pairing.text}\n")
         sys.stdout.flush()
 
 

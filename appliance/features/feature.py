@@ -10,6 +10,7 @@ Invariants:
 
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appliance.cli.verb_table import Group
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from appliance.channel.link import Link
     from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
     from appliance.control.operators.request_method import RequestMethod
+    from appliance.supervisor.service_gate import Pairing
     from appliance.telemetry.audit_trail import AuditTrail, RecordDetails
 
 
@@ -78,9 +80,11 @@ class Feature:
     `recorded` is the function (`module:function`) that gives `rosrv monitor replay` the recorded messages of a period.
     `memory` makes the memory that the supervisor shares with this number of relays; None if none is configured.
 
-    Hooks are named by `module:name`, so that their modules may import what imports the table. `may_start` is a class of
-    `control.assembly.active_role.StartGate`. `inherit(foundation, parts)` returns a `FeaturePart` once control has its
-    parts and may serve, before it serves.
+    `pairing(state)` returns what the start of one of two appliances needs; it raises `StartError`. `state_files` are
+    files in the state directory that the feature may write before the first start.
+    Hooks of control are named by `module:name`, so that their modules may import what imports the table. `may_start` is
+    a class of `control.assembly.active_role.StartGate`. `inherit(foundation, parts)` returns a `FeaturePart` once
+    control may serve and has its parts, before it serves.
     """
 
     name: str
@@ -92,5 +96,7 @@ class Feature:
     recorded: str | None = None
     memory: Callable[[Sections, int], SharedMemory | None] = lambda _sections, _relays: None
     make: Callable[[FeatureContext], FeaturePart] | None = None
+    pairing: "Callable[[Path], Pairing | None] | None" = None
+    state_files: tuple[str, ...] = ()
     may_start: str | None = None
     inherit: str | None = None

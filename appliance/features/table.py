@@ -5,6 +5,7 @@ To remove a feature, remove its folder, and its import and its row here.
 
 import pkgutil
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appliance.configuration.sections import Sections
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from appliance.channel.link import Link
     from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
     from appliance.control.operators.request_method import RequestMethod
+    from appliance.supervisor.service_gate import Pairing
 
 FEATURES: tuple[Feature, ...] = (SYSLOG, EVIDENCE, RECORDER, STANDBY)
 
@@ -91,6 +93,12 @@ class FeatureParts:
     def work(self) -> dict[str, Callable[[], Awaitable[None]]]:
         """Return the work that runs until control ends."""
         return {what: one for part in self._parts for what, one in part.work.items()}
+
+
+def pairing_in(state: Path) -> "Pairing | None":
+    """Return what makes the appliance in a state directory one of two; None on a single one. Raises `StartError`."""
+    found = (feature.pairing(state) for feature in FEATURES if feature.pairing is not None)
+    return next(filter(None, found), None)
 
 
 def start_gates() -> list[Any]:

@@ -92,7 +92,8 @@ class Role:
     of its turns at the processor (0: the kernel's): a process with short turns waits less for each. `receiver` is the
     only other machine that the firewall lets the user reach.
 
-    A feature's role runs if the settings of features let it (`configured`).
+    A feature's role runs if the settings of features let it (`configured`), and a `paired` one only on one of two
+    appliances.
     """
 
     name: str
@@ -122,10 +123,11 @@ class Role:
     nice: int = 0
     slice_ns: int = 0
     sandbox: Callable[[Facts], SandboxPlan] = lambda _facts: SandboxPlan(allowlist=True)
+    paired: bool = False
     configured: Callable[[Sections], bool] = lambda _sections: True
     receiver: Callable[[Sections], RemoteReceiver | None] = lambda _sections: None
 
     @property
     def serves_robot(self) -> bool:
-        """Whether the role may run only while this appliance is active; a lapse of the lease stops it."""
+        """Whether the role may run only while this appliance is active; a pause stops it."""
         return not (self.outlives_takeover or self.stands_by)

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from appliance.base.shipped import DPKG
 from appliance.configuration.sections import DEFAULTS, Sections
-from appliance.features.standby.membership import LEASE_FILE
 from appliance.features.table import FEATURES
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.port_check import first_free
@@ -23,7 +22,6 @@ ROSMASTER = Path("/usr/bin/rosmaster")
 _ROSMASTER_LOGGING = Path(__file__).with_name("rosmaster_logging.conf")
 ROSOUT = Path("/usr/lib/rosout/rosout")
 SYSTEM_PYTHON = Path("/usr/bin/python3")
-LEASE_NICE = -10  # as the unit of the witness has
 _SHORTEST_SLICE = 100_000  # nanoseconds, the kernel's minimum
 ROS_PROGRAMS = {ROSMASTER: "python3-rosmaster", ROSOUT: "rosout"}
 
@@ -52,11 +50,7 @@ def _messages_at(ports: range | None) -> tuple[str, ...]:
 _ours = partial(Role, path=lambda facts: facts.config, links=("control",))
 _OF_FEATURES = tuple(role for feature in FEATURES for role in feature.roles)
 ROLES = (
-    Role(
-        "lease", "rosrv-lease", "lease", "appliance.features.standby.process:main",
-        path=lambda facts: facts.run(LEASE_FILE), links=("control",), outlives_takeover=True, nice=LEASE_NICE,
-        sandbox=lambda _facts: SandboxPlan(allowlist=True, families=NETWORK, binds=None),
-    ),
+    *(role for role in _OF_FEATURES if role.after is None),
     Role(
         "rosmaster", "rosmaster", "rosmaster",
         program=lambda facts: ExternalProgram(
@@ -85,7 +79,7 @@ ROLES = (
         "control", "rosrv", "control", "appliance.control.process:main",
         ended_early=100, files=65_536,
         links=(
-            "relay", "signer", "compiler", "api", "charon", *(role.name for role in _OF_FEATURES), "fleet", "lease",
+            "relay", "signer", "compiler", "api", "charon", *(role.name for role in _OF_FEATURES), "fleet",
             "bundles",
         ),
         readable_by="rosrv-api", inputs=lambda facts: facts.control_reads,
@@ -134,7 +128,7 @@ ROLES = (
             writes=("/dev/net", "/proc/sys/net"),
         ),
     ),
-    *_OF_FEATURES,
+    *(role for role in _OF_FEATURES if role.after is not None),
     _ours(
         "fleet", "rosrv-fleet", "fleet", "appliance.forwarding.segment_process:main",
         ended_early=600, nice=10, after="control", dispensable=True, group="rosrv-api", stands_by=True,
@@ -165,15 +159,19 @@ def roles_of(
     sections: Sections = DEFAULTS,
     api: bool = True,
     fleet: bool = False,
-    lease: bool = False,
+    paired: bool = False,
     bundles: bool = False,
 ) -> tuple[Role, ...]:
     """Return the roles of an appliance with these parts. Raises `StartError` if a ROS program is missing."""
     require_programs(ROS_PROGRAMS)
     wanted = {
-        "api": api, "fleet": fleet, "lease": lease, "bundles": bundles,
+        "api": api, "fleet": fleet, "bundles": bundles,
     }  # fmt: skip
-    return tuple(role for role in ROLES if wanted.get(role.name, True) and role.configured(sections))
+    return tuple(
+        role
+        for role in ROLES
+        if wanted.get(role.name, True) and role.configured(sections) and (paired or not role.paired)
+    )
 
 
 def require_programs(packages: Mapping[Path, str]) -> None:

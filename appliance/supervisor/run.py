@@ -7,13 +7,11 @@ import socket
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import structlog
 
 from appliance.configuration.config_sources import plain
 from appliance.configuration.settings import Settings, Unasked
-from appliance.features.standby.membership import Membership
 from appliance.features.table import memories
 from appliance.network.close_ports import local_port_range
 from appliance.network.firewall.firewall_rules import StandbyAccess
@@ -27,13 +25,13 @@ from appliance.supervisor.port_check import free_port, require_free, spare_ports
 from appliance.supervisor.privileges import drop_unused_capabilities, raise_file_limit, raise_priority
 from appliance.supervisor.restore_mark import refuse_half_restored
 from appliance.supervisor.role import Facts, Role
-from appliance.supervisor.roles import LEASE_NICE
 from appliance.supervisor.sandbox.private_view import (
     PrivateView,
     program_folders,
     require_view,
     view_of,
 )
+from appliance.supervisor.service_gate import Pairing, ServiceGate
 from appliance.supervisor.service_manager import ServiceManager
 from appliance.supervisor.state_directory import StateDirectory
 from appliance.supervisor.supervisor import ControlReady, Supervisor
@@ -45,25 +43,19 @@ _FILES = 65_536  # open files: each kept socket counts twice while it is sent to
 log = structlog.get_logger()
 
 
-class StandbyStart(NamedTuple):
-    """The start of one of two appliances; `announce` is called once, when this appliance could take over."""
-
-    membership: Membership
-    announce: Callable[[], None]
-
-
 def run_appliance(
     settings: Settings,
     roles: tuple[Role, ...],
     ready: Callable[[ControlReady, Settings], None],
     *,
     node_ports: range,
-    standby: StandbyStart | None = None,
+    pairing: Pairing | None = None,
+    waits: Callable[[], None] = lambda: None,
 ) -> None:
     """Run the appliance until it is stopped. Raises `StartError` if it cannot start or go on.
 
     `ready` is called once, when nodes may connect; it gets control's message and the settings with all ports chosen.
-    With `standby` the appliance is one of two.
+    With `pairing` the appliance is one of two, and `waits` is called once when it could serve.
     `node_ports` is the policy's `[Ports] range`: the firewall limits connections to it, and `netns` forwards it.
     """
     if settings.isolation == "none":
@@ -84,16 +76,16 @@ def run_appliance(
             "node when it reconnects",
             mediation=settings.mediation,
         )
-    raised = _weigh() if standby is not None else 0
+    raised = _weigh(pairing) if pairing is not None else 0
     drop_unused_capabilities()
     refuse_half_restored(settings.state)
     with signals.held():
-        _run(settings, roles, ready, node_ports, standby, raised=raised)
+        _run(settings, roles, ready, node_ports, pairing=pairing, waits=waits, raised=raised)
 
 
-def _weigh() -> int:
-    """Give the supervisor of one of two appliances the weight of the witness, so that no load delays the lease."""
-    raised = raise_priority(-LEASE_NICE)
+def _weigh(pairing: Pairing) -> int:
+    """Give the supervisor of one of two appliances a priority, so that no load delays its gate."""
+    raised = raise_priority(-pairing.nice)
     if not raised:
         log.warning(
             "a busy machine can interrupt the service, because the lease has no priority: give CAP_SYS_NICE"
@@ -106,8 +98,9 @@ def _run(
     roles: tuple[Role, ...],
     ready: Callable[[ControlReady, Settings], None],
     node_ports: range,
-    standby: StandbyStart | None,
     *,
+    pairing: Pairing | None,
+    waits: Callable[[], None],
     raised: int,
 ) -> None:
     manager = ServiceManager.of(os.environ)
@@ -129,14 +122,13 @@ def _run(
             ),
             collector=settings.fleet.destination if settings.fleet.collector is not None else None,
             own_node=_ports_of_rosout(settings, node_ports),
-            standby=_standby_access(standby.membership) if standby is not None else None,
+            standby=StandbyAccess(pairing.other, pairing.port) if pairing is not None else None,
         )
         view = require_view(view_of(program_folders(), state.path), may_mount=has_privileges())
         isolation = isolation_for(settings.isolation, ports, settings.firewall.backend)
         state.prepare(roles)
         state.write_config(json.dumps(plain(settings)))
-        if standby is not None:
-            state.write_membership(standby.membership)
+        state.write_files(pairing.files if pairing is not None else ())
         raise_file_limit(_FILES)
         isolation.build()
         try:
@@ -149,7 +141,8 @@ def _run(
                 view=view,
                 manager=manager,
                 rosout_ports=ports.own_node,
-                stands_by=standby.announce if standby is not None else None,
+                pairing=pairing,
+                waits=waits,
                 raised=raised,
             )
         finally:
@@ -168,10 +161,6 @@ def _ports_of_rosout(settings: Settings, node_ports: range) -> range:
         [node_ports, range(chosen.first, chosen.last + 1), *(range(port, port + 1) for port in taken)],
         _UNPRIVILEGED,
     )
-
-
-def _standby_access(membership: Membership) -> StandbyAccess:
-    return StandbyAccess(membership.other_address, membership.port)
 
 
 def _files_of_fleet(settings: Settings) -> tuple[Path, ...]:
@@ -234,7 +223,8 @@ def _supervise(
     view: PrivateView | None,
     manager: ServiceManager,
     rosout_ports: range,
-    stands_by: Callable[[], None] | None,
+    pairing: Pairing | None,
+    waits: Callable[[], None],
     raised: int,
 ) -> None:
     with isolation.inside():
@@ -249,9 +239,9 @@ def _supervise(
         manager.ready(f"nodes may connect: ROS_MASTER_URI={said.master}")
 
     def say_standing_by() -> None:
-        if stands_by is not None:
-            stands_by()
-        manager.ready("ready to take over: rosrv standby status")
+        waits()
+        if pairing is not None:
+            manager.ready(pairing.ready)
 
     async def supervise() -> None:
         supervisor = Supervisor(
@@ -278,7 +268,8 @@ def _supervise(
             listeners={"api": api} if api is not None else {},
             memories=memories(settings.sections, settings.relays),
             memory=MonitorMemory(state.path, settings.relays),
-            stands_by=say_standing_by if stands_by is not None else None,
+            stands_by=say_standing_by,
+            gate=pairing.gate if pairing is not None else ServiceGate,
         )
         async with manager.watched():
             try:

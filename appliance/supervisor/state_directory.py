@@ -17,18 +17,11 @@ import fcntl
 import os
 import socket
 import stat
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from appliance.base.atomic_files import remove_unfinished, write_whole
-from appliance.features.standby.membership import (
-    LEASE_FILE,
-    LEFT_FILE,
-    LINK_FILE,
-    Membership,
-    path_of,
-    save_membership,
-)
+from appliance.features.table import FEATURES
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.role import Role
 from appliance.supervisor.users import account_of
@@ -48,9 +41,8 @@ def foreign(path: Path) -> str | None:
     if not path.is_dir():
         return None
     found = sorted(entry.name for entry in path.iterdir() if entry.name != _OF_THE_DISK)
-    membership = path_of(path)
-    joined = membership.is_file() or membership.with_name(LEFT_FILE).is_file()
-    if not found or _has_lock(path) or (path / _RESTORED).is_file() or joined:
+    prepared = any((path / name).is_file() for feature in FEATURES for name in feature.state_files)
+    if not found or _has_lock(path) or (path / _RESTORED).is_file() or prepared:
         return None
     more = " …" if len(found) > _SHOWN else ""
     return f"{path} is not the state directory of an appliance: it contains {', '.join(found[:_SHOWN])}{more}"
@@ -71,6 +63,7 @@ class StateDirectory:
     def __init__(self, path: Path) -> None:
         """Create the directory if needed, and lock it. Raises `StartError`."""
         self.path = path.absolute()
+        self._written: list[str] = []  # for the children, beside the configuration
         try:
             if (reason := foreign(self.path)) is not None:
                 raise StartError(f"{reason}; name another directory, empty or new, with --state DIR")
@@ -125,15 +118,19 @@ class StateDirectory:
         """Write the configuration for the children."""
         write_whole(self.config, text.encode(), 0o644)
 
-    def write_membership(self, membership: Membership) -> None:
-        """Write the membership for the two processes that need it, each with its secrets."""
-        for name, user, part in (
-            (LEASE_FILE, "rosrv-lease", membership.for_lease()),
-            (LINK_FILE, "rosrv", membership.for_control()),
-        ):
+    def write_files(self, files: Iterable[tuple[str, str, bytes]]) -> None:
+        """Write further files (name, user, contents) for the children, each readable by its user only.
+
+        Remove those of an earlier start, which may have been killed.
+        """
+        for path in self.config.parent.iterdir():
+            if path != self.config and not path.is_dir():
+                path.unlink()
+        for name, user, contents in files:
             account = account_of(user)
             owner = (account.uid, account.gid) if os.geteuid() == 0 else None
-            save_membership(self.config.with_name(name), part, owner)
+            write_whole(self.config.with_name(name), contents, 0o600, owner)
+            self._written.append(name)
 
     def open_admin_socket(self) -> socket.socket:
         """Return the listening socket for the other verbs; replace an old one."""
@@ -156,7 +153,7 @@ class StateDirectory:
     def close(self) -> None:
         """Remove the files of a running appliance, and release the lock."""
         (self.path / ADMIN_SOCKET).unlink(missing_ok=True)
-        for name in (self.config.name, LEASE_FILE, LINK_FILE):
+        for name in (self.config.name, *self._written):
             self.config.with_name(name).unlink(missing_ok=True)
         os.ftruncate(self._lock, 0)
         os.close(self._lock)

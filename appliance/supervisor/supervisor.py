@@ -8,10 +8,10 @@
    after at most a minute.
 4. If one end of a link is new, both ends get a new link. A new control first gets every kept socket, then its links,
    then the list of processes.
-5. One of two appliances (docs/standby.md) is passive until the lease is held. When the lease lapses, all processes that
-   serve the robot are stopped (SIGSTOP), and operators learn that the appliance is paused. They go on if the lease is
-   renewed in the same epoch. Otherwise they are killed and start again, passive: no state in memory is older than the
-   next takeover.
+5. One of two appliances is passive until its gate (`service_gate.py`) lets it serve. When the gate suspends the
+   service, all processes that serve the robot are stopped (SIGSTOP), and operators learn that the appliance is paused.
+   They go on if the gate resumes the service in the same epoch. Otherwise they are killed and start again, passive: no
+   state in memory is older than the next epoch.
 6. Stopping the appliance takes less than five seconds, even if children hang, and leaves no process behind.
 """
 
@@ -30,8 +30,6 @@ import structlog
 
 from appliance.base import clock
 from appliance.channel import messages
-from appliance.features.standby.lapse_answers import BECOMES_STANDBY, PAUSED, answer_for_control
-from appliance.features.standby.lease_watch import LeaseWatch, RoleChanges
 from appliance.ipsec.charon import PROGRAM as CHARON
 from appliance.supervisor import rosmaster_probe, signals
 from appliance.supervisor.clock_sync import clock_is_synchronised
@@ -40,6 +38,7 @@ from appliance.supervisor.inherited_listeners import InheritedListeners, Listene
 from appliance.supervisor.input_lender import lend_inputs
 from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.isolation_watchdog import IsolationWatchdog
+from appliance.supervisor.lapse_answers import answer_for_control
 from appliance.supervisor.monitor_memory import MonitorMemory
 from appliance.supervisor.process_handle import (
     ANSWER_SECONDS,
@@ -51,6 +50,7 @@ from appliance.supervisor.process_handle import (
 )
 from appliance.supervisor.process_slot import ProcessSlot
 from appliance.supervisor.role import Facts, Role, SharedMemory
+from appliance.supervisor.service_gate import RoleChanges, ServiceGate
 from appliance.supervisor.shutdown import end_all
 from appliance.supervisor.users import account_of
 
@@ -60,7 +60,7 @@ _START_SECONDS = 180.0  # a longer start must show progress
 _LOOK_SECONDS = 10.0
 OUTPUT_LINES = 40  # last lines kept of a failing process
 _LONGEST_LINE = 500  # characters
-_SUSPENDED_SECONDS = 0.2  # until a start is tried again that a lapse of the lease delays
+_SUSPENDED_SECONDS = 0.2  # until a start is tried again that a pause delays
 _MOST_UNANSWERED = 4096  # requests of control at once
 
 _FROM_ANY: tuple[type[messages.Message], ...] = (
@@ -79,8 +79,6 @@ _FROM_CONTROL: tuple[type[messages.Message], ...] = (
     messages.TunnelsWanted,
     messages.CompilerWanted,
 )
-_FROM_LEASE: tuple[type[messages.Message], ...] = (messages.LeaseHeld, messages.LeaseEnded)
-_FROM_ROLE = {"control": _FROM_CONTROL, "lease": _FROM_LEASE}
 
 log = structlog.get_logger()
 
@@ -112,11 +110,12 @@ class Supervisor:
         listeners: Mapping[str, socket.socket] | None = None,
         memories: Sequence[SharedMemory] = (),
         memory: MonitorMemory | None = None,
-        stands_by: Callable[[], None] | None = None,
+        stands_by: Callable[[], None] = lambda: None,
+        gate: Callable[[RoleChanges], ServiceGate] = ServiceGate,
     ) -> None:
         """Prepare the slots. `ready` is called once when nodes may connect; it may raise `StartError`.
 
-        `stands_by` is given on one of two appliances; it is called once when this appliance could take over.
+        `gate` decides whether the appliance may serve. `stands_by` is called once when it only waits for that.
         Control gets `admin`. `listeners` are the sockets of roles that listen; they stay open while a process restarts,
         so connections wait. `memories` are those of features. `memory` keeps the state of monitors; None: the state
         is lost when relays die.
@@ -134,10 +133,7 @@ class Supervisor:
         self.is_ready = False
         self._stands_by = stands_by
         self._parked = False
-        self._lease = LeaseWatch(
-            RoleChanges(self._activate, self._passivate, self._suspend, self._resume),
-            member=stands_by is not None,
-        )
+        self._gate = gate(RoleChanges(self._activate, self._passivate, self._suspend, self._resume))
         self._suspended_at = 0.0
         self._answers: asyncio.Task[None] | None = None  # to operators, instead of control
         self._watchdog = IsolationWatchdog(isolation or NoIsolation(), self._tell_control)
@@ -243,7 +239,7 @@ class Supervisor:
     def start(self, slot: ProcessSlot) -> None:
         """Start the process of a slot; after a failure try again with growing delays."""
         slot.due = None
-        if self._lease.suspended and slot.role.serves_robot:
+        if self._gate.suspended and slot.role.serves_robot:
             slot.due = asyncio.get_running_loop().call_later(_SUSPENDED_SECONDS, self.start, slot)
             return
         slot.wanted = False
@@ -285,11 +281,11 @@ class Supervisor:
 
     def _may_start(self, slot: ProcessSlot) -> bool:
         """Whether a role may run now: while this appliance is passive, most that follow control do not."""
-        return self._lease.active or slot.role.after is None or slot.role.stands_by
+        return self._gate.active or slot.role.after is None or slot.role.stands_by
 
     def _equip_control(self, process: ProcessHandle) -> None:
-        if self._lease.member and self._lease.epoch is not None:
-            process.send(messages.Activated(self._lease.epoch))
+        if self._gate.member and self._gate.epoch is not None:
+            process.send(messages.Activated(self._gate.epoch))
         for name, descriptor in self.kept:
             process.send(messages.SocketRestored(name), (descriptor,))
         process.send(messages.SocketsRestored(len(self.kept), self.is_ready))
@@ -304,7 +300,8 @@ class Supervisor:
     # --- messages of children -----------------------------------------------------------------------------
 
     def _received(self, process: ProcessHandle, message: Any, descriptors: tuple[int, ...]) -> None:
-        allowed = _FROM_ANY + _FROM_ROLE.get(process.role, ())
+        decisive = self._gate.accepts.get(process.role, ())
+        allowed = _FROM_ANY + decisive + (_FROM_CONTROL if process.role == "control" else ())
         if not isinstance(message, allowed):
             for descriptor in descriptors:
                 os.close(descriptor)
@@ -319,10 +316,8 @@ class Supervisor:
                 self._child_ready(process, detail)
             case messages.Failed(said, output):
                 self._cannot_serve(process, _printable(said), output)
-            case messages.LeaseHeld(until, epoch):
-                self._lease.held(until, epoch)
-            case messages.LeaseEnded(renewable):
-                self._lease.lapsed() if renewable else self._lease.ended()
+            case _ if isinstance(message, decisive):
+                self._gate.heard(message)
             case _:
                 self.control_said(process, message, descriptors)
 
@@ -428,7 +423,7 @@ class Supervisor:
         for slot in self.slots:
             if slot.role.stands_by and slot.is_free:
                 self.start(slot)
-        if self._stands_by is not None and not self._parked:
+        if not self._parked:
             self._parked = True
             self._stands_by()
 
@@ -438,9 +433,9 @@ class Supervisor:
 
     def _passivate(self) -> None:
         """End everything that serves the robot; each process starts again, passive."""
-        log.warning("this appliance is not active any more; its processes start again as a standby")
+        log.warning("this appliance is not active any more; its processes start again, passive")
         self._tell("api", messages.ServicePaused(""))
-        self._answer_for_control(BECOMES_STANDBY)
+        self._answer_for_control(self._gate.ended_text)
         for name, _descriptor in self.kept:
             if name != ADMIN:
                 self.kept.drop(name)
@@ -461,8 +456,8 @@ class Supervisor:
             if slot.process is not None:
                 slot.process.kill(signal.SIGSTOP)
         self._suspended_at = clock.now()
-        self._answer_for_control(PAUSED)
-        self._tell("api", messages.ServicePaused(PAUSED))
+        self._answer_for_control(self._gate.paused)
+        self._tell("api", messages.ServicePaused(self._gate.paused))
         log.warning("the lease has lapsed; nothing is answered or relayed until it is renewed")
         return True
 
@@ -494,7 +489,7 @@ class Supervisor:
         reason = await self._watchdog.control_ready(said.inner_port, said.own_port)
         if reason is not None and not self.is_ready:
             self.stop(reason)
-        if self.stopping.is_set() or not process.alive or not self._lease.active:
+        if self.stopping.is_set() or not process.alive or not self._gate.active:
             return
         for slot in self.slots:
             if slot.role.after == process.role and slot.is_free:
@@ -569,7 +564,7 @@ class Supervisor:
             now = clock.now()
             slept, before = now - before - 1.0, now
             for slot in self.slots:
-                suspended = self._lease.suspended and slot.role.serves_robot
+                suspended = self._gate.suspended and slot.role.serves_robot
                 if slot.process is not None and not suspended:
                     self._look_at(slot, slot.process, slept)
                 if slot.recovers():
@@ -612,17 +607,14 @@ class Supervisor:
         self._process_died.set()
         if self.stopping.is_set():
             return
-        if slot.role.name == "lease":
-            self._lease.not_renewable()
-        elif self._lease.suspended and slot.role.serves_robot:
-            self._lease.ended()
+        self._gate.died(slot.role.name, serves_robot=slot.role.serves_robot)
         if slot.role.on_demand and code == 0:
             self._ended(slot)
             return
         if slot.pardoned:
             slot.pardoned = False
             if slot.role.name == "charon":
-                self._spawn(self._watchdog.clear_tunnels(lambda: not self._lease.active))
+                self._spawn(self._watchdog.clear_tunnels(lambda: not self._gate.active))
             if not slot.role.on_demand or slot.wanted:
                 self.start(slot)
             return
@@ -673,7 +665,7 @@ class Supervisor:
         self.stopping.set()
         for task in self._tasks:
             task.cancel()
-        for slot in self.slots if self._lease.suspended else ():
+        for slot in self.slots if self._gate.suspended else ():
             if slot.process is not None and slot.role.serves_robot:
                 slot.process.kill()  # it is stopped, and cannot end in order
         await end_all(self.slots, self._process_died)

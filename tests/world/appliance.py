@@ -13,11 +13,12 @@ from appliance.channel import messages
 from appliance.configuration.settings import Audit, LivenessSection, Settings
 from appliance.control.assembly.assembly import Parts
 from appliance.control.process import _run as run_control
-from appliance.features.standby.lease_watch import LeaseWatch, RoleChanges
+from appliance.features.standby.lease_watch import LeaseWatch
 from appliance.features.standby.membership import LINK_FILE, Membership, save_membership
 from appliance.features.standby.process import EPOCH, LeaseProcess
 from appliance.relay.connections.admission import missing
 from appliance.relay.grant_table import GrantTable
+from appliance.supervisor.service_gate import RoleChanges, ServiceGate
 from tests.world.loop import BrokenPromiseError, Machine, Process
 from tests.world.network import LinkEnd
 from tests.world.ros import RosMaster
@@ -188,9 +189,9 @@ class Appliance:
         self.sockets.clear()
         self.start_rosmaster()
         self.start_relay()
-        self.watch = LeaseWatch(
-            RoleChanges(self._activate, self._passivate, self._suspend, lambda: self._pause(paused=False)),
-            member=self.membership is not None,
+        kind = ServiceGate if self.membership is None else LeaseWatch
+        self.watch = kind(
+            RoleChanges(self._activate, self._passivate, self._suspend, lambda: self._pause(paused=False))
         )
 
     def start(self) -> None:
@@ -229,11 +230,7 @@ class Appliance:
         self.lease.start(made.run()).add_done_callback(self.world.done)
 
     def _heard_lease(self, message: Any, _descriptors: tuple[Any, ...]) -> None:
-        match message:
-            case messages.LeaseHeld(until, epoch):
-                self.watch.held(until, epoch)
-            case messages.LeaseEnded(renewable):
-                self.watch.lapsed() if renewable else self.watch.ended()
+        self.watch.heard(message)
 
     def _activate(self, epoch: int) -> None:
         self.world.activated(self, epoch)
@@ -253,8 +250,7 @@ class Appliance:
 
     def _end_lapse(self) -> None:
         """Become passive, because a process ended that would start again unpaused."""
-        if self.watch.suspended:
-            self.watch.ended()
+        self.watch.died("control", serves_robot=True)
 
     def pause_lease(self, seconds: float) -> None:
         """Let the process `lease` run no callback for some seconds."""

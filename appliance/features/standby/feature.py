@@ -1,14 +1,35 @@
 """The feature standby: two appliances, of which one stands by to take over (docs/standby.md)."""
 
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 from appliance.cli.verb_table import Group, Verb
 from appliance.features.feature import Feature
+from appliance.features.standby.membership import FILE, FOLDER, LEASE_FILE, LEASE_NICE, LEFT_FILE
+from appliance.supervisor.role import Role
+from appliance.supervisor.sandbox.sandbox_plan import NETWORK, SandboxPlan
+
+if TYPE_CHECKING:
+    from appliance.supervisor.service_gate import Pairing
 
 _PLACE = "appliance.features.standby."
 
+
+def _pairing(state: Path) -> "Pairing | None":
+    from appliance.features.standby.pairing import pairing_in  # noqa: PLC0415  only the supervisor needs it
+
+    return pairing_in(state)
+
+
 STANDBY = Feature(
     "standby",
-    may_start=f"{_PLACE}start_gate:StandbyGate",
-    inherit=f"{_PLACE}service_begin:inherit",
+    roles=(
+        Role(
+            "lease", "rosrv-lease", "lease", f"{_PLACE}process:main",
+            path=lambda facts: facts.run(LEASE_FILE), links=("control",), outlives_takeover=True, nice=LEASE_NICE,
+            paired=True, sandbox=lambda _facts: SandboxPlan(allowlist=True, families=NETWORK, binds=None),
+        ),
+    ),
     verbs={
         "standby": Group(
             "Run two appliances, of which one stands by to take over.",
@@ -22,4 +43,8 @@ STANDBY = Feature(
             after="host",
         ),
     },
-)
+    pairing=_pairing,
+    state_files=(f"{FOLDER}/{FILE}", f"{FOLDER}/{LEFT_FILE}"),
+    may_start=f"{_PLACE}start_gate:StandbyGate",
+    inherit=f"{_PLACE}service_begin:inherit",
+)  # fmt: skip

@@ -9,44 +9,51 @@ in the same epoch; in all other cases they end.
 """
 
 import asyncio
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import Any
 
 from appliance.base import clock
+from appliance.channel import messages
+from appliance.supervisor.service_gate import RoleChanges, ServiceGate
 
 LONGEST_LAPSE = 10.0  # seconds; then the appliance stands by, and answers its operators again
+PAUSED = (
+    "the appliance is paused: its lease has lapsed, and it answers and relays nothing until the lease is renewed; after"
+    f" {LONGEST_LAPSE:g} s it becomes the standby. Check its load, and its network to the robot and the other appliance"
+)
+BECOMES_STANDBY = (
+    "this appliance lost its lease, and is starting again as the standby: try again in some seconds"
+)
 
 
-@dataclass(frozen=True)
-class RoleChanges:
-    """The orders at a change of the role.
+class LeaseWatch(ServiceGate):
+    """The role of one of two appliances, by the reports of the process `lease`."""
 
-    `activate(epoch)` and `passivate()` begin and end the service. `suspend()` stops it, with all state kept; it returns
-    False if that is not possible now. `resume()` goes on.
-    """
+    accepts: Mapping[str, tuple[type, ...]] = {"lease": (messages.LeaseHeld, messages.LeaseEnded)}
+    member = True
+    paused, ended_text = PAUSED, BECOMES_STANDBY
 
-    activate: Callable[[int], None]
-    passivate: Callable[[], None]
-    suspend: Callable[[], bool]
-    resume: Callable[[], None]
-
-
-class LeaseWatch:
-    """The role of this appliance. An appliance that is not one of two (`member` is False) is always active."""
-
-    def __init__(self, changes: RoleChanges, *, member: bool) -> None:
-        self.member = member
-        self.epoch: int | None = None if member else 0
-        self.suspended = False
+    def __init__(self, changes: RoleChanges) -> None:
+        super().__init__(changes)
+        self.epoch = None
         self._renewable = True
-        self._changes = changes
         self._until = 0.0
         self._timer: asyncio.TimerHandle | None = None
 
-    @property
-    def active(self) -> bool:
-        """Whether this appliance may serve."""
-        return self.epoch is not None and not self.suspended
+    def heard(self, message: Any) -> None:
+        """Take a report of the lease."""
+        match message:
+            case messages.LeaseHeld(until, epoch):
+                self.held(until, epoch)
+            case messages.LeaseEnded(renewable):
+                self.lapsed() if renewable else self.ended()
+
+    def died(self, role: str, *, serves_robot: bool) -> None:
+        """End a lapse if what could end it in order is gone."""
+        if role == "lease":
+            self.not_renewable()
+        elif self.suspended and serves_robot:
+            self.ended()
 
     def held(self, until: float, epoch: int) -> None:
         """Take a report: the lease is valid until `until` (seconds of CLOCK_BOOTTIME), in this epoch."""
@@ -65,7 +72,7 @@ class LeaseWatch:
 
     def lapsed(self) -> None:
         """Take a report: the lease is not valid, but it may be renewed."""
-        if not self.member or self.epoch is None or self.suspended:
+        if self.epoch is None or self.suspended:
             return
         self._stop_timer()
         if not self._renewable or not self._changes.suspend():
@@ -77,7 +84,7 @@ class LeaseWatch:
     def ended(self) -> None:
         """Take a report: the lease is not valid any more, and is not renewed."""
         self._stop_timer()
-        if self.member and self.epoch is not None:
+        if self.epoch is not None:
             self.epoch, self.suspended = None, False
             self._changes.passivate()
 

@@ -13,6 +13,7 @@ FILE = "membership.json"
 LEASE_FILE, LINK_FILE = "lease.json", "link.json"
 """The parts of it that the supervisor writes for the process `lease` and for control."""
 
+LEASE_NICE = -10  # as the unit of the witness has
 LEFT_FILE = "left.json"
 """The last membership that this appliance left, without its secrets."""
 
@@ -99,4 +100,9 @@ def load_membership(path: Path) -> Membership | None:
 def save_membership(path: Path, membership: Membership, owner: tuple[int, int] | None = None) -> None:
     """Write the membership, readable by its owner (user id, group id) only. Raises `OSError`."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    write_whole(path, msgspec.json.format(msgspec.json.encode(membership)), 0o600, owner)
+    write_whole(path, encoded(membership), 0o600, owner)
+
+
+def encoded(membership: Membership) -> bytes:
+    """Return the contents of a file with a membership."""
+    return msgspec.json.format(msgspec.json.encode(membership))

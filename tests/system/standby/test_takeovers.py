@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 from appliance.channel import admin
-from appliance.features.standby.lapse_answers import PAUSED
+from appliance.features.standby.lease_watch import PAUSED
 from appliance.features.standby.membership import PORT
 from appliance.features.standby.witness import EXPIRY
 from examples.landshark.lab import Host

@@ -7,7 +7,6 @@ import pytest
 
 from appliance.backup.contents import BackupError
 from appliance.backup.rotate_authority import rotate_authority
-from appliance.features.standby.membership import path_of
 from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.supervisor.state_directory import StateDirectory
 
@@ -44,12 +43,7 @@ def test_it_needs_a_stopped_single_appliance_with_an_authority(state: Path, tmp_
     before = CertificateAuthority(state / "signer").certificate
     with closing(StateDirectory(state)), pytest.raises(BackupError, match="stop the appliance first"):
         rotate_authority(state)
-    path_of(state).parent.mkdir()
-    path_of(state).write_text("{}")
-    with pytest.raises(BackupError, match="rosrv standby leave"):
-        rotate_authority(state)
     assert CertificateAuthority(state / "signer").certificate == before
-    path_of(state).unlink()
     rotate_authority(state)
     with pytest.raises(BackupError, match="no authority yet"):
         rotate_authority(state)

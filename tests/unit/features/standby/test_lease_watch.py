@@ -9,7 +9,8 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from appliance.base import clock
-from appliance.features.standby.lease_watch import LeaseWatch, RoleChanges
+from appliance.features.standby.lease_watch import LeaseWatch
+from appliance.supervisor.service_gate import RoleChanges
 from tests.support import autojump
 from tests.support.virtual_clock import VirtualClock
 
@@ -17,7 +18,7 @@ from tests.support.virtual_clock import VirtualClock
 class Role:
     """A watch, and what it ordered."""
 
-    def __init__(self, *, member: bool = True) -> None:
+    def __init__(self) -> None:
         self.orders: list[int | str] = []
         self.stopped = asyncio.Event()
         self.serving = True  # False: a process is only starting
@@ -27,7 +28,7 @@ class Role:
             self._suspend,
             lambda: self.orders.append("resumed"),
         )
-        self.watch = LeaseWatch(changes, member=member)
+        self.watch = LeaseWatch(changes)
 
     def _stop(self, order: str) -> None:
         self.orders.append(order)
@@ -44,11 +45,11 @@ class Role:
         return clock.since_boot()
 
 
-def run(work: Callable[[Role], Awaitable[None]], *, member: bool = True) -> None:
+def run(work: Callable[[Role], Awaitable[None]]) -> None:
     """Run a test in a loop."""
 
     async def inside() -> None:
-        await work(Role(member=member))
+        await work(Role())
 
     autojump.run(inside())
 
@@ -197,13 +198,3 @@ def test_the_time_counts_while_the_machine_sleeps() -> None:
             await role.until_stopped()
 
     run(work)
-
-
-def test_a_single_appliance_is_always_active() -> None:
-    """It has no lease that could end."""
-
-    async def work(role: Role) -> None:
-        role.watch.ended()
-        assert role.watch.active and role.orders == []
-
-    run(work, member=False)

@@ -17,7 +17,7 @@ from appliance.features.standby.replication_frames import Introduction
 from appliance.features.standby.shared_authority import SharedAuthority
 from appliance.hosts.appliances import Appliances
 from appliance.hosts.certificate_requests import AuthorityError
-from appliance.hosts.enrolment import HostRefusedError
+from appliance.hosts.host_table import HostRefusedError
 from appliance.hosts.revoked_certificates import RevokedCertificates
 from appliance.hosts.stored_authority import StoredAuthority
 from appliance.ipsec.requests import fingerprint, make_key, signing_request
@@ -247,6 +247,7 @@ def test_a_kit_of_two_appliances_has_both(tmp_path: Path, monkeypatch: pytest.Mo
         kit = await bench.certification.kit("a", None)
         assert kit.second == ""
         assert "later, rosrv host kit a" in (kit.warning or "")
+        assert isinstance(bench.appliances, ApplianceTable)
         await bench.appliances.introduce(other, bench.shared)
         kit = await bench.certification.kit("a", None)
         assert (kit.second, kit.pin, kit.warning) == ("192.168.1.21", f"sha256//pin;{pin}", None)

@@ -1,7 +1,7 @@
-"""Answer operators while a lapse of the lease stops control, and while control starts again as that of a standby.
+"""Answer operators while control is stopped, and while it starts again without the right to serve.
 
 Requests on the admin socket would otherwise wait for ten seconds and more. The supervisor reads each request up to its
-line end without parsing it, and gives every request the same answer. Most lapses are shorter than `_PATIENCE_SECONDS`:
+line end without parsing it, and gives every request the same answer. Most pauses are shorter than `_PATIENCE_SECONDS`:
 control itself answers after these.
 """
 
@@ -13,15 +13,6 @@ from functools import partial
 
 import msgspec
 
-from appliance.features.standby.lease_watch import LONGEST_LAPSE
-
-PAUSED = (
-    "the appliance is paused: its lease has lapsed, and it answers and relays nothing until the lease is renewed; after"
-    f" {LONGEST_LAPSE:g} s it becomes the standby. Check its load, and its network to the robot and the other appliance"
-)
-BECOMES_STANDBY = (
-    "this appliance lost its lease, and is starting again as the standby: try again in some seconds"
-)
 _PATIENCE_SECONDS = 1.0
 _REQUEST_SECONDS = 1.0
 _LONGEST_REQUEST = 16 << 20  # bytes, as in `control/admin_socket.py`

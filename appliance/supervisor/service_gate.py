@@ -1,0 +1,68 @@
+"""Decide whether the appliance may serve. A feature can bring another decision for one of two appliances."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class RoleChanges:
+    """The orders at a change of the role.
+
+    `activate(epoch)` and `passivate()` begin and end the service. `suspend()` stops it, with all state kept; it returns
+    False if that is not possible now. `resume()` goes on.
+    """
+
+    activate: Callable[[int], None]
+    passivate: Callable[[], None]
+    suspend: Callable[[], bool]
+    resume: Callable[[], None]
+
+
+class ServiceGate:
+    """The gate of a single appliance, which always may serve, in epoch 0.
+
+    `accepts` has the messages of roles that the gate decides by. Operators get `paused` as the answer while the service
+    is suspended, and `ended` while this appliance stops serving.
+    """
+
+    accepts: Mapping[str, tuple[type, ...]] = {}
+    member = False
+    suspended = False
+    paused = ended_text = ""
+
+    def __init__(self, changes: RoleChanges) -> None:
+        self._changes = changes
+        self.epoch: int | None = 0
+
+    @property
+    def active(self) -> bool:
+        """Whether this appliance may serve."""
+        return self.epoch is not None and not self.suspended
+
+    def heard(self, message: Any) -> None:
+        """Take a message of `accepts`."""
+
+    def died(self, role: str, *, serves_robot: bool) -> None:
+        """Note the death of a process."""
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """One of two appliances, before it starts.
+
+    `robot` is an address of the robot. Only `other` may send to `port`. `files` are written for the processes: names,
+    users, contents. The supervisor gets the priority `nice`. `fixed_authority` is why the authority of hosts cannot be
+    replaced. `event` and `text` are printed when this appliance could serve, and `ready` is its state for systemd.
+    """
+
+    robot: str
+    other: str
+    port: int
+    files: tuple[tuple[str, str, bytes], ...]
+    nice: int
+    gate: Callable[[RoleChanges], ServiceGate]
+    fixed_authority: str
+    event: Mapping[str, str]
+    text: str
+    ready: str

@@ -1,0 +1,62 @@
+"""What the start of an appliance that is one of two needs, from the membership in its state directory."""
+
+import json
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from appliance.backup.contents import BackupError
+from appliance.backup.rotate_authority import rotate_authority
+from appliance.features.standby.membership import LINK_FILE, path_of, save_membership
+from appliance.features.table import pairing_in
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.roles import roles_of
+from appliance.supervisor.state_directory import StateDirectory, foreign
+from tests.support.standby_site import memberships
+
+
+@pytest.fixture
+def state(tmp_path: Path) -> Path:
+    """Return the state directory of an appliance that joined before its first start."""
+    made, *_settings = memberships(tmp_path / "made")
+    save_membership(path_of(tmp_path / "state"), made["a"])
+    return tmp_path / "state"
+
+
+def test_each_process_gets_its_own_secrets(state: Path) -> None:
+    """Control gets no key of the lease, and the lease no key of the replication."""
+    pairing = pairing_in(state)
+    assert pairing is not None
+    lease, link = (json.loads(contents) for _name, _user, contents in pairing.files)
+    assert lease["witness_key"] and lease["peer_key"] and not lease["key"]
+    assert link["key"] and not link["witness_key"] and not link["peer_key"]
+    assert (pairing.robot, pairing.other) == (link["witness"], link["other_address"])
+    extra = {role.name for role in roles_of(paired=True)} - {role.name for role in roles_of()}
+    assert extra == {"lease"}
+
+
+def test_files_of_a_pair_end_with_the_pair(state: Path) -> None:
+    """An appliance that was killed and then left its pair starts as a single one: control finds no membership."""
+    assert foreign(state) is None
+    link = state / "run" / LINK_FILE
+    with closing(StateDirectory(state)) as directory:
+        directory.prepare(())
+        pairing = pairing_in(state)
+        assert pairing is not None
+        directory.write_files(pairing.files)
+        assert link.stat().st_mode & 0o777 == 0o600
+        path_of(state).unlink()
+        directory.write_files(())
+        assert not link.exists()
+    assert pairing_in(state) is None
+
+
+def test_a_damaged_membership_stops_the_start(state: Path) -> None:
+    """The error names the file and the command; a pair also keeps its authority."""
+    with pytest.raises(BackupError, match="end the pair first"):
+        rotate_authority(state)
+    path_of(state).write_text("{}")
+    for error, work in ((StartError, pairing_in), (BackupError, rotate_authority)):
+        with pytest.raises(error, match=r"membership\.json cannot be used: .*rosrv standby leave"):
+            work(state)
