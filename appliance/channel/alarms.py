@@ -10,7 +10,7 @@ from msgspec import structs
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.status import BlocksState, BundlesState, ProcessInfo, Status
 from appliance.channel.status_summary import no_relay, probe_failed
-from appliance.features.standby.standby_summary import PATIENCE_SECONDS, standby_troubles
+from appliance.features.views import pair_view
 
 Severity = Literal["alarm", "warning", "notice"]
 About = Literal["system", "policy", "monitors", "hosts", "audit"]
@@ -41,7 +41,7 @@ def open_alarms(status: Status) -> list[Alarm]:
     found += [("warning", "ipsec", "hosts", line) for line in status.ipsec.troubles]
     found += _blocks(status.blocks)
     if status.standby is not None:
-        troubles = standby_troubles(status.standby, PATIENCE_SECONDS)
+        troubles = pair_view().alarms(status.standby)
         found += [(one.severity, one.kind, "system", one.text) for one in troubles]
     found += _bundles(status.bundles)
     alarms = (

@@ -17,7 +17,6 @@ from appliance.base.actors import DISK
 from appliance.channel.admin import A, AdminAnswer, StandbyWanted, StatusWanted
 from appliance.channel.alarms import Alarm, activity, open_alarms
 from appliance.channel.answers.host_answers import PortsSeen
-from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.answers.status import (
     BundlesState,
     ClockState,
@@ -32,8 +31,7 @@ from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
 from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusView, Watch, watched
-from appliance.features.standby.standby_summary import standby_troubles
-from appliance.features.standby.standby_view import answer_in_words, lag_in_words, standby_view
+from appliance.features.views import pair_view
 from rosmop.tool.tables import table_of
 from rosmop.tool.terminal import counted
 
@@ -97,8 +95,7 @@ def _answer(appliance: Appliance) -> AdminAnswer[StatusView]:
     """Return the status; on a standby, which has none, the state of both appliances. Raises `NotRunningError`."""
     answer = appliance.ask(StatusWanted())
     if answer.trouble == "standby":
-        state = appliance.ask(StandbyWanted())
-        return _shown(state, standby_view)
+        return _shown(appliance.ask(StandbyWanted()), pair_view().status)
     return _shown(answer, _view)
 
 
@@ -162,7 +159,7 @@ def _grid(body: Status) -> Table:
     if doubted is not None:
         grid.add_row("clock", Text(doubted, style=_YELLOW))
     if body.standby is not None:
-        grid.add_row("standby", _standby(body.standby))
+        grid.add_row("standby", pair_view().line(body.standby))
     for name, text in _others_rules(body.firewall):
         grid.add_row(name, text)
     grid.add_row("policy", _policy(body.policy))
@@ -204,12 +201,6 @@ def _grid(body: Status) -> Table:
             "recorder", f"{counted(kept.recordings, 'recording')}, {kept.bytes / 1e6:.1f} MB{making}"
         )
     return grid
-
-
-def _standby(state: StandbyState) -> Text:
-    other, witness = lag_in_words(state.other), answer_in_words(state.witness)
-    line = f"{state.name} is {state.role}; {state.other.name}: {other}; witness: {witness}"
-    return Text(line, style=_YELLOW if any(standby_troubles(state)) else "")
 
 
 def _bundle(bundles: BundlesState) -> Text:

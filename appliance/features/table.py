@@ -1,6 +1,6 @@
 """List the features of the product. The core imports only this module and `feature.py` of the folder `features`.
 
-To remove a feature, remove its folder, and its import and its row here.
+To remove a feature, remove its folder, and its imports and rows here and in `views.py`.
 """
 
 import pkgutil

@@ -1,6 +1,5 @@
 """Answer `/metrics` in Prometheus's format."""
 
-import math
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -25,7 +24,7 @@ from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.answers.status import BundlesState, ForwardingState, ProcessInfo
 from appliance.channel.status_summary import no_relay, probe_failed, process_names
-from appliance.features.standby.standby_summary import both_active
+from appliance.features.views import pair_view
 from appliance.telemetry.metrics import METRICS, Metric
 
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
@@ -66,7 +65,7 @@ def rendered(body: Measures, calls: Mapping[tuple[str, str], int]) -> bytes:
 
 def rendered_standby(state: StandbyState, calls: Mapping[tuple[str, str], int]) -> bytes:
     """Return the metrics of a standby, which has only its own state and the numbers of REST calls."""
-    samples = {**_standby(state), "rosrv_rest_calls_total": calls.items()}
+    samples = {**pair_view().samples(state), "rosrv_rest_calls_total": calls.items()}
     return _page(samples, [metric for metric in METRICS if metric.name in samples])
 
 
@@ -168,7 +167,7 @@ def _samples(body: Measures) -> dict[str, _Samples]:
         "rosrv_recorder_up": [((), recorder.running)] if recorder else [],
         "rosrv_recordings": [((), recorder.recordings)] if recorder else [],
         "rosrv_recordings_bytes": [((), recorder.bytes)] if recorder else [],
-        **_standby(status.standby),
+        **pair_view().samples(status.standby),
         "rosrv_policy_revision": [((), policy.revision)],
         "rosrv_policy_differs_from_file": [((), policy.differs_from_file)],
         "rosrv_process_restarts_total": [
@@ -188,28 +187,6 @@ def _forwarding(to: str, forwarding: ForwardingState | None) -> dict[str, _Sampl
         f"rosrv_{to}_lag_records": [((), forwarding.behind)],
         f"rosrv_{to}_lag_seconds": [((), forwarding.seconds)],
         f"rosrv_{to}_missed_total": [((), forwarding.missed)],
-    }
-
-
-def _standby(state: StandbyState | None) -> dict[str, _Samples]:
-    if state is None:
-        return {metric.name: [] for metric in METRICS if metric.name.startswith("rosrv_standby_")}
-    other, answered, active = state.other, state.witness.answered_seconds, state.role == "active"
-    return {
-        "rosrv_standby_role": [((role,), state.role == role) for role in ("active", "standby")],
-        "rosrv_standby_connected": [((), other.connected)],
-        "rosrv_standby_in_sync": [((), other.in_sync)] if active else [],
-        "rosrv_standby_obstacle": [((), bool(state.obstacle))],
-        "rosrv_standby_behind_changes": [((), other.behind_changes)] if active else [],
-        "rosrv_standby_behind_bytes": [((), other.behind_bytes)] if active else [],
-        "rosrv_standby_witness_age_seconds": [((), math.inf if answered is None else answered)],
-        "rosrv_standby_other_witness_age_seconds": [((), seen)]
-        if (seen := other.witness_seconds) is not None
-        else [],
-        "rosrv_standby_witness_trouble": [((), bool(state.witness.trouble))],
-        "rosrv_standby_both_active": [((), both_active(state))] if active else [],
-        # Until the epoch is known after a restart: a counter that falls to 0 and returns would look like takeovers.
-        "rosrv_standby_takeovers_total": [((), state.epoch)] if state.epoch else [],
     }
 
 

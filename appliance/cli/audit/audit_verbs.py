@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, TextIO, TypeVar
+from typing import Annotated, Any, TextIO
 
 import msgspec
 import typer
@@ -40,21 +40,13 @@ from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_over_rest import RestLog
 from appliance.cli.connection.target import Appliance, speaks_with
-from appliance.features.standby.membership import MembershipError, load_membership, path_of
-from appliance.features.standby.takeover_table import print_pair
-from appliance.features.standby.takeover_verification import (
-    PairVerification,
-    VerifiedLog,
-    verify_alone,
-    verify_takeovers,
-)
+from appliance.features.views import pair_view
 from rosmop.tool.progress_bar import progress
 
 _CHECKPOINT_SECONDS = (
     5.0  # pause between two queries: a checkpoint is made once a minute, and REST queries are recorded
 )
 _PROGRESS_EVERY = 1000  # records
-_R = TypeVar("_R", Verification, PairVerification)
 _JSON_HELP = "One JSON object a line (NDJSON)"
 _ALWAYS_JSON_HELP = "Accepted; the output is always NDJSON"
 
@@ -174,16 +166,14 @@ def verify(
         source = appliance.audit()
         partner = None if other is None else _files(source, other)
         result = _verified(source, key, checkpoints)
-        absent = _absent(partner[1], other) if partner is not None and other is not None else ""
-        if partner is not None and absent:
-            pair = verify_alone(VerifiedLog(partner[0].path, result), absent)
-            _print_result(pair, print_pair, as_json_lines=appliance.as_json)
-        elif partner is not None:
-            of_other = VerifiedLog(partner[1].path, _verified(partner[1], other_key, other_checkpoints))
-            pair = verify_takeovers(VerifiedLog(partner[0].path, result), of_other)
-            _print_result(pair, print_pair, as_json_lines=appliance.as_json)
-        else:
+        if partner is None or other is None:
             _print_result(result, print_verification, as_json_lines=appliance.as_json)
+            return
+        own, of_other = partner
+        found, printed = pair_view().verify(
+            own.path, result, of_other.path, other, lambda: _verified(of_other, other_key, other_checkpoints)
+        )
+        _print_result(found, printed, as_json_lines=appliance.as_json)
 
 
 def _files(source: FileLog | RestLog, other: Path) -> tuple[FileLog, FileLog]:
@@ -194,17 +184,6 @@ def _files(source: FileLog | RestLog, other: Path) -> tuple[FileLog, FileLog]:
     return source, FileLog(other)
 
 
-def _absent(log: FileLog, state: Path) -> str:
-    """Return the name of the other appliance of a pair if it has no log; else an empty text."""
-    if log.path.exists():
-        return ""
-    try:
-        membership = load_membership(path_of(state))
-    except MembershipError as error:
-        fail(str(error), 2)
-    return membership.name if membership is not None else ""
-
-
 def _verified(source: FileLog | RestLog, key: Path | None, checkpoints: Path | None) -> Verification:
     copies = None if checkpoints is None else read_copies(checkpoints)
     public_key = None if key is None else read_public_key(key)
@@ -212,7 +191,7 @@ def _verified(source: FileLog | RestLog, key: Path | None, checkpoints: Path | N
         return source.verify(public_key, copies, report)
 
 
-def _print_result(result: _R, printed: Callable[[_R], None], *, as_json_lines: bool) -> None:
+def _print_result(result: Any, printed: Callable[[Any], None], *, as_json_lines: bool) -> None:
     """Print the result of a verification; exit with status 1 if it has findings."""
     if as_json_lines:
         write(json.dumps(msgspec.to_builtins(result)))

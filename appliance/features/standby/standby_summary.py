@@ -1,9 +1,9 @@
 """Judge the state of two appliances for alarms, metrics and `rosrv standby status`. No I/O."""
 
 from collections.abc import Iterator
-from typing import Literal, NamedTuple
 
 from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState, WitnessSeen
+from appliance.features.view import Trouble
 
 PATIENCE_SECONDS = 60.0
 """How long the standby may be away or behind before this is an alarm: an update of its machine takes longer."""
@@ -12,15 +12,7 @@ SILENT_SECONDS = 5.0
 """From this age of its last answer on, the witness is silent. It is asked every 0.3 s."""
 
 
-class StandbyTrouble(NamedTuple):
-    """A condition that needs attention; `text` has the reason and what to do."""
-
-    severity: Literal["alarm", "warning"]
-    kind: str
-    text: str
-
-
-def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[StandbyTrouble]:
+def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Trouble]:
     """Yield what is wrong, the most urgent first; `patience`: seconds that the other may be away or behind."""
     other = state.other
     if both_active(state):
@@ -29,7 +21,7 @@ def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Sta
             f"both appliances claim to be active: this one does, but the witness names {holder}, and the robot admits"
             f" only {holder}; stop this appliance, then start it again"
         )
-        yield StandbyTrouble("alarm", "both-active", text)
+        yield Trouble("alarm", "both-active", text)
     if state.obstacle:
         yield _unready(state)
     lasting = other.trouble_seconds
@@ -73,7 +65,7 @@ def lasting(seconds: float) -> str:
     return f"{int(seconds)} s"
 
 
-def _away(state: StandbyState, seconds: float) -> StandbyTrouble:
+def _away(state: StandbyState, seconds: float) -> Trouble:
     other, away = state.other, lasting(seconds)
     why = f": {other.reason}" if other.reason else ""
     check = "check that it runs, and the network between the two"
@@ -84,49 +76,49 @@ def _away(state: StandbyState, seconds: float) -> StandbyTrouble:
             f"the active appliance {other.name} ({other.address}) has not been connected for {away}, so its changes"
             f" since then are missing here{why}; {check}"
         )
-    return StandbyTrouble("warning", "standby-away", text)
+    return Trouble("warning", "standby-away", text)
 
 
-def _unready(state: StandbyState) -> StandbyTrouble:
+def _unready(state: StandbyState) -> Trouble:
     active = state.role == "active"
     name, address = (state.other.name, state.other.address) if active else (state.name, state.address)
     text = (
         f"the standby {name} ({address}) cannot take over: {state.obstacle}; once this is corrected, {name} notices it"
         " within seconds"
     )
-    return StandbyTrouble("alarm", "standby-unready", text)
+    return Trouble("alarm", "standby-unready", text)
 
 
-def _behind(other: OtherAppliance, seconds: float) -> StandbyTrouble:
+def _behind(other: OtherAppliance, seconds: float) -> Trouble:
     text = (
         f"the standby {other.name} has been {lag_of(other)} for {lasting(seconds)}, so it cannot take over;"
         " check the disk and the load of its machine"
     )
-    return StandbyTrouble("warning", "standby-behind", text)
+    return Trouble("warning", "standby-behind", text)
 
 
-def _silent(witness: WitnessSeen) -> StandbyTrouble:
+def _silent(witness: WitnessSeen) -> Trouble:
     seconds = witness.answered_seconds
     since = "has never answered" if seconds is None else f"has not answered for {lasting(seconds)}"
     text = (
         f"the witness on the robot ({witness.address}) {since}, so the standby cannot take over; check on the robot:"
         " systemctl status rosrv-witness"
     )
-    return StandbyTrouble("warning", "witness-silent", text)
+    return Trouble("warning", "witness-silent", text)
 
 
-def _blind(state: StandbyState) -> StandbyTrouble:
+def _blind(state: StandbyState) -> Trouble:
     other, witness = state.other, state.witness
     text = (
         f"the witness on the robot ({witness.address}) has not answered the standby {other.name} ({other.address}) for"
         f" {lasting(other.witness_seconds or 0)}, so the standby cannot take over; check the network between both"
     )
-    return StandbyTrouble("alarm", "standby-blind", text)
+    return Trouble("alarm", "standby-blind", text)
 
 
-def _unsaved(witness: WitnessSeen) -> StandbyTrouble:
+def _unsaved(witness: WitnessSeen) -> Trouble:
     text = (
         f"the witness on the robot ({witness.address}) could not save a takeover: {witness.trouble}; correct"
         " that on the robot"
     )
-    return StandbyTrouble("alarm", "witness-disk", text)
+    return Trouble("alarm", "witness-disk", text)

@@ -12,7 +12,7 @@ from appliance.cli.output import moment
 from appliance.cli.status_watch import StatusView
 from appliance.features.standby.standby_summary import is_silent, lag_of, lasting, standby_troubles
 
-_RED = "bold red"
+_RED, _YELLOW = "bold red", "yellow"
 
 
 def standby_view(state: StandbyState) -> StatusView:
@@ -46,6 +46,13 @@ class StandbyScreen:
         if state.role == "active":
             grid.add_row("answers", _answers(state))
         yield grid
+
+
+def standby_line(state: StandbyState) -> Text:
+    """Return the state in a line of `rosrv status`."""
+    other, witness = lag_in_words(state.other), answer_in_words(state.witness)
+    line = f"{state.name} is {state.role}; {state.other.name}: {other}; witness: {witness}"
+    return Text(line, style=_YELLOW if any(standby_troubles(state)) else "")
 
 
 def lag_in_words(other: OtherAppliance) -> str:

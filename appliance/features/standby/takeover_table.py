@@ -1,10 +1,24 @@
 """Print the verification of two logs and of the takeovers between them."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 from appliance.audit.log.record_format import printable, rfc3339
+from appliance.cli.audit.audit_errors import fail
 from appliance.cli.audit.record_table import print_verification, write
+from appliance.features.standby.membership import MembershipError, load_membership, path_of
 from appliance.features.standby.takeover_verification import PairVerification, TakeoverProof
+
+
+def absent(log: Path, state: Path) -> str:
+    """Return the name of the other appliance of a pair if it has no log; else an empty text."""
+    if log.exists():
+        return ""
+    try:
+        membership = load_membership(path_of(state))
+    except MembershipError as error:
+        fail(str(error), 2)
+    return membership.name if membership is not None else ""
 
 
 def print_pair(pair: PairVerification) -> None:

@@ -46,7 +46,7 @@ def test_no_other_test_imports_a_feature(name: str) -> None:
 
 
 def without(name: str, copy: Path) -> None:
-    """Copy the files of the repository, without a feature's folders and its lines in the table."""
+    """Copy the files of the repository, without a feature's folders and its lines in the tables."""
     files = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
     for file in filter(None, files.decode().split("\0")):
         if f"/features/{name}/" not in file and (ROOT / file).is_file():
@@ -54,10 +54,10 @@ def without(name: str, copy: Path) -> None:
             shutil.copy2(ROOT / file, copy / file)
     for built in (ROOT / "appliance").rglob("*.so"):
         shutil.copy2(built, copy / built.relative_to(ROOT))
-    table = copy / "appliance/features/table.py"
-    text = table.read_text(encoding="utf-8")
-    text = re.sub(rf"from appliance\.features\.{name}\..*\n", "", text)
-    table.write_text(re.sub(rf"\b{name.upper()}\b(, |,)?", "", text), encoding="utf-8")
+    for table in (copy / "appliance/features/table.py", copy / "appliance/features/views.py"):
+        text = table.read_text(encoding="utf-8")
+        text = re.sub(rf"from appliance\.features\.{name}\..*\n", "", text)
+        table.write_text(re.sub(rf"\b{name.upper()}(_VIEW)?\b(, |,)?", "", text), encoding="utf-8")
 
 
 @pytest.mark.nightly

@@ -1,0 +1,61 @@
+"""The views of two appliances. Methods import what only one of the processes and commands needs."""
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from appliance.channel.answers.standby_answers import StandbyState
+from appliance.features.standby.standby_summary import PATIENCE_SECONDS, standby_troubles
+from appliance.features.view import PairView, Samples, Trouble
+
+if TYPE_CHECKING:
+    from appliance.audit.proof.chain_findings import Verification
+
+
+class StandbyPairView(PairView):
+    """The views of an appliance that can be one of two."""
+
+    def alarms(self, state: StandbyState) -> Iterable[Trouble]:
+        """Return what is wrong; the other appliance may be away for some time first."""
+        return standby_troubles(state, PATIENCE_SECONDS)
+
+    def samples(self, state: StandbyState | None) -> Mapping[str, Samples]:
+        """Return the samples of each metric of a pair."""
+        from appliance.features.standby.samples import samples_of  # noqa: PLC0415  only the api needs it
+
+        return samples_of(state)
+
+    def line(self, state: StandbyState) -> Any:
+        """Return the state in a line, for rich."""
+        from appliance.features.standby.standby_view import standby_line  # noqa: PLC0415  only the command needs it
+
+        return standby_line(state)
+
+    def status(self, state: StandbyState) -> Any:
+        """Return the `StatusView` of a standby."""
+        from appliance.features.standby.standby_view import standby_view  # noqa: PLC0415  only the command needs it
+
+        return standby_view(state)
+
+    def verify(
+        self,
+        own: Path,
+        verified: "Verification",
+        other: Path,
+        state: Path,
+        verify: "Callable[[], Verification]",
+    ) -> tuple[Any, Callable[[Any], None]]:
+        """Verify two logs and the takeovers between them; the other appliance may have no log yet."""
+        from appliance.features.standby import takeover_table  # noqa: PLC0415  only one command needs it
+        from appliance.features.standby.takeover_verification import (  # noqa: PLC0415  as above
+            VerifiedLog,
+            verify_alone,
+            verify_takeovers,
+        )
+
+        first = VerifiedLog(own, verified)
+        absent = takeover_table.absent(other, state)
+        pair = (
+            verify_alone(first, absent) if absent else verify_takeovers(first, VerifiedLog(other, verify()))
+        )
+        return pair, takeover_table.print_pair
