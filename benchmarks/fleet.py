@@ -32,7 +32,7 @@ import psycopg
 from rosrv_fleet.bundles.keys import KeyFolder
 from rosrv_fleet.bundles.repository import TIMESTAMP_KEY, BundleRepository
 
-from appliance.bundles.terms import Ring
+from appliance.formats.terms import Ring
 from benchmarks.fleet_robots import BAD, SimulatedLoad, SimulatedRobots, enrol
 from benchmarks.fleet_rows import fill, searches
 from tests.support.bundle_site import GROUP, PASSPHRASE, SITE, bundle_files, everywhere

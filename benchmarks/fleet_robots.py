@@ -18,11 +18,12 @@ from multiprocessing.process import BaseProcess
 import structlog
 from rosrv_fleet.robots import Robots
 
-from appliance.bundles.poller import EVENTS, Poller
-from appliance.bundles.process import PollLoop
-from appliance.bundles.verified_bundles import VerifiedBundles
-from appliance.channel.messages import BundleOffered, BundleStated, RefusedBundle
-from appliance.collector.connection import robot_connection
+from appliance.features.fleet.bundle_link import BundleOffered, BundleStated, RefusedBundle
+from appliance.features.fleet.connection import robot_connection
+from appliance.features.fleet.poller import Poller
+from appliance.features.fleet.process import PollLoop
+from appliance.features.fleet.verified_bundles import VerifiedBundles
+from appliance.formats.bundle_api import EVENTS
 from tests.support.bundle_site import GROUP, SITE
 from tests.system.fleet.fleet_site import FleetRobot, FleetSite
 

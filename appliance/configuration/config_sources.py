@@ -27,8 +27,8 @@ from pydantic import TypeAdapter, ValidationError
 from appliance.base.input_files import read_given_text
 from appliance.base.user_errors import UserError
 from appliance.base.validation_messages import must_be, not_yaml
-from appliance.configuration.fleet_membership import FOLDER, SETTINGS, joined_settings
 from appliance.configuration.settings import SECTIONS, Settings
+from appliance.formats.fleet_membership import FOLDER, SETTINGS, joined_settings
 
 if typing.TYPE_CHECKING:
     from _typeshed import DataclassInstance

@@ -6,8 +6,6 @@ from functools import partial
 from appliance.channel.answers.status import AuditState
 from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.foundation import Current, Foundation
-from appliance.control.bundle_gate import BundleGate
-from appliance.control.bundle_health import RobotHealth
 from appliance.control.links.forwarder_link import ForwarderLink
 from appliance.control.operators.administration import Administration
 from appliance.control.operators.alarm_orders import AlarmOrders, HandledAlarms
@@ -21,6 +19,8 @@ from appliance.control.operators.switched_off import SwitchedOffWatch
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
 from appliance.control.rest.rest_certificate import RestCertificate
+from appliance.features.fleet.bundle_gate import BundleGate
+from appliance.features.fleet.bundle_health import RobotHealth
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment import HostEnrolment, find_endpoint
 from appliance.hosts.rest_address import rest_address

@@ -16,6 +16,7 @@ from appliance.control.assembly.foundation import Foundation
 from appliance.control.assembly.policies import RevisionChangedError
 from appliance.control.assembly.policy_gate import PolicyRefusedError
 from appliance.control.operator_assembly import Operators
+from appliance.features.fleet.bundle_link import BundleLink
 from appliance.hosts.host_table import HostRefusedError
 from appliance.master.graph.registry import Kind
 from appliance.specifications.allocation import TOPIC
@@ -86,7 +87,7 @@ class SupervisorMessages:
             case "fleet":
                 self._operators.collected.link.attach(Channel(sock, messages.ForwardingLink))
             case "bundles":
-                self._operators.bundles.link.attach(Channel(sock, messages.BundleLink, longest=16 << 20))
+                self._operators.bundles.link.attach(Channel(sock, BundleLink, longest=16 << 20))
             case _:
                 self._feature_link(role, sock)
 

@@ -130,7 +130,7 @@ ROLES = (
     ),
     *(role for role in _OF_FEATURES if role.after is not None),
     _ours(
-        "fleet", "rosrv-fleet", "fleet", "appliance.forwarding.segment_process:main",
+        "fleet", "rosrv-fleet", "fleet", "appliance.features.fleet.segment_process:main",
         ended_early=600, nice=10, after="control", dispensable=True, group="rosrv-api", stands_by=True,
         inputs=lambda facts: facts.fleet_reads,
         sandbox=lambda facts: SandboxPlan(
@@ -141,7 +141,7 @@ ROLES = (
         ),
     ),
     _ours(
-        "bundles", "rosrv-bundles", "bundles", "appliance.bundles.process:main",
+        "bundles", "rosrv-bundles", "bundles", "appliance.features.fleet.process:main",
         ended_early=600, nice=10, after="control", dispensable=True, inputs=lambda facts: facts.fleet_reads,
         sandbox=lambda facts: SandboxPlan(
             allowlist=True,

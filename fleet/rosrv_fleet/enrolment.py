@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from cryptography.hazmat.primitives.serialization import Encoding, load_pem_public_key
 
 from appliance.base import clock
-from appliance.bundles.terms import TermsError, role_of
+from appliance.formats.terms import TermsError, role_of
 from appliance.signing.own_certificate import untimely
 
 FIRST = "a"

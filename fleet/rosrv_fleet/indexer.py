@@ -23,7 +23,7 @@ import structlog
 from psycopg import sql
 
 from appliance.audit.log.chain import StoredColumns
-from appliance.audit.proof.segments import SegmentError, SegmentReader
+from appliance.formats.segments import SegmentError, SegmentReader
 from rosrv_fleet.config import FleetConfig
 from rosrv_fleet.database import IndexDatabase, migrate
 from rosrv_fleet.enrolment import Robot

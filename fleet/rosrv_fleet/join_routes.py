@@ -12,7 +12,7 @@ from fastapi import APIRouter, HTTPException, Request, Response
 from starlette.concurrency import run_in_threadpool
 
 from appliance.base import clock
-from appliance.configuration.fleet_membership import JOIN_PATH, JoinRequest
+from appliance.formats.fleet_membership import JOIN_PATH, JoinRequest
 from rosrv_fleet.collector import Collector
 from rosrv_fleet.enrolment import EnrolmentError, Robot, require_own_signature
 from rosrv_fleet.invitations import InvalidInvitationError, Invitations

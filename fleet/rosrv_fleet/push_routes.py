@@ -15,7 +15,7 @@ from fastapi import Path as PathParameter
 from starlette.requests import ClientDisconnect
 
 from appliance.base import clock
-from appliance.signing.receipts import SegmentReceipt
+from appliance.formats.receipts import SegmentReceipt
 from appliance.signing.signed_statements import checkpoint_hash
 from rosrv_fleet.access import certificate_of, robot_of
 from rosrv_fleet.collector import LONG_CHECKS, SHORT_CHECKS, Collector

@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from appliance.configuration.fleet_membership import Invitation
+from appliance.formats.fleet_membership import Invitation
 from rosrv_fleet.config import load_config
 from rosrv_fleet.enrolment import Robot, RobotGroup, check_name
 from rosrv_fleet.invitations import Invitations

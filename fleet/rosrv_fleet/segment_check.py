@@ -7,7 +7,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
-from appliance.audit.proof.segments import SegmentError, SegmentReader, SegmentSummary
+from appliance.formats.segments import SegmentError, SegmentReader, SegmentSummary
 from rosrv_fleet.workers import OutOfTimeError, processor_time
 
 

@@ -37,9 +37,9 @@ from typing import IO, NamedTuple
 
 import msgspec
 
-from appliance.audit.proof.segments import LONGEST_LINE, SegmentHeader, SegmentSummary
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
+from appliance.formats.segments import LONGEST_LINE, SegmentHeader, SegmentSummary
 from rosrv_fleet.robots import make_folder
 from rosrv_fleet.stored_files import read_stored
 

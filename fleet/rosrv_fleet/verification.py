@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 
 import msgspec
 
-from appliance.audit.proof.segments import SegmentError, SegmentHeader, SegmentReader
+from appliance.formats.segments import SegmentError, SegmentHeader, SegmentReader
 from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.segment_store import RemovalNote, SegmentPlace, SegmentStore
 

@@ -19,9 +19,9 @@ from rosrv_fleet.bundles.keys import KeyFolder, load_online_key
 from rosrv_fleet.bundles.publication import next_timestamp, read_publication
 from rosrv_fleet.bundles.repository import TIMESTAMP_KEY, BundleRepository
 
-from appliance.bundles.terms import BundlePath, Ring, Terms
-from appliance.bundles.verified_bundles import VerifiedBundles
-from appliance.collector.connection import CollectorConnection, robot_connection
+from appliance.features.fleet.connection import CollectorConnection, robot_connection
+from appliance.features.fleet.verified_bundles import VerifiedBundles
+from appliance.formats.terms import BundlePath, Ring, Terms
 from tests.support.fleet_certificates import FleetAuthority
 
 PASSPHRASE = "a passphrase for tests"  # noqa: S105  of keys that a test makes

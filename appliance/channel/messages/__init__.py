@@ -12,7 +12,6 @@ of operators: only the two ends of its link import that module.
 
 # ruff: noqa: F403  so that a new message need not be listed
 from appliance.channel.answers.status import ProcessInfo as ProcessInfo
-from appliance.channel.messages.bundle_link import *
 from appliance.channel.messages.compiler import *
 from appliance.channel.messages.forwarding import *
 from appliance.channel.messages.lifeline import *

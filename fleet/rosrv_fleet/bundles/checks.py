@@ -2,7 +2,7 @@
 
 import ipaddress
 
-from appliance.channel.messages import BundleContents
+from appliance.formats.bundle_archive import BundleContents
 from appliance.hosts.hosts_file import DeclaredHostsError, parse_declared
 from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.policy_findings import PolicyError

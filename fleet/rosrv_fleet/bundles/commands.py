@@ -10,9 +10,14 @@ import typer
 
 from appliance.base.atomic_files import write_whole
 from appliance.base.input_files import files_below, read_given
-from appliance.bundles.bundle_archive import LONGEST, BundleArchiveError, contents_of, is_bundle_file
-from appliance.bundles.terms import BundlePath, Ring, Terms, TermsError, terms_of
-from appliance.channel.messages import BundleContents
+from appliance.formats.bundle_archive import (
+    LONGEST,
+    BundleArchiveError,
+    BundleContents,
+    contents_of,
+    is_bundle_file,
+)
+from appliance.formats.terms import BundlePath, Ring, Terms, TermsError, terms_of
 from rosrv_fleet.bundles.keys import KeyFileError, KeyFolder
 from rosrv_fleet.bundles.publication import PublicationError, read_publication
 from rosrv_fleet.bundles.repository import BundleRepository, RepositoryError

@@ -17,7 +17,7 @@ from tuf.api.metadata import Metadata, MetaFile, Root, Snapshot, TargetFile, Tar
 from tuf.api.serialization import DeserializationError
 from tuf.api.serialization.json import JSONSerializer
 
-from appliance.bundles.terms import Terms, TermsError, terms_of
+from appliance.formats.terms import Terms, TermsError, terms_of
 
 S = TypeVar("S", Root, Snapshot, Targets)
 _ROOT = re.compile(r"([1-9][0-9]*)\.root\.json")

@@ -37,8 +37,8 @@ from tuf.api.serialization.json import JSONSerializer
 
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
-from appliance.bundles.bundle_archive import pack
-from appliance.bundles.terms import BundlePath, Terms, custom_of, role_of
+from appliance.formats.bundle_archive import pack
+from appliance.formats.terms import BundlePath, Terms, custom_of, role_of
 from rosrv_fleet.bundles.keys import KeyFolder, make_online_key
 
 TIMESTAMP_KEY = "timestamp.pem"

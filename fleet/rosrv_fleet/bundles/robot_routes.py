@@ -18,8 +18,7 @@ from fastapi import APIRouter, Depends, HTTPException, Request, Response
 from fastapi.responses import StreamingResponse
 from psycopg import Error as DatabaseError
 
-from appliance.bundles.poller import EVENTS, REPORT, RobotReport
-from appliance.bundles.verified_bundles import METADATA, SELECTION, TARGETS
+from appliance.formats.bundle_api import EVENTS, METADATA, REPORT, SELECTION, TARGETS, RobotReport
 from rosrv_fleet.enrolment import Robot, RobotGroup
 from rosrv_fleet.request_body import read_body
 from rosrv_fleet.rollouts.service import BundleService, RolloutRefusedError

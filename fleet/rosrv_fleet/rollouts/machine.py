@@ -19,7 +19,7 @@ from typing import Literal
 
 import msgspec
 
-from appliance.bundles.terms import BundlePath, Terms
+from appliance.formats.terms import BundlePath, Terms
 
 RolloutState = Literal["running", "stopped", "reverted", "done"]
 

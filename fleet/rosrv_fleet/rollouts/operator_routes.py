@@ -10,7 +10,7 @@ from fastapi import APIRouter, Depends, HTTPException, Request
 from psycopg import Error as DatabaseError
 from pydantic import BaseModel, ConfigDict, Field
 
-from appliance.bundles.terms import BundlePath, TermsError
+from appliance.formats.terms import BundlePath, TermsError
 from rosrv_fleet.enrolment import RobotGroup
 from rosrv_fleet.rollouts.conditions import ConditionKind
 from rosrv_fleet.rollouts.machine import HealthGates

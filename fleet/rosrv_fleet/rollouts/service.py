@@ -20,8 +20,8 @@ import structlog
 from tuf.api.metadata import Metadata
 
 from appliance.base import clock
-from appliance.bundles.poller import RobotReport
-from appliance.bundles.terms import BundlePath, TermsError
+from appliance.formats.bundle_api import RobotReport
+from appliance.formats.terms import BundlePath, TermsError
 from rosrv_fleet.bundles.keys import KeyFileError, load_online_key
 from rosrv_fleet.bundles.publication import (
     PublicationError,

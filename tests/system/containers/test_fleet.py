@@ -22,9 +22,9 @@ import pytest
 import yaml
 
 from appliance.audit.log.signatures import read_public_key
-from appliance.collector.connection import robot_connection
 from appliance.configuration.config_sources import resolve
-from appliance.forwarding.segment_pusher import SegmentPusher
+from appliance.features.fleet.connection import robot_connection
+from appliance.features.fleet.segment_pusher import SegmentPusher
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV

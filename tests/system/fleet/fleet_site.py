@@ -22,8 +22,8 @@ from rosrv_fleet.robots import Robots
 from appliance.audit.log.log import AuditLog
 from appliance.audit.log.signatures import read_public_key, write_public_key
 from appliance.audit.proof.copies import signed_checkpoints
-from appliance.collector.connection import robot_connection
-from appliance.forwarding.segment_pusher import SegmentPusher
+from appliance.features.fleet.connection import robot_connection
+from appliance.features.fleet.segment_pusher import SegmentPusher
 from tests.support.audit import decision, settle
 from tests.support.certificates import Certificates, make_certificates
 from tests.support.sources import ROOT

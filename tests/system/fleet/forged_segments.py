@@ -12,7 +12,7 @@ from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import LogEntry
 from appliance.audit.proof.chain_proofs import ChainProof, evidence_line
 from appliance.audit.proof.copies import SignedCheckpoint
-from appliance.audit.proof.segments import RecordPlace, SegmentHeader, SegmentSummary
+from appliance.formats.segments import RecordPlace, SegmentHeader, SegmentSummary
 from appliance.signing.signed_statements import NO_CHECKPOINT, Checkpoint
 from tests.system.fleet.fleet_site import FleetRobot
 

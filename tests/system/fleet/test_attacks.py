@@ -13,8 +13,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from appliance.audit.proof.segments import SegmentSummary, write_segment
-from appliance.collector.connection import CollectorConnection, CollectorError
+from appliance.features.fleet.connection import CollectorConnection, CollectorError
+from appliance.formats.segments import SegmentSummary, write_segment
 from tests.support.certificates import Certificates, make_certificates
 from tests.support.small_disk import small_disk
 from tests.support.waiting import eventually

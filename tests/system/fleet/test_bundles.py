@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from appliance.collector.connection import CollectorError, robot_connection
+from appliance.features.fleet.connection import CollectorError, robot_connection
 from tests.support.appliance import Appliance
 from tests.support.certificates import make_certificates
 from tests.support.sources import ROOT

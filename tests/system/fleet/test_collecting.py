@@ -7,7 +7,7 @@ from collections.abc import Callable
 import msgspec
 import pytest
 
-from appliance.signing.receipts import SegmentReceipt
+from appliance.formats.receipts import SegmentReceipt
 from tests.support.waiting import eventually
 from tests.system.fleet.fleet_site import FleetRobot, FleetSite
 

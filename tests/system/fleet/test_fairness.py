@@ -17,7 +17,7 @@ import pytest
 from rosrv_fleet.collector import make_collector
 from rosrv_fleet.config import load_config
 
-from appliance.audit.proof.segments import SegmentSummary
+from appliance.formats.segments import SegmentSummary
 from tests.support.processes import runs
 from tests.support.waiting import eventually
 from tests.system.fleet.fleet_site import FleetRobot, FleetSite, running

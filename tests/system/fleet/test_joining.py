@@ -19,10 +19,10 @@ import httpx
 import pytest
 from rosrv_fleet.invitations import Invitations
 
-from appliance.collector.connection import robot_connection
 from appliance.configuration.config_sources import resolve
-from appliance.configuration.fleet_membership import JOIN_PATH
-from appliance.forwarding.segment_pusher import SegmentPusher
+from appliance.features.fleet.connection import robot_connection
+from appliance.features.fleet.segment_pusher import SegmentPusher
+from appliance.formats.fleet_membership import JOIN_PATH
 from appliance.signing.own_certificate import make_own_certificate
 from tests.support.command import rosrv
 from tests.support.sources import ROOT

@@ -14,7 +14,7 @@ import msgspec
 import pytest
 from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
 
-from appliance.signing.receipts import SegmentReceipt
+from appliance.formats.receipts import SegmentReceipt
 from tests.support.waiting import eventually
 from tests.system.fleet.fleet_site import FleetRobot, FleetSite, running
 from tests.system.fleet.postgres import PostgresCluster, postgres

@@ -18,10 +18,10 @@ from rosrv_fleet.enrolment import RobotGroup
 from rosrv_fleet.rollouts.machine import BundleRollout
 from rosrv_fleet.rollouts.service import RolloutRefusedError
 
-from appliance.bundles.poller import Poller
-from appliance.bundles.terms import BundlePath, Ring
-from appliance.channel.messages import BundleHealth, BundleOffered, BundleStated, RefusedBundle
-from appliance.collector.connection import robot_context
+from appliance.features.fleet.bundle_link import BundleHealth, BundleOffered, BundleStated, RefusedBundle
+from appliance.features.fleet.connection import robot_context
+from appliance.features.fleet.poller import Poller
+from appliance.formats.terms import BundlePath, Ring
 from tests.support.bundle_site import GROUP, SITE, BundleSite, bundle_files, everywhere
 from tests.support.processes import LIMIT
 from tests.support.rollout_collector import RolloutCollector, collector, serving

@@ -20,7 +20,7 @@ from rosrv_fleet.rollouts.machine import (
     stopped,
 )
 
-from appliance.bundles.terms import Ring, Terms
+from appliance.formats.terms import Ring, Terms
 
 OLD, NEW = "s/g/1.tar", "s/g/2.tar"
 RINGS = [Ring("canary", ["r0", "r1"], 0, 0), Ring("some", [], 40, 100), Ring("rest", [], 100, 100)]

@@ -15,8 +15,8 @@ from rosrv_fleet.rollouts.machine import Baseline, BundleRollout, HealthGates, O
 from rosrv_fleet.rollouts.service import BundleService, RolloutRefusedError
 from rosrv_fleet.rollouts.store import RolloutStore, StoredReport, StoredRollout
 
-from appliance.bundles.poller import RobotReport
-from appliance.bundles.terms import BundlePath, Ring, Terms
+from appliance.formats.bundle_api import RobotReport
+from appliance.formats.terms import BundlePath, Ring, Terms
 
 T = TypeVar("T")
 _GROUP = RobotGroup("site-a", "arms")

@@ -13,7 +13,7 @@ from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
 from rosrv_fleet.verification import LogProof, prove
 
-from appliance.audit.proof.segments import write_segment
+from appliance.formats.segments import write_segment
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog, Notary, key, make_log, notary, path
 

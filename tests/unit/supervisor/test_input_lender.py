@@ -29,7 +29,7 @@ _TLS = """
 import os, sys
 from pathlib import Path
 from appliance.base.owner_access import FileLender
-from appliance.collector.connection import robot_context
+from appliance.features.fleet.connection import robot_context
 files = [Path(name) for name in sys.argv[1:]]
 lent = {path: os.open(path, os.O_RDONLY) for path in files}
 os.setresgid(61099, 61099, 61099)

@@ -14,10 +14,10 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.proof.copies import signed_checkpoints
 from appliance.base.clock import now, using
-from appliance.collector.connection import CollectorConnection, CollectorError
-from appliance.forwarding import segment_pusher
-from appliance.forwarding.segment_pusher import SegmentPusher
-from appliance.signing.receipts import SegmentReceipt
+from appliance.features.fleet import segment_pusher
+from appliance.features.fleet.connection import CollectorConnection, CollectorError
+from appliance.features.fleet.segment_pusher import SegmentPusher
+from appliance.formats.receipts import SegmentReceipt
 from appliance.signing.signed_statements import checkpoint_hash
 from tests.support.audit import decision
 from tests.support.virtual_clock import VirtualClock

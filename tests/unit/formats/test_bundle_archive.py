@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.bundles.bundle_archive import LONGEST, BundleArchiveError, contents_of, pack, unpack
-from appliance.bundles.terms import BundlePath, Ring, Terms, TermsError, checked_terms, custom_of, terms_of
+from appliance.formats.bundle_archive import LONGEST, BundleArchiveError, contents_of, pack, unpack
+from appliance.formats.terms import BundlePath, Ring, Terms, TermsError, checked_terms, custom_of, terms_of
 
 FILES = {"policy.ini": b"[Nodes]\n", "hosts.yaml": b"hosts: []\n"}
 texts = st.text(st.characters(codec="utf-8", exclude_characters="\r\ufeff"), max_size=600).map(str.encode)

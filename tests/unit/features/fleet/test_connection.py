@@ -12,13 +12,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from appliance.bundles.poller import Poller
-from appliance.bundles.verified_bundles import VerifiedBundles
-from appliance.channel.messages import BundleOffered, BundleStated
-from appliance.collector import connection
-from appliance.collector.connection import CollectorConnection, CollectorError, robot_connection
-from appliance.configuration.fleet_membership import Invitation
-from appliance.forwarding.segment_pusher import SegmentPusher
+from appliance.features.fleet import connection
+from appliance.features.fleet.bundle_link import BundleOffered, BundleStated
+from appliance.features.fleet.connection import CollectorConnection, CollectorError, robot_connection
+from appliance.features.fleet.poller import Poller
+from appliance.features.fleet.segment_pusher import SegmentPusher
+from appliance.features.fleet.verified_bundles import VerifiedBundles
+from appliance.formats.fleet_membership import Invitation
 from tests.support.audit import decision
 from tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite
 from tests.support.command import rosrv

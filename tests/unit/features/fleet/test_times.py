@@ -9,9 +9,9 @@ from rosrv_fleet.enrolment import EnrolmentError
 from rosrv_fleet.robots import Robots
 
 from appliance.base.clock import using, wall
-from appliance.cli import fleet_verbs
-from appliance.collector.connection import CollectorError, robot_context
-from appliance.configuration.fleet_membership import Invitation
+from appliance.features.fleet import fleet_verbs
+from appliance.features.fleet.connection import CollectorError, robot_context
+from appliance.formats.fleet_membership import Invitation
 from appliance.signing.own_certificate import make_own_certificate
 from tests.support.enrolled_robots import JoiningAppliance
 from tests.support.virtual_clock import VirtualClock

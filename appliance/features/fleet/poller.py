@@ -15,7 +15,9 @@ import msgspec
 import structlog
 
 from appliance.base import clock
-from appliance.bundles.verified_bundles import (
+from appliance.features.fleet.bundle_link import BundleOffered, BundlePollReported, BundleStated
+from appliance.features.fleet.connection import CollectorConnection, CollectorError
+from appliance.features.fleet.verified_bundles import (
     BundleFolderError,
     BundleRejectedError,
     BundleTooEarlyError,
@@ -23,34 +25,13 @@ from appliance.bundles.verified_bundles import (
     VerifiedBundle,
     VerifiedBundles,
 )
-from appliance.channel.messages import BundleOffered, BundlePollReported, BundleStated
-from appliance.collector.connection import CollectorConnection, CollectorError
-
-EVENTS = "v1/bundles/events"
-"""The path of the collector's event stream."""
-REPORT = "v1/bundles/report"
-"""The path of the collector for reports."""
+from appliance.formats.bundle_api import REPORT, RobotReport
 
 _log = structlog.get_logger()
 _BACK_OFF = (1.0, 2.0, 5.0, 15.0, 30.0, 60.0)
 _JITTER = 0.2  # of the pause, in both directions
 _REPORT_SECONDS = 30.0
 _REPORT_AGAIN_SECONDS = 5.0
-
-
-class RobotReport(msgspec.Struct, frozen=True):
-    """The report of a robot to the collector: bundles by path (empty: none), its health, and polling problems."""
-
-    site: str
-    group: str
-    in_force: str
-    trying: str
-    refused: str
-    reason: str
-    changed: bool
-    denials: int
-    failing: int
-    trouble: str
 
 
 @dataclass(slots=True)

@@ -5,7 +5,7 @@ import ipaddress
 import pytest
 
 from appliance.audit.log.budget import Budget
-from appliance.control.bundle_health import RobotHealth, counted_denials
+from appliance.features.fleet.bundle_health import RobotHealth, counted_denials
 from appliance.policy.lost_rights import LostRights
 from appliance.policy.model import Decision
 from appliance.policy.policy_compiler import compile_policy

@@ -28,12 +28,11 @@ from tuf.api.metadata import TargetFile
 from tuf.ngclient import FetcherInterface, Updater, UpdaterConfig
 
 from appliance.base import clock
-from appliance.bundles.bundle_archive import LONGEST, BundleArchiveError, unpack
-from appliance.bundles.terms import BundlePath, TermsError, terms_of
-from appliance.channel.messages import BundleContents
-from appliance.collector.connection import CollectorConnection, CollectorError
+from appliance.features.fleet.connection import CollectorConnection, CollectorError
+from appliance.formats.bundle_api import METADATA, SELECTION, TARGETS
+from appliance.formats.bundle_archive import LONGEST, BundleArchiveError, BundleContents, unpack
+from appliance.formats.terms import BundlePath, TermsError, terms_of
 
-METADATA, TARGETS, SELECTION = "v1/bundles/metadata", "v1/bundles/targets", "v1/bundles/selection"
 """The paths of the collector."""
 
 _LONGEST_TIMESTAMP = 1 << 14

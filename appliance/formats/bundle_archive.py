@@ -21,7 +21,7 @@ import re
 import tarfile
 from collections.abc import Mapping
 
-from appliance.channel.messages import BundleContents
+import msgspec
 
 LONGEST = 6 << 20
 """The most bytes of an archive."""
@@ -33,6 +33,22 @@ _WORD = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}"
 _SPECIFICATION = re.compile(rf"monitors/({_WORD}\.rv)")
 _DEFINITION = re.compile(rf"monitors/msg/({_WORD}/{_WORD}\.(?:msg|srv))")
 _SIGNATURE = ".sig"
+
+
+class BundleContents(msgspec.Struct, frozen=True):
+    """The texts of a bundle. `cases` is None without test cases; missing signatures are empty.
+
+    `files` are the specifications by name, `definitions` the message definitions by `package/Type.msg` (or `.srv`), and
+    `signatures` the signatures of both by the same names.
+    """
+
+    policy: str
+    hosts: str
+    policy_signature: str = ""
+    cases: str | None = None
+    files: dict[str, str] = {}
+    definitions: dict[str, str] = {}
+    signatures: dict[str, str] = {}
 
 
 class BundleArchiveError(Exception):

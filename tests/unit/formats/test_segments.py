@@ -13,7 +13,9 @@ from appliance.audit.log.log import AuditLog
 from appliance.audit.log.retention import Retention
 from appliance.audit.proof.chain_proofs import evidence, evidence_line
 from appliance.audit.proof.copies import SignedCheckpoint, signed_checkpoints
-from appliance.audit.proof.segments import (
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import export
+from appliance.formats.segments import (
     RecordPlace,
     SegmentError,
     SegmentHeader,
@@ -21,8 +23,6 @@ from appliance.audit.proof.segments import (
     next_segment,
     write_segment,
 )
-from appliance.audit.search.query import Filter
-from appliance.audit.search.search import export
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.log.test_retention import first_sequence, make_old, retain

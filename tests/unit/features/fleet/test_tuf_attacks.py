@@ -14,16 +14,16 @@ from rosrv_fleet.bundles.repository import TIMESTAMP_KEY
 from securesystemslib.signer import CryptoSigner
 from tuf.api.metadata import Metadata, MetaFile, Snapshot, TargetFile, Targets, Timestamp
 
-from appliance.bundles.bundle_archive import pack
-from appliance.bundles.terms import BundlePath, Ring, custom_of
-from appliance.bundles.verified_bundles import (
+from appliance.features.fleet import connection
+from appliance.features.fleet.connection import CollectorError
+from appliance.features.fleet.verified_bundles import (
     BundleRejectedError,
     BundleTooEarlyError,
     VerifiedBundle,
     VerifiedBundles,
 )
-from appliance.collector import connection
-from appliance.collector.connection import CollectorError
+from appliance.formats.bundle_archive import pack
+from appliance.formats.terms import BundlePath, Ring, custom_of
 from tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite, bundle_files, everywhere, give
 from tests.support.waiting import allowed
 

@@ -27,12 +27,12 @@ import structlog
 
 from appliance.audit.log.log_database import LogUnreadableError, reading
 from appliance.audit.proof.copies import signed_checkpoints
-from appliance.audit.proof.segments import SegmentSummary, next_segment, write_segment
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.channel.messages import ForwardingReported
-from appliance.collector.connection import CollectorConnection, CollectorError
-from appliance.signing.receipts import SegmentReceipt
+from appliance.features.fleet.connection import CollectorConnection, CollectorError
+from appliance.formats.receipts import SegmentReceipt
+from appliance.formats.segments import SegmentSummary, next_segment, write_segment
 from appliance.signing.signed_statements import checkpoint_hash
 
 _IDLE_SECONDS = 1.0

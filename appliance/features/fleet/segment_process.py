@@ -4,10 +4,10 @@ import asyncio
 from pathlib import Path
 
 from appliance.audit.log.signatures import read_public_key
-from appliance.collector.connection import robot_connection
 from appliance.configuration.settings import Settings, load_resolved
+from appliance.features.fleet.connection import robot_connection
+from appliance.features.fleet.segment_pusher import SegmentPusher
 from appliance.forwarding.process import ForwardingProcess
-from appliance.forwarding.segment_pusher import SegmentPusher
 
 
 def main(lifeline_fd: int, config: Path) -> None:

@@ -14,8 +14,8 @@ from appliance.backup.contents import AUDIT_LOG
 from appliance.base.atomic_files import write_whole
 from appliance.cli.connection.target import DEFAULT_STATE, State
 from appliance.cli.output import Json, say_json, usage_error
-from appliance.collector.connection import CollectorConnection, CollectorError, trusting_context
-from appliance.configuration.fleet_membership import (
+from appliance.features.fleet.connection import CollectorConnection, CollectorError, trusting_context
+from appliance.formats.fleet_membership import (
     AUTHORITY,
     CERTIFICATE,
     FOLDER,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.bundles.verified_bundles import BundleFolderError, BundleRejectedError, VerifiedBundles
+from appliance.features.fleet.verified_bundles import BundleFolderError, BundleRejectedError, VerifiedBundles
 from tests.support.bundle_site import BundleSite
 
 pytestmark = pytest.mark.nightly

@@ -16,13 +16,15 @@ import structlog
 
 from appliance.base import clock
 from appliance.base.input_files import read_given
-from appliance.bundles.poller import EVENTS, Poller
-from appliance.bundles.verified_bundles import VerifiedBundles
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
-from appliance.collector.connection import CollectorConnection, CollectorError, robot_connection
 from appliance.configuration.settings import Fleet, load_resolved
+from appliance.features.fleet.bundle_link import BundleLink, BundleOffered, BundlePollReported, BundleStated
+from appliance.features.fleet.connection import CollectorConnection, CollectorError, robot_connection
+from appliance.features.fleet.poller import Poller
+from appliance.features.fleet.verified_bundles import VerifiedBundles
+from appliance.formats.bundle_api import EVENTS
 
 _log = structlog.get_logger()
 _TICK_SECONDS = 1.0
@@ -97,13 +99,13 @@ class _Process:
         lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
         self._child = Child(
             lifeline,
-            messages.BundleLink,
+            BundleLink,
             said=self._said,
             linked=self._linked,
             lost=lambda _why: self._lost(),
         )
-        self._stated: messages.BundleStated | None = None
-        self._told: messages.BundlePollReported | None = None
+        self._stated: BundleStated | None = None
+        self._told: BundlePollReported | None = None
         self._event_loop: asyncio.AbstractEventLoop | None = None
         self._poller = make_poller(fleet, Path.cwd(), lambda: self._stated, self._offer)
         place = f"{fleet.bundles.site}/{fleet.bundles.group}"
@@ -122,7 +124,7 @@ class _Process:
                     break  # the supervisor restarts the process
         await asyncio.to_thread(self._loop.stop, _LAST_SECONDS)
 
-    def _said(self, message: messages.BundleStated) -> None:
+    def _said(self, message: BundleStated) -> None:
         self._stated = message
 
     def _linked(self) -> None:
@@ -137,7 +139,7 @@ class _Process:
         if progress != self._told and self._child.tell(progress):
             self._told = progress
 
-    def _offer(self, offered: messages.BundleOffered) -> None:
+    def _offer(self, offered: BundleOffered) -> None:
         """Send a bundle to control; the polling thread calls this."""
         if self._event_loop is not None:
             self._event_loop.call_soon_threadsafe(self._child.tell, offered)
@@ -172,8 +174,8 @@ def listen(
 def make_poller(
     fleet: Fleet,
     folder: Path,
-    stated: Callable[[], messages.BundleStated | None],
-    offer: Callable[[messages.BundleOffered], object],
+    stated: Callable[[], BundleStated | None],
+    offer: Callable[[BundleOffered], object],
 ) -> Poller:
     """Return the poller for these settings; they must configure bundles. Raises `OSError`."""
     wanted = fleet.bundles

@@ -7,8 +7,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from appliance.cli import fleet_verbs
-from appliance.configuration.fleet_membership import JoinRequest
+from appliance.features.fleet import fleet_verbs
+from appliance.formats.fleet_membership import JoinRequest
 
 _CERTIFICATE = "-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n"
 _INVITATION = {

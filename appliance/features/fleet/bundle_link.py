@@ -3,22 +3,7 @@
 import msgspec
 
 from appliance.channel.messages.message import Message
-
-
-class BundleContents(msgspec.Struct, frozen=True):
-    """The texts of a bundle. `cases` is None without test cases; missing signatures are empty.
-
-    `files` are the specifications by name, `definitions` the message definitions by `package/Type.msg` (or `.srv`), and
-    `signatures` the signatures of both by the same names.
-    """
-
-    policy: str
-    hosts: str
-    policy_signature: str = ""
-    cases: str | None = None
-    files: dict[str, str] = {}
-    definitions: dict[str, str] = {}
-    signatures: dict[str, str] = {}
+from appliance.formats.bundle_archive import BundleContents
 
 
 class BundleOffered(Message):

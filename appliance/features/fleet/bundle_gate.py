@@ -22,14 +22,21 @@ import structlog
 
 from appliance.base import clock
 from appliance.base.actors import UNCONFIRMED
-from appliance.channel import admin, messages
+from appliance.channel import admin
 from appliance.channel.answers.status import BundlesState
 from appliance.channel.link import Link
-from appliance.channel.messages import BundleHealth, BundleOffered, BundleStated, RefusedBundle
 from appliance.configuration.settings import Fleet
 from appliance.control.assembly.policies import Policies, PolicyCases, RevisionChangedError
 from appliance.control.assembly.policy_gate import PolicyRefusedError
-from appliance.control.bundle_health import RobotHealth
+from appliance.features.fleet.bundle_health import RobotHealth
+from appliance.features.fleet.bundle_link import (
+    BundleHealth,
+    BundleOffered,
+    BundlePollReported,
+    BundleStated,
+    RefusedBundle,
+)
+from appliance.formats.bundle_archive import BundleContents
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.hosts.host_table import HostRefusedError
 from appliance.hosts.hosts_file import IN_BUNDLE, DeclaredHostsError, parse_declared
@@ -121,7 +128,7 @@ class BundleGate:
         self._held = frozenset[str]()  # monitors that hold topics since the bundle replaced them
         self.link = Link(self._heard)
         self._record = msgspec.json.decode(store.settings().get(_SETTING, "{}"), type=BundleRecord)
-        self._poll = messages.BundlePollReported()
+        self._poll = BundlePollReported()
         self._stated: BundleStated | None = None
         self._stated_to: object = None
         self._offered: BundleOffered | None = None
@@ -171,7 +178,7 @@ class BundleGate:
 
     # --- the link ---
 
-    def _heard(self, message: messages.BundleOffered | messages.BundlePollReported) -> None:
+    def _heard(self, message: BundleOffered | BundlePollReported) -> None:
         if isinstance(message, BundleOffered):
             self._offered = message
             self._there.set()
@@ -263,7 +270,7 @@ class BundleGate:
             await self._undo(trial)
             self._save(msgspec.structs.replace(self._record, trial=None))
 
-    async def _try(self, trial: Trial, contents: messages.BundleContents) -> None:
+    async def _try(self, trial: Trial, contents: BundleContents) -> None:
         """Put a bundle into force for the trial; keep it if the robot stays healthy, otherwise go back."""
         before, self._earlier = self._health(), self._policies.current
         try:
@@ -297,7 +304,7 @@ class BundleGate:
             revision_of_specifications=monitors,
         )
 
-    async def _put_in_force(self, trial: Trial, contents: messages.BundleContents) -> None:
+    async def _put_in_force(self, trial: Trial, contents: BundleContents) -> None:
         """Bring all parts into force. Raises one of `_REFUSALS`; then some parts may be in force."""
         await self._monitors.take_bundle(_sources(contents), trial.who, "of the bundle")
         load = admin.PolicyLoad(contents.policy, "of the bundle", signature=contents.policy_signature)
@@ -382,9 +389,9 @@ class BundleGate:
         self._store.save_setting(_SETTING, msgspec.json.encode(record).decode())
 
 
-def _sources(contents: messages.BundleContents) -> Sources:
+def _sources(contents: BundleContents) -> Sources:
     return Sources(contents.files, contents.definitions, contents.signatures)
 
 
-def _cases(contents: messages.BundleContents) -> PolicyCases:
+def _cases(contents: BundleContents) -> PolicyCases:
     return PolicyCases("policy.ini.tests.yaml", contents.cases)

@@ -1,0 +1,24 @@
+"""The collector's paths for bundles, and the report that a robot sends there."""
+
+import msgspec
+
+METADATA, TARGETS, SELECTION = "v1/bundles/metadata", "v1/bundles/targets", "v1/bundles/selection"
+EVENTS = "v1/bundles/events"
+"""The path of the collector's event stream."""
+REPORT = "v1/bundles/report"
+"""The path of the collector for reports."""
+
+
+class RobotReport(msgspec.Struct, frozen=True):
+    """The report of a robot to the collector: bundles by path (empty: none), its health, and polling problems."""
+
+    site: str
+    group: str
+    in_force: str
+    trying: str
+    refused: str
+    reason: str
+    changed: bool
+    denials: int
+    failing: int
+    trouble: str
