@@ -128,10 +128,6 @@ VERBS: Verbs = {
             "unblock": Verb("host.block_verbs:unblock"),
         },
     ),
-    "fleet": Group(
-        "Push the audit log to a collector of many robots.",
-        {"join": Verb("fleet_verbs:join"), "leave": Verb("fleet_verbs:leave")},
-    ),
     "certificate": Verb("certificate_verb:certificate"),
     "backup": Verb("backup:backup"),
     "restore": Verb("backup:restore"),

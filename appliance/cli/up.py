@@ -113,8 +113,6 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
         roles_of(
             sections=settings.sections,
             api=settings.api_address is not None,
-            fleet=settings.fleet.receipt_key is not None,
-            bundles=settings.fleet.bundles.root is not None,
             paired=pairing is not None,
         ),
         partial(_announce, as_json=as_json),

@@ -1,6 +1,6 @@
 """Read `Settings` from file, environment and flags; later sources override earlier ones.
 
-    1. defaults; for the section `fleet` those of `rosrv fleet join`, unless a source names a collector
+    1. defaults; for the section `fleet` those of `rosrv fleet join`, unless a source names a collector (`stored_in`)
     2. `appliance.yaml` (`--config`, else `ROSRV_CONFIG`, else the one in the working directory, if any)
     3. the environment: `ROSRV_LISTEN`, and `ROSRV_LIMITS__BODY_BYTES` for the key `body_bytes` under `limits`
     4. flags
@@ -28,7 +28,6 @@ from appliance.base.input_files import read_given_text
 from appliance.base.user_errors import UserError
 from appliance.base.validation_messages import must_be, not_yaml
 from appliance.configuration.settings import SECTIONS, Settings
-from appliance.formats.fleet_membership import FOLDER, SETTINGS, joined_settings
 
 if typing.TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -39,17 +38,21 @@ _PREFIX = "ROSRV_"
 _NOT_CONFIGURATION = {"ROSRV_CONFIG", "ROSRV_TOKEN", "ROSRV_API_URL", "ROSRV_API_CA"}
 # Variables that Kubernetes and container links set for a service named `rosrv`.
 _SERVICE_LINK = re.compile(r"ROSRV_(SERVICE_(HOST|PORT.*+)|PORT|PORT_\d++_.*+|NAME|ENV_.*+)")
+
+
+def _paths_of(section: type) -> Iterator[tuple[str, ...]]:
+    """Yield the keys of a section, and of the sections in it, that are paths."""
+    for name, annotation in typing.get_type_hints(section).items():
+        if Path in (annotation, *typing.get_args(annotation)):
+            yield (name,)
+        elif dataclasses.is_dataclass(annotation) and isinstance(annotation, type):
+            yield from ((name, *path) for path in _paths_of(annotation))
+
+
 _PATH_KEYS = (
     ("policy",), ("monitors",), ("state",), ("hosts",),
     ("ipsec", "ca_passphrase_file"),
-    *(
-        (*kind.place.split("."), name)
-        for kind in SECTIONS
-        for name, annotation in typing.get_type_hints(kind).items()
-        if Path in (annotation, *typing.get_args(annotation))
-    ),
-    ("fleet", "ca"), ("fleet", "certificate"), ("fleet", "key"), ("fleet", "receipt_key"),
-    ("fleet", "bundles", "root"),
+    *((*kind.place.split("."), *path) for kind in SECTIONS for path in _paths_of(kind)),
 )  # fmt: skip
 KeyPath = tuple[str | int, ...]
 _SHORT_NAMES: dict[str, KeyPath] = {
@@ -181,27 +184,26 @@ class _Gathered:
             if value is not None:
                 self._set((key,), value, _FLAGS.get(key, "--" + key.replace("_", "-")))
 
-    def add_joined(self) -> None:
-        """Add the section `fleet` that `rosrv fleet join` left in the state directory; each given key overrides it."""
-        state, fleet = self._values.get("state", _DEFAULT_STATE), self._values.get("fleet", {})
-        if not isinstance(state, str | Path) or not isinstance(fleet, dict) or fleet.get("collector"):
-            return
-        file = Path(state) / FOLDER / SETTINGS
-        try:
-            joined = joined_settings(Path(state))
-        except (OSError, ValueError) as error:
-            reason = error.strerror if isinstance(error, OSError) else error
-            self._mistakes.append(Mistake(str(file), f"cannot be used: {reason}"))
-            return
-        if joined:
-            section, bundles = joined | fleet, fleet.get("bundles", {})
-            if "bundles" in joined and isinstance(bundles, dict):
-                section["bundles"] = joined["bundles"] | bundles
-            self._values["fleet"] = section
-            self._places.setdefault(("fleet",), str(file))
+    def add_stored(self) -> None:
+        """Add the values of features' sections that their verbs left in the state directory."""
+        state = self._values.get("state", _DEFAULT_STATE)
+        for kind in SECTIONS:
+            given = self._values.get(kind.place, {})
+            if not kind.stored_in or not isinstance(state, str | Path) or not isinstance(given, dict):
+                continue
+            file = Path(state) / kind.stored_in
+            try:
+                section = kind.with_stored(Path(state), given)
+            except (OSError, ValueError) as error:
+                reason = error.strerror if isinstance(error, OSError) else error
+                self._mistakes.append(Mistake(str(file), f"cannot be used: {reason}"))
+                continue
+            if section != given:
+                self._values[kind.place] = section
+                self._places.setdefault((kind.place,), str(file))
 
     def settings(self) -> Settings:
-        self.add_joined()
+        self.add_stored()
         try:
             settings = read(self._values)
         except ValidationError as error:

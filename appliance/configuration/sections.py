@@ -5,6 +5,7 @@ import ipaddress
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar, dataclass_transform
 
 HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?")
@@ -79,9 +80,23 @@ def is_loopback(host: str) -> bool:
 
 
 class FeatureSection:
-    """The base of a feature's section; `place` is its key in `appliance.yaml`, such as `audit.syslog`."""
+    """The base of a feature's section; `place` is its key in `appliance.yaml`, such as `audit.syslog`.
+
+    `stored_in` is a file in the state directory that also has values of the section; empty: none.
+    """
 
     place: ClassVar[str]
+    stored_in: ClassVar[str] = ""
+
+    @property
+    def holds_records(self) -> str:
+        """The key that keeps old audit records until the feature has stored them elsewhere; empty: none."""
+        return ""
+
+    @classmethod
+    def with_stored(cls, _state: Path, given: dict[str, Any]) -> dict[str, Any]:
+        """Return the section as given, with the values of `stored_in`. Raises `OSError` and `ValueError`."""
+        return given
 
     def receivers(self) -> dict[str, tuple[str | None, str | None]]:
         """Return the URL and the address of each receiver on another machine, by key."""

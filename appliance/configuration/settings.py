@@ -38,13 +38,11 @@ from appliance.configuration.sections import (
     key,
     section,
     split_address,
-    split_receiver,
 )
 from appliance.features.table import FEATURES
 from appliance.signing.site_keys import checked_key
 
 _NODE_NAME = re.compile(r"(/[A-Za-z][A-Za-z0-9_]{0,99}+){1,5}")
-_FLEET_WORD = re.compile(r"[a-z0-9][a-z0-9-]{0,62}")
 
 SECTIONS = tuple(feature.settings for feature in FEATURES if feature.settings is not None)
 
@@ -87,20 +85,6 @@ class Unasked(str):
     """A default string. Its class distinguishes it from a string that the user configured."""
 
     __slots__ = ()
-
-
-def split_collector(text: str) -> tuple[str, int]:
-    """Parse `https://ADDRESS:PORT`. Raises `ValueError`."""
-    protocol, _slashes, place = text.partition("://")
-    if protocol != "https" or place.endswith("/"):
-        raise ValueError(f"{text!r} is not https://ADDRESS:PORT, for example https://10.0.0.9:8444")
-    _protocol, host, port = split_receiver(f"tls://{place}")
-    return host, port
-
-
-def _checked_collector(text: str) -> str:
-    split_collector(text)
-    return text
 
 
 def _checked_address(text: str) -> str:
@@ -298,116 +282,6 @@ class Ipsec:
     )
 
 
-def _checked_fleet_word(text: str) -> str:
-    if text and not _FLEET_WORD.fullmatch(text):
-        raise ValueError(
-            f"{text!r} is not a name of lower-case letters, digits and -, for example arm-robots"
-        )
-    return text
-
-
-@section
-class Bundles:
-    """Policy, specifications and hosts from the fleet's signed bundles; off unless `root` is given."""
-
-    root: Path | None = key(
-        default=None, description="the trusted root metadata (root.json) that the fleet's operator gives out"
-    )
-    site: Annotated[str, AfterValidator(_checked_fleet_word)] = key(
-        default="", description="the site that this robot belongs to"
-    )
-    group: Annotated[str, AfterValidator(_checked_fleet_word)] = key(
-        default="", description="the robot group: the robots that get the same bundles"
-    )
-    interval: Annotated[float, Field(ge=1, le=86_400, allow_inf_nan=False)] = key(
-        default=300.0,
-        description="seconds between two polls; an event of the collector makes the next one earlier",
-    )
-    confirm_seconds: Annotated[float, Field(ge=1, le=3600, allow_inf_nan=False)] = key(
-        default=30.0,
-        description="for which a new bundle must stay healthy; otherwise it is rolled back automatically",
-    )
-
-    def __post_init__(self) -> None:
-        if self.root is not None and not (self.site and self.group):
-            raise ValueError("root needs site and group: the bundles are signed for one group of one site")
-
-
-@section
-class Fleet:
-    """A collector of many appliances: it gets the audit log's segments, and gives bundles; off by default.
-
-    `rosrv fleet join` gives `collector`, `robot` and the files; keys here override them.
-    """
-
-    collector: Annotated[str, AfterValidator(_checked_collector)] | None = key(
-        default=None, description="https://ADDRESS:PORT: an address, so that no name server is needed"
-    )
-    name: str | None = key(
-        default=None, description="name in the collector's certificate; default: its address"
-    )
-    ca: Path | None = key(default=None, description="authority of the collector's certificate (PEM)")
-    certificate: Path | None = key(
-        default=None, description="client certificate, enrolled at the collector (PEM)"
-    )
-    receipt_key: Path | None = key(
-        default=None,
-        description="public key of the collector's receipts (PEM); `rosrv-fleet init` prints its file."
-        " With it, sealed segments are pushed",
-    )
-    retention_waits: bool = key(
-        default=False,
-        description="records that are older than `audit.retention_days` stay until the collector has them;"
-        " `audit.retention_bytes` and a full disk remove them nevertheless",
-    )
-    robot: str = key(
-        default="",
-        pattern=r"^([a-z0-9][a-z0-9._-]{0,62})?$",
-        description="this robot's name at the collector (`rosrv-fleet robot add`); bundles need it",
-    )
-    key: Path | None = key(
-        default=None, description="key of `certificate`; readable by users rosrv-fleet and rosrv-bundles"
-    )
-    bundles: Bundles = Bundles()
-
-    def __post_init__(self) -> None:
-        if self.collector is None:
-            files = (self.ca, self.certificate, self.key, self.receipt_key)
-            if any((self.name, *files, self.robot, self.retention_waits, self.bundles != Bundles())):
-                raise ValueError(
-                    "the section has no effect without a collector: remove it, name a `collector`,"
-                    " or run 'rosrv fleet join'"
-                )
-            return
-        needed: dict[str, Path | str | None] = {
-            "ca": self.ca,
-            "certificate": self.certificate,
-            "key": self.key,
-        }
-        if self.bundles.root is not None:
-            needed |= {"robot": self.robot}
-        missing = [name for name, value in needed.items() if not value]
-        if missing:
-            raise ValueError(f"{', '.join(missing)} must be given with collector")
-        if self.receipt_key is None and self.bundles.root is None:
-            raise ValueError(
-                "collector needs receipt_key, to push segments, or bundles.root, to take bundles"
-            )
-        if self.receipt_key is None and self.retention_waits:
-            raise ValueError("retention_waits has no effect without receipt_key")
-
-    @property
-    def destination(self) -> tuple[str, int]:
-        """`collector` as address and port; only where it is given."""
-        return split_collector(self.collector or "")
-
-    @property
-    def connection(self) -> tuple[str, Path, Path, Path, str | None]:
-        """The collector's URL, its authority, this robot's certificate and key, and the collector's name."""
-        assert self.collector and self.ca and self.certificate and self.key  # noqa: S101  checked above
-        return self.collector, self.ca, self.certificate, self.key, self.name
-
-
 @section
 class Availability:
     """Two appliances, of which one takes over from the other; `rosrv standby join` makes them a pair."""
@@ -574,7 +448,6 @@ class Settings:
     ipsec: Ipsec = Ipsec()
     availability: Availability = Availability()
     api_limits: ApiLimits = ApiLimits()
-    fleet: Fleet = Fleet()
 
     @property
     def rest_names(self) -> list[str]:
@@ -582,20 +455,18 @@ class Settings:
         return [*self.api_names, *filter(None, [self.name])]
 
     def __post_init__(self) -> None:
-        collector = self.fleet.collector
-        receivers = [("fleet.collector", collector, collector and split_collector(collector)[0])]
         for kind in SECTIONS:
-            receivers += [
-                (f"{kind.place}.{name}", *receiver) for name, receiver in self.of(kind).receivers().items()
-            ]
-        for name, url, address in receivers:
-            if address and self.isolation == "netns" and is_loopback(address):
+            section = self.of(kind)
+            for name, (url, address) in section.receivers().items():
+                if address and self.isolation == "netns" and is_loopback(address):
+                    raise ValueError(
+                        f"{kind.place}.{name}: {url} is the loopback of the appliance's own namespace"
+                        " (isolation: netns); for a receiver on this machine, use another of its addresses"
+                    )
+            if section.holds_records and self.audit.retention_days is None:
                 raise ValueError(
-                    f"{name}: {url} is the loopback of the appliance's own namespace (isolation: netns);"
-                    " for a receiver on this machine, use another of its addresses"
+                    f"{kind.place}.{section.holds_records} has no effect without audit.retention_days"
                 )
-        if self.fleet.retention_waits and self.audit.retention_days is None:
-            raise ValueError("fleet.retention_waits has no effect without audit.retention_days")
 
     def of(self, kind: type[S]) -> S:
         """Return a feature's section."""

@@ -6,7 +6,6 @@ from functools import partial
 from appliance.channel.answers.status import AuditState
 from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.foundation import Current, Foundation
-from appliance.control.links.forwarder_link import ForwarderLink
 from appliance.control.operators.administration import Administration
 from appliance.control.operators.alarm_orders import AlarmOrders, HandledAlarms
 from appliance.control.operators.block_orders import BlockOrders
@@ -19,8 +18,6 @@ from appliance.control.operators.switched_off import SwitchedOffWatch
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
 from appliance.control.rest.rest_certificate import RestCertificate
-from appliance.features.fleet.bundle_gate import BundleGate
-from appliance.features.fleet.bundle_health import RobotHealth
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment import HostEnrolment, find_endpoint
 from appliance.hosts.rest_address import rest_address
@@ -36,10 +33,8 @@ class Operators:
     tokens: TokenOrders
     ends_of_tokens: StoredDeadlines
     clock: ClockCheck
-    collected: ForwarderLink
     switched_off: SwitchedOffWatch
     blocks: BlockOrders
-    bundles: BundleGate
     administration: Administration
     rest: RestLink
 
@@ -70,8 +65,6 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
     rest = Current[RestLink]()
     tokens = TokenOrders(base.store, trail, ends_of_tokens, lambda: rest().state_tokens())
     clock = ClockCheck(trail, lambda: base.audit.ids.ahead)
-    pushed_to = settings.fleet.collector if settings.fleet.receipt_key is not None else None
-    collected = ForwarderLink(pushed_to, "all", trail, base.receipts.received)
     switched_off = SwitchedOffWatch(
         parts.monitors, base.policies, base.store, trail, settings.forgotten_after
     )
@@ -87,16 +80,14 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         remotes=lambda: {name: seen.remote for name, seen in base.tunnels.seen.items()},
         carried_out=ends.relay.carried_out,
     )
-    bundles = BundleGate(
-        settings.fleet,
+    base.features.operate(
+        appliance=base.role.name,
+        store=base.store,
         policies=base.policies,
         monitors=parts.monitors,
         hosts=hosts,
-        store=base.store,
-        trail=trail,
-        health=lambda deprived: RobotHealth.of(
-            trail.meter, base.policies.current, parts.monitors, base.lifeline.surroundings.processes, deprived
-        ),
+        processes=lambda: base.lifeline.surroundings.processes,
+        received=base.receipts.received,
     )
     handled = HandledAlarms(base.store)
     looks = Queries(
@@ -105,7 +96,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         base.policies,
         hosts,
         base.lifeline.surroundings,
-        audit=partial(_audit_state, base, collected),
+        audit=partial(_audit_state, base),
         clock=clock.state,
         recorder=base.features.recorder,
         queued_deliveries=lambda: ends.enactor.delivery.waiting,
@@ -113,7 +104,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         switched_off=switched_off.rows,
         blocks=blocks.status,
         standby=base.features.pair,
-        bundles=bundles.status,
+        bundles=base.features.bundles,
         handled=handled.marked,
         name=base.settings.name,
     )
@@ -150,10 +141,8 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         tokens=tokens,
         ends_of_tokens=ends_of_tokens,
         clock=clock,
-        collected=collected,
         switched_off=switched_off,
         blocks=blocks,
-        bundles=bundles,
         administration=administration,
         rest=rest(),
     )
@@ -166,12 +155,12 @@ async def _durable(base: Foundation) -> None:
         await base.role.before_answer()
 
 
-def _audit_state(base: Foundation, collected: ForwarderLink) -> AuditState:
+def _audit_state(base: Foundation) -> AuditState:
     return AuditState(
         *base.audit.lag,
         failed=base.audit.failed,
         on_failure=base.settings.audit.on_audit_failure,
         degraded=base.audit.degraded,
         forwarding=base.features.forwarding(),
-        collector=collected.status(),
+        collector=base.features.collector(),
     )

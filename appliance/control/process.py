@@ -149,7 +149,6 @@ class _Control:
             "the ends of tokens": operators.ends_of_tokens.watch,
             "the check of protection that is off": operators.switched_off.watch,
             "the blocks of hosts": operators.blocks.watch,
-            "the bundles": operators.bundles.run,
             "the storage of parameters": self._save_parameters,
             "the tunnels": partial(base.tunnels.run, operators.certification.each_hour),
             "the publications of monitors": partial(parts.publisher.run, parts.reconciler.ready),

@@ -16,7 +16,6 @@ from appliance.control.assembly.foundation import Foundation
 from appliance.control.assembly.policies import RevisionChangedError
 from appliance.control.assembly.policy_gate import PolicyRefusedError
 from appliance.control.operator_assembly import Operators
-from appliance.features.fleet.bundle_link import BundleLink
 from appliance.hosts.host_table import HostRefusedError
 from appliance.master.graph.registry import Kind
 from appliance.specifications.allocation import TOPIC
@@ -84,10 +83,6 @@ class SupervisorMessages:
                 self._operators.rest.attach(self._base.lifeline.api_channel(sock.detach()))
             case "charon":
                 self._base.tunnels.attach(Channel(sock, messages.TunnelLink))
-            case "fleet":
-                self._operators.collected.link.attach(Channel(sock, messages.ForwardingLink))
-            case "bundles":
-                self._operators.bundles.link.attach(Channel(sock, BundleLink, longest=16 << 20))
             case _:
                 self._feature_link(role, sock)
 
@@ -98,7 +93,7 @@ class SupervisorMessages:
             sock.close()
             return
         link, accepted = found
-        link.attach(Channel(sock, accepted))
+        link.attach(Channel(sock, accepted, longest=self._base.features.longest(role)))
 
     def _relay_link(self, index: int, channel: Channel) -> None:
         ends, graph = self._parts.endpoints, self._parts.core.graph

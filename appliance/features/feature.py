@@ -8,10 +8,10 @@ Invariants:
 3. No feature imports `configuration.settings` except in the entry of a process, because the settings import the table.
 """
 
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from appliance.cli.verb_table import Group
 from appliance.configuration.sections import FeatureSection, Sections
@@ -22,12 +22,26 @@ if TYPE_CHECKING:
     from appliance.channel.admin import AdminRequest
     from appliance.channel.answers.limit_answers import LimitUse
     from appliance.channel.answers.standby_answers import StandbyState
-    from appliance.channel.answers.status import ForwardingState, RecorderState
+    from appliance.channel.answers.status import BundlesState, ForwardingState, ProcessInfo, RecorderState
     from appliance.channel.link import Link
     from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
+    from appliance.control.assembly.policies import Policies
     from appliance.control.operators.request_method import RequestMethod
+    from appliance.specifications.specification_manager import SpecificationManager
+    from appliance.store.state_file import StateStore
     from appliance.supervisor.service_gate import Pairing
     from appliance.telemetry.audit_trail import AuditTrail, RecordDetails
+
+
+class HostDeclarations(Protocol):
+    """The hosts that a bundle declares, in place of the file hosts.yaml."""
+
+    @property
+    def bundled(self) -> str:
+        """Return the text of the bundle in force; empty: the file is in force."""
+
+    async def take_bundle(self, text: str, who: str) -> object:
+        """Bring the hosts of a bundle into force; empty: those of the file. Raises `HostRefusedError`."""
 
 
 @dataclass(frozen=True)
@@ -47,27 +61,50 @@ class FeatureContext:
 
 
 @dataclass(frozen=True)
+class OperatorContext:
+    """Hold the objects of control that exist later, and that parts of features use for operators' work.
+
+    `appliance` is the name of one of two appliances, empty on a single one. `processes` returns the processes of the
+    appliance. `received` notes that another machine has all records up to a sequence.
+    """
+
+    core: FeatureContext
+    appliance: str
+    store: "StateStore"
+    policies: "Policies"
+    monitors: "SpecificationManager"
+    hosts: HostDeclarations
+    processes: "Callable[[], Sequence[ProcessInfo]]"
+    received: Callable[[int], None]
+
+
+@dataclass(frozen=True)
 class FeaturePart:
     """The part of control that a feature adds.
 
-    `links` are control's ends of the links to the feature's roles, with the messages that control accepts.
-    `methods` answer the feature's `operations`. `limits` returns how much of its resources is used.
-    `details` returns what it adds to the details of a record (`RecordDetails`).
-    `called` answers nodes' calls of its service. `work` runs until control ends; its names go into error messages.
-    `forwarding` returns the state of the forwarding of the audit log, or None if none is configured.
-    `recorder` returns the state of the flight recorder, or None if none is configured. `pair` returns the state of this
-    appliance and of the one that can take over, None for a single appliance.
+    `links` are control's ends of the links to the feature's roles, with the messages that control accepts, and
+    `longest` limits the bytes of a message. `methods` answer the feature's `operations`. `work` runs until control
+    ends; its names go into error messages. `limits` returns how much of its resources is used.
+    `details` returns what it adds to the details of a record (`RecordDetails`). `called` answers nodes' calls of its
+    service.
+
+    These return a state, or None if there is none: `forwarding` that of the forwarding of the audit log, `collector`
+    that of its segments, `bundles` that of the fleet's bundles, `recorder` that of the flight recorder, and `pair` that
+    of this appliance and of the one that can take over.
     """
 
     links: "Mapping[str, tuple[Link, Any]]" = field(default_factory=dict)
     forwarding: "Callable[[], ForwardingState | None]" = lambda: None
     methods: "tuple[RequestMethod[Any], ...]" = ()
+    longest: Mapping[str, int] = field(default_factory=dict)
     limits: "Callable[[], tuple[LimitUse, ...]]" = lambda: ()
     details: "RecordDetails" = lambda *_event: {}
     called: "Callable[[OwnServiceCalled], Awaitable[OwnServiceAnswered]] | None" = None
     recorder: "Callable[[], RecorderState | None]" = lambda: None
     pair: "Callable[[], StandbyState | None]" = lambda: None
     work: Mapping[str, Callable[[], Awaitable[None]]] = field(default_factory=dict)
+    collector: "Callable[[], ForwardingState | None]" = lambda: None
+    bundles: "Callable[[], BundlesState | None]" = lambda: None
 
 
 @dataclass(frozen=True)
@@ -96,6 +133,7 @@ class Feature:
     recorded: str | None = None
     memory: Callable[[Sections, int], SharedMemory | None] = lambda _sections, _relays: None
     make: Callable[[FeatureContext], FeaturePart] | None = None
+    operate: Callable[[OperatorContext], FeaturePart] | None = None
     pairing: "Callable[[Path], Pairing | None] | None" = None
     state_files: tuple[str, ...] = ()
     may_start: str | None = None

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from appliance.configuration.sections import Sections
 from appliance.features.evidence.feature import EVIDENCE
-from appliance.features.feature import Feature, FeatureContext, FeaturePart
+from appliance.features.feature import Feature, FeatureContext, FeaturePart, OperatorContext
+from appliance.features.fleet.feature import FLEET
 from appliance.features.recorder.feature import RECORDER
 from appliance.features.standby.feature import STANDBY
 from appliance.features.syslog.feature import SYSLOG
@@ -20,13 +21,16 @@ if TYPE_CHECKING:
     from appliance.audit.log.record import Severity
     from appliance.channel.answers.limit_answers import LimitUse
     from appliance.channel.answers.standby_answers import StandbyState
-    from appliance.channel.answers.status import ForwardingState, RecorderState
+    from appliance.channel.answers.status import BundlesState, ForwardingState, RecorderState
     from appliance.channel.link import Link
     from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
     from appliance.control.operators.request_method import RequestMethod
     from appliance.supervisor.service_gate import Pairing
 
-FEATURES: tuple[Feature, ...] = (SYSLOG, EVIDENCE, RECORDER, STANDBY)
+LONGEST = 64 << 20
+"""The most bytes of a message on a link of a feature, unless its part has a smaller limit."""
+
+FEATURES: tuple[Feature, ...] = (SYSLOG, EVIDENCE, RECORDER, STANDBY, FLEET)
 
 
 def memories(sections: Sections, relays: int) -> tuple[SharedMemory, ...]:
@@ -43,7 +47,13 @@ class FeatureParts:
     """The parts of all features in control."""
 
     def __init__(self, core: FeatureContext) -> None:
+        self._core = core
         self._parts = [feature.make(core) for feature in FEATURES if feature.make is not None]
+
+    def operate(self, **later: Any) -> None:
+        """Add the parts that need objects of control that exist now: the fields of `OperatorContext`."""
+        context = OperatorContext(self._core, **later)
+        self._parts += [feature.operate(context) for feature in FEATURES if feature.operate is not None]
 
     async def inherit(self, foundation: Any, parts: Any) -> None:
         """Add the parts that need the other parts of control."""
@@ -55,6 +65,10 @@ class FeatureParts:
     def link(self, role: str) -> "tuple[Link, Any] | None":
         """Return control's end of the link to a role, with the accepted messages; None for an unknown role."""
         return next((part.links[role] for part in self._parts if role in part.links), None)
+
+    def longest(self, role: str) -> int:
+        """Return the most bytes of a message of a role."""
+        return next((part.longest[role] for part in self._parts if role in part.longest), LONGEST)
 
     def methods(self) -> "tuple[RequestMethod[Any], ...]":
         """Return the methods that answer the features' requests."""
@@ -85,6 +99,14 @@ class FeatureParts:
         """Answer a node's call of the appliance's own service."""
         (called,) = filter(None, (part.called for part in self._parts))
         return await called(call)
+
+    def collector(self) -> "ForwardingState | None":
+        """Return the state of the push of segments, or None if none is configured."""
+        return next(filter(None, (part.collector() for part in self._parts)), None)
+
+    def bundles(self) -> "BundlesState | None":
+        """Return the state of the fleet's bundles, or None if none are configured or in force."""
+        return next(filter(None, (part.bundles() for part in self._parts)), None)
 
     def pair(self) -> "StandbyState | None":
         """Return the state of both appliances, or None for a single appliance."""

@@ -69,7 +69,6 @@ class AppliancePorts:
     own: int | None = None  # the port of the own node's master
     standby: StandbyAccess | None = None  # on one of two appliances
     receivers: tuple[tuple[str, RemoteReceiver], ...] = ()  # of features' roles, by user
-    collector: tuple[str, int] | None = None  # address and port of the fleet's collector
 
 
 class NoIsolation:
@@ -312,7 +311,7 @@ class ContainerIsolation(NoIsolation):
             api_networks=self._api_networks(),
             neighbours=self._neighbours(),
             tunnel_only=(self._tunnels[0],) if self._tunnels else (),
-            forwarders=(*self._forwarders(), *self._collector_clients()),
+            forwarders=self._forwarders(),
             standby=self._ports.standby,
             tunnel_interface=USER_SPACE_INTERFACE
             if self._tunnels and self._tunnels[1] == "user space"
@@ -325,14 +324,6 @@ class ContainerIsolation(NoIsolation):
     def _neighbours(self) -> tuple[str, ...]:
         """Return the addresses that on the link to the appliance only the machine itself may use."""
         return ()
-
-    def _collector_clients(self) -> tuple[ForwarderAccess, ...]:
-        if self._ports.collector is None:
-            return ()
-        return tuple(
-            ForwarderAccess(account_of(user).uid, *self._ports.collector, name=name)
-            for user, name in (("rosrv-fleet", "segments"), ("rosrv-bundles", "bundles"))
-        )
 
     def _forwarders(self) -> tuple[ForwarderAccess, ...]:
         return tuple(

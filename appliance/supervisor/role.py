@@ -25,8 +25,6 @@ class Facts:
     ca_passphrase_file: Path | None = None
     control_reads: tuple[Path, ...] = ()
     sections: Sections = DEFAULTS  # of features
-    fleet_reads: tuple[Path, ...] = ()
-    collector_port: int | None = None
     view: "PrivateView | None" = None
     raised: int = 0  # by which the supervisor has lowered its own niceness; its children inherit this
 

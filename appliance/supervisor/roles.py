@@ -79,8 +79,7 @@ ROLES = (
         "control", "rosrv", "control", "appliance.control.process:main",
         ended_early=100, files=65_536,
         links=(
-            "relay", "signer", "compiler", "api", "charon", *(role.name for role in _OF_FEATURES), "fleet",
-            "bundles",
+            "relay", "signer", "compiler", "api", "charon", *(role.name for role in _OF_FEATURES),
         ),
         readable_by="rosrv-api", inputs=lambda facts: facts.control_reads,
         sandbox=lambda facts: SandboxPlan(
@@ -129,27 +128,6 @@ ROLES = (
         ),
     ),
     *(role for role in _OF_FEATURES if role.after is not None),
-    _ours(
-        "fleet", "rosrv-fleet", "fleet", "appliance.features.fleet.segment_process:main",
-        ended_early=600, nice=10, after="control", dispensable=True, group="rosrv-api", stands_by=True,
-        inputs=lambda facts: facts.fleet_reads,
-        sandbox=lambda facts: SandboxPlan(
-            allowlist=True,
-            families=ROUTES,
-            reads=(str(facts.part("control")), *folders_of(*facts.fleet_reads)),
-            connects=None if facts.collector_port is None else (facts.collector_port,),
-        ),
-    ),
-    _ours(
-        "bundles", "rosrv-bundles", "bundles", "appliance.features.fleet.process:main",
-        ended_early=600, nice=10, after="control", dispensable=True, inputs=lambda facts: facts.fleet_reads,
-        sandbox=lambda facts: SandboxPlan(
-            allowlist=True,
-            families=ROUTES,
-            reads=folders_of(*facts.fleet_reads),
-            connects=None if facts.collector_port is None else (facts.collector_port,),
-        ),
-    ),
 )  # fmt: skip
 """The roles in the order of their start."""
 
@@ -158,15 +136,11 @@ def roles_of(
     *,
     sections: Sections = DEFAULTS,
     api: bool = True,
-    fleet: bool = False,
     paired: bool = False,
-    bundles: bool = False,
 ) -> tuple[Role, ...]:
     """Return the roles of an appliance with these parts. Raises `StartError` if a ROS program is missing."""
     require_programs(ROS_PROGRAMS)
-    wanted = {
-        "api": api, "fleet": fleet, "bundles": bundles,
-    }  # fmt: skip
+    wanted = {"api": api}
     return tuple(
         role
         for role in ROLES

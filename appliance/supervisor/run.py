@@ -6,7 +6,6 @@ import os
 import socket
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import structlog
 
@@ -120,7 +119,6 @@ def _run(
                 for role in roles
                 if (receiver := role.receiver(settings.sections)) is not None
             ),
-            collector=settings.fleet.destination if settings.fleet.collector is not None else None,
             own_node=_ports_of_rosout(settings, node_ports),
             standby=StandbyAccess(pairing.other, pairing.port) if pairing is not None else None,
         )
@@ -161,12 +159,6 @@ def _ports_of_rosout(settings: Settings, node_ports: range) -> range:
         [node_ports, range(chosen.first, chosen.last + 1), *(range(port, port + 1) for port in taken)],
         _UNPRIVILEGED,
     )
-
-
-def _files_of_fleet(settings: Settings) -> tuple[Path, ...]:
-    fleet = settings.fleet
-    files = (fleet.ca, fleet.certificate, fleet.key, fleet.receipt_key, fleet.bundles.root)
-    return tuple(filter(None, files))
 
 
 def _with_ports(settings: Settings) -> Settings:
@@ -253,10 +245,6 @@ def _supervise(
                 rosout_ports=rosout_ports if settings.isolation != "none" else None,
                 control_reads=tuple(filter(None, (settings.policy, settings.monitors, settings.hosts))),
                 sections=settings.sections,
-                fleet_reads=_files_of_fleet(settings),
-                collector_port=settings.fleet.destination[1]
-                if settings.fleet.collector is not None
-                else None,
                 ca_passphrase_file=settings.ipsec.ca_passphrase_file,
                 view=view,
                 raised=raised,

@@ -13,14 +13,12 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from rosrv_fleet.bundles.keys import KeyFolder, load_online_key
 from rosrv_fleet.bundles.publication import next_timestamp, read_publication
 from rosrv_fleet.bundles.repository import TIMESTAMP_KEY, BundleRepository
 
-from appliance.features.fleet.connection import CollectorConnection, robot_connection
-from appliance.features.fleet.verified_bundles import VerifiedBundles
 from appliance.formats.terms import BundlePath, Ring, Terms
 from tests.support.fleet_certificates import FleetAuthority
 
@@ -44,6 +42,13 @@ def everywhere(signed: float | None = None, *rings: Ring) -> Terms:
     return Terms(int(time.time() if signed is None else signed), [*rings] or [Ring("all", [], 100)])
 
 
+class SupportsClose(Protocol):
+    """A connection of a robot, which ends with the server."""
+
+    def close(self) -> None:
+        """Close it."""
+
+
 class BundleSite:
     """An operator's repository with one group, and the collector's folder; `selection` is what it selects."""
 
@@ -62,7 +67,7 @@ class BundleSite:
         self.reports: queue.Queue[tuple[str, dict[str, Any]]] = queue.Queue()
         self.requests: list[str] = []
         self.wakes: list[threading.Event] = []
-        self.connections: list[CollectorConnection] = []
+        self.connections: list[SupportsClose] = []
 
     @property
     def root(self) -> bytes:
@@ -109,21 +114,6 @@ class BundleSite:
                 event.set()
             server.shutdown()
             server.server_close()
-
-    def connection(self, url: str, robot: str = ROBOT) -> CollectorConnection:
-        certificate, key = self.authority.issue(robot)
-        made = robot_connection(url, self.authority.ca, certificate, key)
-        self.connections.append(made)
-        return made
-
-    def robot(
-        self, url: str, folder: Path, robot: str = ROBOT, clock: Callable[[], float] = time.time
-    ) -> VerifiedBundles:
-        """Return a robot's client of bundles."""
-        connection = self.connection(url, robot)
-        return VerifiedBundles(
-            folder, self.first_root, connection, site=SITE, group=GROUP, robot=robot, clock=clock
-        )
 
     def answer(self, path: str) -> bytes | None:
         """Return the honest answer at a path, or None."""

@@ -2,15 +2,26 @@
 
 from appliance.audit.log.log import AuditLog
 from appliance.configuration.sections import DEFAULTS
+from appliance.control.assembly.policies import Policies
 from appliance.features.feature import FeatureContext
 from appliance.features.table import FeatureParts
+from appliance.hosts.enrolment import HostEnrolment
+from appliance.specifications.specification_manager import SpecificationManager
+from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.idle import idle
 
 
 def idle_parts() -> FeatureParts:
     """Return the parts of all features, with default settings and a log that records nothing."""
-    core = FeatureContext(
+    store, monitors, hosts = idle(StateStore), idle(SpecificationManager), idle(HostEnrolment)
+    store.settings = dict  # type: ignore[method-assign]
+    early = FeatureContext(
         DEFAULTS, idle(AuditTrail), idle(AuditLog), "", charged_to=lambda host: host, in_force=lambda: (0, 0)
     )
-    return FeatureParts(core)
+    parts = FeatureParts(early)
+    parts.operate(
+        appliance="", store=store, policies=idle(Policies), monitors=monitors, hosts=hosts, processes=tuple,
+        received=lambda _sequence: None,
+    )  # fmt: skip
+    return parts

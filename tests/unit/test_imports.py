@@ -38,7 +38,7 @@ PUBLIC = {
 
 
 def test_the_appliance_imports_only_public_modules_of_the_language(imports: dict[str, set[str]]) -> None:
-    """They are the modules of the table, and the command's modules, which only the appliance's command imports."""
+    """They are the modules of the table, and the command's modules, which only verbs import."""
     found = {
         (module, imported.removeprefix("rosmop."))
         for module, all_imported in imports.items()

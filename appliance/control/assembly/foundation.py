@@ -113,7 +113,11 @@ async def make_foundation(
     """
     audit, quota_class, enforcement = Current[AuditLog](), Current[HostQuotaClass](), Current[Enforcement]()
     signing = SignerRequests(audit)
-    receipts = ReceiptFloor(settings)
+    receipts = ReceiptFloor(
+        settings.state,
+        int(settings.audit.reserve_bytes),
+        holding=any(section.holds_records for section in settings.sections.values.values()),
+    )
     held_by = lifeline.log_held()
     audit.set(
         open_audit(

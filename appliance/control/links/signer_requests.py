@@ -6,29 +6,29 @@ Missing signatures are requested again whenever a signer process starts.
 import asyncio
 import os
 from collections.abc import Callable
+from pathlib import Path
 
 from appliance.audit.log.log import AuditLog
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.link import Link
-from appliance.configuration.settings import Settings
 
 _ANY = 1 << 63
 
 
 class ReceiptFloor:
-    """The last record that retention by age may remove: any, or with `fleet.retention_waits` what the collector has.
+    """The last record that retention by age may remove: any, or if `holding`, what another machine has.
 
     While only the reserve of the log's disk is free, it is any record. One thread writes, another reads.
     """
 
-    def __init__(self, settings: Settings) -> None:
-        self._folder = settings.state / "control"
-        self._reserve = int(settings.audit.reserve_bytes)
-        self._received = 0 if settings.fleet.retention_waits else _ANY
+    def __init__(self, state: Path, reserve: int, *, holding: bool) -> None:
+        self._folder = state / "control"
+        self._reserve = reserve
+        self._received = 0 if holding else _ANY
 
     def received(self, sequence: int) -> None:
-        """Note that the collector has all records up to this sequence."""
+        """Note that another machine has all records up to this sequence."""
         if self._received != _ANY:
             self._received = sequence
 

@@ -25,9 +25,9 @@ from appliance.base.actors import UNCONFIRMED
 from appliance.channel import admin
 from appliance.channel.answers.status import BundlesState
 from appliance.channel.link import Link
-from appliance.configuration.settings import Fleet
 from appliance.control.assembly.policies import Policies, PolicyCases, RevisionChangedError
 from appliance.control.assembly.policy_gate import PolicyRefusedError
+from appliance.features.feature import HostDeclarations
 from appliance.features.fleet.bundle_health import RobotHealth
 from appliance.features.fleet.bundle_link import (
     BundleHealth,
@@ -36,8 +36,8 @@ from appliance.features.fleet.bundle_link import (
     BundleStated,
     RefusedBundle,
 )
+from appliance.features.fleet.settings import Fleet
 from appliance.formats.bundle_archive import BundleContents
-from appliance.hosts.enrolment import HostEnrolment
 from appliance.hosts.host_table import HostRefusedError
 from appliance.hosts.hosts_file import IN_BUNDLE, DeclaredHostsError, parse_declared
 from appliance.policy.lost_rights import LostRights
@@ -115,7 +115,7 @@ class BundleGate:
         *,
         policies: Policies,
         monitors: SpecificationManager,
-        hosts: HostEnrolment,
+        hosts: HostDeclarations,
         store: StateStore,
         trail: AuditTrail,
         health: Callable[[Callable[[Address], bool]], RobotHealth],

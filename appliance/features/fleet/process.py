@@ -19,10 +19,11 @@ from appliance.base.input_files import read_given
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
-from appliance.configuration.settings import Fleet, load_resolved
+from appliance.configuration.settings import load_resolved
 from appliance.features.fleet.bundle_link import BundleLink, BundleOffered, BundlePollReported, BundleStated
 from appliance.features.fleet.connection import CollectorConnection, CollectorError, robot_connection
 from appliance.features.fleet.poller import Poller
+from appliance.features.fleet.settings import Fleet
 from appliance.features.fleet.verified_bundles import VerifiedBundles
 from appliance.formats.bundle_api import EVENTS
 
@@ -39,7 +40,7 @@ _LONGEST_ROOT = 1 << 18
 
 def main(lifeline_fd: int, config: Path) -> None:
     """Poll for bundles until the supervisor ends the process."""
-    asyncio.run(_Process(load_resolved(config).fleet, lifeline_fd).run())
+    asyncio.run(_Process(load_resolved(config).of(Fleet), lifeline_fd).run())
 
 
 class PollLoop:

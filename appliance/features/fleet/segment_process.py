@@ -7,6 +7,7 @@ from appliance.audit.log.signatures import read_public_key
 from appliance.configuration.settings import Settings, load_resolved
 from appliance.features.fleet.connection import robot_connection
 from appliance.features.fleet.segment_pusher import SegmentPusher
+from appliance.features.fleet.settings import Fleet
 from appliance.forwarding.process import ForwardingProcess
 
 
@@ -18,7 +19,7 @@ def main(lifeline_fd: int, config: Path) -> None:
 
 def make_pusher(settings: Settings, folder: Path) -> SegmentPusher:
     """Return the pusher for these settings, which must configure a collector. Raises `KeyUnreadableError`."""
-    fleet = settings.fleet
+    fleet = settings.of(Fleet)
     assert fleet.receipt_key is not None  # noqa: S101  the role runs only with it
     return SegmentPusher(
         settings.state / "control" / "audit.db",

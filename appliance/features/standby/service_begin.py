@@ -12,7 +12,6 @@ from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.foundation import Foundation
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.feature import FeaturePart
-from appliance.features.standby.fleet_of_pair import compare_fleets
 from appliance.features.standby.inheritance import StateCopies, inherited_state, keep_state, leave_state
 from appliance.features.standby.replication import Pair
 from appliance.features.standby.service_report import ServiceReport
@@ -78,6 +77,5 @@ async def _begin_epoch(base: Foundation, parts: Parts, pair: Pair) -> TakeoverRe
         base.trail, base.audit, base.store, base.signing.signed, name=name, other=other
     )
     await recorder.took_over(pair.epoch)
-    compare_fleets(base.settings.fleet, base.store, base.trail, name=name)
     parts.monitors.rollout.inherit(*inherited_state(pair, base.store))
     return recorder

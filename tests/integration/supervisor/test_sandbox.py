@@ -132,15 +132,22 @@ class Place:
     def start(self, role: Role, entry: str) -> tuple[subprocess.CompletedProcess[str], list[Lifeline]]:
         """Start a function in the role's sandbox; return the ended process and its reports."""
         here, there = socket.socketpair()
-        to = f"tcp://127.0.0.1:{self.ports[0]}"
-        sections = [one.settings(to=to) for one in FEATURES if one.name == "syslog" and one.settings]  # type: ignore[call-arg]  # of syslog
+        files = dict.fromkeys(("ca", "certificate", "key", "receipt_key"), Path("/etc/ssl/certs/none.pem"))
+        receivers: dict[str, dict[str, Any]] = {
+            "syslog": {"to": f"tcp://127.0.0.1:{self.ports[0]}"},
+            "fleet": {"collector": f"https://127.0.0.1:{self.ports[0]}", **files},
+        }
+        sections = [
+            one.settings(**receivers[one.name])
+            for one in FEATURES
+            if one.name in receivers and one.settings is not None
+        ]
         facts = Facts(
             self.state.path,
             self.state.config,
             self.ports[0],
             "http://127.0.0.1:1",
             sections=Sections({type(one): one for one in sections}),
-            collector_port=self.ports[0],
         )
         plan = ProcessSlot(role, 0).plan(facts, there.fileno(), None)
         sandbox = replace(plan.sandbox, reads=(*plan.sandbox.reads, str(ROOT)))

@@ -21,10 +21,6 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
-from appliance.audit.log.signatures import read_public_key
-from appliance.configuration.config_sources import resolve
-from appliance.features.fleet.connection import robot_connection
-from appliance.features.fleet.segment_pusher import SegmentPusher
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
@@ -33,7 +29,7 @@ from tests.support.processes import LIMIT
 from tests.support.rosmaster import master_at
 from tests.support.sources import ROOT
 from tests.support.waiting import eventually
-from tests.system.fleet.fleet_site import FleetRobot
+from tests.system.fleet.fleet_site import FleetRobot, push_joined
 
 pytestmark = pytest.mark.timeout(2400)  # for the first test: the images are built, and twenty robots join
 
@@ -118,7 +114,7 @@ class Walk:
     def push(self) -> None:
         """Push the sealed segments of the simulated robots, as the appliance's process does."""
         for robot in self.simulated:
-            self.machine.run(lambda robot=robot: _push(robot, self.folder / "robots" / robot.name))  # type: ignore[misc]  # mypy does not infer it
+            self.machine.run(lambda robot=robot: push_joined(robot, self.folder / "robots" / robot.name))  # type: ignore[misc]  # mypy does not infer it
 
     def everything_is_proven(self) -> None:
         """Wait until every record that the robots have now is collected, and verify it."""
@@ -159,15 +155,6 @@ def _work(appliance: Appliance) -> None:
 
 def _collected(appliance: Appliance) -> int:
     return int(appliance.status()["audit"]["collector"]["sequence"])
-
-
-def _push(robot: FleetRobot, state: Path) -> None:
-    fleet = resolve(None, {}, {"state": state}).fleet
-    assert fleet.receipt_key
-    link = robot_connection(*fleet.connection)
-    pusher = SegmentPusher(robot.log_file, robot.folder / "state", link, read_public_key(fleet.receipt_key))
-    eventually(lambda: pusher.step() > 0 and not pusher.progress.trouble, lambda: pusher.progress.trouble)
-    pusher.close()
 
 
 @pytest.fixture(scope="module")

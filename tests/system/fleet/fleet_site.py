@@ -22,8 +22,10 @@ from rosrv_fleet.robots import Robots
 from appliance.audit.log.log import AuditLog
 from appliance.audit.log.signatures import read_public_key, write_public_key
 from appliance.audit.proof.copies import signed_checkpoints
+from appliance.configuration.config_sources import resolve
 from appliance.features.fleet.connection import robot_connection
 from appliance.features.fleet.segment_pusher import SegmentPusher
+from appliance.features.fleet.settings import Fleet
 from tests.support.audit import decision, settle
 from tests.support.certificates import Certificates, make_certificates
 from tests.support.sources import ROOT
@@ -251,6 +253,16 @@ class FleetRobot:
     def close(self) -> None:
         """Close the log."""
         self.log.close()
+
+
+def push_joined(robot: FleetRobot, state: Path) -> None:
+    """Push the log of a robot with the settings that `rosrv fleet join` left in a state directory."""
+    fleet = resolve(None, {}, {"state": state}).of(Fleet)
+    assert fleet.receipt_key
+    link = robot_connection(*fleet.connection)
+    pusher = SegmentPusher(robot.log_file, robot.folder / "state", link, read_public_key(fleet.receipt_key))
+    eventually(lambda: pusher.step() > 0 and not pusher.progress.trouble, lambda: pusher.progress.trouble)
+    pusher.close()
 
 
 @contextmanager

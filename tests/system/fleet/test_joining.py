@@ -22,6 +22,7 @@ from rosrv_fleet.invitations import Invitations
 from appliance.configuration.config_sources import resolve
 from appliance.features.fleet.connection import robot_connection
 from appliance.features.fleet.segment_pusher import SegmentPusher
+from appliance.features.fleet.settings import Fleet
 from appliance.formats.fleet_membership import JOIN_PATH
 from appliance.signing.own_certificate import make_own_certificate
 from tests.support.command import rosrv
@@ -63,7 +64,7 @@ def join(robot: FleetRobot, file: Path, status: int = 0) -> str:
 
 def pusher_of(robot: FleetRobot) -> SegmentPusher:
     """Return the appliance's client with the settings that a join left."""
-    fleet = resolve(None, {}, {"state": state_of(robot), "isolation": "none"}).fleet
+    fleet = resolve(None, {}, {"state": state_of(robot), "isolation": "none"}).of(Fleet)
     link = robot_connection(*fleet.connection)
     return SegmentPusher(robot.log_file, robot.folder / "state", link, robot.site.receipt_key)
 
@@ -97,7 +98,7 @@ def test_a_robot_joins_and_pushes(inviting: FleetSite, make_robot: MakeRobot, tm
         "is not SITE/GROUP" in inviting.run("robot", "invite", "arm7", "--group", "site-a", status=2).stderr
     )
     said = join(robot, invite(inviting, "arm7", tmp_path / "arm7.json", "--group", "site-a/arms"))
-    bundles = resolve(None, {}, {"state": state_of(robot), "isolation": "none"}).fleet.bundles
+    bundles = resolve(None, {}, {"state": state_of(robot), "isolation": "none"}).of(Fleet).bundles
     assert (bundles.site, bundles.group) == ("site-a", "arms")
     (listed,) = map(json.loads, inviting.run("robot", "list", "--json").stdout.splitlines())
     assert (listed["name"], listed["group"]) == ("arm7", "site-a/arms")
@@ -302,7 +303,7 @@ def test_a_second_join_renews(inviting: FleetSite, make_robot: MakeRobot, tmp_pa
     assert now != earlier
     assert listed["certificate"] == _fingerprint(now)
     assert rosrv("fleet", "leave", "--state", str(state_of(robot))).returncode == 0
-    assert resolve(None, {}, {"state": state_of(robot), "isolation": "none"}).fleet.collector is None
+    assert resolve(None, {}, {"state": state_of(robot), "isolation": "none"}).of(Fleet).collector is None
 
 
 def test_a_certificate_without_its_key_is_refused(

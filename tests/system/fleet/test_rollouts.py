@@ -22,11 +22,12 @@ from appliance.features.fleet.bundle_link import BundleHealth, BundleOffered, Bu
 from appliance.features.fleet.connection import robot_context
 from appliance.features.fleet.poller import Poller
 from appliance.formats.terms import BundlePath, Ring
-from tests.support.bundle_site import GROUP, SITE, BundleSite, bundle_files, everywhere
+from tests.support.bundle_site import GROUP, SITE, bundle_files, everywhere
 from tests.support.processes import LIMIT
 from tests.support.rollout_collector import RolloutCollector, collector, serving
 from tests.support.waiting import NoAnswerError, eventually
 from tests.system.fleet.postgres import PostgresCluster
+from tests.unit.features.fleet.robot_site import RobotSite
 
 QUICK = {"healthy_seconds": 0, "share": 0.9}
 RINGS = (Ring("canary", ["r-0", "r-1"]), Ring("half", [], 50), Ring("rest", [], 100))
@@ -60,7 +61,7 @@ class Robot:
 class Fleet:
     """A site, its collector and robots; `poll` lets all robots poll once, several at a time."""
 
-    def __init__(self, site: BundleSite, running: RolloutCollector, folder: Path) -> None:
+    def __init__(self, site: RobotSite, running: RolloutCollector, folder: Path) -> None:
         self.site, self.collector, self.folder = site, running, folder
         self.robots: dict[str, Robot] = {}
         certificate, key = site.authority.issue("operator")
@@ -141,14 +142,14 @@ def _nameless(fleet: Fleet) -> httpx.Client:
     return httpx.Client(verify=ssl.create_default_context(cafile=fleet.site.authority.ca), trust_env=False)
 
 
-def _context(site: BundleSite, certificate: Path, key: Path) -> Any:
+def _context(site: RobotSite, certificate: Path, key: Path) -> Any:
     return robot_context(site.authority.ca, certificate, key)
 
 
 @pytest.fixture
 def fleet(tmp_path: Path, database: str) -> Iterator[Fleet]:
     """Run a site and its collector."""
-    site = BundleSite(tmp_path / "site")
+    site = RobotSite(tmp_path / "site")
     with collector(site.repository.folder, site.authority, database) as running:
         made = Fleet(site, running, tmp_path)
         try:

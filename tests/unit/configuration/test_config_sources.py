@@ -1,6 +1,5 @@
 """Tests of `appliance.configuration.config_sources`."""
 
-import json
 import re
 from contextlib import suppress
 from dataclasses import asdict
@@ -37,58 +36,6 @@ def test_later_sources_override_earlier_ones(file: Path) -> None:
     assert settings.rosmaster_port == 2
     assert (settings.limits.nesting, settings.limits.elements) == (9, 8)
     assert settings.isolation == "netns"
-
-
-def joined(state: Path) -> Path:
-    """Write the settings that `rosrv fleet join` leaves in a state directory; return their folder."""
-    folder = state / "joined"
-    folder.mkdir(parents=True)
-    section = {
-        "collector": "https://10.0.0.9:8444", "robot": "arm7", "ca": "collector.pem", "certificate": "robot.pem",
-        "key": "robot.key", "receipt_key": "receipts.pub", "bundles": {"site": "site-a", "group": "arms"},
-    }  # fmt: skip
-    (folder / "fleet.json").write_text(json.dumps(section))
-    return folder
-
-
-def test_a_join_gives_the_section_fleet(file: Path, tmp_path: Path) -> None:
-    """The settings of a join apply; keys of the file override them, and a collector in the file replaces all."""
-    folder = joined(tmp_path / "state")
-    state = {"state": tmp_path / "state"}
-    fleet = resolve(None, {}, state).fleet
-    assert (fleet.collector, fleet.robot, fleet.key) == (
-        "https://10.0.0.9:8444",
-        "arm7",
-        folder / "robot.key",
-    )
-    assert (fleet.bundles.site, fleet.bundles.group, fleet.bundles.root) == ("site-a", "arms", None)
-    file.write_text(
-        "state: state\naudit: {retention_days: 9}\nfleet: {retention_waits: true, bundles: {root: root.json}}\n"
-    )
-    fleet = resolve(file, {}, {}).fleet
-    assert (fleet.collector, fleet.retention_waits) == ("https://10.0.0.9:8444", True)
-    assert (fleet.bundles.root, fleet.bundles.group) == (tmp_path / "root.json", "arms")
-    file.write_text(
-        "state: state\nfleet: {collector: 'https://10.0.0.8:1', ca: a, certificate: b, key: c, receipt_key: d}\n"
-    )
-    fleet = resolve(file, {}, {}).fleet
-    assert (fleet.collector, fleet.robot, fleet.key) == ("https://10.0.0.8:1", "", tmp_path / "c")
-
-
-def test_a_damaged_join_is_a_mistake(tmp_path: Path) -> None:
-    """An unreadable file of a join is reported with its path and the command that makes it again."""
-    (joined(tmp_path) / "fleet.json").write_text("{")
-    (found,) = mistakes(None, {}, {"state": tmp_path})
-    assert found.startswith(f"{tmp_path}/joined/fleet.json: cannot be used: ")
-    assert found.endswith("join again: rosrv fleet join FILE")
-
-
-def test_wrong_bundles_beside_a_join_are_a_mistake(file: Path, tmp_path: Path) -> None:
-    """A value that is not a table is reported, also if a join has one."""
-    joined(tmp_path / "state")
-    file.write_text("state: state\nfleet: {bundles: 3}\n")
-    (found,) = mistakes(file, {}, {})
-    assert "bundles" in found
 
 
 def test_all_mistakes_are_reported_with_their_positions(file: Path) -> None:

@@ -98,40 +98,6 @@ def test_rest_can_be_disabled() -> None:
     assert Settings().api_address == ("127.0.0.1", 8443)
 
 
-_FLEET = {"collector": "https://10.0.0.9:8444", "ca": "a", "certificate": "b", "key": "c", "receipt_key": "d"}
-
-
-def test_a_collector() -> None:
-    """A collector has an address and a port; an appliance may push segments, take bundles, or both."""
-    assert read({"fleet": _FLEET}).fleet.destination == ("10.0.0.9", 8444)
-    bundles = {"robot": "arm1", "bundles": {"root": "r", "site": "s", "group": "g"}}
-    only_bundles = {name: value for name, value in _FLEET.items() if name != "receipt_key"} | bundles
-    assert read({"fleet": only_bundles}).fleet.receipt_key is None
-
-
-@pytest.mark.parametrize(
-    ("fleet", "why"),
-    [
-        (_FLEET | {"collector": "http://10.0.0.9:8444"}, "is not https://"),
-        (_FLEET | {"collector": "https://10.0.0.9:8444/"}, "is not https://"),
-        (_FLEET | {"collector": "https://fleet.example:8444"}, "names are not looked up"),
-        (_FLEET | {"collector": "https://127.0.0.1:8444"}, "loopback of the appliance's own namespace"),
-        (
-            {name: value for name, value in _FLEET.items() if name != "receipt_key"},
-            "collector needs receipt_key, to push segments, or bundles.root",
-        ),
-        ({"ca": "x.pem"}, "no effect without a collector: remove it"),
-        (_FLEET | {"bundles": {"root": "r", "site": "s", "group": "g"}}, "robot must be given"),
-        (_FLEET | {"bundles": {"root": "r", "site": "s"}}, "root needs site and group"),
-        (_FLEET | {"retention_waits": True}, "no effect without audit.retention_days"),
-    ],
-)
-def test_an_invalid_collector_is_rejected(fleet: dict[str, object], why: str) -> None:
-    """A useless or impossible setting is an error with its key and the reason."""
-    with pytest.raises(ValidationError, match=why):
-        read({"fleet": fleet})
-
-
 @pytest.mark.parametrize(
     ("pool", "said"),
     [

@@ -40,7 +40,8 @@ def test_no_other_test_imports_a_feature(name: str) -> None:
     knowing = [
         str(path.relative_to(ROOT))
         for path in (ROOT / "tests").rglob("*.py")
-        if f"features/{name}/" not in str(path) and imported.search(path.read_text(encoding="utf-8"))
+        if not re.search(rf"(features|system)/{name}/", str(path))
+        and imported.search(path.read_text(encoding="utf-8"))
     ]
     assert knowing == []
 

@@ -8,11 +8,14 @@ import pytest
 
 from appliance.channel.messages import LogHeld
 from appliance.supervisor.process_handle import ProcessHandle
-from appliance.supervisor.role import Facts
+from appliance.supervisor.role import Facts, Role
 from appliance.supervisor.roles import roles_of
 from appliance.supervisor.supervisor import Supervisor
 
 pytestmark = pytest.mark.nightly
+
+READER = Role("reader", "rosrv-syslog", "reader", "reader:main", dispensable=True, group="rosrv-api")
+"""A role of a feature that reads the log."""
 
 
 class _Life:
@@ -31,18 +34,18 @@ class _Life:
     ("holding", "ended"),
     [
         (["api"], {"api"}),
-        (["fleet"], {"fleet"}),
-        (["api", "fleet", "relay", "control", "charon", "signer"], {"api", "fleet"}),
+        (["reader"], {"reader"}),
+        (["api", "reader", "relay", "control", "charon", "signer"], {"api", "reader"}),
         (["relay"], set()),
-        ([-1], {"api", "fleet"}),
-        ([4_000_000], {"api", "fleet"}),
+        ([-1], {"api", "reader"}),
+        ([4_000_000], {"api", "reader"}),
     ],
 )
 def test_only_readers_of_the_log_are_ended(tmp_path: Path, holding: list[str | int], ended: set[str]) -> None:
     """The named reader is ended, or all readers if the kernel names none; no other process is ended."""
     admin = socket.create_server(("127.0.0.1", 0))
     facts = Facts(state=tmp_path, config=tmp_path / "c", rosmaster_port=1)
-    supervisor = Supervisor(roles_of(fleet=True), facts, admin=admin, ready=lambda _said: None)
+    supervisor = Supervisor((*roles_of(), READER), facts, admin=admin, ready=lambda _said: None)
     try:
         starts = {}
         for number, slot in enumerate(supervisor.slots):

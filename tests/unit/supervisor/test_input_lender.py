@@ -29,13 +29,18 @@ _TLS = """
 import os, sys
 from pathlib import Path
 from appliance.base.owner_access import FileLender
-from appliance.features.fleet.connection import robot_context
+import ssl
+from appliance.base.input_files import path_for_library
 files = [Path(name) for name in sys.argv[1:]]
 lent = {path: os.open(path, os.O_RDONLY) for path in files}
 os.setresgid(61099, 61099, 61099)
 os.setresuid(61099, 61099, 61099)
 FileLender.install(lent.get)
-assert robot_context(*files).get_ca_certs()
+context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+with path_for_library(files[0]) as ca, path_for_library(files[1]) as chain, path_for_library(files[2]) as key:
+    context.load_verify_locations(ca)
+    context.load_cert_chain(chain, key)
+assert context.get_ca_certs()
 """
 
 

@@ -1,20 +1,15 @@
 """`ReceiptFloor` of `signer_requests`: retention by age waits for receipts, within limits."""
 
 from pathlib import Path
-from typing import Any
 
-from appliance.configuration.settings import Audit, Fleet, Settings
 from appliance.control.links.signer_requests import ReceiptFloor
 
 _ANY = 1 << 63
-_FILES: dict[str, Any] = {name: Path(name) for name in ("ca", "certificate", "key", "receipt_key")}
 
 
 def floor(folder: Path, *, waits: bool, reserve: int = 1 << 20) -> ReceiptFloor:
     (folder / "control").mkdir()
-    fleet = Fleet(collector="https://10.0.0.9:8444", retention_waits=waits, **_FILES)
-    audit = Audit(retention_days=30.0, reserve_bytes=reserve)
-    return ReceiptFloor(Settings(state=folder, fleet=fleet, audit=audit))
+    return ReceiptFloor(folder, reserve, holding=waits)
 
 
 def test_it_follows_the_receipts(tmp_path: Path) -> None:

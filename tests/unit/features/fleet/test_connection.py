@@ -20,12 +20,13 @@ from appliance.features.fleet.segment_pusher import SegmentPusher
 from appliance.features.fleet.verified_bundles import VerifiedBundles
 from appliance.formats.fleet_membership import Invitation
 from tests.support.audit import decision
-from tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite
+from tests.support.bundle_site import GROUP, ROBOT, SITE
 from tests.support.command import rosrv
 from tests.support.fleet_certificates import FleetAuthority
 from tests.support.lying_collector import Lie, Visitor, lying_collector
 from tests.support.waiting import allowed, eventually
 from tests.unit.audit.conftest import MakeLog, Notary, key, make_log, notary, path
+from tests.unit.features.fleet.robot_site import RobotSite
 
 pytestmark = pytest.mark.nightly
 
@@ -124,13 +125,13 @@ IN_ANSWER = {
 
 
 @pytest.fixture
-def site(tmp_path: Path) -> BundleSite:
+def site(tmp_path: Path) -> RobotSite:
     """Return a fleet's repository and certificates."""
-    return BundleSite(tmp_path / "site")
+    return RobotSite(tmp_path / "site")
 
 
 @pytest.fixture
-def authority(site: BundleSite) -> FleetAuthority:
+def authority(site: RobotSite) -> FleetAuthority:
     return site.authority
 
 
@@ -155,7 +156,7 @@ def pusher(authority: FleetAuthority, make_log: MakeLog, path: Path, tmp_path: P
 
 
 @pytest.fixture
-def poller(site: BundleSite, tmp_path: Path) -> Client:
+def poller(site: RobotSite, tmp_path: Path) -> Client:
     def step(url: str) -> str:
         authority = site.authority
         collector = robot_connection(url, authority.ca, *authority.issue(ROBOT))

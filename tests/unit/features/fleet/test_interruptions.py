@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from appliance.features.fleet.verified_bundles import BundleFolderError, BundleRejectedError, VerifiedBundles
-from tests.support.bundle_site import BundleSite
+from tests.unit.features.fleet.robot_site import RobotSite
 
 pytestmark = pytest.mark.nightly
 
@@ -17,9 +17,9 @@ _KILLED, _DONE, _FULL = 9, 0, 7
 
 
 @pytest.fixture
-def site(tmp_path: Path) -> Iterator[tuple[BundleSite, str]]:
+def site(tmp_path: Path) -> Iterator[tuple[RobotSite, str]]:
     """Serve a site with two bundles; the robot knows the first one."""
-    site = BundleSite(tmp_path / "site")
+    site = RobotSite(tmp_path / "site")
     site.add()
     with site.served() as url:
         poll(site.robot(url, tmp_path / "robot"))
@@ -63,7 +63,7 @@ def killed_at(step: int, folder: Path) -> None:
     sys.addaudithook(hook)
 
 
-def test_a_kill_at_any_step_loses_nothing(site: tuple[BundleSite, str], tmp_path: Path) -> None:
+def test_a_kill_at_any_step_loses_nothing(site: tuple[RobotSite, str], tmp_path: Path) -> None:
     """Killed at every access to its files in turn, the client finds the new bundle, and still refuses the old time."""
     served, url = site
     old = served.timestamp
@@ -90,7 +90,7 @@ def test_a_kill_at_any_step_loses_nothing(site: tuple[BundleSite, str], tmp_path
     assert step > 15
 
 
-def test_a_full_disk_is_reported_and_passes(site: tuple[BundleSite, str], tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_and_passes(site: tuple[RobotSite, str], tmp_path: Path) -> None:
     """While files cannot be written, the client reports that; afterwards it takes the bundle."""
     served, url = site
     path = served.add()

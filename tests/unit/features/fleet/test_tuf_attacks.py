@@ -24,8 +24,9 @@ from appliance.features.fleet.verified_bundles import (
 )
 from appliance.formats.bundle_archive import pack
 from appliance.formats.terms import BundlePath, Ring, custom_of
-from tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite, bundle_files, everywhere, give
+from tests.support.bundle_site import GROUP, ROBOT, SITE, bundle_files, everywhere, give
 from tests.support.waiting import allowed
+from tests.unit.features.fleet.robot_site import RobotSite
 
 pytestmark = pytest.mark.nightly
 
@@ -35,7 +36,7 @@ METADATA = "/v1/bundles/metadata"
 class Field:
     """A site with one served bundle, and one robot that has taken it."""
 
-    def __init__(self, folder: Path, url: str, site: BundleSite) -> None:
+    def __init__(self, folder: Path, url: str, site: RobotSite) -> None:
         self.site, self.url, self.folder = site, url, folder
         self.robot = site.robot(url, folder / "robot")
 
@@ -67,7 +68,7 @@ class Field:
 @pytest.fixture
 def field(tmp_path: Path) -> Iterator[Field]:
     """Return a site with a first bundle, which the robot has verified."""
-    site = BundleSite(tmp_path / "site")
+    site = RobotSite(tmp_path / "site")
     site.add()
     with site.served() as url:
         made = Field(tmp_path, url, site)
@@ -144,7 +145,7 @@ def test_freeze_ends_with_the_timestamp(field: Field) -> None:
 def test_freeze_by_a_stolen_timestamp_key_ends_with_the_snapshot(tmp_path: Path) -> None:
     """Fresh timestamps of an expired snapshot are rejected: the snapshot's key is offline."""
     months_ago = datetime.datetime.now(datetime.UTC).replace(microsecond=0) - datetime.timedelta(days=70)
-    site = BundleSite(tmp_path / "site", now=lambda: months_ago)
+    site = RobotSite(tmp_path / "site", now=lambda: months_ago)
     site.repository.add(SITE, GROUP, bundle_files(), everywhere())
     with site.served() as url:
         field = Field(tmp_path, url, site)
@@ -233,7 +234,7 @@ def test_arbitrary_software_is_rejected(field: Field) -> None:
     forged.sign(CryptoSigner.generate_ed25519())
     field.give(f"{METADATA}/timestamp.json", forged.to_bytes())
     refused(field, "signed")
-    foreign = BundleSite(field.folder / "foreign")
+    foreign = RobotSite(field.folder / "foreign")
     foreign.add()
     field.give(f"{METADATA}/timestamp.json", foreign.timestamp)
     refused(field, "signed")
@@ -321,7 +322,7 @@ def test_a_compromised_root_key_is_replaced(field: Field) -> None:
 
 def test_a_root_that_the_old_root_did_not_sign_is_rejected(field: Field) -> None:
     """A new root needs the signature of the root that robots trust."""
-    foreign = BundleSite(field.folder / "foreign")
+    foreign = RobotSite(field.folder / "foreign")
     foreign.repository.rotate("root")
     field.give(f"{METADATA}/2.root.json", (foreign.repository.metadata / "2.root.json").read_bytes())
     refused(field, "signed")

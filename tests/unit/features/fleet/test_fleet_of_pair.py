@@ -1,4 +1,4 @@
-"""Tests of `appliance.features.standby.fleet_of_pair`: a pair of which one appliance is not in the fleet is noticed."""
+"""Tests of `appliance.features.fleet.fleet_of_pair`: a pair of which one appliance is not in the fleet is noticed."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -6,8 +6,8 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.configuration.settings import Fleet
-from appliance.features.standby.fleet_of_pair import compare_fleets
+from appliance.features.fleet.fleet_of_pair import compare_fleets
+from appliance.features.fleet.settings import Fleet
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.engines import InlineDatabase

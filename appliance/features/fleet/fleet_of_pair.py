@@ -7,7 +7,7 @@ robot is quiet.
 
 import msgspec
 
-from appliance.configuration.settings import Fleet
+from appliance.features.fleet.settings import Fleet
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
