@@ -27,7 +27,7 @@ def values(kind: Any) -> st.SearchStrategy[Any]:
     if get_origin(kind) is list:
         return st.lists(values(get_args(kind)[0]), min_size=1, max_size=3)
     if get_origin(kind) is dict:
-        return st.dictionaries(TEXT, TEXT, max_size=3)
+        return st.dictionaries(*map(values, get_args(kind)), max_size=3)
     if get_args(kind):
         return st.one_of([values(one) for one in get_args(kind)])
     plainly: dict[Any, st.SearchStrategy[Any]] = {
