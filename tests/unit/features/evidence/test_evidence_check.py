@@ -13,13 +13,10 @@ from rosrv_fleet.evidence.check import EvidenceError, check_evidence
 from rosrv_fleet.evidence.store import EvidenceContent
 from rosrv_fleet.workers import Workers
 
-from tests.unit.audit.conftest import key, make_log, notary, path
-from tests.unit.features.evidence.conftest import Control, control
+from tests.unit.features.evidence.conftest import Control
 from tests.unit.features.evidence.test_bundle import members_of, written
 
 pytestmark = pytest.mark.nightly
-
-__all__ = ["control", "key", "make_log", "notary", "path"]
 
 
 @pytest.fixture
