@@ -12,9 +12,9 @@ from typing import Any
 
 from appliance.channel import admin
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
+from tests.support.features.standby.standby_site import ADDRESSES, ROBOT, StandbySite
 from tests.support.processes import Process
 from tests.support.small_disk import filled
-from tests.support.standby_site import ADDRESSES, ROBOT, StandbySite
 from tests.support.waiting import eventually
 
 _NEVER = threading.Event()

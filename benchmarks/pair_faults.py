@@ -37,10 +37,10 @@ from appliance.features.standby.standby_summary import standby_troubles
 from benchmarks.pair_fault_kinds import Fault, drawn
 from benchmarks.standby import Successes, Watch, busy
 from examples.landshark.lab import Lab
+from tests.support.features.standby.standby_robot import StandbyRobot
+from tests.support.features.standby.standby_site import ADDRESSES, MASTER_PORT, OCU, StandbySite
 from tests.support.processes import Process
 from tests.support.small_disk import small_disk
-from tests.support.standby_robot import StandbyRobot
-from tests.support.standby_site import ADDRESSES, MASTER_PORT, OCU, StandbySite
 from tests.support.waiting import eventually
 
 _RATE = 20

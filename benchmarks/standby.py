@@ -34,9 +34,9 @@ from appliance.channel import admin
 from appliance.cli.connection.admin_client import NotRunningError
 from examples.landshark.lab import Lab
 from tests.support.appliance import Appliance
+from tests.support.features.standby.standby_robot import StandbyRobot
+from tests.support.features.standby.standby_site import MASTER, StandbySite
 from tests.support.processes import Process
-from tests.support.standby_robot import StandbyRobot
-from tests.support.standby_site import MASTER, StandbySite
 from tests.support.waiting import eventually
 
 _AFTER = 1.0  # seconds of service after the takeover that are also watched

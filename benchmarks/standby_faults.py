@@ -30,9 +30,9 @@ from pathlib import Path
 
 from benchmarks.standby import Successes, Watch, busy, print_pauses
 from examples.landshark.lab import Host, Lab
+from tests.support.features.standby.standby_robot import CLIENTS, StandbyRobot
+from tests.support.features.standby.standby_site import ADDRESSES, ARM, ROBOT, StandbySite
 from tests.support.processes import Process
-from tests.support.standby_robot import CLIENTS, StandbyRobot
-from tests.support.standby_site import ADDRESSES, ARM, ROBOT, StandbySite
 from tests.support.waiting import eventually
 
 _RATE = 20  # messages a second

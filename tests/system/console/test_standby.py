@@ -14,9 +14,9 @@ from playwright.sync_api import Browser, Page, Playwright, expect
 
 from examples.landshark.lab import Host as LabHost
 from examples.landshark.lab import Lab
+from tests.support.features.standby.standby_site import ADDRESSES, StandbySite
 from tests.support.requirements import need_root
 from tests.support.rest import Rest
-from tests.support.standby_site import ADDRESSES, StandbySite
 from tests.support.waiting import eventually
 from tests.system.console.conftest import launch
 from tests.system.console.reader import LIMIT, Reader

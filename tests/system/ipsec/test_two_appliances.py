@@ -22,10 +22,10 @@ from appliance.network import interfaces
 from appliance.supervisor.users import account_of
 from examples.landshark.lab import INTERFACE, Host, Lab
 from tests.support.appliance import Appliance
+from tests.support.features.standby.standby_site import ADDRESSES, OCU, ROBOT, StandbySite
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT, Event, Process
 from tests.support.requirements import need_root
-from tests.support.standby_site import ADDRESSES, OCU, ROBOT, StandbySite
 from tests.support.tunnel_site import numbers
 from tests.support.tunnels import JoinedHost, need_strongswan
 from tests.support.waiting import allowed, eventually

@@ -1,7 +1,6 @@
 """`rosrv` as its users see it: the transcripts (`*.txt`) of this folder; their form: `tests/support/transcript.py`."""
 
 import functools
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -12,7 +11,6 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from appliance.audit.log.log import AuditLog
 from appliance.network.scan import ScanResult
 from rosmop.tests.acting import message
-from tests.support.appliance_pair import four_takeovers, play
 from tests.support.audit import decision, settle
 from tests.support.bags import make_bag
 from tests.support.engines import open_log
@@ -52,10 +50,6 @@ def write_log(signed: str | None = None, *, below: list[str]) -> None:
     assert log.close() is None
 
 
-def write_pair(*, below: list[str]) -> None:
-    assert not below
-    for member, folder in zip(play(Path("pair"), four_takeovers), ("state", "other"), strict=True):
-        shutil.copytree(member.state, folder, dirs_exist_ok=True)
 
 
 def set_scan(monkeypatch: pytest.MonkeyPatch, *, below: list[str]) -> None:
@@ -71,7 +65,6 @@ def transcript(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Tran
         more: dict[str, Callable[..., None]] = {
             "bag": write_bag,
             "log": write_log,
-            "pair": write_pair,
             "scan": functools.partial(set_scan, monkeypatch),
         }
         yield Transcript(fake, more=more)

@@ -13,10 +13,7 @@ from appliance.features.standby.lease import WitnessRequest
 from appliance.features.standby.witness import REQUEST, seal
 from appliance.features.standby.witness_link import WitnessChannel
 from examples.landshark.lab import Lab
-from tests.support.processes import LIMIT
-from tests.support.requirements import need_root
-from tests.support.waiting import eventually
-from tests.support.witness_site import (
+from tests.support.features.standby.witness_site import (
     ADDRESSES,
     BACKENDS,
     FIXED,
@@ -31,6 +28,9 @@ from tests.support.witness_site import (
     forged,
     seconds_until_reset,
 )
+from tests.support.processes import LIMIT
+from tests.support.requirements import need_root
+from tests.support.waiting import eventually
 
 
 class Renewing:

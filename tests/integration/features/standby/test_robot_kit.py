@@ -13,11 +13,11 @@ import pytest
 from appliance.features.standby.membership import Membership, load_membership, path_of
 from examples.landshark.lab import Host, Lab
 from tests.support.command import ROSRV, rosrv
+from tests.support.features.standby.witness_site import ADDRESSES, FIXED, FOLLOWER, MASTER, NODE, ROBOT, Peer
 from tests.support.processes import LIMIT
 from tests.support.requirements import need_program, need_root
 from tests.support.script_host import ScriptHost
 from tests.support.waiting import eventually
-from tests.support.witness_site import ADDRESSES, FIXED, FOLLOWER, MASTER, NODE, ROBOT, Peer
 
 _SYSTEMCTL = """\
 #!/bin/sh

@@ -15,10 +15,7 @@ from appliance.features.standby import witness
 from appliance.features.standby.lease import WitnessAnswer, WitnessRequest
 from appliance.features.standby.witness_link import WitnessChannel, WitnessLink
 from examples.landshark.lab import Lab
-from tests.support.processes import LIMIT, Process
-from tests.support.requirements import need_program, need_root
-from tests.support.waiting import eventually
-from tests.support.witness_site import (
+from tests.support.features.standby.witness_site import (
     ADDRESSES,
     AT_ONCE,
     BACKENDS,
@@ -32,6 +29,9 @@ from tests.support.witness_site import (
     forged,
     seconds_until_reset,
 )
+from tests.support.processes import LIMIT, Process
+from tests.support.requirements import need_program, need_root
+from tests.support.waiting import eventually
 
 
 @pytest.fixture(params=BACKENDS)

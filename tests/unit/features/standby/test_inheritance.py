@@ -22,7 +22,7 @@ from appliance.features.standby.standby_tunnels import StandbyTunnels
 from appliance.specifications.rollout import Rollout
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase
-from tests.support.standby_site import memberships
+from tests.support.features.standby.standby_site import memberships
 from tests.support.virtual_clock import VirtualClock, let_time_pass
 
 

@@ -13,7 +13,7 @@ from appliance.features.table import pairing_in
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.roles import roles_of
 from appliance.supervisor.state_directory import StateDirectory, foreign
-from tests.support.standby_site import memberships
+from tests.support.features.standby.standby_site import memberships
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from appliance.store.state_file import SCHEMA as WHOLE_SCHEMA
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.engines import InlineDatabase
-from tests.support.replication import SCHEMA, tables_of
+from tests.support.features.standby.replication import SCHEMA, tables_of
 from tests.support.small_disk import small_disk
 
 pytestmark = pytest.mark.nightly

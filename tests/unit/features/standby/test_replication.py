@@ -49,8 +49,7 @@ from appliance.store.state_file import (
     StateStore,
 )
 from tests.support.engines import InlineDatabase
-from tests.support.processes import LIMIT
-from tests.support.replication import (
+from tests.support.features.standby.replication import (
     SCHEMA,
     ActiveSide,
     CuttingProxy,
@@ -60,6 +59,7 @@ from tests.support.replication import (
     replicated,
     tables_of,
 )
+from tests.support.processes import LIMIT
 from tests.support.waiting import allowed
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.replication import certificates, listening_socket, tables_of
+from tests.support.features.standby.replication import certificates, listening_socket, tables_of
 
 pytestmark = pytest.mark.nightly
 
@@ -17,7 +17,7 @@ class Side:
     """One process, which is killed and started again."""
 
     def __init__(self, name: str, directory: Path, descriptor: int, port: int) -> None:
-        module = "tests.support.replication_process"
+        module = "tests.support.features.standby.replication_process"
         self._command = [sys.executable, "-m", module, name, str(directory), str(port), str(descriptor)]
         self._descriptor = descriptor
         self.process = self._start()

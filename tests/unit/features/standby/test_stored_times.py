@@ -23,7 +23,7 @@ from appliance.store.access_tokens import make_token
 from appliance.store.revisions import LIMITS
 from appliance.store.state_file import SCHEMA, StateStore
 from tests.support.engines import InlineDatabase
-from tests.support.standby_site import memberships
+from tests.support.features.standby.standby_site import memberships
 from tests.support.virtual_clock import VirtualClock
 
 pytestmark = pytest.mark.anyio

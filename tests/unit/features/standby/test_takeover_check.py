@@ -19,8 +19,8 @@ from appliance.specifications.specification_revisions import text_of
 from appliance.store.state_file import IncarnationRow, MonitorRevisionRow, RevisionRow, StateStore
 from tests.support.appliance import OPEN_POLICY
 from tests.support.engines import InlineDatabase
+from tests.support.features.standby.standby_site import memberships
 from tests.support.site_key import LINE, signed
-from tests.support.standby_site import memberships
 from tests.unit.specifications.monitor_desk import TEXTS, here
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]

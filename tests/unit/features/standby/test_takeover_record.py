@@ -12,7 +12,7 @@ import structlog
 from appliance.audit.proof.copies import SignedCheckpoint, newest_checkpoint
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import search
-from tests.support.appliance_pair import Member, World, play
+from tests.support.features.standby.appliance_pair import Member, World, play
 from tests.support.waiting import eventually
 
 pytestmark = pytest.mark.nightly

@@ -25,11 +25,11 @@ from appliance.features.standby.takeover_verification import (
     verify_takeovers,
 )
 from appliance.signing.signed_statements import parse_checkpoint
-from tests.support.appliance_pair import Member, Story, World, four_takeovers, play
 from tests.support.audit import decision
 from tests.support.command import rosrv
+from tests.support.features.standby.appliance_pair import Member, Story, World, four_takeovers, play
+from tests.support.features.standby.standby_site import memberships
 from tests.support.forgery import write_anew
-from tests.support.standby_site import memberships
 
 pytestmark = pytest.mark.nightly
 

@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 from typing import Self
 
+from tests.support.features.standby.standby_site import ADDRESSES, MASTER, ROBOT, StandbySite
 from tests.support.nodes import Client, RosSession
 from tests.support.processes import Process
-from tests.support.standby_site import ADDRESSES, MASTER, ROBOT, StandbySite
 from tests.support.waiting import eventually
 
 _REGISTRAR = Path(__file__).with_name("standby_registrar.py")

@@ -8,9 +8,9 @@ import pytest
 
 from examples.landshark.lab import Lab
 from tests.integration.monitors.test_emergency_stop import STOP
+from tests.support.features.standby.standby_site import ADDRESSES, ROBOT, StandbySite
 from tests.support.nodes import has_ros
 from tests.support.requirements import need_root, needs
-from tests.support.standby_site import ADDRESSES, ROBOT, StandbySite
 from tests.support.waiting import eventually
 
 

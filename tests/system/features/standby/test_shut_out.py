@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.support.features.standby.standby_robot import StandbyRobot
+from tests.support.features.standby.standby_site import StandbySite
 from tests.support.processes import Process
-from tests.support.standby_robot import StandbyRobot
-from tests.support.standby_site import StandbySite
 from tests.support.waiting import allowed
 
 BACK_SECONDS = 3.0

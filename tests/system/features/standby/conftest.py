@@ -8,10 +8,10 @@ import pytest
 from appliance.channel import admin
 from examples.landshark.lab import Lab
 from tests.support.appliance import OPEN_POLICY
+from tests.support.features.standby.standby_robot import StandbyRobot
+from tests.support.features.standby.standby_site import StandbySite
 from tests.support.nodes import has_ros
 from tests.support.requirements import need_program, need_root, needs
-from tests.support.standby_robot import StandbyRobot
-from tests.support.standby_site import StandbySite
 
 RULE = "seen() { event said() /map std_msgs/String '{}' { } }\n"
 

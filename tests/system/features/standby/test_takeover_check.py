@@ -12,13 +12,13 @@ import pytest
 from appliance.channel import admin
 from examples.landshark.lab import Lab
 from tests.support.appliance import OPEN_POLICY
+from tests.support.features.standby.standby_site import StandbySite
 from tests.support.nodes import has_ros
 from tests.support.printed import row_of
 from tests.support.requirements import need_program, need_root, needs
 from tests.support.site_key import LINE, signed
-from tests.support.standby_site import StandbySite
 from tests.support.waiting import eventually
-from tests.system.standby.conftest import RULE
+from tests.system.features.standby.conftest import RULE
 
 NO_SIGNATURE = "it has no signature of the site"
 

@@ -22,9 +22,9 @@ from appliance.features.standby.link_certificates import replication_context
 from appliance.features.standby.membership import PORT, load_membership, path_of
 from appliance.features.standby.replication_frames import FromActive, ReplicationLink, SnapshotEnd, Stored
 from examples.landshark.lab import INTERFACE, Host
+from tests.support.features.standby.standby_robot import StandbyRobot
+from tests.support.features.standby.standby_site import ADDRESSES, ROBOT, StandbySite
 from tests.support.small_disk import small_disk
-from tests.support.standby_robot import StandbyRobot
-from tests.support.standby_site import ADDRESSES, ROBOT, StandbySite
 from tests.support.waiting import allowed, eventually
 
 

@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 
 from appliance.channel import admin
-from tests.support.standby_site import OCU, StandbySite
+from tests.support.features.standby.standby_site import OCU, StandbySite
 from tests.support.waiting import allowed, eventually
 
 HOUR = 3600.0

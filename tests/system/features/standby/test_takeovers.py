@@ -25,9 +25,9 @@ from appliance.features.standby.membership import PORT
 from appliance.features.standby.witness import EXPIRY
 from examples.landshark.lab import Host
 from tests.support.appliance import Appliance
+from tests.support.features.standby.standby_robot import StandbyRobot
+from tests.support.features.standby.standby_site import ADDRESSES, MASTER_PORT, OCU, ROBOT, StandbySite
 from tests.support.rest import Answer, Rest
-from tests.support.standby_robot import StandbyRobot
-from tests.support.standby_site import ADDRESSES, MASTER_PORT, OCU, ROBOT, StandbySite
 from tests.support.waiting import allowed, eventually
 
 REST = "https://127.0.0.1:8443"

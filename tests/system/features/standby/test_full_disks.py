@@ -7,11 +7,11 @@ import pytest
 
 from appliance.features.standby.membership import load_membership, path_of, save_membership
 from examples.landshark.lab import Lab
+from tests.support.features.standby.standby_robot import StandbyRobot
+from tests.support.features.standby.standby_site import ADDRESSES, ROBOT, StandbySite
 from tests.support.nodes import has_ros
 from tests.support.requirements import need_program, need_root, needs
 from tests.support.small_disk import filled, small_disk
-from tests.support.standby_robot import StandbyRobot
-from tests.support.standby_site import ADDRESSES, ROBOT, StandbySite
 from tests.support.waiting import eventually
 
 

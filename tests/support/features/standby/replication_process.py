@@ -1,6 +1,6 @@
 """Run one side of the replication in a process, which tests kill.
 
-python -m tests.support.replication_process SIDE DIRECTORY PORT DESCRIPTOR
+python -m tests.support.features.standby.replication_process SIDE DIRECTORY PORT DESCRIPTOR
 
 The active side makes random changes without end, and prints the number of each mark that is acknowledged. After a line
 on standard input it makes no further changes; when the standby has all of them, it prints `equal`. It takes its
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import structlog
 
-from tests.support.replication import ActiveSide, StandbySide, certificates, change_randomly
+from tests.support.features.standby.replication import ActiveSide, StandbySide, certificates, change_randomly
 
 
 async def main() -> None:
