@@ -6,8 +6,8 @@ without a link, it continues under the existing grants until the supervisor open
 
 import contextlib
 import gc
-import importlib
 import logging
+import pkgutil
 import resource
 import socket
 from dataclasses import replace
@@ -79,8 +79,7 @@ class RelayProcess:
         elif isinstance(message, messages.LinkOpened) and message.role == "control":
             self._open_control(socket.socket(fileno=descriptors[0]))
         elif isinstance(message, messages.MemoryGiven):
-            module, _colon, function = message.used_by.partition(":")
-            open_sink: OpenSink = getattr(importlib.import_module(module), function)
+            open_sink: OpenSink = pkgutil.resolve_name(message.used_by)
             self._engine.copy_to(open_sink(message.terms, descriptors[0], self._engine.interceptor.now))
         elif isinstance(message, messages.StateGiven):
             self._keep_state(message, descriptors[0])

@@ -22,12 +22,13 @@ OUTSIDE = frozenset(
     master.calls.monitor_calls master.calls.request_peek master.endpoints.delivery master.endpoints.node_ports
     master.endpoints.node_api master.endpoints.topic_taps_control master.endpoints.traffic
     master.parameter_charges master.reconcile.arrivals master.reconcile.entries master.reconcile.liveness
-    master.rosmaster policy.policy_lint quotas.descriptors quotas.pool quotas.queue quotas.table features.recorder.ring
-    relay.connections.introductions relay.connections.latched_message relay.connections.named_subscribers
+    master.rosmaster policy.policy_lint quotas.descriptors quotas.pool quotas.queue quotas.table
+    relay.connections.introductions relay.connections.latched_message relay.connections.message_sink
+    relay.connections.named_subscribers
     relay.context relay.loop relay.monitors.fast_path_counts relay.monitors.holds relay.monitors.monitor_sets
     relay.monitors.observation_points relay.monitors.observations relay.monitors.observer
     relay.monitors.shadow relay.monitors.state_keeper relay.monitors.state_memory relay.monitors.time_budget
-    features.recorder.recorder_ring relay.relay_limits relay.report relay.topic_taps relay.transport.loop_channel
+    relay.relay_limits relay.report relay.topic_taps relay.transport.loop_channel
     relay.transport.memory relay.transport.sockets rpc.bulk rpc.connection_table rpc.fair_queue rpc.front
     rpc.method_name rpc.processor_time rpc.server rpc.source_queues rpc.xmlrpc_client
     specifications.allocation specifications.specification_files specifications.specification_manager
