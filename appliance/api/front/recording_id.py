@@ -17,3 +17,5 @@ class _RecordingId(StringConvertor):
 
 
 register_url_convertor("recording", _RecordingId())
+CONVERTORS = {"{recording_id}": "{recording_id:recording}"}
+"""The parameter of a path in the contract, and as Starlette matches it."""

@@ -16,6 +16,7 @@ from pydantic import StringConstraints, create_model
 from appliance.api.front.access import Bearer
 from appliance.api.front.etags import etag
 from appliance.api.front.problems import ProblemError
+from appliance.api.front.recording_id import CONVERTORS
 from appliance.api.front.request_gate import asked_of
 from appliance.api.front.route_roles import answered, problem_of, requires
 from appliance.api.front.routing import ETAG, Responses, Routes, Tagged, answer, body, content, tagged
@@ -58,9 +59,6 @@ async def _none() -> None:
 
 async def _nothing() -> dict[str, Any]:
     return {}
-
-
-_CONVERTORS = {"{recording_id}": "{recording_id:recording}"}  # of Starlette
 
 
 @dataclass(frozen=True)
@@ -138,7 +136,7 @@ def _add(router: Routes, services: Services, operation: Operation, own: Answer |
         return tagged(done) if operation.of is not None else done
 
     path = operation.path
-    for name, converted in _CONVERTORS.items():
+    for name, converted in CONVERTORS.items():
         path = path.replace(name, converted)
     has_model = given is not Response
     options: dict[str, Any] = {"response_model": given} if has_model else {"response_class": Response}

@@ -1,5 +1,7 @@
 """Make the recorder's part of control: the plan of recordings, the orders, and the link to the process."""
 
+from typing import Any
+
 from appliance.audit.log.ids import IdSource
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.feature import FeatureContext, FeaturePart
@@ -25,7 +27,7 @@ def make(core: FeatureContext) -> FeaturePart:
     )
 
 
-def request_methods(orders: RecordingOrders) -> tuple[RequestMethod[object], ...]:
+def request_methods(orders: RecordingOrders) -> tuple[RequestMethod[Any], ...]:
     """Return the method that answers each request."""
     return (
         RequestMethod(recording_requests.RecordingsWanted, orders.recordings),

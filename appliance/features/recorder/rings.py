@@ -22,7 +22,7 @@ from appliance.supervisor.errors import StartError
 
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 _PAGE = 4096
-_USED_BY = "appliance.features.recorder.recorder_ring:open_ring"
+USED_BY = "appliance.features.recorder.recorder_ring:open_ring"
 
 
 class RecorderRings:
@@ -52,7 +52,7 @@ class RecorderRings:
             if role == "recorder":
                 yield MemoryGiven(msgspec.to_builtins(given)), readable
             elif role == "relay" and given.index == index:
-                yield MemoryGiven(msgspec.to_builtins(given), _USED_BY), writable
+                yield MemoryGiven(msgspec.to_builtins(given), USED_BY), writable
 
     def close(self) -> None:
         """Close all descriptors."""

@@ -52,7 +52,7 @@ class Scene:
         self.orders = RecordingOrders(
             RecorderRules(**{"enabled": True} | rules),
             cast(AuditTrail, self.trail),
-            lambda: recorder_link.RevisionsStated(4, 2),
+            lambda: (4, 2),
             RecordingPlan(RecorderRules(**{"enabled": True} | rules), lambda host: host, IdSource().next),
         )
 
