@@ -73,7 +73,7 @@ class RecordingRead(WaitingRequest[Recording], frozen=True, tag="recording read"
     """Record who reads messages of a recording, of these topics (none: of all)."""
 
     id: RecordingId
-    topics: Annotated[list[str], parameter(name="topic")] = []  # noqa: RUF012  msgspec copies it
+    topics: Annotated[list[str], parameter(name="topic")] = msgspec.field(default_factory=list)
 
 
 @rest(
