@@ -22,47 +22,47 @@ class RingTerms(msgspec.Struct, frozen=True):
     sums: dict[str, str] = msgspec.field(default_factory=dict)
 
 
-class RecordingsAsked(Message):
+class RecordingsAsked(Message, frozen=True):
     """Control asks for the list of recordings, and for a new report of each recording that it has not noted."""
 
 
-class RecordingsStated(Message):
+class RecordingsStated(Message, frozen=True):
     """The recorder lists all kept recordings, oldest first, and those that it is making."""
 
     recordings: list[Recording]
     in_progress: list[OpenRecording] = msgspec.field(default_factory=list)
 
 
-class RecordingOpened(Message):
+class RecordingOpened(Message, frozen=True):
     """The recorder began a recording."""
 
     recording: OpenRecording
 
 
-class RevisionsWanted(Message):
+class RevisionsWanted(Message, frozen=True):
     """The recorder asks for the revisions in force."""
 
 
-class RevisionsStated(Message):
+class RevisionsStated(Message, frozen=True):
     """Control states the revisions of policy and specifications in force."""
 
     policy: int
     monitors: int
 
 
-class RecordingClosed(Message):
+class RecordingClosed(Message, frozen=True):
     """A recording is complete. The recorder repeats this report until control has noted it."""
 
     recording: Recording
 
 
-class RecordingNoted(Message):
+class RecordingNoted(Message, frozen=True):
     """Control has made an audit record of a recording, or of its removal."""
 
     id: str
 
 
-class RecordingRequested(Message):
+class RecordingRequested(Message, frozen=True):
     """Control asks for a recording from `before` seconds before the trigger to `after` seconds after it."""
 
     number: int
@@ -71,7 +71,7 @@ class RecordingRequested(Message):
     after: float
 
 
-class RecordingStarted(Message):
+class RecordingStarted(Message, frozen=True):
     """The recorder began the recording `id` for request `number`. It covers `began` to `ends` (ns) or later."""
 
     number: int
@@ -80,7 +80,7 @@ class RecordingStarted(Message):
     began: int = 0
 
 
-class RecordingRemovalWanted(Message):
+class RecordingRemovalWanted(Message, frozen=True):
     """Control asks to remove a recording for `who`."""
 
     number: int
@@ -88,7 +88,7 @@ class RecordingRemovalWanted(Message):
     who: str
 
 
-class RecordingRemoved(Message):
+class RecordingRemoved(Message, frozen=True):
     """A recording was removed by order `number` of `who`, or because of `reason`.
 
     The recorder repeats this report until control has noted it.
@@ -100,7 +100,7 @@ class RecordingRemoved(Message):
     reason: str
 
 
-class MemoryWanted(Message):
+class MemoryWanted(Message, frozen=True):
     """Control asks for a temporary recording of the data in memory from `since` to `until` (ns)."""
 
     number: int
@@ -109,14 +109,14 @@ class MemoryWanted(Message):
     until: int
 
 
-class MemoryLent(Message):
+class MemoryLent(Message, frozen=True):
     """The data of request `number` can be read as `recording`. It expires, or is removed for later ones."""
 
     number: int
     recording: Recording
 
 
-class RecordingRefused(Message):
+class RecordingRefused(Message, frozen=True):
     """Request `number` was refused; `unknown`: there is no such recording."""
 
     number: int
@@ -124,7 +124,7 @@ class RecordingRefused(Message):
     unknown: bool = False
 
 
-class RecordingMissed(Message):
+class RecordingMissed(Message, frozen=True):
     """A trigger made no recording, for this reason. The recorder sends only some of these reports.
 
     `planned` is the recording that the trigger's audit record promised, if any.
