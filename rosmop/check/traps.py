@@ -67,19 +67,30 @@ def _ends(statement: tree.Statement | None) -> bool:
     return False
 
 
+def _acts(statement: tree.Statement) -> bool:
+    """Whether a statement drops or replaces the message, on some path."""
+    return _ends(statement) or any(
+        isinstance(node, tree.DropStatement | tree.StopStatement) for node in tree.walk(statement)
+    )
+
+
 def _lost_changes(event: tree.EventDefinition) -> Iterator[Diagnostic]:
-    """Warn of a field that is assigned just before the message is dropped."""
+    """Warn of a field that is assigned just before the message is dropped or replaced."""
     fields = {parameter.name for parameter in event.parameters}
     for block in tree.walk(event.action):
-        if not isinstance(block, tree.Block) or not _ends(block):
+        if not isinstance(block, tree.Block):
             continue
+        stops = any(isinstance(statement, tree.StopStatement) for statement in block.statements)
+        if not stops and not _ends(block):
+            continue
+        how, word = ("replaces", "STOP;") if stops else ("drops", "return;")
         for statement in block.statements:
             if isinstance(statement, tree.ExpressionStatement) and (name := _assigned(statement)) in fields:
-                text = f"the new value of {shown(name)} is lost, because this path drops the message"
+                text = f"the new value of {shown(name)} is lost, because this path {how} the message"
                 yield Diagnostic(
                     statement.position,
                     "warning",
-                    f"{text}; to send the changed message, leave out the `return;`",
+                    f"{text}; to send the changed message, leave out the `{word}`",
                 )
 
 
@@ -120,7 +131,7 @@ def _bounds(
     condition: tree.Expression, yes: tree.Statement, numbers: frozenset[str] | set[str]
 ) -> Iterator[Diagnostic]:
     """Yield warnings about comparisons that drop a message or change a field, but not for NaN."""
-    changed = numbers if _ends(yes) else numbers & _assigned_in(yes)
+    changed = numbers if _acts(yes) else numbers & _assigned_in(yes)
     for bound in _unordered(condition, changed):
         name = next(name for name in sorted(changed) if name in {_operand(bound.left), _operand(bound.right)})
         yield _nan_passes(name, bound)
