@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from msgspec.structs import asdict
 
 from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel import admin, messages
@@ -247,6 +246,10 @@ def sources(**texts: str) -> Sources:
     return Sources(files, {}, {name: signed(text) for name, text in files.items()})
 
 
+def load_of(new: Sources) -> admin.MonitorLoad:
+    return admin.MonitorLoad(new.files, new.definitions, signatures=new.signatures)
+
+
 async def test_with_site_keys_only_signed_specifications_come_into_force(desk: Desk) -> None:
     unsigned = "a.rv:1:1: error: it has no signature of the site"
     assert unsigned in (await desk.monitors(site_keys=[LINE])).checked.left_out["a.rv"]
@@ -262,7 +265,7 @@ async def test_with_site_keys_only_signed_specifications_come_into_force(desk: D
         Sources({"a.rv": A + "//"}),
     ):
         with pytest.raises(SpecificationsRefusedError):
-            await monitors.load(admin.MonitorLoad(**asdict(new)), "eve")
+            await monitors.load(load_of(new), "eve")
     with pytest.raises(SpecificationsRefusedError, match=r"msg/own/T.msg:1:1: error: it has no signature"):
         await monitors.load(
             admin.MonitorLoad({"a.rv": A}, {"own/T.msg": "int32 x"}, signatures={"a.rv": signed(A)}), "eve"
@@ -270,7 +273,7 @@ async def test_with_site_keys_only_signed_specifications_come_into_force(desk: D
     with pytest.raises(SpecificationsRefusedError, match=unsigned):
         await monitors.roll_back(admin.MonitorRollback(1), "eve")
     assert monitors.revision == 2
-    await monitors.load(admin.MonitorLoad(**asdict(sources(b=B))), "adam")
+    await monitors.load(load_of(sources(b=B)), "adam")
     await monitors.remove(admin.MonitorRemove(["a"]), "adam")
     assert monitors.sources == sources(b=B)
     await monitors.roll_back(admin.MonitorRollback(3), "adam")
