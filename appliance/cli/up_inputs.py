@@ -33,10 +33,10 @@ _LAST_POLICY = """
 """
 
 
-def read_inputs(settings: Settings, witness: str | None = None) -> range:
+def read_inputs(settings: Settings, robot: str | None = None) -> range:
     """Validate policy and specifications; return the range of ports that the policy gives to nodes.
 
-    One of two appliances, with a `witness`, starts with what was in force on the active one.
+    One of two appliances, which knows the address of the `robot`, starts with what was in force on the active one.
 
     Raises `StartError` with every error of the policy or of the specifications.
     """
@@ -44,10 +44,10 @@ def read_inputs(settings: Settings, witness: str | None = None) -> range:
     author = _last_author(state)
     if settings.monitors is not None and author in ("", DISK):
         _require_specifications(settings.monitors, settings.site_keys, kept=author == DISK)
-    return read_node_ports(settings, witness)
+    return read_node_ports(settings, robot)
 
 
-def read_node_ports(settings: Settings, witness: str | None = None) -> range:
+def read_node_ports(settings: Settings, robot: str | None = None) -> range:
     """Return the range of ports that the policy gives to nodes: the policy that RVMaster will bring into force.
 
     Raises `StartError` with every error of the policy file, if there is no policy but this.
@@ -56,9 +56,9 @@ def read_node_ports(settings: Settings, witness: str | None = None) -> range:
     state = settings.state / _STATE
     try:
         stored = _stored_in(state)
-        known = PolicyContext(stored.hosts, robot_addresses(settings, witness), site_keys=settings.site_keys)
+        known = PolicyContext(stored.hosts, robot_addresses(settings, robot), site_keys=settings.site_keys)
         kept = stored.policy
-        first = kept is not None and (kept.who != DISK or witness is not None)
+        first = kept is not None and (kept.who != DISK or robot is not None)
         return policy_at_start(kept, settings.policy, known, kept_first=first).policy.ports
     except PolicyRefusedError as error:
         if not stored.complete or stored.policy is not None:

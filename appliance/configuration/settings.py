@@ -283,17 +283,6 @@ class Ipsec:
 
 
 @section
-class Availability:
-    """Two appliances, of which one takes over from the other; `rosrv standby join` makes them a pair."""
-
-    wait: Literal["standby", "none"] = key(
-        default="standby",
-        description="an answer to a node waits until the standby has stored the change; none: it does not wait, and a"
-        " takeover may lose the last changes",
-    )
-
-
-@section
 class ApiLimits:
     """Limits of the REST interface; beyond them a client gets 429 or 503 with the time to repeat."""
 
@@ -446,7 +435,6 @@ class Settings:
     relay: Relay = Relay()
     firewall: FirewallSection = FirewallSection()
     ipsec: Ipsec = Ipsec()
-    availability: Availability = Availability()
     api_limits: ApiLimits = ApiLimits()
 
     @property

@@ -80,11 +80,11 @@ class Bulk:
 
 
 class LargeWrites:
-    """Limit the large values that are on their way to the ROS master and to the standby: one at a time for each host.
+    """Limit the large values under way to the ROS master and to another appliance: one at a time for each host.
 
     The ROS master is one Python process. Many threads that read large values would block its other threads. The
-    changes of all hosts reach the standby in one order. A call that has its turn waits only for these two; `stored`
-    waits for the standby.
+    changes of all hosts reach the other appliance in one order. A call that has its turn waits only for these two;
+    `stored` waits for the other appliance.
     """
 
     def __init__(

@@ -209,9 +209,9 @@ class StateStore:
         self._noted.clear()
 
     def note_whole_parameters(self) -> None:
-        """Store also large values at once: a standby must have each value before it is answered.
+        """Store also large values at once: another appliance must have each value before it is answered.
 
-        Then the tree is stored rarely (`tree_is_due`). It would be sent to the standby, whichever host had changed
+        Then the tree is stored rarely (`tree_is_due`). It would be sent to that one, whichever host had changed
         whichever part of it; so each change replaces the earlier ones of its key instead.
         """
         self._largest_change = None

@@ -32,8 +32,8 @@ from appliance.network.firewall.firewall_rules import (
     FirewallSettings,
     ForwarderAccess,
     OwnNodeAccess,
+    PeerAccess,
     PortRange,
-    StandbyAccess,
 )
 from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.namespaces import (
@@ -67,7 +67,7 @@ class AppliancePorts:
     api: int | None = None  # None: there is no REST
     api_networks: tuple[str, ...] = ()  # networks that may connect to REST; this machine always may
     own: int | None = None  # the port of the own node's master
-    standby: StandbyAccess | None = None  # on one of two appliances
+    peer: PeerAccess | None = None  # on one of two appliances
     receivers: tuple[tuple[str, RemoteReceiver], ...] = ()  # of features' roles, by user
 
 
@@ -312,7 +312,7 @@ class ContainerIsolation(NoIsolation):
             neighbours=self._neighbours(),
             tunnel_only=(self._tunnels[0],) if self._tunnels else (),
             forwarders=self._forwarders(),
-            standby=self._ports.standby,
+            peer=self._ports.peer,
             tunnel_interface=USER_SPACE_INTERFACE
             if self._tunnels and self._tunnels[1] == "user space"
             else None,
@@ -355,8 +355,8 @@ class NetnsIsolation(ContainerIsolation):
         if ports.api is not None:
             forwarded.append(PortRange.one(ports.api))
         datagrams: tuple[PortRange, ...] = ()
-        if ports.standby is not None:
-            datagrams = (PortRange.one(ports.standby.port),)
+        if ports.peer is not None:
+            datagrams = (PortRange.one(ports.peer.port),)
             forwarded += datagrams
         self._isolation = isolation or Isolation(
             Namespace.own(), IsolationSettings(ports=tuple(forwarded), datagrams=datagrams)

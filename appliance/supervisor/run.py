@@ -13,7 +13,7 @@ from appliance.configuration.config_sources import plain
 from appliance.configuration.settings import Settings, Unasked
 from appliance.features.table import memories
 from appliance.network.close_ports import local_port_range
-from appliance.network.firewall.firewall_rules import StandbyAccess
+from appliance.network.firewall.firewall_rules import PeerAccess
 from appliance.network.firewall.iptables import load_modules
 from appliance.network.namespaces import has_privileges
 from appliance.supervisor import signals
@@ -120,7 +120,7 @@ def _run(
                 if (receiver := role.receiver(settings.sections)) is not None
             ),
             own_node=_ports_of_rosout(settings, node_ports),
-            standby=StandbyAccess(pairing.other, pairing.port) if pairing is not None else None,
+            peer=PeerAccess(pairing.other, pairing.port) if pairing is not None else None,
         )
         view = require_view(view_of(program_folders(), state.path), may_mount=has_privileges())
         isolation = isolation_for(settings.isolation, ports, settings.firewall.backend)

@@ -418,7 +418,7 @@ class Supervisor:
     # --- one of two appliances ----------------------------------------------------------------------------
 
     def _note_parked(self) -> None:
-        """Start what a standby has, and announce once that this appliance could take over."""
+        """Start what a waiting appliance has, and announce once that it could serve."""
         self._leave_answers()
         for slot in self.slots:
             if slot.role.stands_by and slot.is_free:

@@ -173,6 +173,8 @@ LOOKUPS = {
     "appliance/formats/bundle_verifier.py ": _LIBRARY,
     "appliance/formats/bundle_verifier.py regular": _LIBRARY,
     "appliance/features/syslog/log_forwarder.py step": _TEXT,
+    "appliance/features/table.py _loaded": _IMPORTED,
+    "appliance/features/views.py pair_view": _IMPORTED,
     "appliance/features/fleet/segment_pusher.py _failed": _TEXT,
     "appliance/master/calls/call.py _type_name": _TEXT,
     "appliance/features/table.py recorded_messages": _IMPORTED,

@@ -1,6 +1,6 @@
 """Name hosts in text for people, as the running appliance does.
 
-A stopped appliance, a copy of a log and a standby have no policy in force, so their hosts are shown by address.
+A stopped or waiting appliance and a copy of a log have no policy in force, so their hosts are shown by address.
 """
 
 import ipaddress

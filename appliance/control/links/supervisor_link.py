@@ -92,7 +92,7 @@ class ControlLifeline:
         self._heard = self.queue
 
     def queue(self, message: Any, descriptors: tuple[int, ...]) -> None:
-        """Queue a message; it replaces an earlier one of its kind, because a standby may wait for months."""
+        """Queue a message; it replaces an earlier one of its kind, because control may wait for months."""
         key: tuple[object, ...] = (type(message),)
         if isinstance(message, messages.LinkOpened):
             key = (*key, message.role, message.index)

@@ -10,7 +10,7 @@ Invariants:
 5. Records that retention removed before they had a receipt are counted and reported (`missed`).
 6. If the log was restored from a copy, pushing continues from the last checkpoint that both have.
 7. While nothing waits, the robot states so every minute (`idle`): a robot without records is not a silent one. It does
-   not while a checkpoint waits for its signature or for a receipt. A standby that has no log yet is also idle.
+   not while a checkpoint waits for its signature or for a receipt. An appliance that has no log yet is also idle.
 """
 
 import gzip

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from appliance.cli.verb_table import Group, Verb
 from appliance.features.feature import Feature
 from appliance.features.standby.membership import FILE, FOLDER, LEASE_FILE, LEASE_NICE, LEFT_FILE
+from appliance.features.standby.settings import Availability
 from appliance.supervisor.role import Role
 from appliance.supervisor.sandbox.sandbox_plan import NETWORK, SandboxPlan
 
@@ -23,6 +24,7 @@ def _pairing(state: Path) -> "Pairing | None":
 
 STANDBY = Feature(
     "standby",
+    settings=Availability,
     roles=(
         Role(
             "lease", "rosrv-lease", "lease", f"{_PLACE}process:main",

@@ -30,6 +30,7 @@ from appliance.features.standby.replication_frames import Introduction, Replicat
 from appliance.features.standby.replication_sender import ReplicationSender
 from appliance.features.standby.replication_transport import ReplicationListener
 from appliance.features.standby.robot_admission import RobotAdmission
+from appliance.features.standby.settings import Availability
 from appliance.features.standby.standby_tunnels import StandbyTunnels
 from appliance.store.writer_thread import Database, StoreError
 
@@ -96,6 +97,11 @@ def state_of(
         ),
         obstacle=obstacle,
     )
+
+
+def waits_for(settings: Settings) -> Literal["standby", "none"]:
+    """Return whether answers to nodes wait for the standby (`availability.wait`)."""
+    return settings.sections.of(Availability).wait
 
 
 def host_endpoint(settings: Settings, membership: Membership) -> str:

@@ -15,7 +15,7 @@ from appliance.features.standby.lease_client import LeaseClient
 from appliance.features.standby.lease_link import LeaseLink
 from appliance.features.standby.membership import LINK_FILE, MembershipError, load_membership
 from appliance.features.standby.passive import until_activated
-from appliance.features.standby.replication import Pair, Replication, host_endpoint
+from appliance.features.standby.replication import Pair, Replication, host_endpoint, waits_for
 from appliance.features.standby.shared_authority import SharedAuthority
 from appliance.features.standby.stored_times import adopt_times
 from appliance.hosts.certificate_requests import Authority
@@ -61,7 +61,7 @@ class PairedRole(ActiveRole):
             pair.lease,
             store.database,
             pair.epoch,
-            wait=settings.availability.wait,
+            wait=waits_for(settings),
             taken_over=pair.taken_over,
             folder=settings.state / "control",
         )

@@ -227,7 +227,7 @@ class ForwarderAccess:
 
 
 @dataclass(frozen=True)
-class StandbyAccess:
+class PeerAccess:
     """The other one of two appliances, and the port of both (TCP and UDP)."""
 
     other: str
@@ -285,7 +285,7 @@ class FirewallSettings:
     tunnel_only: tuple[str, ...] = ()
     tunnel_interface: str | None = None
     forwarders: tuple[ForwarderAccess, ...] = ()
-    standby: StandbyAccess | None = None
+    peer: PeerAccess | None = None
     new_connections: RateLimit | None = RateLimit(per_second=1000, burst=2000)
 
     def __post_init__(self) -> None:
@@ -336,7 +336,7 @@ def appliance_rules(settings: FirewallSettings) -> tuple[PacketRule, ...]:
         *_rosmaster(settings),
         *_own_node(settings),
         *(rule for forwarder in settings.forwarders for rule in _forwarding(forwarder)),
-        *_standby(settings.standby),
+        *_peer(settings.peer),
         *_api(settings),
         *_rate_limits(settings),
         *_chosen_by_the_kernel(settings),
@@ -445,8 +445,8 @@ def _forwarding(forwarder: ForwarderAccess) -> tuple[PacketRule, ...]:
     )
 
 
-def _standby(access: StandbyAccess | None) -> tuple[PacketRule, ...]:
-    """Let only the other appliance send to the port of replication (TCP) and lease (UDP)."""
+def _peer(access: PeerAccess | None) -> tuple[PacketRule, ...]:
+    """Let only the other appliance send to the port of both (TCP and UDP)."""
     if access is None:
         return ()
     port = PortRange.one(access.port)

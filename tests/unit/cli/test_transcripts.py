@@ -50,8 +50,6 @@ def write_log(signed: str | None = None, *, below: list[str]) -> None:
     assert log.close() is None
 
 
-
-
 def set_scan(monkeypatch: pytest.MonkeyPatch, *, below: list[str]) -> None:
     found = yaml.safe_load("\n".join(below))
     result = ScanResult(**found | {"open": tuple(found.get("open", ()))})

@@ -1,4 +1,4 @@
-"""What the start of an appliance that is one of two needs, from the membership in its state directory."""
+"""The start of an appliance that is one of two, from the membership in its state directory."""
 
 import json
 from contextlib import closing

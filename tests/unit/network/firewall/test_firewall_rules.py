@@ -16,9 +16,9 @@ from appliance.network.firewall.firewall_rules import (
     OwnNodeAccess,
     PacketRule,
     PacketVerdict,
+    PeerAccess,
     PortRange,
     RateLimit,
-    StandbyAccess,
     appliance_rules,
     family_of,
     inner_port,
@@ -306,9 +306,9 @@ CONDITIONS: dict[str, tuple[PacketRule, Any]] = {
 
 def test_replication_and_lease_are_for_the_other_appliance() -> None:
     """Only it connects to the replication and sends datagrams; all others are refused."""
-    access = StandbyAccess("10.0.0.3", 7412)
+    access = PeerAccess("10.0.0.3", 7412)
     rules = appliance_rules(
-        FirewallSettings(control_uid=1, rosmaster_uid=2, standby=access, new_connections=None)
+        FirewallSettings(control_uid=1, rosmaster_uid=2, peer=access, new_connections=None)
     )
     ours = [
         rule
