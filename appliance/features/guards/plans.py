@@ -1,0 +1,64 @@
+"""Choose topics and types for a new guard from the graph, and refuse a guard that the graph contradicts."""
+
+from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
+
+from appliance.features.guards.presets import Guard, GuardError, Preset
+from appliance.features.guards.suggestions import TopicFacts
+
+_UNKNOWN = "*"  # the type of a topic that has only subscribers which do not know it
+
+
+def planned(  # noqa: PLR0917  one caller
+    preset: Preset,
+    name: str,
+    topics: Mapping[str, str],
+    graph: Iterable[TopicFacts],
+    values: Mapping[str, str],
+    kinds: Mapping[str, str],
+) -> Guard:
+    """Return a guard for these topics. `kinds` are types that the user gives, for topics that no node has yet.
+
+    Raises `GuardError` if a topic of several types is neither in the graph nor in `kinds`, or has another type there.
+    """
+    known = {one.name: one.type for one in graph if one.type != _UNKNOWN}
+    given = preset.given_topics
+    chosen = dict(topics)
+    if preset.name == "answer":
+        before = topics["command"].removesuffix("/goal")
+        chosen = {"by": f"{before}/result", "cancel": f"{before}/cancel"} | chosen
+    types = {}
+    for each, rows in preset.topics.items():
+        if each not in chosen and each in given and given[each] not in known:
+            raise GuardError(_needed(preset, each, rows, known))
+        topic = chosen.setdefault(each, given[each])
+        types[each] = _type_of(topic, each, known, kinds, rows)
+    return Guard(name, preset, chosen, types, values)
+
+
+def _type_of(
+    topic: str, given: str, known: Mapping[str, str], kinds: Mapping[str, str], rows: Mapping[str, object]
+) -> str:
+    if topic in known:
+        if given in kinds and kinds[given] != known[topic]:
+            raise GuardError(f"{topic} has the type {known[topic]} on this robot, not {kinds[given]}")
+        return known[topic]
+    if given in kinds:
+        return kinds[given]
+    close = get_close_matches(topic, [name for name, kind in known.items() if kind in rows], 1, 0.5)
+    hint = f"did you mean {close[0]}? " if close else ""
+    raise GuardError(
+        f"no node has the topic {topic} now; {hint}If it comes later, give its type: --type {given}=TYPE, of"
+        f" {', '.join(rows)}"
+    )
+
+
+def _needed(preset: Preset, given: str, rows: Mapping[str, object], known: Mapping[str, str]) -> str:
+    option = "--by" if given == "by" else f"--topic {given}="
+    fitting = sorted(name for name, kind in known.items() if kind in rows)
+    there = (
+        f"this robot has {', '.join(fitting[:5])}"
+        if fitting
+        else f"no topic now has a type of {', '.join(rows)}"
+    )
+    return f"{preset.name} needs a topic for {given}: give {option}{'' if option.endswith('=') else ' '}TOPIC; {there}"

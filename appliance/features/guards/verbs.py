@@ -1,0 +1,326 @@
+"""`rosrv guard list|suggest|new|set|enforce|remove`: guards from presets, without editing a file."""
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from appliance.base.atomic_files import write_where_told
+from appliance.channel import admin
+from appliance.channel.answers.graph_answers import Graph
+from appliance.channel.answers.monitor_answers import Monitors, MonitorState, Replacement
+from appliance.channel.messages import GivenValue
+from appliance.cli import completion
+from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
+from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.monitor.in_force import say_replaced
+from appliance.cli.output import say_json
+from appliance.features.guards.plans import planned
+from appliance.features.guards.presets import (
+    PRESETS,
+    GuardError,
+    Preset,
+    file_of,
+    preset_named,
+    preset_of,
+    text_of,
+    with_values,
+)
+from appliance.features.guards.suggestions import TopicFacts, proposals
+from rosmop.tool.tables import say_table, table_of
+from rosmop.tool.terminal import say
+
+_Name = Annotated[
+    str, typer.Argument(metavar="GUARD", autocompletion=completion.monitors, show_default=False)
+]
+_Values = Annotated[list[str] | None, typer.Argument(metavar="PARAMETER=VALUE…", show_default=False)]
+_Hold = Annotated[
+    bool,
+    typer.Option("--hold", help="Load even if monitors then hold topics with traffic until they are resumed"),
+]
+
+
+@speaks
+def list_guards(appliance: Appliance) -> None:
+    """List the presets with their parameters, and the guards of the running appliance.
+
+    Example: rosrv guard list
+    """
+    for preset in PRESETS.values():
+        if appliance.as_json:
+            say_json(_as_json(preset))
+        else:
+            _say_preset(preset)
+    if not appliance.said and not _runs(appliance):
+        return
+    loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True))
+    for row in loaded.monitors:
+        preset_of_row = preset_of((loaded.files or {}).get(row.file, ""))
+        if preset_of_row is not None and appliance.as_json:
+            say_json({"guard": row.name, "preset": preset_of_row.name, "shadow": row.shadow, "enabled": row.enabled,
+                      "held": row.held, "topics": row.topics})  # fmt: skip
+        elif preset_of_row is not None:
+            say(f"guard {row.name}: {preset_of_row.name} on {', '.join(row.topics)}, {_state(row)}")
+
+
+@speaks
+def suggest(appliance: Appliance) -> None:
+    """Propose guards for the topics of the running robot, as commands to paste. Nothing changes.
+
+    Values in the commands come from the present rates of topics; all others are defaults.
+
+    Example: rosrv guard suggest
+    """
+    found = proposals(_facts(appliance.ask_or_exit(admin.GraphWanted())))
+    for one in found:
+        if appliance.as_json:
+            say_json({"preset": one.preset, "name": one.name, "topics": dict(one.topics),
+                      "measured": dict(one.measured), "values": dict(one.values), "command": one.command})  # fmt: skip
+            continue
+        set_by = {**one.measured, **one.values}
+        rest = ", ".join(f"{each.name}={each.default}" for each in PRESETS[one.preset].parameters
+                         if each.name not in set_by and each.name != "limits")  # fmt: skip
+        say(one.command)
+        say(f"    {PRESETS[one.preset].what}", "dim")
+        say("    " + "; ".join(filter(None, (
+            f"from the present rate: {', '.join(one.measured)}" if one.measured else "",
+            f"defaults, which you should check: {rest}" if rest else ""))), "dim")  # fmt: skip
+    if not found and not appliance.as_json:
+        say(
+            "no topic now commands a base or an arm: start the robot's nodes, or name a topic: rosrv guard new --help"
+        )
+
+
+@speaks
+def new(
+    appliance: Appliance,
+    preset: Annotated[str, typer.Argument(metavar="PRESET", show_default=False)],
+    topic: Annotated[
+        str, typer.Argument(metavar="TOPIC", autocompletion=completion.topics, show_default=False)
+    ],
+    values: _Values = None,
+    *,
+    by: Annotated[
+        str | None,
+        typer.Option("--by", metavar="TOPIC", help="Topic of the sensor", autocompletion=completion.topics),
+    ] = None,
+    further: Annotated[
+        list[str] | None,
+        typer.Option("--topic", metavar="NAME=TOPIC", help="Another topic of the preset (repeatable)"),
+    ] = None,
+    kinds: Annotated[
+        list[str] | None,
+        typer.Option("--type", metavar="NAME=TYPE", help="Type of a topic that no node has yet (repeatable)"),
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option("--name", help="Name of the guard (default: that of the preset)")
+    ] = None,
+    shadow: Annotated[
+        bool, typer.Option("--shadow", help="Only record what the guard would have done")
+    ] = False,
+    confirm_within: ConfirmWithin = None,
+    hold: _Hold = False,
+) -> None:
+    """Make a guard from a preset and load it. Its text is also written into the folder of specifications.
+
+    A topic that the robot lacks, or of a type that the preset does not know, is refused. `rosrv guard list` prints the
+    presets with their parameters.
+
+    Example: rosrv guard new deadman /cmd_vel --shadow silent=0.5
+    """
+    chosen = preset_named(preset)
+    topics = {"command": topic, **({} if by is None else {"by": by}), **_pairs(further, "--topic NAME=TOPIC")}
+    graph = _facts(appliance.ask_or_exit(admin.GraphWanted()))
+    guard = planned(chosen, name or preset, topics, graph, _pairs(values, "PARAMETER=VALUE"),
+                    _pairs(kinds, "--type NAME=TYPE"))  # fmt: skip
+    text = text_of(guard)
+    loaded = appliance.ask_or_exit(admin.MonitorsWanted())
+    file = f"{guard.name}.rv"
+    if any(guard.name == row.name or file == row.file for row in loaded.monitors):
+        raise GuardError(
+            f"a monitor {guard.name} is loaded: give --name, or change it with rosrv guard set {guard.name}"
+        )
+    body = _load(appliance, file, text, shadow=shadow, confirm_within=confirm_within, hold=hold)
+    say_replaced(body)
+    _write(loaded, file, text, temporary=body.confirm_by is not None)
+    if shadow:
+        say(f"in shadow mode: {guard.name}; rosrv guard enforce {guard.name}", "yellow")
+
+
+@speaks
+def set_values(
+    appliance: Appliance,
+    name: _Name,
+    values: Annotated[list[str], typer.Argument(metavar="PARAMETER=VALUE…", show_default=False)],
+    *,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only list what it would have stopped, from the flight recorder")
+    ] = False,
+    since: Annotated[str, typer.Option("--since", help="With --dry-run: from this time on")] = "1h",
+    hold: _Hold = False,
+) -> None:
+    """Set parameters of a guard while it runs. Its state stays, except for a polygon, limits of joints or a deadline.
+
+    Example: rosrv guard set fence margin=0.5
+    """
+    wanted = _pairs(values, "PARAMETER=VALUE")
+    loaded, row, text = _guard(appliance, name)
+    preset = preset_of(text)
+    assert preset is not None  # noqa: S101  `_guard` checks it
+    checked = {each: preset.parameter(each).checked(value) for each, value in wanted.items()}
+    if dry_run:
+        _replay(appliance, row, with_values(text, _in_force(row, preset) | checked), since)
+        return
+    in_text = {each: value for each, value in checked.items() if preset.parameter(each).loads}
+    if in_text:
+        changed = with_values(text, in_text)
+        say_replaced(_load(appliance, row.file, changed, shadow=row.shadow, hold=hold))
+        _write(loaded, row.file, changed)
+    constants: dict[str, GivenValue] = {each: value for each, value in checked.items() if each not in in_text}
+    if constants:
+        answer = appliance.ask_or_exit(admin.MonitorSet(name, constants))
+        say(
+            f"{name}: set {', '.join(f'{each}={constants[each]}' for each in answer.changed) or 'no difference'}"
+        )
+
+
+@speaks
+def enforce(appliance: Appliance, name: _Name) -> None:
+    """Bring a guard from shadow mode into force. It keeps its state.
+
+    Example: rosrv guard enforce fence
+    """
+    _guard(appliance, name)
+    body = appliance.answer_or_exit(admin.MonitorShadow([name], False))
+    say(f"in force: {', '.join(body.names) or 'no change'}")
+    if body.began:
+        say(f"{', '.join(body.began)} started in the initial state", "yellow")
+
+
+@speaks
+def remove(appliance: Appliance, name: _Name, confirm_within: ConfirmWithin = None) -> None:
+    """Remove a guard, and its file from the folder of specifications.
+
+    Example: rosrv guard remove fence
+    """
+    loaded, row, _text = _guard(appliance, name)
+    order = admin.MonitorRemove([name], confirm_within=seconds_within(confirm_within, "guard"))
+    body = appliance.answer_or_exit(order)
+    say_replaced(body)
+    if loaded.folder and body.confirm_by is None:
+        file_of(row.file.removesuffix(".rv"), Path(loaded.folder)).unlink(missing_ok=True)
+
+
+def _runs(appliance: Appliance) -> bool:
+    """Whether an appliance answers; presets are listed without one also."""
+    from appliance.cli.connection.admin_client import NotRunningError  # noqa: PLC0415  only for this verb
+
+    try:
+        return appliance.ask(admin.MonitorsWanted()).ok
+    except NotRunningError:
+        return False
+
+
+def _facts(graph: Graph) -> list[TopicFacts]:
+    return [
+        TopicFacts(
+            one.name, one.type, tuple(each.node for each in one.publishers), tuple(one.subscribers),
+            sum(each.messages_per_second for each in one.publishers),
+        )
+        for one in graph.topics
+    ]  # fmt: skip
+
+
+def _pairs(texts: list[str] | None, form: str) -> dict[str, str]:
+    found = {}
+    for text in texts or []:
+        name, sign, value = text.partition("=")
+        if not sign or not name or not value:
+            raise GuardError(f"{text}: write {form}")
+        found[name] = value
+    return found
+
+
+def _guard(appliance: Appliance, name: str) -> tuple[Monitors, MonitorState, str]:
+    """Return all monitors, the guard's row and its text. Raises `GuardError`."""
+    loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True))
+    texts = loaded.files or {}
+    guards = {row.name: row for row in loaded.monitors if preset_of(texts.get(row.file, ""))}
+    if name not in guards:
+        known = ", ".join(guards) or "none is loaded; see rosrv guard suggest"
+        raise GuardError(f"no guard is named {name}; there are: {known}")
+    return loaded, guards[name], texts[guards[name].file]
+
+
+def _in_force(row: MonitorState, preset: Preset) -> dict[str, str]:
+    """Return the values in force of what is given to a guard, as text."""
+    names = {each.name for each in preset.parameters}
+    return {
+        one.name: str(one.value).lower() if isinstance(one.value, bool) else f"{one.value!r}"
+        for one in row.given
+        if one.name in names
+    }
+
+
+def _load(
+    appliance: Appliance, file: str, text: str, *, shadow: bool, hold: bool, confirm_within: str | None = None
+) -> Replacement:
+    within = seconds_within(confirm_within, "guard")
+    note = text.split("\n", 1)[0].removeprefix("// ")
+    order = admin.MonitorLoad({file: text}, note=note, confirm_within=within, shadow=shadow, hold=hold)
+    return appliance.answer_or_exit(order)
+
+
+def _write(loaded: Monitors, file: str, text: str, *, temporary: bool = False) -> None:
+    """Write a guard into the folder of specifications, if it is on this machine and the load is permanent."""
+    if loaded.folder is None or not Path(loaded.folder).is_dir():
+        say("the appliance keeps the text; it has no folder of specifications on this machine", "dim")
+    elif temporary:
+        say(f"{loaded.folder} is not changed while the load waits for rosrv monitor confirm", "yellow")
+    else:
+        try:
+            write_where_told(Path(loaded.folder) / file, text.encode())
+        except OSError as error:
+            say(
+                f"the appliance keeps the text, but {loaded.folder}/{file} is not written: {error.strerror}",
+                "yellow",
+            )
+
+
+def _replay(appliance: Appliance, row: MonitorState, text: str, since: str) -> None:
+    """Print what a text would have stopped, from the flight recorder."""
+    from appliance.cli.monitor.replay import replay_monitor  # noqa: PLC0415  slow to import
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / row.file
+        path.write_text(text, encoding="utf-8")
+        replay_monitor.function(appliance, str(path), since=since)
+
+
+def _say_preset(preset: Preset) -> None:
+    say(f"{preset.name}: {preset.what}")
+    for given, rows in preset.topics.items():
+        say(f"    {given}: {', '.join(rows)}", "dim")
+    if preset.parameters:
+        table = table_of("parameter", "default", "range", "meaning")
+        for one in preset.parameters:
+            span = f"{one.least}..{one.most}" if one.least else ""
+            table.add_row(f"    {one.name}", f"{one.default} {one.unit}".strip(), span, one.what)
+        say_table(table)
+
+
+def _as_json(preset: Preset) -> Mapping[str, Any]:
+    return {
+        "preset": preset.name, "version": preset.version, "what": preset.what, "topics": preset.given_topics,
+        "types": {given: list(rows) for given, rows in preset.topics.items()},
+        "parameters": [{"name": one.name, "kind": one.kind, "default": one.default, "unit": one.unit,
+                        "least": one.least, "most": one.most, "what": one.what} for one in preset.parameters],
+    }  # fmt: skip
+
+
+def _state(row: MonitorState) -> str:
+    if row.held:
+        return f"holds its topics: rosrv monitor resume {row.name}"
+    return "in shadow mode" if row.shadow else "in force" if row.enabled else "disabled"

@@ -1,0 +1,129 @@
+"""`rosrv guard` loads, changes and removes guards by the operations of monitors."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from appliance.channel import admin
+from appliance.features.guards import verbs
+from appliance.features.guards.presets import PRESETS, Guard, GuardError, text_of
+from tests.unit.features.guards.test_suggestions import graph_of
+
+
+class Robot:
+    """An appliance with some guards; it keeps the orders that it gets."""
+
+    as_json = False
+    said = True
+
+    def __init__(self, folder: Path | None, *guards: Guard, shadow: bool = False) -> None:
+        self.orders: list[Any] = []
+        self.files = {f"{one.name}.rv": text_of(one) for one in guards}
+        self.folder = None if folder is None else str(folder)
+        self.rows = [
+            SimpleNamespace(name=one.name, file=f"{one.name}.rv", shadow=shadow, enabled=not shadow, held=False,
+                            topics=["/cmd_vel"], given=[SimpleNamespace(name="margin", value=0.2, kind="double")])
+            for one in guards
+        ]  # fmt: skip
+
+    def ask_or_exit(self, request: Any) -> Any:
+        """Answer as control does."""
+        match request:
+            case admin.GraphWanted():
+                flows = {one.name: [SimpleNamespace(node=node, messages_per_second=one.rate) for node in one.publishers]
+                         for one in graph_of("turtlebot3")}  # fmt: skip
+                topics = [SimpleNamespace(name=one.name, type=one.type, publishers=flows[one.name],
+                                          subscribers=one.subscribers) for one in graph_of("turtlebot3")]  # fmt: skip
+                return SimpleNamespace(topics=topics)
+            case admin.MonitorsWanted():
+                return SimpleNamespace(monitors=self.rows, files=self.files, folder=self.folder)
+        self.orders.append(request)
+        changed = [*getattr(request, "values", {})]
+        return SimpleNamespace(
+            revision=2,
+            replaced=1,
+            added=[],
+            changed=changed,
+            removed=[],
+            warnings=[],
+            moved=[],
+            confirm_by=getattr(request, "confirm_within", None),
+            names=["fence"],
+            began=[],
+        )
+
+    answer_or_exit = ask_or_exit
+
+
+FENCE = Guard("fence", PRESETS["fence"], types={"command": "geometry_msgs/Twist", "by": "nav_msgs/Odometry"})
+
+
+def run(verb: Any, robot: Robot, *arguments: Any, **options: Any) -> Any:
+    """Run a verb; return its only order, or None."""
+    verb.function(robot, *arguments, **options)
+    return robot.orders[0] if robot.orders else None
+
+
+def test_a_new_guard_is_loaded_and_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """In shadow mode if wanted; the file in the folder is what was loaded."""
+    order = run(verbs.new, Robot(tmp_path), "fence", "/cmd_vel", ["margin=0.5"], by="/odom", shadow=True)
+    assert (order.shadow, order.hold, order.note[:14]) == (True, False, "preset fence 1")
+    assert (tmp_path / "fence.rv").read_text() == order.files["fence.rv"]
+    assert "double margin = 0.5 m" in order.files["fence.rv"]
+    assert "rosrv guard enforce fence" in capsys.readouterr().out
+
+
+def test_a_guard_that_may_roll_back_is_not_written(tmp_path: Path) -> None:
+    """A start would load it from the folder although nobody confirmed it."""
+    order = run(verbs.new, Robot(tmp_path), "speed", "/cmd_vel", confirm_within="5m")
+    assert order.confirm_within == 300 and not [*tmp_path.iterdir()]
+
+
+def test_a_name_that_is_taken_is_refused(tmp_path: Path) -> None:
+    """Nothing is loaded."""
+    robot = Robot(tmp_path, FENCE)
+    with pytest.raises(GuardError, match="a monitor fence is loaded: give --name"):
+        run(verbs.new, robot, "fence", "/cmd_vel", by="/odom")
+    assert not robot.orders
+
+
+def test_a_constant_is_set_and_a_polygon_is_loaded(tmp_path: Path) -> None:
+    """A guard in shadow mode stays there; a wrong value changes nothing."""
+    robot = Robot(tmp_path, FENCE, shadow=True)
+    run(verbs.set_values, robot, "fence", ["margin=0.5", "polygon=0,0 1,0 1,1"])
+    load, constant = robot.orders
+    assert (load.shadow, "{0, 0, 1, 0, 1, 1}" in load.files["fence.rv"]) == (True, True)
+    assert (constant.name, constant.values) == ("fence", {"margin": "0.5"})
+    robot.orders.clear()
+    for values in (["polygon=0,0 1,0 1,1", "margin=99"], ["nothing=1"], ["margin"]):
+        with pytest.raises(GuardError):
+            run(verbs.set_values, robot, "fence", values)
+    assert not robot.orders
+
+
+def test_a_guard_is_brought_into_force_and_removed(tmp_path: Path) -> None:
+    """Its file goes with it, unless the removal may roll back; a monitor that is not a guard is not touched."""
+    robot = Robot(tmp_path, FENCE)
+    (tmp_path / "fence.rv").write_text("x")
+    assert run(verbs.enforce, robot, "fence") == admin.MonitorShadow(["fence"], False)
+    run(verbs.remove, robot, "fence", confirm_within="5m")
+    assert (tmp_path / "fence.rv").exists()
+    run(verbs.remove, robot, "fence")
+    assert not (tmp_path / "fence.rv").exists()
+    robot.files["fence.rv"] = "fence() { }"
+    with pytest.raises(GuardError, match="no guard is named fence"):
+        run(verbs.remove, robot, "fence")
+
+
+def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each preset with its parameters; each proposal as a command, with the defaults that are to be checked."""
+    run(verbs.list_guards, Robot(tmp_path, FENCE))
+    shown = capsys.readouterr().out
+    assert all(f"{name}: {preset.what}" in shown for name, preset in PRESETS.items())
+    assert "guard fence: fence on /cmd_vel, in force" in shown
+    run(verbs.suggest, Robot(None))
+    shown = capsys.readouterr().out
+    assert "rosrv guard new fence /cmd_vel --by /odom --shadow silent=0.2\n" in shown
+    assert "defaults, which you should check: margin=0.2" in shown
