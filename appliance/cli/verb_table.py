@@ -1,7 +1,6 @@
 """Define the rows of the tables of verbs, without importing a verb."""
 
 import functools
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,6 +59,6 @@ def _text(file: Path) -> str:
 
 
 def _first_sentence(file: Path, function: str) -> str:
-    found = re.search(rf'(?ms)^def {function}\(.*?"""(.+?)(?:"""|\n\n)', _text(file))
-    assert found is not None, function  # noqa: S101  every verb has a docstring
-    return " ".join(found[1].split())
+    text = _text(file)
+    docstring = text[text.index(f"\ndef {function}(") :].split('"""', 2)[1]  # every verb has one
+    return " ".join(docstring.partition("\n\n")[0].split())
