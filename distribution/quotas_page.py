@@ -1,8 +1,10 @@
 """Write docs/reference/quotas.md: `python -m distribution.quotas_page > docs/reference/quotas.md`."""
 
+import pkgutil
 import sys
 from collections.abc import Callable, Iterator
 
+from appliance.features.table import FEATURES
 from appliance.quotas.table import QUOTA_ROWS, QuotaRow
 
 _HEAD = """# Quotas of finite resources
@@ -13,6 +15,15 @@ An *unknown host* is an address that no rule of the policy names, or that an ope
 one quota. The *kept* part is for hosts with a registration only, so the robot's own nodes find it free at any time.
 `[Ports]` and `[Limits]` are sections of the policy; the other settings are keys of `appliance.yaml`.
 """
+
+
+def all_rows() -> tuple[QuotaRow, ...]:
+    """Return the rows of the core, then those of features."""
+    named = (feature.quotas for feature in FEATURES)
+    return (
+        *QUOTA_ROWS,
+        *(row for place in named if place is not None for row in pkgutil.resolve_name(place)),
+    )
 
 
 def page() -> str:
@@ -49,7 +60,7 @@ def _tables() -> Iterator[str]:
 
 
 def _table(title: str, columns: tuple[str, ...], cells: Callable[[QuotaRow], tuple[str, ...] | None]) -> str:
-    rows = ((row.thing, *found) for row in QUOTA_ROWS if (found := cells(row)) is not None)
+    rows = ((row.thing, *found) for row in all_rows() if (found := cells(row)) is not None)
     lines = (columns, ("---",) * len(columns), *rows)
     return f"## {title}\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines)
 

@@ -114,6 +114,7 @@ class Feature:
     `operations` returns the requests of operators' tools; the admin socket, REST and the client follow from their
     rows. `routes` is the function (`module:function`) that returns further routes of the api for its `Services`.
     `verbs` are commands of `rosrv`.
+    `quotas` names the tuple of rows (`module:name`) that the table of quotas lists.
     `recorded` is the function (`module:function`) that gives `rosrv monitor replay` the recorded messages of a period.
     `memory` makes the memory that the supervisor shares with this number of relays; None if none is configured.
 
@@ -130,6 +131,7 @@ class Feature:
     operations: "Callable[[], tuple[type[AdminRequest[Any]], ...]]" = lambda: ()
     routes: str | None = None
     verbs: Mapping[str, Group] = field(default_factory=dict)
+    quotas: str | None = None
     recorded: str | None = None
     memory: Callable[[Sections, int], SharedMemory | None] = lambda _sections, _relays: None
     make: Callable[[FeatureContext], FeaturePart] | None = None

@@ -50,6 +50,7 @@ RECORDER = Feature(
     operations=_operations,
     routes="appliance.features.recorder.recording_routes:routes",
     memory=_memory,
+    quotas="appliance.features.recorder.quotas:ROWS",
     recorded="appliance.features.recorder.recorder_input:recorded_messages",
     make=_make,
     verbs={

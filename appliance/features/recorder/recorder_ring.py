@@ -9,9 +9,9 @@ import msgspec
 
 from appliance.base import clock
 from appliance.features.recorder.excluded_topics import fits, left_out_because
+from appliance.features.recorder.quotas import RECORDER_MEMORY
 from appliance.features.recorder.recorder_link import RingTerms
 from appliance.features.recorder.ring import LEFT_OUT, RingStream, RingWriter
-from appliance.quotas.table import RECORDER_MEMORY
 
 _TOPIC_SHARE = 0.25
 _STEP = 100_000_000  # nanoseconds

@@ -1,0 +1,37 @@
+"""The quotas of the memory and of the disk that recordings use."""
+
+from appliance.quotas.pool import Bounds
+from appliance.quotas.table import QuotaRow
+
+RECORDER_MEMORY = QuotaRow(
+    thing="bytes of messages that the flight recorder keeps, divided among the relays",
+    bounds=Bounds(whole=64 << 20, host=32 << 20, unknown=0, kept=0),
+    at_limit="the oldest messages of the topic or host are overwritten",
+    between="any host may use free memory; messages older than `recorder.before` are overwritten first",
+    alarm="the recording lists what is missing",
+    setting="recorder.memory (half of it for a host, a quarter for a topic)",
+    shown_by=(
+        "unit/features/recorder/test_ring.py::test_a_flood_displaces_only_itself",
+        "unit/features/recorder/test_ring.py::test_many_topics_of_a_host_displace_only_its_own",
+    ),
+)
+RECORDER_DISK = QuotaRow(
+    thing="bytes of recordings",
+    bounds=Bounds(whole=2 << 30, host=512 << 20, unknown=512 << 20, kept=512 << 20),
+    at_limit="the host's oldest recording of its most frequent kind of trigger is removed; a host starts at most six"
+    " recordings an hour for each kind of trigger",
+    between="no host displaces recordings of the robot, which gets half of the whole back; two hosts besides the"
+    " robot are recorded at once",
+    counting="unknown: no rule names the host, or no host caused the recording; kept: for the robot and operators",
+    alarm="`recording removed`, `recording missed`; `detail.not_recorded` of the record",
+    setting="recorder.disk (an eighth of it for one recording)",
+    shown_by=(
+        "unit/features/recorder/test_recording_store.py::test_a_guest_makes_room_from_its_own_recordings",
+        "unit/features/recorder/test_recording_store.py::test_no_guest_displaces_a_recording_of_the_robot",
+        "unit/features/recorder/test_recording_plan.py::test_a_guests_flood_leaves_the_robot_its_recording",
+        "unit/features/recorder/test_recording_plan.py::test_unknown_hosts_are_one",
+        "unit/features/recorder/test_recorder.py::test_a_flood_of_triggers_does_not_fill_the_disk",
+    ),
+)
+
+ROWS = (RECORDER_MEMORY, RECORDER_DISK)
