@@ -16,12 +16,6 @@ GOOD: dict[str, Any] = {
     "policy": {"revision": 3, "file": "robot.ini"},
     "monitors": {"revision": 1},
 }
-PAIR: dict[str, Any] = {
-    "name": "a",
-    "role": "active",
-    "other": {"name": "b", "connected": True, "in_sync": True},
-    "witness": {"answered_seconds": 0.3, "holder": "a"},
-}
 
 
 def changed(path: str, value: object, **more: object) -> Status:
@@ -56,35 +50,6 @@ def test_a_healthy_appliance_has_none() -> None:
         ("ipsec.troubles", ["a certificate ends"], "ipsec", "warning", "hosts"),
         ("blocks.hosts", 1, "hosts-blocked", "warning", "hosts"),
         ("recorder", {"running": False}, "recorder", "warning", "system"),
-        ("standby", PAIR | {"other": {"trouble_seconds": 60.0}}, "standby-away", "warning", "system"),
-        (
-            "standby", PAIR | {"other": {"connected": True, "trouble_seconds": 60.0}}, "standby-behind", "warning",
-            "system",
-        ),
-        ("standby", PAIR | {"witness": {"answered_seconds": 5.0}}, "witness-silent", "warning", "system"),
-        ("standby", PAIR | {"witness": {}}, "witness-silent", "warning", "system"),
-        ("standby", PAIR | {"obstacle": "other keys"}, "standby-unready", "alarm", "system"),
-        (
-            "standby",
-            PAIR | {"other": {"connected": True, "witness_seconds": 5.0}},
-            "standby-blind",
-            "alarm",
-            "system",
-        ),
-        (
-            "standby",
-            PAIR | {"witness": {"answered_seconds": 0.1, "trouble": "full"}},
-            "witness-disk",
-            "alarm",
-            "system",
-        ),
-        (
-            "standby",
-            PAIR | {"witness": {"answered_seconds": 0.1, "holder": "b"}},
-            "both-active",
-            "alarm",
-            "system",
-        ),
         (
             "processes",
             [{"role": "charon", "failing": "no /dev/net/tun"}],
@@ -141,11 +106,3 @@ def test_drops_and_many_denials_of_the_last_minute_are_warnings() -> None:
         *drops,
     ]
     assert open_alarms(status) == []
-
-
-@pytest.mark.parametrize(
-    "state",
-    [PAIR, PAIR | {"other": {"trouble_seconds": 59.0}}, PAIR | {"witness": {"answered_seconds": 4.9, "holder": ""}}],
-)  # fmt: skip
-def test_two_appliances_that_work_have_no_alarm(state: dict[str, Any]) -> None:
-    assert open_alarms(changed("standby", state)) == []
