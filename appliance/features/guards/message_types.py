@@ -14,7 +14,7 @@ _LEGS = ("linear.x", "linear.y", "linear.z", "angular.x", "angular.y", "angular.
 
 
 @dataclass(frozen=True)
-class Row:
+class TypeRow:
     """A message type: the path of each value. `parameters` and `local` replace a value that is made of fields."""
 
     paths: Mapping[str, str] = field(default_factory=dict)
@@ -24,14 +24,14 @@ class Row:
     local: str = ""
 
 
-def _twist(before: str = "") -> Row:
-    return Row({axis: before + leg for axis, leg in zip(AXES, _LEGS, strict=True)})
+def _twist(before: str = "") -> TypeRow:
+    return TypeRow({axis: before + leg for axis, leg in zip(AXES, _LEGS, strict=True)})
 
 
-def _listed(*paths: str) -> Row:
+def _listed(*paths: str) -> TypeRow:
     """Return a row whose `values` are these numbers."""
     names = [f"v{place}" for place in range(len(paths))]
-    return Row(
+    return TypeRow(
         dict(zip(names, paths, strict=True)),
         parameters=", ".join(f"double {name}" for name in names),
         local=f"double values[] = {{{', '.join(names)}}};",
@@ -41,25 +41,25 @@ def _listed(*paths: str) -> Row:
 VELOCITIES = {
     "geometry_msgs/Twist": _twist(),
     "geometry_msgs/TwistStamped": _twist("twist."),
-    "ackermann_msgs/AckermannDrive": Row({"x": "speed"}),
-    "ackermann_msgs/AckermannDriveStamped": Row({"x": "drive.speed"}),
+    "ackermann_msgs/AckermannDrive": TypeRow({"x": "speed"}),
+    "ackermann_msgs/AckermannDriveStamped": TypeRow({"x": "drive.speed"}),
 }
 TRAJECTORY = {"names": "joint_names", "points": "points"}
 GOAL = "control_msgs/FollowJointTrajectoryActionGoal"
 TRAJECTORIES = {
-    "trajectory_msgs/JointTrajectory": Row(TRAJECTORY),
-    GOAL: Row({name: f"goal.trajectory.{path}" for name, path in TRAJECTORY.items()}, stops=False),
+    "trajectory_msgs/JointTrajectory": TypeRow(TRAJECTORY),
+    GOAL: TypeRow({name: f"goal.trajectory.{path}" for name, path in TRAJECTORY.items()}, stops=False),
 }
 GOALS = {
-    "move_base_msgs/MoveBaseActionGoal": Row({"id": "goal_id.id"}, stops=False),
-    GOAL: Row({"id": "goal_id.id"}, stops=False),
+    "move_base_msgs/MoveBaseActionGoal": TypeRow({"id": "goal_id.id"}, stops=False),
+    GOAL: TypeRow({"id": "goal_id.id"}, stops=False),
 }
-COMMANDS = VELOCITIES | TRAJECTORIES | {"move_base_msgs/MoveBaseActionGoal": Row(stops=False)}
-RESULTS = {goal.replace("ActionGoal", "ActionResult"): Row({"id": "status.goal_id.id"}) for goal in GOALS}
+COMMANDS = VELOCITIES | TRAJECTORIES | {"move_base_msgs/MoveBaseActionGoal": TypeRow(stops=False)}
+RESULTS = {goal.replace("ActionGoal", "ActionResult"): TypeRow({"id": "status.goal_id.id"}) for goal in GOALS}
 
 
-def _pose(before: str) -> Row:
-    return Row({"px": f"{before}position.x", "py": f"{before}position.y", "q": f"{before}orientation"})
+def _pose(before: str) -> TypeRow:
+    return TypeRow({"px": f"{before}position.x", "py": f"{before}position.y", "q": f"{before}orientation"})
 
 
 POSITIONS = {
@@ -68,12 +68,12 @@ POSITIONS = {
     "geometry_msgs/PoseWithCovarianceStamped": _pose("pose.pose."),
 }
 SPEEDS = {
-    "nav_msgs/Odometry": Row({"v": "twist.twist.linear.x"}),
-    "geometry_msgs/TwistStamped": Row({"v": "twist.linear.x"}),
-    "geometry_msgs/TwistWithCovarianceStamped": Row({"v": "twist.twist.linear.x"}),
+    "nav_msgs/Odometry": TypeRow({"v": "twist.twist.linear.x"}),
+    "geometry_msgs/TwistStamped": TypeRow({"v": "twist.linear.x"}),
+    "geometry_msgs/TwistWithCovarianceStamped": TypeRow({"v": "twist.twist.linear.x"}),
 }
 SENSORS = {
-    "sensor_msgs/LaserScan": Row({"values": "ranges"}),
+    "sensor_msgs/LaserScan": TypeRow({"values": "ranges"}),
     "sensor_msgs/Range": _listed("range"),
     "sensor_msgs/NavSatFix": _listed("latitude", "longitude", "altitude"),
     "sensor_msgs/Imu": _listed(
@@ -83,13 +83,13 @@ SENSORS = {
         *(f"pose.pose.position.{axis}" for axis in "xyz"),
         *(f"pose.pose.orientation.{axis}" for axis in "xyzw"),
     ),
-    "sensor_msgs/JointState": Row({"values": "position"}, parameters="double[] values"),
+    "sensor_msgs/JointState": TypeRow({"values": "position"}, parameters="double[] values"),
 }
 _SCAN = {
     "start": "angle_min", "step": "angle_increment", "low": "range_min", "high": "range_max", "ranges": "ranges",
 }  # fmt: skip
-SCANS = {"sensor_msgs/LaserScan": Row(_SCAN)}
-BATTERIES = {"sensor_msgs/BatteryState": Row({"percentage": "percentage"})}
+SCANS = {"sensor_msgs/LaserScan": TypeRow(_SCAN)}
+BATTERIES = {"sensor_msgs/BatteryState": TypeRow({"percentage": "percentage"})}
 
 _EVENT = re.compile(
     r"event (?P<name>\w+)\((?P<parameters>[^)]*)\) (?P<topic>\w+)\s+(?P<type>\w+/\w+)\s+'\{(?P<pattern>[^}]*)\}' \{"
@@ -100,7 +100,7 @@ _STOP = re.compile(r"\bSTOP;")
 _WIDTH = 110
 
 
-def text_for(text: str, topic: str, kind: str, row: Row) -> str:
+def text_for(text: str, topic: str, kind: str, row: TypeRow) -> str:
     """Return the text of a preset whose events on this given topic have another type."""
     for found in reversed([*_EVENT.finditer(text)]):
         if found["topic"] == topic:
@@ -115,7 +115,7 @@ def text_for(text: str, topic: str, kind: str, row: Row) -> str:
     return _SAFE.sub(f"safe {kind} {{ }} on command every 100ms;", text) if row.stops else _cancelling(text)
 
 
-def _header(found: "re.Match[str]", kind: str, row: Row) -> str:
+def _header(found: "re.Match[str]", kind: str, row: TypeRow) -> str:
     """Return the head of an event with the fields of a row, and variables for the values that it lacks."""
     wanted = [one.rsplit(" ", 1) for one in found["parameters"].split(", ") if one]
     bound = {name: row.paths[name] for _type, name in wanted if name in row.paths}

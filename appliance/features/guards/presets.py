@@ -1,6 +1,6 @@
 """Presets: reviewed texts in `monitors/guards`, their parameters, and the texts that are made from them.
 
-What is made is an ordinary specification. Its first line names the preset, its version, the topics and their types.
+A guard is an ordinary specification. Its first line names the preset, its version, the topics and their types.
 """
 
 import functools
@@ -12,7 +12,7 @@ from pathlib import Path
 from appliance.base.shipped import SHIPPED
 from appliance.base.user_errors import UserError
 from appliance.features.guards import message_types as types
-from appliance.features.guards.message_types import Row, text_for
+from appliance.features.guards.message_types import TypeRow, text_for
 
 FOLDER = SHIPPED / "monitors" / "guards"
 
@@ -91,7 +91,7 @@ class Preset:
     """A preset: the rows of each of its topics that has several types, and the parameters that are in its text."""
 
     name: str
-    topics: Mapping[str, Mapping[str, Row]]
+    topics: Mapping[str, Mapping[str, TypeRow]]
     further: tuple[Parameter, ...] = ()
 
     @functools.cached_property
@@ -108,7 +108,7 @@ class Preset:
 
     @property
     def what(self) -> str:
-        """What it does: the second line of the text."""
+        """The effect: the second line of the text."""
         return self.text.split("\n", 2)[1].removeprefix("// ")
 
     @property

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from appliance.features.guards import message_types as types
-from appliance.features.guards.message_types import Row
+from appliance.features.guards.message_types import TypeRow
 
 _COMMAND = re.compile(r"cmd|command|setpoint|drive|ackermann", re.IGNORECASE)
 _STOP = re.compile(r"e_?stop|emergency|protective_stop", re.IGNORECASE)
@@ -98,7 +98,7 @@ def _for_a_base(base: TopicFacts, topics: list[TopicFacts], *, alone: bool) -> I
 
 def _for_an_arm(arm: TopicFacts, topics: list[TopicFacts], *, alone: bool) -> Iterator[Proposal]:
     yield Proposal("joints", _name("joints", arm, alone), {"command": arm.name})
-    states = _sources(arm, topics, {"sensor_msgs/JointState": Row()})
+    states = _sources(arm, topics, {"sensor_msgs/JointState": TypeRow()})
     if states:
         by = {"command": arm.name, "by": states[0].name}
         # An arm that stands still repeats its positions.
@@ -114,7 +114,7 @@ def _for_an_arm(arm: TopicFacts, topics: list[TopicFacts], *, alone: bool) -> It
 def _sources(
     command: TopicFacts,
     topics: Iterable[TopicFacts],
-    rows: Mapping[str, Row],
+    rows: Mapping[str, TypeRow],
     prefer: "re.Pattern[str] | None" = None,
     avoid: "re.Pattern[str] | None" = None,
 ) -> list[TopicFacts]:

@@ -83,7 +83,7 @@ PLANS = [
 
 
 @pytest.mark.parametrize(("preset", "topics", "kinds", "why"), PLANS)
-def test_what_the_graph_contradicts_is_refused(
+def test_a_guard_that_the_graph_contradicts_is_refused(
     preset: str, topics: dict[str, str], kinds: dict[str, str], why: str
 ) -> None:
     """The error names the topic, its type, and what fits."""

@@ -76,7 +76,7 @@ def test_a_new_guard_is_loaded_and_written(tmp_path: Path, capsys: pytest.Captur
 
 
 def test_a_guard_that_may_roll_back_is_not_written(tmp_path: Path) -> None:
-    """A start would load it from the folder although nobody confirmed it."""
+    """A start would load it from the folder before it is confirmed."""
     order = run(verbs.new, Robot(tmp_path), "speed", "/cmd_vel", confirm_within="5m")
     assert order.confirm_within == 300 and not [*tmp_path.iterdir()]
 

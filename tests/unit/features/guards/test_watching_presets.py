@@ -41,13 +41,10 @@ def test_an_emergency_stop_stays_until_a_reset(hands: bool) -> None:
         guard, at = Guarded("estop", twoHands=hands), 0
         latched = pressed = released = False
         hand, hand_at = "", 0
-        for _message in range(15):
-            at += random.choice((1, 30, 500, 1999, 2000, 2001))
-            given, on, node = (
-                random.choice(("stop", "reset", "reset", "command")),
-                random.random() < 0.6,
-                "/a",
-            )
+        for _message in range(30):
+            at += random.choice((1, 30, 500, 1999, 2001))
+            given = random.choice(("stop", "reset", "reset", "reset", "command", "command"))
+            on = random.random() < (0.3 if given == "stop" else 0.5)
             if given == "command":
                 assert runs(guard, at) != latched
                 continue
@@ -171,7 +168,7 @@ def test_two_sources_agree_for_a_number_of_messages() -> None:
 
 @pytest.mark.parametrize(
     ("charge", "fixed", "checked", "passes"),
-    [(0.5, 0, True, True), (0.2, 0, True, True), (0.19, 0, True, False), (math.nan, 0, True, False),
+    [(0.5, 0, True, True), (0.25, 0, True, True), (0.2499, 0, True, False), (math.nan, 0, True, False),
      (0.5, -1, True, False), (0.5, 0, False, False), (None, 0, True, False), (0.5, None, True, False),
      (0.5, 0, None, False)],
 )  # fmt: skip
@@ -179,15 +176,17 @@ def test_an_interlock_needs_battery_position_and_check(
     charge: float | None, fixed: int | None, checked: bool | None, passes: bool
 ) -> None:
     """What was not heard is missing; what is old also."""
-    guard = Guarded("arm", needFix=True, needCheck=True, silent=1)
+    guard = Guarded("arm", charge=0.25, needFix=True, needCheck=True, silent=1)
     if charge is not None:
-        guard.tell("by", message("sensor_msgs/BatteryState", percentage=charge + 1e-8), 1)
+        guard.tell("by", message("sensor_msgs/BatteryState", percentage=charge), 1)
     if fixed is not None:
         guard.tell("fix", message("sensor_msgs/NavSatFix", status__status=fixed), 1)
     if checked is not None:
         guard.tell("check", button(checked), 1)
     assert runs(guard, 2) == passes
     assert not runs(guard, 1002)
+    guard.tell("by", message("sensor_msgs/BatteryState", percentage=1.0), 1003)
+    assert not runs(guard, 1003)
 
 
 def trajectory(names: list[str], *points: tuple[float, list[float]]) -> bytes:
