@@ -8,7 +8,7 @@ from appliance.base import clock
 from appliance.channel.messages import MonitorCallAnswered, MonitorCallWanted
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.mediation import Mediation
-from appliance.master.graph.registry import Kind, Registry
+from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reconcile.enactor import Enactor
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, request_of, rights_of_call
@@ -20,7 +20,10 @@ _CALL = "lookupService"
 
 @dataclass(frozen=True, slots=True)
 class MonitorCallGate:
-    """Decides for the node `name`, which makes the calls, and grants them like those of another client."""
+    """Decides for the node `name`, which makes the calls, and grants them like those of another client.
+
+    `port(provider, kind, service)` returns the port of a service on its relay.
+    """
 
     registry: Registry
     graph: RosGraph
@@ -28,6 +31,7 @@ class MonitorCallGate:
     policy: Callable[[], Policy]
     trail: AuditTrail
     mediation: Mediation
+    port: Callable[[Incarnation, Kind, str], int]
     name: str
 
     async def answer(self, wanted: MonitorCallWanted) -> MonitorCallAnswered:
@@ -37,10 +41,11 @@ class MonitorCallGate:
         if not refused and provider is None:
             refused = "no node offers the service"
         if refused or provider is None:
-            return MonitorCallAnswered(wanted.number, "", "", "", refused)
+            return MonitorCallAnswered(wanted.number, "", 0, "", refused)
         host = ipaddress.ip_address(LOOPBACK)
         self.enactor.carry_out(self.graph.service_granted(provider, wanted.service, host, self.name))
-        return MonitorCallAnswered(wanted.number, provider.key, LOOPBACK, self.name, "")
+        port = self.port(provider, Kind.SERVICE, wanted.service)
+        return MonitorCallAnswered(wanted.number, LOOPBACK, port, self.name, "")
 
     async def _refused(self, service: str) -> str:
         """Return why the call is denied; empty if it is allowed."""

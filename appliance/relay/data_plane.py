@@ -10,16 +10,16 @@ Invariants:
 """
 
 import socket
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
 from appliance.channel import messages
 from appliance.relay.connections.admission import NOTHING, asked_for, bound_name, flaw, missing
+from appliance.relay.connections.headers import kept
 from appliance.relay.connections.incoming_connection import IncomingConnection, RefusedConnection
 from appliance.relay.connections.listening_ports import ListeningPorts
 from appliance.relay.connections.message_sink import MessageSink
-from appliance.relay.connections.monitor_calls import CallGrant, ServiceCalls
+from appliance.relay.connections.monitor_calls import ServiceCalls
 from appliance.relay.connections.named_subscribers import ActionServers
-from appliance.relay.connections.own_service import OwnService
 from appliance.relay.connections.own_topic import OwnTopicPublisher
 from appliance.relay.connections.pending_connections import PendingConnections
 from appliance.relay.connections.relayed_topic import RelayedTopic, Upstream
@@ -30,7 +30,7 @@ from appliance.relay.context import RelayContext
 from appliance.relay.grant_table import GrantTable, PeerGrant, Statement
 from appliance.relay.loop import EventLoop
 from appliance.relay.monitors.interceptor import Interceptor
-from appliance.relay.monitors.observation_points import ObservationPoint, WantedCall
+from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.relay.monitors.topic_pipeline import TopicPipeline
 from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.report import Reporter
@@ -53,8 +53,7 @@ class DataPlane:
             loop,
             self._reporter,
             budget=limits.budget / 1000,
-            publish=self._publish,
-            call=lambda wanted: self._monitor_calls.call(wanted),  # noqa: PLW0108  it is made below
+            publish=lambda m: self._calls.call(m) if m.is_call else self._publish(m.topic, m.data),
             changed=self._monitors_changed,
             holder=self._holder,
             payer=self._table.payer,
@@ -75,15 +74,7 @@ class DataPlane:
         self._servers = ActionServers()
         self._own: dict[str, OwnTopicPublisher] = {}
         self._own_headers: dict[str, dict[str, str]] = {}
-        self._own_service = OwnService(loop, self._reporter.send)
-        self._monitor_calls = ServiceCalls(
-            loop,
-            seconds=limits.service_seconds,
-            send=self._reporter.send,
-            valid=self._may_call,
-            serve=self._serve_monitor,
-            failed=self.interceptor.call_failed,
-        )
+        self._calls = ServiceCalls(self._context)
         self.clients: set[ServiceClient] = set()
         self._by_grant: dict[PeerGrant, set[Subscriber | ServiceClient]] = {}
         self._services: dict[tuple[str, str], ServiceTraffic] = {}
@@ -103,8 +94,7 @@ class DataPlane:
         self._link = link
         self._reporter.attach(link)
         self._topic_taps.end_all()
-        self._own_service.control_gone()
-        self._monitor_calls.attach(link is not None)
+        self._calls.attach(link is not None)
 
     def copy_to(self, sink: MessageSink) -> None:
         """Copy to this sink the messages of publishers whose topics are placed from now on."""
@@ -137,7 +127,7 @@ class DataPlane:
         elif isinstance(message, messages.OwnHeaderStated | messages.OwnPublished):
             self._own_topic(message)
         elif isinstance(message, messages.OwnServiceAnswered | messages.MonitorCallAnswered):
-            self._answered(message)
+            self._calls.answered(message)
         elif isinstance(message, messages.OrdersAsked):
             self._reporter.send(messages.OrdersCarriedOut())
         else:
@@ -336,12 +326,6 @@ class DataPlane:
             if concerned and relayed.lacks_latched:
                 publisher.request_latched()
 
-    def _answered(self, message: messages.OwnServiceAnswered | messages.MonitorCallAnswered) -> None:
-        if isinstance(message, messages.OwnServiceAnswered):
-            self._own_service.answered(message)
-        else:
-            self._monitor_calls.answered(message)
-
     def _own_topic(self, message: messages.OwnHeaderStated | messages.OwnPublished) -> None:
         if isinstance(message, messages.OwnPublished):
             self._publish(message.topic, message.data)
@@ -472,9 +456,9 @@ class DataPlane:
             asked = (kind, incoming.key, name, incoming.host, fields.get("callerid", ""))
             self._refuse(asked, sock, reason)
         elif "topic" in fields:
-            self._subscribe(incoming, sock, incoming.kept_fields)
+            self._subscribe(incoming, sock, kept(fields))
         else:
-            self._serve_client(incoming, sock, incoming.kept_fields, rest)
+            self._serve_client(incoming, sock, kept(fields), rest)
 
     def _not_all_is_stated(self) -> bool:
         """Whether control may still state a grant that is missing."""
@@ -521,56 +505,11 @@ class DataPlane:
             traffic=traffic,
             refuse=self._peer_refused,
             ended=self._peer_ended,
-            own=self._own_service if node is not None and node.monitors else None,
+            own=self._calls.own if node is not None and node.monitors else None,
         )
         self.clients.add(client)
         self._by_grant.setdefault(client.grant, set()).add(client)
         client.start(rest)
-
-    def _may_call(self, service: str, grant: CallGrant) -> bool:
-        """Whether the appliance's node may call a service by an earlier grant."""
-        known = self._table.service(grant.key, service) is not None
-        return known and self._table.may_call(grant.key, service, grant.host, grant.caller_id)
-
-    def _serve_monitor(
-        self,
-        wanted: WantedCall,
-        grant: CallGrant,
-        sock: socket.socket,
-        request: bytes,
-        refused: Callable[[str], None],
-    ) -> ServiceClient | None:
-        """Serve the appliance's node, which calls a service for a monitor. Its socket does not count for a host."""
-        service = self._table.service(grant.key, wanted.service)
-        if service is None:
-            return None
-
-        def refuse(client: ServiceClient, sock: socket.socket, reason: str) -> None:
-            self._forget(client)
-            sock.close()
-            refused(reason)
-
-        fields = {
-            "callerid": grant.caller_id,
-            "service": wanted.service,
-            "type": wanted.type,
-            "md5sum": wanted.md5sum,
-        }
-        client = ServiceClient(
-            self._context,
-            sock,
-            service,
-            grant.host,
-            fields,
-            caller_id=grant.caller_id,
-            traffic=self._services.setdefault((service.key, service.service), ServiceTraffic()),
-            refuse=refuse,
-            ended=self._forget,
-        )
-        self.clients.add(client)
-        self._by_grant.setdefault(client.grant, set()).add(client)
-        client.start(request)
-        return client
 
     def _subscribe(
         self, incoming: IncomingConnection, sock: socket.socket, fields: Mapping[str, str]
@@ -638,7 +577,7 @@ class DataPlane:
             if self._loop.over():
                 self._loop.after(0, self._go_on_tidying)
                 return
-        self._own_service.tidy()
+        self._calls.own.tidy()
         self.interceptor.tick()
         self._reporter.tick(self._rows, self.memory.held())
         self._loop.after(self._limits.report_every, self._tick)

@@ -31,7 +31,6 @@ def told_to_a_new_relay(
         broken=lambda _node: None,
         own_header=None,
         own_call=cast(Any, None),
-        monitor_call=cast(Any, None),
     )
     relay.attach(0, cast(Any, link))
     return link.told

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "dev" / "architecture.md").read_text()
 SECTION = PAGE.split("\n## The kernel", 1)[1].split("\n## ", 1)[0]
 SIZES = {path: int(lines) for path, lines in re.findall(r"`([\w/]+\.pyx?)` (\d+)", SECTION)}
-BUDGET = 11_860  # lines of code: lower this number with the kernel, and never raise it
+BUDGET = 11_658  # lines of code: lower this number with the kernel, and never raise it
 
 # The modules outside the kernel that the kernel may import.
 OUTSIDE = frozenset(
@@ -24,7 +24,7 @@ OUTSIDE = frozenset(
     master.parameter_charges master.reconcile.arrivals master.reconcile.entries master.reconcile.liveness
     master.rosmaster policy.policy_lint quotas.descriptors quotas.pool quotas.queue quotas.table
     relay.connections.introductions relay.connections.latched_message relay.connections.message_sink
-    relay.connections.named_subscribers
+    relay.connections.monitor_calls relay.connections.named_subscribers
     relay.context relay.loop relay.monitors.fast_path_counts relay.monitors.holds relay.monitors.monitor_sets
     relay.monitors.observation_points relay.monitors.observations relay.monitors.observer
     relay.monitors.shadow relay.monitors.state_keeper relay.monitors.state_memory relay.monitors.time_budget

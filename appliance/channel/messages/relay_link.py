@@ -437,12 +437,12 @@ class MonitorCallWanted(Message):
 class MonitorCallAnswered(Message):
     """Control has decided a call of a monitor.
 
-    The node with this host and `caller_id` may call the incarnation's service; `refused` has the reason if it may not.
+    The node `caller_id` may call the service at `host:port`, a port of its relay; or `refused` has the reason.
     """
 
     number: int
-    key: str
     host: str
+    port: int
     caller_id: str
     refused: str
 

@@ -73,8 +73,11 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         monitors=core.monitors,
         broken=core.watchlist.look_at,
         own_header=_header_of_rosout() if settings.monitors_on_rosout else None,
-        own_call=base.features.called,
-        monitor_call=lambda wanted: gate().answer(wanted),
+        own_call=lambda asked: (
+            gate().answer(asked)
+            if isinstance(asked, messages.MonitorCallWanted)
+            else base.features.called(asked)
+        ),
     )
     rosmaster = RosMaster(
         settings.rosmaster_port,
@@ -106,6 +109,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
             core.policy,
             base.trail,
             core.mediation,
+            relay.port,
             settings.publish_as,
         )
     )

@@ -81,6 +81,7 @@ class RelayOutbox(Link):
 
 
 RELAY_NAME = "/rosrv"
+OwnCall = messages.OwnServiceCalled | messages.MonitorCallWanted
 _KINDS = {TOPIC: Kind.PUBLICATION, SERVICE: Kind.SERVICE}
 _WORDS = {kind: word for word, kind in _KINDS.items()}
 
@@ -90,8 +91,8 @@ class RelayControl:
     """Control's end of the links to the relays.
 
     `broken(incarnation)` is called for lost upstreams. `own_header` is the header of control's own publications.
-    `own_call` answers calls of the appliance's own service, and `monitor_call` decides calls of monitors. `monitors()`
-    returns the specifications that relays run.
+    `own_call` answers calls of the appliance's own service, and decides calls of monitors. `monitors()` returns the
+    specifications that relays run.
     """
 
     registry: Registry
@@ -104,8 +105,7 @@ class RelayControl:
     monitors: Callable[[], SpecificationManager]
     broken: Callable[[Incarnation], None]
     own_header: messages.OwnHeaderStated | None
-    own_call: Callable[[messages.OwnServiceCalled], Awaitable[messages.OwnServiceAnswered]]
-    monitor_call: Callable[[messages.MonitorCallWanted], Awaitable[messages.MonitorCallAnswered]]
+    own_call: Callable[[OwnCall], Awaitable[messages.OwnServiceAnswered | messages.MonitorCallAnswered]]
     _posts: tuple[RelayOutbox, ...] = field(init=False)
     _asking: set[asyncio.Task[None]] = field(default_factory=set)
     _taps: TapRequests = field(default_factory=TapRequests)
@@ -323,15 +323,9 @@ class RelayControl:
             case _:
                 self.monitors().received(message, post.index)
 
-    async def _answer(
-        self,
-        post: RelayOutbox,
-        asked: messages.UpstreamWanted | messages.OwnServiceCalled | messages.MonitorCallWanted,
-    ) -> None:
-        if isinstance(asked, messages.OwnServiceCalled):
+    async def _answer(self, post: RelayOutbox, asked: messages.UpstreamWanted | OwnCall) -> None:
+        if isinstance(asked, OwnCall):
             post.send(await self.own_call(asked))
-        elif isinstance(asked, messages.MonitorCallWanted):
-            post.send(await self.monitor_call(asked))
         else:
             await self._find_upstream(post, asked.key, asked.topic)
 

@@ -11,7 +11,7 @@ Invariants:
 import socket
 from collections.abc import Callable, Mapping
 
-from appliance.relay.connections.headers import canonical, kept
+from appliance.relay.connections.headers import canonical
 from appliance.relay.connections.pending_connections import PendingConnections
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import EventLoop
@@ -55,11 +55,6 @@ class IncomingConnection:
         )
         self._received_bytes = 0
         pending.enter(self, host)
-
-    @property
-    def kept_fields(self) -> dict[str, str]:
-        """Return the fields that are kept while the peer is connected."""
-        return kept(self.fields)
 
     def take(self) -> socket.socket:
         """Return the socket, which the caller owns from now on."""

@@ -1,153 +1,132 @@
 """The service calls of monitors, which the appliance's own node makes.
 
-A call passes through the relay like that of any client: control decides it by the policy and grants it, and a
-`ServiceClient` carries it, whose client is this file. So its request and its response are events of the service.
+Control decides each call by the policy, grants it like that of another client, and answers with the port of the service
+on its relay. The relay then connects to this port as any client does. So the call passes through all checks, and its
+request and response are events of the service.
 
 Invariants:
-- At most `MOST` calls are under way, and each ends after `seconds` at the latest.
+- At most `MOST` calls are under way, and each ends after `RelayLimits.service_seconds` at the latest.
 - Each call that does not get a successful response is reported once, as a fault of its monitor.
 """
 
-import socket
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple
+from __future__ import annotations
 
-from appliance.channel.messages import Message, MonitorCallAnswered, MonitorCallWanted
-from appliance.relay.connections.service_client import ServiceClient
-from appliance.relay.loop import EventLoop, LoopTimer
-from appliance.relay.monitors.observation_points import WantedCall
-from appliance.relay.transport.sockets import BufferedSocket
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from appliance.channel.messages import MonitorCallAnswered, MonitorCallWanted, OwnServiceAnswered
+from appliance.relay.connections.own_service import OwnService
+from appliance.relay.context import RelayContext
+from appliance.relay.loop import LoopTimer
+from appliance.relay.transport.sockets import BufferedSocket, begin_connect
 from roswire.errors import PeerError
-from roswire.tcpros import HeaderParser, ServiceReplyParser, encode_frame
+from roswire.tcpros import HeaderParser, ServiceReplyParser, encode_frame, encode_header
+
+if TYPE_CHECKING:
+    from rosmop.run.outcomes import Published
 
 MOST = 16
 """The maximum number of calls under way in a relay."""
 
 
-class CallGrant(NamedTuple):
-    """A grant for calls: the incarnation that offers the service, and the host and name of the appliance's node."""
-
-    key: str
-    host: str
-    caller_id: str
-
-
 @dataclass(eq=False, slots=True)
 class _Call:
-    """A call under way. `client` and `end` exist while the service is connected."""
+    """A call under way; `sock` is its connection, once control has granted it."""
 
-    wanted: WantedCall
+    wanted: Published
     timer: LoopTimer
-    header: HeaderParser
-    replies: ServiceReplyParser
+    header: HeaderParser = field(default_factory=HeaderParser)
+    replies: ServiceReplyParser = field(default_factory=ServiceReplyParser)
     greeted: bool = False
-    client: ServiceClient | None = None
-    end: BufferedSocket | None = None
+    sock: BufferedSocket | None = None
 
 
 class ServiceCalls:
-    """The calls under way.
-
-    `send` passes a message to a running control. `valid(service, grant)` tells whether an earlier grant is in force.
-    `serve(wanted, grant, sock, refused)` serves the client at the socket, and returns None if the service is gone;
-    `refused(reason)` is called if the service rejects the client. `failed(wanted, reason)` reports a failed call.
+    """The calls under way, and those of the service that the appliance offers (`own`), whose answers also come from
+    control.
     """
 
-    def __init__(
-        self,
-        loop: EventLoop,
-        *,
-        seconds: float,
-        send: Callable[[Message], None],
-        valid: Callable[[str, CallGrant], bool],
-        serve: Callable[
-            [WantedCall, CallGrant, socket.socket, bytes, Callable[[str], None]], ServiceClient | None
-        ],
-        failed: Callable[[WantedCall, str], None],
-    ) -> None:
-        self._loop = loop
-        self._seconds = seconds
-        self._send = send
-        self._valid = valid
-        self._serve = serve
-        self._failed = failed
+    def __init__(self, context: RelayContext) -> None:
+        self.own = OwnService(context.loop, context.reporter.send)
+        self._context = context
         self._calls: dict[int, _Call] = {}
-        self._grants: dict[str, CallGrant] = {}
         self._number = 0
-        self.connected = False
-        """Whether control is running."""
+        self._connected = False
 
-    def call(self, wanted: WantedCall) -> None:
+    def call(self, wanted: Published) -> None:
         """Begin a call; nothing of it happens before the next turn of the loop."""
         if len(self._calls) >= MOST:
             self._failed(wanted, f"{MOST} calls of monitors are under way; the call was not made")
             return
         self._number += 1
-        number = self._number
-        late = f"no response within {self._seconds:g} s"
-        timer = self._loop.after(self._seconds, lambda: self._end(number, late))
-        self._calls[number] = _Call(wanted, timer, HeaderParser(), ServiceReplyParser())
-        grant = self._grants.get(wanted.service)
-        if grant is not None and self._valid(wanted.service, grant):
-            self._loop.after(0, lambda: self._begin(number, grant))
-        elif self.connected:
-            self._send(MonitorCallWanted(number, wanted.service))
+        number, loop = self._number, self._context.loop
+        seconds = self._context.limits.service_seconds
+        late = f"no response within {seconds:g} s"
+        self._calls[number] = _Call(wanted, loop.after(seconds, lambda: self._end(number, late)))
+        if self._connected:
+            self._context.reporter.send(MonitorCallWanted(number, wanted.topic))
         else:
-            self._loop.after(0, lambda: self._end(number, "the appliance's control is not running"))
+            loop.after(0, lambda: self._end(number, "the appliance's control is not running"))
 
-    def answered(self, message: MonitorCallAnswered) -> None:
-        """Make the call that control has granted, or report that it was denied."""
-        call = self._calls.get(message.number)
+    def answered(self, message: OwnServiceAnswered | MonitorCallAnswered) -> None:
+        """Make the call that control has granted, or report that it was denied; or pass an answer to `own` on."""
+        if isinstance(message, OwnServiceAnswered):
+            self.own.answered(message)
+            return
+        call, number = self._calls.get(message.number), message.number
         if call is None:
             return
-        if message.refused:
-            self._end(message.number, message.refused)
+        monitors = self._context.interceptor.monitors
+        if message.refused or monitors is None:
+            self._end(number, message.refused or "there are no monitors any longer")
             return
-        grant = CallGrant(message.key, message.host, message.caller_id)
-        self._grants[call.wanted.service] = grant
-        self._begin(message.number, grant)
+        try:
+            sock = begin_connect(message.host, message.port)
+        except (OSError, OverflowError) as error:
+            self._end(number, str(error))
+            return
+        header = {
+            "callerid": message.caller_id,
+            "service": call.wanted.topic,
+            "type": call.wanted.type,
+            "md5sum": monitors.definitions.service_md5sum(call.wanted.type),
+        }
+        call.sock = BufferedSocket(
+            self._context.loop,
+            sock,
+            lambda data: self._received(number, data),
+            lambda reason: self._end(number, reason),
+            payer=message.host,
+            opened=lambda: self._opened(number, encode_header(header)),
+        )
 
     def attach(self, connected: bool) -> None:
         """End the calls that wait for a control that has gone."""
-        self.connected = connected
+        self._connected = connected
+        self.own.control_gone()
         for number, call in list(self._calls.items()):
-            if call.end is None:
+            if call.sock is None:
                 self._end(number, "the appliance's control has ended")
 
-    def _begin(self, number: int, grant: CallGrant) -> None:
+    def _opened(self, number: int, header: bytes) -> None:
         call = self._calls.get(number)
-        if call is None:
-            return
-        here, there = socket.socketpair()
-        here.setblocking(False)
-        there.setblocking(False)
-        call.end = BufferedSocket(
-            self._loop,
-            here,
-            lambda data: self._received(number, data),
-            lambda reason: self._end(number, reason),
-            payer=grant.host,
-        )
-        request = encode_frame(call.wanted.request)
-        call.client = self._serve(
-            call.wanted, grant, there, request, lambda reason: self._end(number, reason)
-        )
-        if call.client is None:
-            there.close()
-            self._end(number, "no node offers the service any longer")
+        if call is not None and call.sock is not None:
+            call.sock.send(header + encode_frame(call.wanted.data))
 
     def _received(self, number: int, data: bytes) -> None:
         call = self._calls.get(number)
         if call is None:
             return
         if not data:
-            self._end(number, "the service closed the connection")
+            self._end(number, "the connection was closed without a response")
             return
         try:
             if not call.greeted:
                 header = call.header.feed(data)
                 if header is None:
+                    return
+                if "error" in header:
+                    self._end(number, header["error"])
                     return
                 call.greeted, data = True, call.header.rest
             replies = call.replies.feed(data)
@@ -163,9 +142,15 @@ class ServiceCalls:
         if call is None:
             return
         call.timer.cancel()
-        if call.end is not None:
-            call.end.close()
-        if call.client is not None:
-            call.client.cut("")
+        if call.sock is not None:
+            call.sock.close()
         if reason:
             self._failed(call.wanted, reason)
+
+    def _failed(self, wanted: Published, reason: str) -> None:
+        """Count a failed call as a fault of its monitor, and report it."""
+        interceptor = self._context.interceptor
+        for monitor in interceptor.monitors.monitors if interceptor.monitors is not None else ():
+            monitor.faults += monitor.name == wanted.monitor
+        text = f"the call of {wanted.topic} failed: {reason}"
+        interceptor.observer.call_failed(wanted.monitor, wanted.topic, interceptor.now(), text)

@@ -34,7 +34,7 @@ from appliance.channel.messages import (
 from appliance.relay.loop import EventLoop, LoopTimer
 from appliance.relay.monitors.holds import hold_begun, taken
 from appliance.relay.monitors.loader import Loader, Result
-from appliance.relay.monitors.observation_points import NOWHERE, ObservationPoint, Senders, WantedCall
+from appliance.relay.monitors.observation_points import NOWHERE, ObservationPoint, Senders
 from appliance.relay.monitors.observations import SHOWN, Observations
 from appliance.relay.monitors.observer import Observer, dropped, refusal
 from appliance.relay.monitors.shadow import ShadowMonitors
@@ -64,10 +64,10 @@ class ServiceVerdict:
 class Interceptor:
     """The monitors of one relay.
 
-    `budget` is the most seconds of processor time that a message may take. `publish(topic, data)` sends a message that
-    a monitor publishes, and `call(wanted)` makes its call of a service. `changed(topics)` is called when monitors may
-    want other topics; `topics` are those whose messages may now be judged differently (None: all). For messages of a
-    host, `holder(host)` is charged for the slices that they create, and `payer(host)` for their processor time.
+    `budget` is the most seconds of processor time that a message may take. `publish(message)` sends a message that a
+    monitor publishes, or makes its call of a service. `changed(topics)` is called when monitors may want other topics;
+    `topics` are those whose messages may now be judged differently (None: all). For messages of a host, `holder(host)`
+    is charged for the slices that they create, and `payer(host)` for their processor time.
     """
 
     def __init__(
@@ -76,8 +76,7 @@ class Interceptor:
         reporter: Reporter,
         *,
         budget: float,
-        publish: Callable[[str, bytes], None],
-        call: Callable[[WantedCall], None],
+        publish: Callable[[Published], None],
         changed: Callable[[frozenset[str] | None], None],
         holder: Callable[[str], str] = str,
         payer: Callable[[str], str] = str,
@@ -108,7 +107,7 @@ class Interceptor:
         self._payer = payer
         self._shared_pace = TimeBudget()
         self.senders = Senders()
-        self._publish, self._call = publish, call
+        self._publish = publish
         self._keeper: StateKeeper | None = None
         self.observer = Observer(self.observations, self._published, self.senders, held=self._tell_held)
         self._shadow_observer = Observer(self.observations, lambda _published: None, self.senders, "shadow ")
@@ -323,18 +322,7 @@ class Interceptor:
 
     def _published(self, message: Published) -> None:
         self.keep_all()
-        if not message.is_call:
-            self._publish(message.topic, message.data)
-        elif self.monitors is not None:
-            md5sum = self.monitors.definitions.service_md5sum(message.type)
-            self._call(WantedCall(message.monitor, message.topic, message.type, md5sum, message.data))
-
-    def call_failed(self, wanted: WantedCall, reason: str) -> None:
-        """Count a failed call of a service as a fault of its monitor, and report it."""
-        for monitor in self.monitors.monitors if self.monitors is not None else ():
-            monitor.faults += monitor.name == wanted.monitor
-        text = f"the call of {wanted.service} failed: {reason}"
-        self.observer.call_failed(wanted.monitor, wanted.service, self.now(), text)
+        self._publish(message)
 
     # --- messages ---
 

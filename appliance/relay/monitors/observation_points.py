@@ -29,16 +29,6 @@ NOWHERE = ObservationPoint("", "")
 """The point of timed events, which concern no message."""
 
 
-class WantedCall(NamedTuple):
-    """A service call of a monitor: the service, its type with md5sum, and the bytes of the request."""
-
-    monitor: str
-    service: str
-    type: str
-    md5sum: str
-    request: bytes
-
-
 class PointHolder(Protocol):
     """An object that exists as long as its point is in use."""
 

@@ -32,7 +32,7 @@ class Control:
         if offered:
             registry.register(node, Kind.SERVICE, "/arm", "4001")
         compiled, own = compile_policy(policy, file="p.ini"), cast(Any, self)
-        self.gate = MonitorCallGate(registry, own, own, lambda: compiled, own, own, "/rosrv")
+        self.gate = MonitorCallGate(registry, own, own, lambda: compiled, own, own, lambda *_: 4711, "/rosrv")
 
     def decided(self, asker: Any, method: str, _category: str, resource: str, decision: Any) -> str:
         self.records.append((f"{asker.host} {asker.caller_id} {method}", resource, decision.allowed))
@@ -58,7 +58,7 @@ class Control:
 def test_an_allowed_call_is_recorded_and_granted() -> None:
     """The grant is that of a client, so its revocation by another policy cuts the call."""
     control = Control(ALLOWED)
-    assert control.answer() == MonitorCallAnswered(7, "key", "127.0.0.1", "/rosrv", "")
+    assert control.answer() == MonitorCallAnswered(7, "127.0.0.1", 4711, "/rosrv", "")
     assert control.records == [("127.0.0.1 /rosrv lookupService", "/arm", True)]
     assert control.granted == ["key 127.0.0.1 /rosrv /arm"]
 

@@ -117,7 +117,6 @@ class World:
             broken=lambda _incarnation: None,
             own_header=None,
             own_call=cast(Any, None),
-            monitor_call=cast(Any, None),
         )
         self.graph = RosGraph(
             self.registry,

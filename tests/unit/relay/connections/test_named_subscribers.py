@@ -48,7 +48,7 @@ def presences(loop: EventLoop) -> Iterator[NamedSubscribers]:
     limits = RelayLimits()
     reporter = Reporter(limits)
     memory = RelayMemory.of(limits, lambda _host: QuotaClass.REGISTERED)
-    interceptor = Interceptor(loop, reporter, budget=1.0, publish=_nothing, call=_nothing, changed=_nothing)
+    interceptor = Interceptor(loop, reporter, budget=1.0, publish=_nothing, changed=_nothing)
     context = RelayContext(loop, limits, reporter, memory, Scratch(), interceptor, str)
     presences = NamedSubscribers(context, TOPIC, "10.0.0.9")
     yield presences

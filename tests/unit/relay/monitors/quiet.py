@@ -6,8 +6,8 @@ from typing import Any
 from appliance.channel.messages import Message, SpecificationsTaken
 from appliance.relay.loop import LoopTimer
 from appliance.relay.monitors.interceptor import Interceptor
-from appliance.relay.monitors.observation_points import NOWHERE, WantedCall
-from rosmop.run.outcomes import Outcome
+from appliance.relay.monitors.observation_points import NOWHERE
+from rosmop.run.outcomes import Outcome, Published
 from tests.support.stated import stated
 
 
@@ -61,7 +61,8 @@ class QuietMonitors:
     def __init__(self, publish: Callable[[str, bytes], None] | None = None) -> None:
         self.reports = Reports()
         self.published: list[tuple[str, bytes]] = []
-        self.called: list[WantedCall] = []
+        self.called: list[Published] = []
+        self._send = publish or (lambda topic, data: self.published.append((topic, data)))
         loop: Any = Timers()
         self._finish = loop.finish
         reporter: Any = self.reports
@@ -69,10 +70,15 @@ class QuietMonitors:
             loop,
             reporter,
             budget=1.0,
-            publish=publish or (lambda topic, data: self.published.append((topic, data))),
-            call=self.called.append,
+            publish=self._publish,
             changed=lambda _topics: None,
         )
+
+    def _publish(self, message: Published) -> None:
+        if message.is_call:
+            self.called.append(message)
+        else:
+            self._send(message.topic, message.data)
 
     def load(self, *texts: str, **more: Any) -> SpecificationsTaken:
         """Load these files, and return the relay's answer."""

@@ -80,8 +80,7 @@ class Monitored:
             self._loop,
             self.heard,
             budget=1000.0,
-            publish=lambda *message: self.published.append(message),
-            call=lambda _wanted: None,
+            publish=lambda message: self.published.append((message.topic, message.data)),
             changed=lambda _topics: None,
         )
         self.interceptor.over = lambda: False
