@@ -73,7 +73,7 @@ METRICS = (
     _counter("rosrv_monitor_changed_total", "messages that monitors changed", "resource"),
     _counter(
         "rosrv_monitor_events_total",
-        "actions of monitors: verdict, drop, change, fault, log, publish; a change by several counts for each;"
+        "actions of monitors: verdict, drop, change, fault, log, publish, call; a change by several counts for each;"
         " `shadow drop`, … for monitors in shadow mode",
         "kind",
         "monitor",
