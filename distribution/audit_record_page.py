@@ -41,7 +41,8 @@ def markdown() -> str:
     ]
     lines += ["", "## JSON schema", "", "```json", json.dumps(json_schema(), indent=2), "```", ""]
     lines += [
-        "A line of an export has one field more, `chain`:",
+        "A line of an export also has `robot`, if `appliance.yaml` names the robot and the appliance runs, "
+        "and `chain`:",
         "",
         "```json",
         json.dumps(CHAIN, indent=2),

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     AnyRequest = AdminRequest[Any]
 else:
     RestRequest = Union[tuple(operation.request for operation in OPERATIONS)]  # noqa: UP007  of any number
-    AnyRequest = Union[tuple(request for request in REQUESTS if request is not ChallengeWanted)]  # noqa: UP007
+    AnyRequest = Union[tuple(request for request in REQUESTS if request is not ChallengeWanted)]  # noqa: UP007  as above
 
 
 def request_named(verb: str) -> type[AdminRequest[Any]] | None:

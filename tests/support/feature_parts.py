@@ -15,7 +15,7 @@ from tests.support.idle import idle
 def idle_parts() -> FeatureParts:
     """Return the parts of all features, with default settings and a log that records nothing."""
     store, monitors, hosts = idle(StateStore), idle(SpecificationManager), idle(HostEnrolment)
-    store.settings = dict  # type: ignore[method-assign]
+    store.settings = dict  # type: ignore[method-assign]  # an idle store has no settings
     early = FeatureContext(
         DEFAULTS, idle(AuditTrail), idle(AuditLog), "", charged_to=lambda host: host, in_force=lambda: (0, 0)
     )

@@ -98,8 +98,8 @@ class MemoryWriter:
     def __post_init__(self) -> None:
         self.reader = asyncio.StreamReader(limit=_ROOM)
         self.reader.set_transport(self)  # type: ignore[arg-type]  # a reader only pauses and resumes it
-        self._has_room = asyncio.Event()
-        self._has_room.set()
+        self.has_room = asyncio.Event()
+        self.has_room.set()
 
     def write(self, data: bytes) -> None:
         """Send bytes."""
@@ -108,7 +108,7 @@ class MemoryWriter:
 
     async def drain(self) -> None:
         """Wait while the peer does not read."""
-        await self.peer._has_room.wait()
+        await self.peer.has_room.wait()
         if self.closed or self.peer.closed:
             raise ConnectionResetError("the connection ended")
 
@@ -116,18 +116,18 @@ class MemoryWriter:
         """End the connection."""
         if not self.closed:
             self.closed = True
-            self._has_room.set()
+            self.has_room.set()
             for end in (self, self.peer):
                 if not end.reader.at_eof():
                     end.reader.feed_eof()
 
     def pause_reading(self) -> None:
         """Make the peer wait."""
-        self._has_room.clear()
+        self.has_room.clear()
 
     def resume_reading(self) -> None:
         """Let the peer go on."""
-        self._has_room.set()
+        self.has_room.set()
 
     def is_closing(self) -> bool:
         """Return whether this end is closed."""

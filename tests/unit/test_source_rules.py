@@ -173,7 +173,8 @@ LOOKUPS = {
     "appliance/formats/bundle_verifier.py ": _LIBRARY,
     "appliance/formats/bundle_verifier.py regular": _LIBRARY,
     "appliance/features/syslog/log_forwarder.py step": _TEXT,
-    "appliance/features/table.py _loaded": _IMPORTED,
+    "appliance/features/table.py inherit": _IMPORTED,
+    "appliance/features/table.py start_gates": _IMPORTED,
     "appliance/features/views.py pair_view": _IMPORTED,
     "appliance/features/fleet/segment_pusher.py _failed": _TEXT,
     "appliance/master/calls/call.py _type_name": _TEXT,
@@ -365,6 +366,10 @@ def direct_clocks(source: Source) -> Iterator[tuple[int, str]]:
 def forged_signatures(source: Source) -> Iterator[tuple[int, str]]:
     """Yield each use of a signature or of annotations that are not those of the function as written."""
     for node in source.nodes:
+        # A class, `cls`, may get fields.
+        owner = node.value if isinstance(node, ast.Attribute) else None
+        if isinstance(owner, ast.Name) and owner.id == "cls":
+            continue
         if isinstance(node, ast.Attribute) and node.attr in ("__signature__", "__annotations__"):
             yield node.lineno, node.attr
 

@@ -5,7 +5,7 @@ A guard is an ordinary specification. Its first line names the preset, its versi
 
 import functools
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,6 +24,8 @@ _GIVEN = re.compile(
 _HEAD = re.compile(r"^((?:begin |hold )?)(\w+)\(", re.MULTILINE)
 _FIRST_LINE = re.compile(r"// preset (?P<preset>\w+) (?P<version>\d+):.*\n")
 _NAME = re.compile(r"[A-Za-z_]\w{0,63}")
+_GIVEN = re.compile(r"(\b(\w+) (\w+) = )[^ ;]+")
+_TABLE = re.compile(r"(\b(\w+)\[\] = \{)[^}]*")
 _TOPIC = re.compile(r"/[A-Za-z]\w*(?:/[A-Za-z]\w*)*")
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _CORNERS = re.compile(rf"\s*{_NUMBER}\s*,\s*{_NUMBER}(?:\s+{_NUMBER}\s*,\s*{_NUMBER}){{2,99}}\s*")
@@ -236,22 +238,34 @@ def _with_topic(preset: Preset, text: str, name: str, topic: str) -> str:
         raise GuardError(f"no topic {name!r} is given to {preset.name}; there are: {known}")
     if not _TOPIC.fullmatch(topic):
         raise GuardError(f"{topic!r} is not the name of a topic; write it like /cmd_vel")
-    return re.sub(rf"(topic {name} = )[^;]+;", rf"\g<1>{topic};", text, count=1)
+    return _given(text, "topic", name, topic)
 
 
 def _with_value(text: str, parameter: Parameter, value: str) -> str:
     match parameter.kind:
         case "corners":
-            return re.sub(r"(POLYGON\[\] = \{)[^}]*", rf"\g<1>{', '.join(re.split('[ ,]+', value))}", text)
+            return _with_table(text, "POLYGON", re.split("[ ,]+", value))
         case "time":
             return re.sub(r"(timeout )\d+(?:\.\d+)?m?s", rf"\g<1>{value}", text)
         case "joints":
             rows = [re.split(r":|\.\.", row) for row in value.split()]
             for table, place in (("NAMES", 0), ("LOW", 1), ("HIGH", 2)):
-                cells = (f'"{row[place]}"' if place == 0 else row[place] for row in rows)
-                text = re.sub(rf"({table}\[\] = \{{)[^}}]*", rf"\g<1>{', '.join(cells)}", text)
+                cells = [f'"{row[place]}"' if place == 0 else row[place] for row in rows]
+                text = _with_table(text, table, cells)
             return text
-    return re.sub(rf"(\n    {parameter.kind} {parameter.name} = )[^ ;]+", rf"\g<1>{value}", text, count=1)
+    return _given(text, parameter.kind, parameter.name, value)
+
+
+def _given(text: str, kind: str, name: str, value: str) -> str:
+    """Return the text with another value of a given constant or topic."""
+    return _GIVEN.sub(
+        lambda found: found[1] + value if (found[2], found[3]) == (kind, name) else found[0], text
+    )
+
+
+def _with_table(text: str, name: str, cells: Sequence[str]) -> str:
+    """Return the text with other cells of a table."""
+    return _TABLE.sub(lambda found: found[1] + ", ".join(cells) if found[2] == name else found[0], text)
 
 
 def file_of(name: str, folder: Path) -> Path:

@@ -180,7 +180,7 @@ def set_values(
         _write(loaded, row.file, changed)
     constants: dict[str, GivenValue] = {each: value for each, value in checked.items() if each not in in_text}
     if constants:
-        answer = appliance.ask_or_exit(admin.MonitorSet(name, constants))
+        answer = appliance.ask_or_exit(admin.MonitorGive(name, constants))
         say(
             f"{name}: set {', '.join(f'{each}={constants[each]}' for each in answer.changed) or 'no difference'}"
         )
