@@ -24,7 +24,7 @@ _GIVEN = re.compile(
 _HEAD = re.compile(r"^((?:begin |hold )?)(\w+)\(", re.MULTILINE)
 _FIRST_LINE = re.compile(r"// preset (?P<preset>\w+) (?P<version>\d+):.*\n")
 _NAME = re.compile(r"[A-Za-z_]\w{0,63}")
-_GIVEN = re.compile(r"(\b(\w+) (\w+) = )[^ ;]+")
+_VALUE = re.compile(r"(\b(\w+) (\w+) = )[^ ;]+")
 _TABLE = re.compile(r"(\b(\w+)\[\] = \{)[^}]*")
 _TOPIC = re.compile(r"/[A-Za-z]\w*(?:/[A-Za-z]\w*)*")
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -258,7 +258,7 @@ def _with_value(text: str, parameter: Parameter, value: str) -> str:
 
 def _given(text: str, kind: str, name: str, value: str) -> str:
     """Return the text with another value of a given constant or topic."""
-    return _GIVEN.sub(
+    return _VALUE.sub(
         lambda found: found[1] + value if (found[2], found[3]) == (kind, name) else found[0], text
     )
 
