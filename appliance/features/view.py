@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from appliance.base.user_errors import UserError
+
 if TYPE_CHECKING:
     from appliance.audit.proof.chain_findings import Verification
     from appliance.channel.answers.standby_answers import StandbyState
@@ -29,7 +31,7 @@ class PairView:
         del state
         return ()
 
-    def samples(self, state: "StandbyState | None") -> Mapping[str, Samples]:
+    def samples(self, state: "StandbyState") -> Mapping[str, Samples]:
         """Return the samples of each metric of a pair."""
         del state
         return {}
@@ -40,7 +42,9 @@ class PairView:
 
     def status(self, state: "StandbyState") -> Any:
         """Return the `StatusView` of an appliance that waits for the other one to end."""
-        raise NotImplementedError(f"no feature shows the state of {state.name}")
+        raise UserError(
+            f"{state.name} is one of two appliances, which this rosrv cannot show: use one with `standby`"
+        )
 
     def verify(
         self,
@@ -54,7 +58,8 @@ class PairView:
 
         Return the result, and the function that prints it.
         """
-        raise NotImplementedError(f"no feature verifies {own} and {other} together")
+        del verified, state, verify
+        raise UserError(f"{own} and {other}: this rosrv cannot verify takeovers: use one with `standby`")
 
 
 @dataclass(frozen=True)

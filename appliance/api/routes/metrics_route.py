@@ -167,7 +167,8 @@ def _samples(body: Measures) -> dict[str, _Samples]:
         "rosrv_recorder_up": [((), recorder.running)] if recorder else [],
         "rosrv_recordings": [((), recorder.recordings)] if recorder else [],
         "rosrv_recordings_bytes": [((), recorder.bytes)] if recorder else [],
-        **pair_view().samples(status.standby),
+        **{metric.name: [] for metric in METRICS if metric.name.startswith("rosrv_standby_")},
+        **(pair_view().samples(status.standby) if status.standby is not None else {}),
         "rosrv_policy_revision": [((), policy.revision)],
         "rosrv_policy_differs_from_file": [((), policy.differs_from_file)],
         "rosrv_process_restarts_total": [

@@ -84,13 +84,18 @@ class Administration:
         The records of an order are in the audit log before the order is answered, so that a later search finds them. If
         the client gives up before the order takes effect, the order is withdrawn (`appliance/base/withdrawal.py`).
         """
-        answer = await self._answer(request, who)
-        if self._methods[type(request)].order:
+        method = self._methods.get(type(request))
+        if method is None:
+            error = f"{admin.verb_of(request)}: this appliance lacks the feature that answers this request"
+            return admin.AdminAnswer(False, error=error, trouble="unknown")
+        answer = await self._answer(method, request, who)
+        if method.order:
             await self._durable()
         return answer
 
-    async def _answer(self, request: admin.AdminRequest[A], who: str) -> admin.AdminAnswer[A]:
-        method = self._methods[type(request)]
+    async def _answer(
+        self, method: RequestMethod[Any], request: admin.AdminRequest[A], who: str
+    ) -> admin.AdminAnswer[A]:
         try:
             require_awaited()
             if method.request in KEPT and not method.full_disk:

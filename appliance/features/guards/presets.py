@@ -28,6 +28,8 @@ _VALUE = re.compile(r"(\b(\w+) (\w+) = )[^ ;]+")
 _TABLE = re.compile(r"(\b(\w+)\[\] = \{)[^}]*")
 _TOPIC = re.compile(r"/[A-Za-z]\w*(?:/[A-Za-z]\w*)*")
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_WHOLE = re.compile(r"[-+]?\d+")
+_DECIMAL = re.compile(_NUMBER)
 _CORNERS = re.compile(rf"\s*{_NUMBER}\s*,\s*{_NUMBER}(?:\s+{_NUMBER}\s*,\s*{_NUMBER}){{2,99}}\s*")
 _JOINTS = re.compile(rf"\s*[\w/]+:{_NUMBER}\.\.{_NUMBER}(?:\s+[\w/]+:{_NUMBER}\.\.{_NUMBER})*\s*")
 _SPAN = re.compile(r"(\d+(?:\.\d+)?)(ms|s)")
@@ -61,8 +63,7 @@ class Parameter:
             if not form.fullmatch(value):
                 raise GuardError(f"{self.name}={value}: write it like {self.name}='{self.default}'")
             return " ".join(value.split())
-        whole = r"[-+]?\d+" if self.kind == "int" else _NUMBER
-        if not re.fullmatch(whole, value):
+        if not (_WHOLE if self.kind == "int" else _DECIMAL).fullmatch(value):
             noun = "a whole number" if self.kind == "int" else "a number"
             raise GuardError(f"{self.name}={value}: give {noun}{f' of {self.unit}' if self.unit else ''}")
         if not float(self.least) <= float(value) <= float(self.most):

@@ -19,7 +19,7 @@ class StandbyPairView(PairView):
         """Return what is wrong; the other appliance may be away for some time first."""
         return standby_troubles(state, PATIENCE_SECONDS)
 
-    def samples(self, state: StandbyState | None) -> Mapping[str, Samples]:
+    def samples(self, state: StandbyState) -> Mapping[str, Samples]:
         """Return the samples of each metric of a pair."""
         from appliance.features.standby.samples import samples_of  # noqa: PLC0415  only the api needs it
 

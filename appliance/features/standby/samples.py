@@ -5,13 +5,10 @@ import math
 from appliance.channel.answers.standby_answers import StandbyState
 from appliance.features.standby.standby_summary import both_active
 from appliance.features.view import Samples
-from appliance.telemetry.metrics import METRICS
 
 
-def samples_of(state: StandbyState | None) -> dict[str, Samples]:
-    """Return the samples of each metric of a pair; none on a single appliance."""
-    if state is None:
-        return {metric.name: [] for metric in METRICS if metric.name.startswith("rosrv_standby_")}
+def samples_of(state: StandbyState) -> dict[str, Samples]:
+    """Return the samples of each metric of a pair."""
     other, answered, active = state.other, state.witness.answered_seconds, state.role == "active"
     return {
         "rosrv_standby_role": [((role,), state.role == role) for role in ("active", "standby")],

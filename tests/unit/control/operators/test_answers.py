@@ -5,12 +5,15 @@ import typing
 from collections import Counter
 from typing import Any, cast, get_args
 
+import pytest
+
 from appliance.channel import admin, messages
 from appliance.channel.admin import answer_to
 from appliance.channel.answers.graph_answers import TopicMessage
 from appliance.channel.messages import api
 from appliance.channel.operations import AnyRequest, RestRequest
 from appliance.control.assembly.policies import Policies
+from appliance.control.operators.administration import Administration
 from appliance.control.operators.alarm_orders import AlarmOrders
 from appliance.control.operators.block_orders import BlockOrders
 from appliance.control.operators.limit_use import LimitQueries
@@ -88,6 +91,13 @@ def test_one_method_answers_each_request() -> None:
         hints = typing.get_type_hints(method.answer)
         del hints["return"]
         assert list(hints.values()) == [method.request, *([str] if method.who else [])]
+
+
+@pytest.mark.anyio
+async def test_a_request_without_its_feature_is_unknown() -> None:
+    administration = Administration(cast(Any, None), (), durable=cast(Any, None), require_room=lambda: None)
+    answer = await administration.carry_out(admin.StandbyWanted(), who="operator")
+    assert (answer.ok, answer.trouble) == (False, "unknown")
 
 
 def test_every_field_between_processes_has_a_type() -> None:
