@@ -144,7 +144,7 @@ def speed(v: float) -> bytes:
 
 
 def test_two_sources_agree_for_a_number_of_messages() -> None:
-    """Each change of the verdict needs this number of messages in a row; both sources must be heard."""
+    """Each change of the verdict needs this number in a row; both sources must be heard."""
     random = seeded(9)
     for _trace in TRACES:
         guard, at, others, other_at, mine_at = Guarded("agree", samples=3), 0, math.nan, -math.inf, -math.inf
@@ -175,7 +175,7 @@ def test_two_sources_agree_for_a_number_of_messages() -> None:
 def test_an_interlock_needs_battery_position_and_check(
     charge: float | None, fixed: int | None, checked: bool | None, passes: bool
 ) -> None:
-    """A reading that was never heard counts as missing, and so does an old one."""
+    """A value that was never heard is missing, and an old one also."""
     guard = Guarded("arm", charge=0.25, needFix=True, needCheck=True, silent=1)
     if charge is not None:
         guard.tell("by", message("sensor_msgs/BatteryState", percentage=charge), 1)
