@@ -62,11 +62,20 @@ def _pose(before: str) -> TypeRow:
     return TypeRow({"px": f"{before}position.x", "py": f"{before}position.y", "q": f"{before}orientation"})
 
 
-POSITIONS = {
+_FIX = TypeRow(
+    {"fixed": "status.status", "lat": "latitude", "lon": "longitude"},
+    parameters="int fixed, double lat, double lon",
+    local="""double px = fixed < 0 ? NAN : metres_east(lat, lon, lat0, lon0);
+        double py = fixed < 0 ? NAN : metres_north(lat, lon, lat0, lon0);
+        geometry_msgs::Quaternion q;
+        q.w = NAN;                                             // a fix has no direction""",
+)
+POSES = {
     "nav_msgs/Odometry": _pose("pose.pose."),
     "geometry_msgs/PoseStamped": _pose("pose."),
     "geometry_msgs/PoseWithCovarianceStamped": _pose("pose.pose."),
 }
+POSITIONS = POSES | {"sensor_msgs/NavSatFix": _FIX}
 SPEEDS = {
     "nav_msgs/Odometry": TypeRow({"v": "twist.twist.linear.x"}),
     "geometry_msgs/TwistStamped": TypeRow({"v": "twist.linear.x"}),

@@ -85,7 +85,7 @@ def _for_a_base(base: TopicFacts, topics: list[TopicFacts], *, alone: bool) -> I
         yield proposal("estop", stop=stop.name)
         break
     scans = _sources(base, topics, types.SCANS, avoid=_SCAN_OF_A_CAMERA)
-    position = next(iter(_sources(base, topics, types.POSITIONS, prefer=_POSITION_FIRST)), None)
+    position = next(iter(_sources(base, topics, types.POSES, prefer=_POSITION_FIRST)), None)
     if position is not None:
         yield proposal("fence", _silence(position, 0.2, 5), by=position.name)
     if scans:

@@ -225,6 +225,22 @@ def test_without_a_position_only_turns_pass() -> None:
     assert guard.drive(twist(0.1), 602)[0] == 0 and guard.drive(twist(0, 0, 0, 0, 0, 1.0), 603)[5] == 1
 
 
+def test_a_fence_by_satellites_is_in_metres_from_its_origin() -> None:
+    """For velocities in that frame; without a fix, or for those in the base's frame, motions stop."""
+
+    def passes(metres: float, y: float, *, fixed: int = 0, world: bool = True) -> bool:
+        guard = Guarded("fence", {"by": "sensor_msgs/NavSatFix"}, worldFrame=world, lat0=48, lon0=11,
+                        polygon="-50,-50 50,-50 50,50 -50,50")  # fmt: skip
+        fix = {"latitude": 48 + metres / 111_200, "longitude": 11.0, "status__status": fixed}
+        guard.tell("by", message("sensor_msgs/NavSatFix", **fix), 1)
+        return guard.drive(twist(0, y), 2)[1] == y
+
+    assert [passes(metres, y) for metres in (0, 49.6, 51, -51) for y in (1, -1)] == [
+        True, True, False, True, False, True, True, False,
+    ]  # fmt: skip
+    assert not passes(0, 1, fixed=-1) and not passes(math.nan, 1) and not passes(0, 1, world=False)
+
+
 # Separation
 
 
