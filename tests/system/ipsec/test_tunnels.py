@@ -89,7 +89,7 @@ def test_a_host_is_blocked_by_its_name_while_its_tunnel_stays(site: TunnelSite, 
         listener.wait_for(event="received", since=listener.mark())
         said = site.appliance.rosrv("host", "block", "ocu-1").stdout
         assert said.startswith(
-            f"{joined.address} (ocu-1) is blocked until `rosrv host unblock {joined.address}`; "
+            f"ocu-1 ({joined.address}) is blocked until `rosrv host unblock {joined.address}`; "
         )
         assert "which is not blocked" not in said
         with RosSession(joined.master, site.home, joined) as there:
