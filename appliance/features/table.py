@@ -12,6 +12,7 @@ from appliance.configuration.sections import Sections
 from appliance.features.evidence.feature import EVIDENCE
 from appliance.features.feature import Feature, FeatureContext, FeaturePart, OperatorContext
 from appliance.features.fleet.feature import FLEET
+from appliance.features.guards.feature import GUARDS
 from appliance.features.recorder.feature import RECORDER
 from appliance.features.standby.feature import STANDBY
 from appliance.features.syslog.feature import SYSLOG
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 LONGEST = 64 << 20
 """The most bytes of a message on a link of a feature, unless its part has a smaller limit."""
 
-FEATURES: tuple[Feature, ...] = (SYSLOG, EVIDENCE, RECORDER, STANDBY, FLEET)
+FEATURES: tuple[Feature, ...] = (SYSLOG, EVIDENCE, RECORDER, STANDBY, FLEET, GUARDS)
 
 
 def memories(sections: Sections, relays: int) -> tuple[SharedMemory, ...]:
