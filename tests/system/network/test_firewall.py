@@ -39,7 +39,7 @@ import socket, sys
 for target in sys.argv[1:]:
     address, port = target.rsplit("/", 1)
     try:
-        socket.create_connection((address, int(port)), timeout=3).close()
+        socket.create_connection((address, int(port)), timeout=10).close()
         print("reached")
     except TimeoutError:
         print("timed out")

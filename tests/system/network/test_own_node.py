@@ -33,7 +33,7 @@ import json, socket, sys
 found = []
 for address, port in json.loads(sys.argv[1]):
     try:
-        socket.create_connection((address, port), timeout=1.5).close()
+        socket.create_connection((address, port), timeout=5).close()
         found.append("reached")
     except TimeoutError:
         found.append("timed out")
