@@ -1,4 +1,4 @@
-"""Name the authors of revisions and records, also those that are not people, and those who are charged."""
+"""Name the authors of revisions and records, including programs, and the hosts that are charged."""
 
 DISK = "disk"
 """The author of a change that was read from the disk, at a start or by a signal to the appliance."""

@@ -76,7 +76,7 @@ class SpecificationNames:
     safes: dict[str, nodes.SafeMessage] = field(default_factory=dict)
     """The safe messages, by topic."""
     instances: dict[tuple[object, ...], HelperFunction] = field(default_factory=dict)
-    """The functions of the library that are called (`library.py`), by name and types."""
+    """The functions of the library that are called (`library_functions.py`), by name and types."""
     is_library: bool = False
     """Whether these are the names that functions of the library see."""
 

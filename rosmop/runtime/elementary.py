@@ -1,8 +1,8 @@
 """`sin`, `cos`, `atan2` and `hypot` of doubles, from IEEE operations only, so every machine gives the same bits.
 
 The algorithms are those of fdlibm (Sun Microsystems, 1993) and, for `hypot`, of musl. The error is below one unit in
-the last place. `check/library.py` has the same operations, in the same order, in the language itself, for modules and
-proofs.
+the last place. `check/library_functions.py` has the same operations in the same order, in the language itself, for
+modules and proofs.
 """
 
 import math

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rosmop.check.library import FREE, TEXT, functions
+from rosmop.check.library_functions import FREE, TEXT, functions
 from rosmop.check.loops import MAX_NESTED
 from rosmop.check.members import TIME_METHODS
 from rosmop.check.sources import compiled_from

@@ -87,7 +87,7 @@ class Foxglove:
         self._channels: dict[int, tuple[str, str]] = {}  # of the client: topic and encoding
         self._calls: dict[int, tuple[int, int]] = {}  # service and call of the client
         self._number = 0
-        self._graph: dict[str, dict[str, Sequence[str]]] | None = None  # the last one that the client got
+        self._graph: dict[str, dict[str, Sequence[str]]] | None = None  # as last sent to the client
         self._seen: DoorSurroundings | None = None
         self._carry_out: dict[type[Any], Callable[[Any], list[DoorRequest]]] = {
             FoxgloveSubscribe: self._subscribe,

@@ -142,7 +142,7 @@ OPERATIONS = (
 
 
 class Envelope(Struct):
-    """The part that all operations have, for the answer to one that cannot be decoded."""
+    """The common fields of an operation; they name an operation that cannot be decoded."""
 
     op: Any = None
     id: Any = None

@@ -101,7 +101,7 @@ def _for_an_arm(arm: TopicFacts, topics: list[TopicFacts], *, alone: bool) -> It
     states = _sources(arm, topics, {"sensor_msgs/JointState": TypeRow()})
     if states:
         by = {"command": arm.name, "by": states[0].name}
-        # An arm that stands still repeats its positions.
+        # A resting arm repeats its positions.
         yield Proposal(
             "sensor", _name("sensor", arm, alone), by, _silence(states[0], 0.1, 5), {"frozen": "0"}
         )
