@@ -70,7 +70,7 @@ class Running:
         if role == "rosout":
             events = self.process.events
             began = next(at for at, event in enumerate(events) if event.get("pid") == pid)
-            self.process.wait_for_text("subscribed to /rosout", since=began)
+            self.process.wait_for(event="subscribed to /rosout", since=began)
         return pid
 
     def echo(self) -> int:
