@@ -7,12 +7,43 @@ fixed sets. Only topics and services on a relay are labels; `control.operators.m
 
 import bisect
 import sys
-from collections import Counter
+from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
+from appliance.base import clock
 from appliance.channel.messages import DELAY_BOUNDS
-from appliance.telemetry.last_minute import LastMinute
+
+_SECONDS = 60
+
+
+class LastMinute:
+    """Counts of the last 60 seconds, one for each second and name; `clock` returns seconds and is never set back.
+
+    The caller limits the number of names.
+    """
+
+    def __init__(self, clock: Callable[[], float] = clock.now) -> None:
+        self._clock = clock
+        self._seconds: deque[tuple[int, Counter[str]]] = deque(maxlen=_SECONDS)
+
+    def add(self, name: str, number: int = 1) -> None:
+        """Count events that happen now."""
+        second = int(self._clock())
+        if not self._seconds or self._seconds[-1][0] != second:
+            self._seconds.append((second, Counter()))
+        self._seconds[-1][1][name] += number
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of events in the last minute for each name that had any."""
+        oldest = int(self._clock()) - _SECONDS
+        total: Counter[str] = Counter()
+        for second, counts in self._seconds:
+            if second > oldest:
+                total.update(counts)
+        return dict(total)
+
 
 BOUNDS = (0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0)  # seconds
 

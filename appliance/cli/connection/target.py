@@ -5,6 +5,7 @@ options `--state`, `--api`, `--api-ca` and `--json`. The socket and REST give th
 overrides the environment; within the environment, REST overrides the socket.
 """
 
+import ipaddress
 import os
 from collections.abc import Callable
 from copy import copy
@@ -16,10 +17,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Concatenate, ParamSpec
 import msgspec
 import typer
 
+from appliance.api.routes.named_hosts import HostLabels, host_in_words
 from appliance.base.option_group import GroupedCommand, GroupedVerb, OptionGroup
-from appliance.channel.admin import A, AdminAnswer, AdminRequest
-from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
+from appliance.channel.admin import A, AdminAnswer, AdminRequest, PolicyWanted
+from appliance.cli.connection.admin_client import QUICK_SECONDS, AdminSocket, NotRunningError
 from appliance.cli.output import Json, say_json, usage_error
+from appliance.policy.host_names import HostInWords, in_words
 from rosmop.tool.terminal import printable
 
 if TYPE_CHECKING:
@@ -28,6 +31,33 @@ if TYPE_CHECKING:
     from appliance.cli.connection.rest_orders import RestWay
     from appliance.cli.connection.rest_session import RestClient
     from appliance.policy.host_names import HostInWords
+
+
+def named_by(way: "AdminSocket | RestWay") -> HostInWords:
+    """Return the function that shows a host as text for people."""
+    if isinstance(way, AdminSocket):
+        return _named_by_socket(way.state)
+    return _named_by_rest(way)
+
+
+def _named_by_socket(state: Path) -> HostInWords:
+    try:
+        answer = AdminSocket(state, QUICK_SECONDS, 0.1).ask(PolicyWanted())
+    except NotRunningError:
+        return str
+    return host_in_words(answer.given() if answer.ok else None)
+
+
+def _named_by_rest(way: "RestWay") -> HostInWords:
+    from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  imports httpx
+
+    try:
+        found = msgspec.convert(way.client.call("GET", "/v1/policy/hosts"), HostLabels)
+    except (NotRunningError, RestProblemError, msgspec.ValidationError):  # an earlier version has no names
+        return str
+    labels = [(ipaddress.ip_network(row.network), row.name) for row in found.labels]
+    return partial(in_words, labels=labels)
+
 
 DEFAULT_STATE = Path(
     "/var/lib/rosrv"
@@ -100,7 +130,6 @@ class Appliance(typer.Context):
     @cached_property
     def host_in_words(self) -> "HostInWords":
         """Return the function that names hosts by the policy in force; it returns addresses if no appliance answers."""
-        from appliance.cli.connection.host_labels import named_by  # noqa: PLC0415  only for text with hosts
 
         return named_by(self.way)
 

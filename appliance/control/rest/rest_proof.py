@@ -16,6 +16,8 @@ Browsers and scripts connect to the api process, so it may be compromised. Invar
 
 import asyncio
 import hashlib
+import hmac
+import secrets
 from typing import Protocol
 
 import msgspec
@@ -27,7 +29,6 @@ from appliance.channel.answers.token_answers import Challenge, TokenRole, may
 from appliance.channel.messages.api import ClientRequest, RequestMade
 from appliance.channel.operations import CHANGES, RestRequest
 from appliance.channel.rest_meaning import NoOrderError, filled_in, meant
-from appliance.control.rest.challenges import SECONDS, ChallengeRefusedError, Challenges
 from appliance.signing.request_signing import (
     HEADER,
     BadProofError,
@@ -39,6 +40,48 @@ from appliance.signing.request_signing import (
     statement,
 )
 from appliance.store.access_tokens import TokenRow, is_secret, parse_token
+
+SECONDS = 60.0
+_MOST_TAKEN = 4096
+
+
+class ChallengeRefusedError(Exception):
+    """The challenge of a proof is not accepted; the message gives the reason."""
+
+
+class Challenges:
+    """The challenges of this process, each accepted once; `now` is in seconds of a monotonic clock."""
+
+    def __init__(self) -> None:
+        self._key = secrets.token_bytes(32)
+        self._taken: dict[str, float] = {}  # accepted challenges, with the time at which they expire
+
+    def give(self, now: float) -> str:
+        """Return a new challenge, valid for `SECONDS`."""
+        begun = f"{now + SECONDS:.3f}.{secrets.token_urlsafe(16)}"
+        return f"{begun}.{self._mac(begun)}"
+
+    def take(self, challenge: str, now: float) -> None:
+        """Accept a challenge, once. Raises `ChallengeRefusedError`."""
+        begun, _dot, mac = challenge.rpartition(".")
+        if not hmac.compare_digest(mac.encode(), self._mac(begun).encode()):
+            raise ChallengeRefusedError(
+                "RVMaster has not issued this challenge since it started: request another one"
+            )
+        ends = float(begun.rpartition(".")[0])
+        if ends <= now:
+            raise ChallengeRefusedError("the challenge has expired: request another one")
+        if challenge in self._taken:
+            raise ChallengeRefusedError("the proof was already used: each is valid once")
+        for old in [taken for taken, end in self._taken.items() if end <= now]:
+            del self._taken[old]
+        if len(self._taken) >= _MOST_TAKEN:
+            raise ChallengeRefusedError(f"{_MOST_TAKEN} orders were signed within {SECONDS:g} s: wait")
+        self._taken[challenge] = ends
+
+    def _mac(self, begun: str) -> str:
+        return hmac.new(self._key, begun.encode(), hashlib.sha256).hexdigest()
+
 
 _ITSELF = "the host itself"
 

@@ -29,10 +29,38 @@ from appliance.features.standby.membership import Membership
 from appliance.features.standby.replication_frames import Introduction, ReplicationError
 from appliance.features.standby.replication_sender import ReplicationSender
 from appliance.features.standby.replication_transport import ReplicationListener
-from appliance.features.standby.robot_admission import RobotAdmission
 from appliance.features.standby.settings import Availability
 from appliance.features.standby.standby_tunnels import StandbyTunnels
 from appliance.store.writer_thread import Database, StoreError
+
+_GAP_SECONDS = 0.9  # without an answer of the witness; less than the confidence of a follower
+_ADMITTED_SECONDS = 2.0  # after the next answer, until all followers admit this appliance again
+
+
+class RobotAdmission:
+    """The times of the witness's answers (seconds of CLOCK_BOOTTIME)."""
+
+    def __init__(self) -> None:
+        self._answered = self._admitted = clock.since_boot()
+        self._gap_ended: Callable[[], None] = lambda: None
+
+    def on_end_of_gap(self, gap_ended: Callable[[], None]) -> None:
+        """Call this at the first answer after each gap."""
+        self._gap_ended = gap_ended
+
+    def note_answer(self, at: float) -> None:
+        """Note an answer of the witness."""
+        gap = at - self._answered > _GAP_SECONDS
+        self._answered = max(self._answered, at)
+        if gap:
+            self._admitted = at
+            self._gap_ended()
+
+    def in_doubt(self) -> bool:
+        """Whether a computer of the robot may shut out this appliance."""
+        now = clock.since_boot()
+        return now - self._answered > _GAP_SECONDS or now - self._admitted < _ADMITTED_SECONDS
+
 
 _REPORT_SECONDS = 0.1
 _SYNC_SECONDS = 0.1

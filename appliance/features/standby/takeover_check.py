@@ -12,9 +12,11 @@ to claim, and stays in the in-sync set: once the cause is gone, it takes over wi
 import asyncio
 import contextlib
 import os
+import sqlite3
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import structlog
 
@@ -26,7 +28,6 @@ from appliance.control.assembly.policy_gate import policy_at_start
 from appliance.control.assembly.robot import robot_addresses
 from appliance.features.standby.link_certificates import replication_context
 from appliance.features.standby.membership import Membership
-from appliance.features.standby.read_only import ReadOnlyDatabase
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.enactor import restore
 from appliance.policy.judgement import PolicyContext
@@ -37,7 +38,31 @@ from appliance.specifications.specification_files import (
 )
 from appliance.specifications.specification_revisions import Check, specifications_at_start
 from appliance.specifications.switches import Switches
+from appliance.store.changes import Change, Value
 from appliance.store.state_file import MonitorRevisionRow, StateStore
+from appliance.store.writer_thread import Database, StoreError
+
+
+class ReadOnlyDatabase(Database):
+    """The state file at `path`. It has no thread and no file of queued changes, and takes no changes."""
+
+    def __init__(self, path: Path, schema: str, *, failed: Callable[[str], None]) -> None:
+        """Take the arguments of `Database`; only the path matters."""
+        del schema, failed
+        self._path = path
+
+    def query(self, sql: str, parameters: Sequence[Value] = ()) -> list[tuple[Any, ...]]:
+        """Read the rows as they are now. Raises `StoreError`."""
+        try:
+            with contextlib.closing(sqlite3.connect(f"{self._path.as_uri()}?mode=ro", uri=True)) as reader:
+                return reader.execute(sql, parameters).fetchall()
+        except sqlite3.Error as error:
+            raise StoreError(f"{self._path}: {error}") from error
+
+    def _submit(self, change: Change, *, ahead: bool) -> None:
+        del change, ahead
+        raise StoreError(f"{self._path}: it is read only here")
+
 
 _AGAIN_SECONDS = 15.0
 _ROOM = 4 << 20  # bytes, as for an order (`Database.require_room`)

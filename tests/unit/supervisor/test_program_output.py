@@ -6,7 +6,7 @@ from typing import Any
 
 from structlog.testing import capture_logs
 
-from appliance.supervisor.program_output import ProgramOutput
+from appliance.supervisor.process_handle import ProgramOutput
 
 
 class Loop:

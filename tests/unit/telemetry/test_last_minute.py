@@ -1,7 +1,6 @@
-"""Tests of `appliance.telemetry.last_minute`."""
+"""Tests of `appliance.telemetry.metrics`."""
 
-from appliance.telemetry.last_minute import LastMinute
-from appliance.telemetry.metrics import Meter
+from appliance.telemetry.metrics import LastMinute, Meter
 
 
 def test_only_the_last_minute_counts() -> None:

@@ -1,8 +1,8 @@
-"""Tests of `appliance.control.rest.challenges`."""
+"""Tests of `appliance.control.rest.rest_proof`."""
 
 import pytest
 
-from appliance.control.rest.challenges import SECONDS, ChallengeRefusedError, Challenges
+from appliance.control.rest.rest_proof import SECONDS, ChallengeRefusedError, Challenges
 
 
 def refusal(challenges: Challenges, challenge: str, now: float) -> str:

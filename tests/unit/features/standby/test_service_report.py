@@ -1,4 +1,4 @@
-"""Tests of `appliance.features.standby.service_report`: what an active appliance reports to its lease."""
+"""Tests of `appliance.features.standby.service_begin`: what an active appliance reports to its lease."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -7,7 +7,7 @@ import pytest
 
 from appliance.base import clock
 from appliance.features.standby.lease_link import ControlServes
-from appliance.features.standby.service_report import ServiceReport
+from appliance.features.standby.service_begin import ServiceReport
 from tests.support.virtual_clock import VirtualClock
 
 
