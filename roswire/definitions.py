@@ -104,7 +104,6 @@ class Definitions:
 
     @property
     def service_types(self) -> list[str]:
-        """Return the names of all service types."""
         return sorted(self._services)
 
     def message(self, name: str) -> MessageDefinition:

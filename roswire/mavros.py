@@ -23,12 +23,10 @@ _IGNORED = "IGNORE_VX IGNORE_VY IGNORE_VZ IGNORE_AFX IGNORE_AFY IGNORE_AFZ FORCE
 
 
 def _counted(kind: str, prefix: str, names: str) -> str:
-    """Return constants 0, 1, 2, …"""
     return "".join(f"{kind} {prefix}{name}={number}\n" for number, name in enumerate(names.split()))
 
 
 def _bits(kind: str, names: str) -> str:
-    """Return constants 1, 2, 4, …"""
     return "".join(f"{kind} {name}={1 << number}\n" for number, name in enumerate(names.split()))
 
 

@@ -36,7 +36,6 @@ class SystemClock:
 
     @staticmethod
     def since_boot_ns() -> int:
-        """Return the time since the boot."""
         return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
@@ -55,7 +54,6 @@ def using(source: ClockSource) -> Iterator[None]:
 
 
 def source() -> ClockSource:
-    """Return the present source."""
     return _source.get()
 
 
@@ -85,10 +83,8 @@ def utc_now() -> datetime:
 
 
 def since_boot() -> float:
-    """Return the seconds since the boot."""
     return _source.get().since_boot_ns() / _SECOND
 
 
 def since_boot_ns() -> int:
-    """Return the nanoseconds since the boot."""
     return _source.get().since_boot_ns()

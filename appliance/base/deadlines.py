@@ -18,7 +18,6 @@ class Deadlines:
         self._limits: dict[str, float] = {}  # by name: the latest end, in seconds since the boot
 
     def passed(self, name: str, end: float) -> bool:
-        """Whether the end of `name` has passed."""
         known = self._deadlines.get(name)
         if known is None or known[0] != end:
             known = self._deadlines[name] = end, clock.since_boot() + end - clock.wall()

@@ -18,5 +18,4 @@ _NUMBER = re.compile(
 
 @functools.lru_cache(4)  # a line of output is compared with the previous one
 def without_numbers(text: str) -> str:
-    """Return the text with `#` for each number."""
     return _NUMBER.sub(lambda found: found["kept"] or "#", text)

@@ -706,7 +706,6 @@ def _decoder(kind: type[AdminRequest[A]]) -> msgspec.json.Decoder[AdminAnswer[A]
 
 
 def answer_to(kind: type[AdminRequest[A]]) -> type[A]:
-    """Return the struct that answers a request."""
     (answer,) = get_args(kind.__orig_bases__[0])  # type: ignore[attr-defined]  # what `typing` keeps of its bases
     return cast(type[A], answer)
 

@@ -45,7 +45,6 @@ class RestCall(NamedTuple):
 
 
 def is_dry_run(query: str) -> bool:
-    """Whether a query asks for a dry run."""
     return parse_qs(query, keep_blank_values=True).get("dry_run", ["0"])[-1].lower() not in _NO
 
 

@@ -120,7 +120,6 @@ class Operation:
         return _fields(self.request)
 
     def in_body(self) -> list[msgspec.structs.FieldInfo]:
-        """Return the fields that are sent in the body."""
         return [
             one
             for name, one in self.fields().items()
@@ -148,5 +147,4 @@ rest = Operation
 
 
 def rows() -> dict[type, tuple[Operation, ...]]:
-    """Return the rows of all requests."""
     return _ROWS

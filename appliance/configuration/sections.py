@@ -114,7 +114,6 @@ class Sections:
     values: Mapping[type[FeatureSection], FeatureSection] = dataclasses.field(default_factory=dict)
 
     def of(self, kind: type[S]) -> S:
-        """Return the section of this type."""
         value = self.values.get(kind, None) or kind()
         assert isinstance(value, kind)  # noqa: S101  the key is the value's type
         return value

@@ -466,7 +466,6 @@ class Settings:
 
     @property
     def sections(self) -> Sections:
-        """Return the sections of all features."""
         return Sections({kind: self.of(kind) for kind in SECTIONS})
 
     @property

@@ -36,7 +36,6 @@ class SupervisorMessages:
         self._failing: frozenset[str] = frozenset()  # the roles of processes that keep ending
 
     def heard(self, message: Any, descriptors: tuple[int, ...]) -> None:
-        """Handle a message and its descriptors."""
         match message:
             case messages.LinkOpened(role, index):
                 self._link(role, index, socket.socket(fileno=descriptors[0]))

@@ -32,12 +32,10 @@ class PairView:
         return ()
 
     def samples(self, state: "StandbyState") -> Mapping[str, Samples]:
-        """Return the samples of each metric of a pair."""
         del state
         return {}
 
     def line(self, state: "StandbyState") -> Any:
-        """Return the state in a line, for rich."""
         return state.role
 
     def status(self, state: "StandbyState") -> Any:

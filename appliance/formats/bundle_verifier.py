@@ -408,7 +408,6 @@ class Verifier:
         self.checkpoints, self.agreeing = self.checkpoints + 1, self.agreeing + (copy is not None)
 
     def is_signed(self, checkpoint: dict[str, Any]) -> bool:
-        """Whether the key signed a checkpoint."""
         fields = [f"{field} {checkpoint[field]}\n" for field in SEALED if checkpoint.get(field) is not None]
         version = 1 if checkpoint.get("removed") is None else 2
         text = f"rosrv audit checkpoint {version}\n{''.join(fields)}".encode()

@@ -25,14 +25,12 @@ class SegmentReceipt(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     signature: str = ""
 
     def text(self) -> bytes:
-        """Return the text that is signed."""
         return (
             f"rosrv fleet receipt 1\nrobot {self.robot}\nlog {self.log}\nnumber {self.number}\n"
             f"segment {self.segment}\nfirst {self.first}\nlast {self.last}\ntime {self.time}\n"
         ).encode()
 
     def signed(self, key: Ed25519PrivateKey) -> "SegmentReceipt":
-        """Return the receipt with its signature."""
         return msgspec.structs.replace(self, signature=key.sign(self.text()).hex())
 
     def is_signed(self, key: bytes) -> bool:

@@ -55,7 +55,6 @@ class SegmentHeader(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     end: SignedCheckpoint
 
     def line(self) -> bytes:
-        """Return the line, with its newline."""
         return msgspec.json.encode(self) + b"\n"
 
     def follows(self, other: "SegmentHeader") -> bool:

@@ -193,7 +193,6 @@ class RosMaster:
             self._away = False
 
     def close(self) -> None:
-        """Close the connections."""
         self.calls.close()
 
     def _enter(self) -> None:

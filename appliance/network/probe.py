@@ -81,7 +81,6 @@ class ProbeResult:
         return tuple(text for text in self.listening if not ipaddress.ip_address(text).is_loopback)
 
     def describe(self) -> str:
-        """Return the result in one line."""
         seen = ", ".join(
             f"{attempt.address} {attempt.detail or attempt.outcome}" for attempt in self.attempts
         )

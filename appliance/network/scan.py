@@ -38,7 +38,6 @@ class ScanResult:
 
     @property
     def answered(self) -> bool:
-        """Whether the machine answered at all."""
         return bool(self.open) or self.refused > 0
 
 

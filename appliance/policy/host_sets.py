@@ -72,12 +72,10 @@ class HostSets:
         return atom
 
     def group(self) -> Atom:
-        """Return a new atom."""
         self._parents.append([])
         return len(self._parents) - 1
 
     def put(self, members: Iterable[Atom], group: Atom) -> None:
-        """Add atoms to a group."""
         for member in members:
             self._parents[member].append(group)
 

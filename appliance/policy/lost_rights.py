@@ -21,7 +21,6 @@ class LostRights:
         self._lost: dict[tuple[str, str], bool] = {}  # by the networks that both policies name
 
     def took_from(self, host: Address) -> bool:
-        """Whether this host lost a right."""
         networks = self.old.alike(host), self.new.alike(host)
         if networks not in self._lost:
             self._lost[networks] = any(

@@ -50,14 +50,12 @@ class Findings:
         self._uncounted = 0
 
     def error(self, line: int, column: int, text: str) -> None:
-        """Note an error."""
         if len(self._errors) < MAXIMUM_FINDINGS:
             self._errors.append(PolicyFinding(self.file, line, column, FindingSeverity.ERROR, text))
         else:
             self._uncounted += 1
 
     def warn(self, line: int, column: int, text: str) -> None:
-        """Note a warning."""
         if len(self.warnings) < MAXIMUM_FINDINGS:
             self.warnings.append(PolicyFinding(self.file, line, column, FindingSeverity.WARNING, text))
 

@@ -92,7 +92,6 @@ class _Overlap:
             self._ends.setdefault(network.version, []).append(int(network.broadcast_address))
 
     def any(self, network: Network) -> bool:
-        """Whether any address of the network is in the set."""
         starts = self._starts.get(network.version, [])
         before = bisect.bisect_right(starts, int(network.broadcast_address)) - 1
         return before >= 0 and self._ends[network.version][before] >= int(network.network_address)

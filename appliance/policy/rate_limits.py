@@ -103,7 +103,6 @@ class LimitTable:
         self._default: LimitRule | None = None
 
     def add(self, rule: LimitRule) -> None:
-        """Add a line."""
         self.rules.append(rule)
         if rule.key is None:
             self._default = rule
@@ -111,7 +110,6 @@ class LimitTable:
             self._tree.add(rule.key, rule)
 
     def find(self, topic: str) -> LimitRule | None:
-        """Return the line for a topic, or None."""
         return (self._tree.find(topic) or self._default) if self.rules else None
 
 

@@ -24,7 +24,6 @@ class Queue(Generic[Holder, Member]):
         self._file(member, host, since, self._quota_class(host))
 
     def remove(self, member: Member) -> bool:
-        """Remove a member; return whether it was waiting."""
         line = self._line_of.pop(member, None)
         if line is None:
             return False

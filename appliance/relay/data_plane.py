@@ -135,7 +135,6 @@ class DataPlane:
             self._withdrawn(message)
 
     def close(self) -> None:
-        """Close all connections."""
         self.interceptor.close()
         self.ports.close_all()
         for topic, publisher in self.topics.values():

@@ -81,7 +81,6 @@ class GrantTable:
         return self._restated is not None
 
     def begin(self, epoch: int) -> None:
-        """Begin a restatement."""
         self._restated = set()
         self._epoch = epoch
 
@@ -118,7 +117,6 @@ class GrantTable:
             self._forget(_fact(message))
 
     def is_registered(self, host: str) -> bool:
-        """Return whether a host has a registration."""
         return self.quota_class(host) is QuotaClass.REGISTERED
 
     def quota_class(self, host: str) -> QuotaClass:
@@ -132,17 +130,14 @@ class GrantTable:
         return host if host in self._named else ANYBODY
 
     def node(self, key: str) -> messages.NodePlaced | None:
-        """Return the incarnation with this key."""
         node = self._facts.get(("node", key))
         return node if isinstance(node, messages.NodePlaced) else None
 
     def publication(self, key: str, topic: str) -> messages.PublicationPlaced | None:
-        """Return the publication of a topic by an incarnation."""
         publication = self._facts.get(("publication", key, topic))
         return publication if isinstance(publication, messages.PublicationPlaced) else None
 
     def service(self, key: str, service: str) -> ServiceEndpoint | None:
-        """Return an incarnation's service."""
         placed = self._facts.get(("service", key, service))
         if not isinstance(placed, messages.ServicePlaced):
             return None

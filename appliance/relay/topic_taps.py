@@ -42,7 +42,6 @@ class TopicTaps:
             topic.tap(tap, latched=wanted.latched)
 
     def end(self, number: int) -> None:
-        """Remove a tap."""
         for topic, tap in self._open.pop(number, ()):
             topic.untap(tap)
         self._left.pop(number, None)

@@ -26,7 +26,6 @@ _VALUE, _TEXT, _MEMBER, _ARRAY, _STRUCT = 45, 35, 40, 50, 40  # approximate byte
 
 
 def bulk_turns(quota_class: Callable[[Address], QuotaClass]) -> Turns[Address]:
-    """Return the turns for the bulks of all requests."""
     return Turns(_BOUNDS, quota_class)
 
 

@@ -19,7 +19,6 @@ Queue = deque[asyncio.Future[None]]
 
 
 def itself(host: Hashable) -> Hashable:
-    """Return the host itself as its group."""
     return host
 
 

@@ -114,7 +114,6 @@ class Front(asyncio.BaseProtocol, ABC):
                 self._reject_head()
 
     def on_message_begin(self) -> None:
-        """Begin a request."""
         if self.waiting >= self.most_waiting and not self.closing:
             what = f"sent {self.most_waiting} requests more while one was being answered"
             self.reject(b"400 Bad Request", what)

@@ -70,7 +70,6 @@ class Line(Generic[Key, Item]):
         self._used.clear()
 
     def put(self, key: Key, item: Item) -> None:
-        """Append an item to the items of a key."""
         queue = self._items.get(key)
         if queue is None:
             self._items[key] = deque([item])

@@ -125,7 +125,6 @@ class HttpServer:
     _closed: bool = field(default=False, init=False)
 
     async def start(self) -> None:
-        """Start accepting."""
         self._acceptors.append(Acceptor(self.sock, self.time, self._accepted))
         if self.first is None:
             return

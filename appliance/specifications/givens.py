@@ -152,7 +152,6 @@ def _allowed(declared: GivenDeclared) -> str:
 
 
 def with_unit(value: GivenValue, unit: str) -> str:
-    """Return a value with its unit."""
     return f"{_shown(value)} {unit}".strip()
 
 

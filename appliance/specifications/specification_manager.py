@@ -257,7 +257,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return msgspec.convert(self._described(row) | texts, answers.RevisionTexts)
 
     def statement(self, relay: int) -> messages.SpecificationsStated:
-        """Return a relay's first message."""
         return self.rollout.statement(relay)
 
     # --- changing ---
@@ -632,7 +631,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             self.rollout.received(message, relay)
 
     def relay_lost(self, relay: int) -> None:
-        """Note that a relay is gone."""
         self.rollout.lost(relay)
 
     # --- internals ---

@@ -156,7 +156,6 @@ class HostTables:
         return [HostRow(*row) for row in self._database.query("SELECT * FROM host ORDER BY name")]
 
     def save_certificate(self, row: CertificateRow) -> None:
-        """Keep the certificate of a host."""
         self._database.put("host_certificate", *row[:-1], *(row.next or (None, None, None)))
 
     def certificates(self) -> list[CertificateRow]:
@@ -172,7 +171,6 @@ class HostTables:
         self._database.put("host_ports", row.name, row.state, json.dumps(row.open), row.checked, row.who)
 
     def ports(self) -> list[PortsRow]:
-        """Return all port checks."""
         rows = self._database.query("SELECT * FROM host_ports")
         return [PortsRow(name, state, json.loads(opened), *told) for name, state, opened, *told in rows]
 
@@ -185,12 +183,10 @@ class HostTables:
         self._database.delete("enrolment_token", name=name)
 
     def awaited(self) -> list[EnrolmentTokenRow]:
-        """Return the unused tokens."""
         rows = self._database.query("SELECT * FROM enrolment_token")
         return [EnrolmentTokenRow._make((*row[:-2], json.loads(row[-2]), row[-1])) for row in rows]
 
     def save_revoked(self, row: RevokedCertificateRow) -> None:
-        """Store that a certificate is revoked."""
         self._database.put("revocation", *row)
 
     def forget_revoked(self, before: float) -> None:

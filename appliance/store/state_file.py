@@ -164,11 +164,9 @@ class StateStore:
                 self.database.delete(table, key=key)
 
     def save_registration(self, row: RegistrationRow) -> None:
-        """Keep a registration."""
         self.database.put("registration", *row)
 
     def remove_registration(self, key: str, kind: str, resource: str) -> None:
-        """Drop a registration."""
         self.database.delete("registration", key=key, kind=kind, resource=resource)
 
     def load_registry(self) -> tuple[list[IncarnationRow], list[RegistrationRow]]:

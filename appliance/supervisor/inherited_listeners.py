@@ -54,7 +54,6 @@ class InheritedListeners:
         return socket.socket(fileno=os.dup(self._sockets[name]))
 
     def close(self) -> None:
-        """Close all sockets."""
         for name in list(self._sockets):
             self.drop(name)
 

@@ -11,7 +11,6 @@ from appliance.supervisor.errors import StartError
 
 
 def free_port() -> int:
-    """Return a free loopback port."""
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))
         port: int = sock.getsockname()[1]

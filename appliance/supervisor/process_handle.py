@@ -197,7 +197,6 @@ class ProcessHandle:
         return self._progress.stalled_seconds()
 
     def kill(self, number: signal.Signals = signal.SIGKILL) -> None:
-        """Send the process a signal."""
         if not self.alive:
             return
         with suppress(ProcessLookupError):

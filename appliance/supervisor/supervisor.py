@@ -350,7 +350,6 @@ class Supervisor:
     def control_said(
         self, process: ProcessHandle, message: messages.Message, descriptors: tuple[int, ...]
     ) -> None:
-        """Handle one message of control."""
         match message:
             case messages.SocketKept(name):
                 self._keep(process, name, descriptors[0])
@@ -601,7 +600,6 @@ class Supervisor:
         return await rosmaster_probe.answers(self._facts.rosmaster_port, account_of("rosrv"), inside, seconds)
 
     def died(self, process: ProcessHandle, code: int) -> None:
-        """Handle the end of a process."""
         slot = next(slot for slot in self.slots if slot.process is process)
         lived = slot.record_death(process)
         self._process_died.set()
@@ -661,7 +659,6 @@ class Supervisor:
     # --- ending -------------------------------------------------------------------------------------------
 
     async def end(self) -> None:
-        """End all processes."""
         self.stopping.set()
         for task in self._tasks:
             task.cancel()

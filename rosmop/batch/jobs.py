@@ -171,7 +171,6 @@ def _coverage(job: CoverageJob, path: Path, recording: RecordedFile) -> Coverage
 
 
 def definitions_by_type(texts: dict[str, str]) -> Definitions:
-    """Return definitions of messages, given by type."""
     return Definitions.from_files({f"{kind}.msg": text for kind, text in texts.items()})
 
 

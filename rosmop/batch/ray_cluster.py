@@ -48,7 +48,6 @@ class RayCluster:
         self._running: dict[Any, int] = {}
 
     def submit(self, number: int, job: bytes) -> None:
-        """Submit a task."""
         self._running[self._task.remote(job)] = number
 
     def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:

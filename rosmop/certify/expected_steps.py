@@ -127,11 +127,9 @@ class ExpectedTopic:
         self.clocked = any(isinstance(one.compiled, ClockedProperty) for one in self.properties.values())
 
     def begun(self) -> States:
-        """Return the states at the beginning."""
         return dict(self._begun)
 
     def walk(self, states: States, case: StepCase) -> ExpectedResult:
-        """Return the expected result for the frames of a case."""
         result = ExpectedResult(states)
         for frame in range(case.frames):
             before = len(result.happened), len(result.dropped), len(result.verdicts)

@@ -36,7 +36,6 @@ class ExpressionDerivatives:
         return self._matching[state]
 
     def step(self, state: int, event: str) -> int:
-        """Return the derivative by an event."""
         known = self._derived.get((state, event))
         if known is None:
             known = self._derived[state, event] = self._derive(state, event)

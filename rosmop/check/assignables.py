@@ -59,7 +59,6 @@ class Value:
 
     @property
     def type(self) -> Type:
-        """Return the type of the expression."""
         return self.form.type
 
 

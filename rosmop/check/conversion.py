@@ -73,7 +73,6 @@ def number(value: nodes.Expression, target: Type) -> nodes.Expression:
 
 
 def condition(value: Value) -> nodes.Expression:
-    """Return a value as a condition."""
     if not value_types.is_number(value.type):
         hint = (
             "; write `.empty()` or compare it"
@@ -89,6 +88,5 @@ def constant_value(position: Position, kind: Type, constant: bool | int | float 
 
 
 def require_number(value: Value, what: str) -> None:
-    """Reject a value that is not a number."""
     if not value_types.is_number(value.type):
         raise SpecificationError.at(value.position, f"{what} needs a number; this is {value.type}")

@@ -61,7 +61,6 @@ def note_facts(scope: FunctionScope, event: str) -> bool:
 
 
 def fact(scope: FunctionScope, node: tree.CallExpression, function: str) -> Value:
-    """Compile a call of one of the functions."""
     event = _event(scope, node, function)
     if function in SENDER:
         return _sender(scope, node, function, event)

@@ -39,7 +39,6 @@ class MemberCall:
         return number_of
 
     def index(self, position: int, default: int | None = None) -> nodes.Expression:
-        """Return an argument as an index."""
         if default is not None and position >= len(self.arguments):
             return nodes.Literal(value_types.ULONG, default)
         value = self.arguments[position]

@@ -42,7 +42,6 @@ def weight(node: tree.SyntaxNode) -> int:
 
 
 def write_while(scope: FunctionScope, node: tree.WhileStatement, write: Write) -> None:
-    """Write `while` or `do … while`."""
     _enter(scope, node, LoopScope((lambda: _leave_unless(scope, node.condition)) if node.at_end else None))
     with scope.nested() as statements:
         charge(scope, node)

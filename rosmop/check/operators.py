@@ -28,7 +28,6 @@ class Operands:
         self.site = site
 
     def value(self, result: nodes.Expression) -> Value:
-        """Return an expression as a value at this position."""
         return Value(result, self.position)
 
     def refused(self, operator: str, hint: str = "") -> SpecificationError:

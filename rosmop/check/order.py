@@ -116,7 +116,6 @@ def of_change(scope: FunctionScope, target: Value, value: Value) -> tuple[First,
 def of_assignment(
     scope: FunctionScope, target: Value, value: nodes.Expression
 ) -> tuple[First, Value, nodes.Expression]:
-    """Return the target and the value of an assignment."""
     if target.pure and (_is_variable(target) or not nodes.acts(value)):
         return [], target, value
     first, read = kept(scope, value)

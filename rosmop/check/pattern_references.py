@@ -72,7 +72,6 @@ class _Rewriting:
         self._prefix = _PREFIX + str(number)
 
     def done(self) -> tree.Specification:
-        """Return the rewritten specification."""
         operator, early, late = self._sides()
         specification, node = self._specification, self._node
         if any(event.name == self._name for event in specification.events):

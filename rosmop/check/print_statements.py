@@ -188,7 +188,6 @@ class OutputStream:
         return name == "flush"
 
     def piece(self, value: Value) -> nodes.Expression:
-        """Return one value as text."""
         kind = value.type
         if isinstance(kind, _TEXTS):
             return convert(self._scope, value, value_types.STRING)

@@ -136,11 +136,9 @@ class CompilationContext:
         """Whether some files of the set could not be parsed. These files may declare names that seem unknown."""
 
     def define(self, function: nodes.Function) -> None:
-        """Add a function."""
         self.functions[function.name] = function
 
     def declare(self, names: SpecificationNames, variable: Variable) -> None:
-        """Add a variable of a specification."""
         names.variables[variable.name] = variable
         self.types[variable.code] = variable.type
         self.owners.setdefault(variable.name, []).append(names)
@@ -211,7 +209,6 @@ class FunctionScope:
             self._blocks.pop()
 
     def enter(self, loop: LoopScope) -> None:
-        """Enter a loop or switch."""
         loop.blocks = self._blocks.copy()
         self.loops.append(loop)
 
@@ -273,11 +270,9 @@ class FunctionScope:
         return SpecificationError.at(position, f"unknown {what} {shown(name)}{hint}")
 
     def published(self, topic: str, kind: str, position: Position) -> None:
-        """Note that the topic is published."""
         self.shared.publications.append(Publication(self.names.name, topic, kind, position))
 
     def called(self, service: str, kind: str, position: Position) -> None:
-        """Note that the service is called."""
         self.shared.calls.append(Publication(self.names.name, service, kind, position))
 
     # Statements
@@ -310,7 +305,6 @@ class FunctionScope:
             self.notes = before
 
     def add(self, statement: nodes.Statement) -> None:
-        """Append a statement."""
         self.lines.found.append(statement)
 
     def evaluate(self, value: nodes.Expression) -> None:

@@ -43,11 +43,9 @@ class Arguments:
             )
 
     def text(self, index: int) -> nodes.Expression:
-        """Return an argument as a string."""
         return convert(self.scope, self.values[index], value_types.STRING)
 
     def result(self, result: nodes.Expression) -> Value:
-        """Return an expression as the value of the call."""
         return Value(result, self.position)
 
     def value(self, kind: value_types.Type, function: str, *arguments: nodes.Expression) -> Value:

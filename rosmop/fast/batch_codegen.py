@@ -218,7 +218,6 @@ def written(
 
 
 def written_of(compiled: Compiled) -> WasmModule:
-    """Return the module of a set of specifications."""
     components = [group.component for group in groups(compiled.specifications)]
     return written(compiled.functions, components, ValueCodec(compiled.messages), compiled.stamped)
 
@@ -406,7 +405,6 @@ class TopicCodegen:
         return found
 
     def code(self) -> bytes:
-        """Return the function."""
         here = local_get(_AT) + I64_EXTEND_I32_U + load(I32, EFFECT) + constant(I32, self._effects) + I32_SUB
         here += constant(I32, 4) + I32_SHR_U + I64_EXTEND_I32_U + constant(I64, 32) + I64_SHL + I64_OR
         if self.verdicts:

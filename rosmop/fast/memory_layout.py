@@ -90,7 +90,6 @@ class MemoryLayout:
         """The address of lines of output."""
 
     def variable(self, name: str, kind: Type) -> int:
-        """Return the address of a variable of the set."""
         cells = self.shared[name]
         if not kept_size(kind):
             machine_type(kind)
@@ -150,7 +149,6 @@ class MemoryLayout:
         return at
 
     def constant(self, raw: bytes) -> int:
-        """Return the address of constant bytes."""
         if raw not in self.constants:
             self.constants[raw] = self.take(len(raw))
         return self.constants[raw]

@@ -86,7 +86,6 @@ def row(items: Sequence[bytes]) -> bytes:
 
 
 def text(name: str) -> bytes:
-    """Encode a name."""
     return unsigned(len(name)) + name.encode()
 
 
@@ -96,7 +95,6 @@ def section(number: int, content: bytes) -> bytes:
 
 
 def function_type(parameters: Sequence[int], result: int) -> bytes:
-    """Encode the type of a function."""
     return FUNCTION_TYPE + row([bytes((kind,)) for kind in parameters]) + row([bytes((result,))])
 
 

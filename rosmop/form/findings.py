@@ -57,5 +57,4 @@ class SpecificationError(Exception):
 
     @classmethod
     def at(cls, position: Position, text: str) -> "SpecificationError":
-        """Return an error with one finding."""
         return cls([Diagnostic(position, "error", text)])

@@ -45,7 +45,6 @@ class Symbols:
         self._owner = ""
 
     def begin(self, specification: str) -> None:
-        """Begin the names of this specification."""
         self._owner = specification
 
     def fresh(self, prefix: str) -> str:

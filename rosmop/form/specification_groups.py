@@ -25,7 +25,6 @@ class SpecificationGroup:
 
 
 def groups(specifications: Sequence[SpecificationCode]) -> Iterator[SpecificationGroup]:
-    """Yield the groups of a set."""
     found = connected([
         [
             specification.name,

@@ -73,7 +73,6 @@ class Candidate:
 
     @property
     def topics(self) -> set[str]:
-        """Return the topics it listens to."""
         return {topic for topic, _ in self.events.values()} | {self.topic}
 
     @property

@@ -229,7 +229,6 @@ class _Run:
 
     @property
     def deadline(self) -> int | None:
-        """Return the machine's deadline."""
         return self._run.deadline
 
     @property

@@ -67,7 +67,6 @@ class TimeFacts(msgspec.Struct, frozen=True, tag=True):
     rhythms: dict[str, TopicRhythm] = {}
 
     def merged(self, other: "TimeFacts") -> "TimeFacts":
-        """Return the facts of both."""
         return TimeFacts(merged_rows(self.rhythms, other.rhythms, TopicRhythm.merged))
 
 
@@ -78,7 +77,6 @@ class ContentFacts(msgspec.Struct, frozen=True, tag=True):
     pairs: dict[tuple[str, str], TopicPair] = {}
 
     def merged(self, other: "ContentFacts") -> "ContentFacts":
-        """Return the facts of both."""
         return ContentFacts(
             merged_rows(self.contents, other.contents, TopicContent.merged),
             merged_rows(self.pairs, other.pairs, TopicPair.merged),
@@ -91,7 +89,6 @@ class AlarmFacts(msgspec.Struct, frozen=True, tag=True):
     alarms: dict[int, int] = {}
 
     def merged(self, other: "AlarmFacts") -> "AlarmFacts":
-        """Return the facts of both."""
         return AlarmFacts(merged_rows(self.alarms, other.alarms, int.__add__))
 
 

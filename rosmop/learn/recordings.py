@@ -49,7 +49,6 @@ class LearnedSpan:
 
     @property
     def seconds(self) -> float:
-        """Return the length in seconds."""
         return (self.ended - self.began) / 10**9
 
 

@@ -65,7 +65,6 @@ def formatted(text: str) -> str:
 
 
 def identifier(text: str) -> str:
-    """Return an identifier made of any text."""
     name = re.sub(r"[^A-Za-z0-9]++", "_", text).strip("_") or "root"
     return f"n{name}" if name[0].isdigit() else name
 

@@ -65,7 +65,6 @@ class ValueSeries(msgspec.Struct):
         self._limit()
 
     def end(self) -> None:
-        """End a recording."""
         self.last = {}
 
     def merged(self, other: "ValueSeries") -> "ValueSeries":

@@ -35,7 +35,6 @@ class TopicPair(msgspec.Struct):
     started: bool = False
 
     def end(self) -> None:
-        """End a recording."""
         self.first = self.last = None
         self.seconds, self.started = 0, False
 
@@ -47,7 +46,6 @@ class TopicPair(msgspec.Struct):
         )  # fmt: skip
 
     def add_first(self, time: int) -> None:
-        """Add a message of the first topic."""
         if self.started and self.seconds != 1:
             self.turns = False
         self.started, self.seconds = True, 0
@@ -56,7 +54,6 @@ class TopicPair(msgspec.Struct):
             self.first = time
 
     def add_second(self, time: int, window: int) -> None:
-        """Add a message of the second topic."""
         if self.last is None:
             self.requires = False
             return
@@ -101,7 +98,6 @@ class TopicOrderReader:
         self._seconds = {b: [self.pairs[a, b] for a in names if a != b] for b in names}
 
     def add(self, topic: str, time: int, window: int) -> None:
-        """Add a message."""
         for pair in self._seconds.get(topic, ()):
             pair.add_second(time, window)
         for pair in self._firsts.get(topic, ()):

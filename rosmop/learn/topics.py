@@ -31,7 +31,6 @@ class TopicRhythm(msgspec.Struct):
     """The time of the last message, until the recording ends."""
 
     def begin(self, recording: int, first_window: int) -> None:
-        """Begin a part of a recording."""
         self.recordings.add(recording)
         self.some[first_window] = []
 
@@ -47,7 +46,6 @@ class TopicRhythm(msgspec.Struct):
         self.last = time
 
     def end(self) -> None:
-        """End a recording."""
         self.last = None
 
     def merged(self, other: "TopicRhythm") -> "TopicRhythm":

@@ -65,11 +65,9 @@ class FormulaCell:
             self.journal[self] = self.saved()
 
     def saved(self) -> tuple[Any, ...]:
-        """Return the content."""
         return self.kind, self.missing, self.operands, self.tells, [*self.users], self.value
 
     def restore(self, saved: tuple[Any, ...]) -> None:
-        """Restore the content."""
         self.kind, self.missing, self.operands, self.tells, self.users, self.value = saved
 
     def stand_for(self, kind: str, operands: tuple["Value", ...]) -> None:
@@ -145,11 +143,9 @@ class _Row:
     cell: FormulaCell | None
 
     def saved(self) -> tuple[Any, ...]:
-        """Return the content."""
         return self.place, self.time, self.left, self.right, self.cell
 
     def restore(self, saved: tuple[Any, ...]) -> None:
-        """Restore the content."""
         self.place, self.time, self.left, self.right, self.cell = saved
 
 
@@ -543,7 +539,6 @@ class BoundedProperty(CompiledProperty):
         self._failing = self._decided_late()
 
     def start(self, time_ns: int) -> Run:
-        """Return a fresh run."""
         return BoundedRun(self, time_ns)
 
     def operators(self, run: "BoundedRun") -> dict[int, _Operator]:
@@ -638,7 +633,6 @@ class BoundedRun:
         return deepcopy(self, {id(one): one for one in shared})
 
     def step(self, event: int, time_ns: int) -> Categories:
-        """Take the event."""
         if self._now < time_ns:
             deadline = self.deadline
             if deadline is not None and time_ns > deadline:

@@ -204,7 +204,6 @@ _NOTHING_LEFT: Sets = frozenset((0,))
 
 
 def _members(bits: int) -> list[int]:
-    """Return the numbers in a bit set."""
     found = []
     while bits:
         lowest = bits & -bits

@@ -64,11 +64,9 @@ class GrammarRun(UntimedRun):
         return MATCH if accepted else UNDECIDED
 
     def saved(self) -> tuple[Any, ...]:
-        """Return the frame."""
         return (self.frame,)
 
     def restore(self, saved: tuple[Any, ...]) -> None:
-        """Restore the frame."""
         (self.frame,) = saved
 
 

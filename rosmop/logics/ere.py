@@ -116,7 +116,6 @@ class ExpressionTable:
         return self._intern(kind, tuple(sorted(flat)), nullable=nullable)
 
     def derivative(self, number: int, letter: int) -> int:
-        """Return the derivative by ``letter``."""
         known = self._derived.get((number, letter))
         if known is None:
             known = self._derived[number, letter] = self._derive(self._all[number], letter)

@@ -96,7 +96,6 @@ class Source:
         return Diagnostic(self.origin.within(self.text, min(offset, len(self.text))), "error", text)
 
     def error(self, offset: int, text: str) -> FormulaError:
-        """Return the error for this formula with one reason."""
         return FormulaError([self.finding(offset, text)])
 
 
@@ -211,7 +210,6 @@ class FiniteRun(UntimedRun):
         return self._automaton.verdicts[self.state]
 
     def mark(self) -> int:
-        """Return the state."""
         return self.state
 
     def take_back(self, mark: int) -> None:
@@ -219,11 +217,9 @@ class FiniteRun(UntimedRun):
         self.state = mark
 
     def saved(self) -> tuple[Any, ...]:
-        """Return the state."""
         return (self.state,)
 
     def restore(self, saved: tuple[Any, ...]) -> None:
-        """Restore the state."""
         (self.state,) = saved
 
 
@@ -292,7 +288,6 @@ class ClockedRun:
         )
 
     def step(self, event: int, time_ns: int) -> Categories:
-        """Take the event."""
         tables = self._tables
         if time_ns > self.now:
             deadline = self.deadline

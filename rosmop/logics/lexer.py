@@ -109,7 +109,6 @@ class TokenReader:
 
     @property
     def token(self) -> FormulaToken:
-        """Return the next token."""
         return self._tokens[self._next]
 
     def ahead(self, count: int) -> FormulaToken:
@@ -137,7 +136,6 @@ class TokenReader:
         return self.take()
 
     def unexpected(self, what: str) -> FormulaError:
-        """Return the error for the next token."""
         return self.source.error(self.token.offset, f"expected {what}, found {describe(self.token)}")
 
     def note(self, token: FormulaToken, text: str) -> None:

@@ -29,7 +29,6 @@ class FormulaNodes:
         return number
 
     def letters(self, mask: int) -> int:
-        """Return the node for any of the letters of a bit set."""
         return self._intern("letters", (mask,))
 
     def _mask(self, node: int) -> int | None:
@@ -83,7 +82,6 @@ class FormulaTranslation:
         self._atoms = atoms
 
     def node(self, formula: Formula, positive: bool) -> int:
-        """Return the node of a formula, or of its negation."""
         key = (id(formula), positive)
         if key not in self._known:
             self._known[key] = self._find(formula, positive)

@@ -70,11 +70,9 @@ class EarleySet:
         self.depth = depth
 
     def saved(self) -> tuple[Any, ...]:
-        """Return the parts of the set."""
         return self.conts, self.depth, self.shape
 
     def restore(self, saved: tuple[Any, ...]) -> None:
-        """Restore the parts of the set."""
         self.conts, self.depth, self.shape = saved
 
     def resolve(self, references: Sequence[int]) -> "Conts":

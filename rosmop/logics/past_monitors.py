@@ -431,7 +431,6 @@ class PastRun(UntimedRun):
         return made
 
     def step(self, event: int, time_ns: int) -> Categories:
-        """Take the event."""
         if time_ns > self.now:  # noqa: PLR1730  `max` takes as long as the rest of the step
             self.now = time_ns
         operations, (result,) = self._residues[event]
@@ -440,7 +439,6 @@ class PastRun(UntimedRun):
         return TOLD[self.values[result]]
 
     def mark(self) -> list[Any]:
-        """Return the values."""
         return list(map(copy.copy, self.values))
 
     def take_back(self, mark: list[Any]) -> None:
@@ -465,5 +463,4 @@ class PastProperty(CompiledProperty):
         self.timed = any(folded.bounds)
 
     def start(self, time_ns: int) -> Run:
-        """Return a fresh run."""
         return PastRun(self._folded, time_ns)

@@ -117,7 +117,6 @@ class CaretRun(UntimedRun):
         return self._stack, self._values
 
     def restore(self, saved: tuple[Any, ...]) -> None:
-        """Restore the values."""
         self._stack, self._values = saved
 
 

@@ -90,7 +90,6 @@ class Reader:
         self.at = 0
 
     def byte(self) -> int:
-        """Read one byte."""
         self.at += 1
         return self._data[self.at - 1]
 

@@ -634,7 +634,6 @@ class FormTerms:
         return self._part(view, sum(map(self._size, before)), node.type)
 
     def _part(self, view: _View, offset: Term | int, kind: Type) -> Any:
-        """Return the part at an offset in a value."""
         start = view.start + offset
         if isinstance(kind, value_types.RecordType):
             return _View(view.message, start, integer(1, 64))

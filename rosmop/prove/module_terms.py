@@ -380,7 +380,6 @@ def _fits(value: Any, family: str) -> bool:
 
 
 def _bits(value: Any) -> Term:
-    """Return a value as a number."""
     if isinstance(value, Pointer):
         raise DiffersError("it calculates with an address")
     return as_bits(value) if z3.is_bool(value) else value

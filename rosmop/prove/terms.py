@@ -39,7 +39,6 @@ class DiffersError(Exception):
 
 
 def integer(value: int, bits: int) -> Term:
-    """Return a constant."""
     return z3.BitVecVal(value, bits)
 
 
@@ -66,7 +65,6 @@ def either(*conditions: Term) -> Term:
 
 
 def opposite(condition: Term) -> Term:
-    """Return the negation."""
     if z3.is_not(condition):
         return condition.arg(0)
     known = z3.is_true(condition) or z3.is_false(condition)
@@ -127,11 +125,9 @@ class State:
     slots: dict[Any, Any]
 
     def where(self, condition: Term) -> "State":
-        """Return a branch of the state."""
         return State(both(self.alive, condition), dict(self.slots))
 
     def require(self, condition: Term) -> None:
-        """Require a condition from here on."""
         self.alive = both(self.alive, condition)
 
     def join(self, test: Term, yes: "State", no: "State") -> None:

@@ -51,7 +51,6 @@ class BoundedMcap:
             raise
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
     def in_order(self) -> Iterator[tuple[Connection, int, bytes]]:

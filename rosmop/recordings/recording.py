@@ -87,7 +87,6 @@ def definitions_of(reader: Reader) -> Definitions:
 
 
 def fits(topic: str, patterns: Sequence[str]) -> bool:
-    """Whether a topic matches one of the patterns."""
     return any(fnmatchcase(topic, pattern) for pattern in patterns)
 
 

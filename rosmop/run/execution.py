@@ -208,7 +208,6 @@ class MonitorExecution:
         return [outcome]
 
     def _expiry(self, monitor: MonitorInstance, deadline: int, running: RunningProperty) -> Outcome:
-        """Start the outcome of the deadline of a property."""
         word = "timeout" if running.code.property.logic == "tfsm" else "deadline"
         outcome = Outcome(time=deadline)
         outcome.timer = f"{monitor.name}.{word}"

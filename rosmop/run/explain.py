@@ -106,7 +106,6 @@ class Exits:
         return categories
 
     def expire(self, run: Run) -> Categories:
-        """Expire the deadline of the run."""
         return run.expire()
 
     def begin(self, time_ns: int) -> None:
@@ -236,7 +235,6 @@ class Steps:
         self._steps.append(happened)
 
     def expire(self, run: Run) -> Categories:
-        """Expire the deadline of the run."""
         self._make_room(run)
         self._steps.append(EventOccurrence(_DEADLINE, run.deadline or 0, NOBODY))
         return run.expire()
@@ -318,7 +316,6 @@ class ClockedSteps(Steps):
         self.begin(time_ns)
 
     def expire(self, run: Run) -> Categories:
-        """Expire the deadline of the run."""
         self._note(run, _DEADLINE & _EVENT, run.deadline or 0, NOBODY)
         return run.expire()
 

@@ -26,7 +26,6 @@ class Guards:
 
 
 def guards_of(compiled: Compiled) -> Guards:
-    """Return the guards of a set."""
     codes = {code.name: code for code in compiled.specifications}
     used = {name: set(_used(codes, name)) for name in codes}
     starts = {name for code in codes.values() for name in code.start}

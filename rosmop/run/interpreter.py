@@ -209,7 +209,6 @@ class _Maker:
     # Statements
 
     def block(self, statements: Sequence[nodes.Statement]) -> _Run:
-        """Build a sequence of statements."""
         runs = [(node.site, self._statement(node)) for node in statements]
         interpreter = self._interpreter
 
@@ -592,7 +591,6 @@ class _Maker:
     # Expressions
 
     def value(self, node: nodes.Expression) -> _Value:
-        """Build an expression."""
         made: _Value = EXPRESSIONS[type(node)](self, node)
         return made
 

@@ -98,7 +98,6 @@ class RunningProperty:
         return dot_of([self.code.property]) is not None
 
     def begin(self, time_ns: int) -> None:
-        """Restart."""
         self.run = self.code.property.start(time_ns)
         self.history.begin(time_ns)
 
@@ -188,7 +187,6 @@ class MonitorInstance:
 
     @property
     def name(self) -> str:
-        """Return the name of the specification."""
         return self.code.name
 
     @property

@@ -41,12 +41,10 @@ class Quota(Generic[Thing]):
         return left >= 0 and (holder is None or self.held(holder) + more <= max(left, 1))
 
     def take(self, holder: Holder, thing: Thing) -> None:
-        """Charge the holder for a thing."""
         self._of.setdefault(holder, OrderedDict())[thing] = None
         self.total += 1
 
     def give_back(self, holder: Holder, thing: Thing) -> None:
-        """Release a thing of the holder."""
         mine = self._of[holder]
         del mine[thing]
         self.total -= 1

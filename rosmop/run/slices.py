@@ -101,7 +101,6 @@ class Slice:
         return min(times, default=None)
 
     def stand(self, states: Sequence[int]) -> None:
-        """Set the states of its automata."""
         for run, state in zip(self.runs, states, strict=True):
             run.state = state  # type: ignore[attr-defined]  # runs over tables
 
@@ -263,7 +262,6 @@ class Slices:
         return after if min(after, default=0) >= 0 else None
 
     def stand(self, slice_: Slice, states: Sequence[int]) -> None:
-        """Set the states of the automata of a slice."""
         slice_.stand(states)
         self._note(slice_)
 
@@ -317,7 +315,6 @@ class Slices:
         return [*known.slices] if not part else [*known.parts[part].get(key, ())]
 
     def _fresh(self, event: EventCode, domain: int, key: Key) -> list[Slice]:
-        """Return the slices that begin with this event."""
         own = dict(zip(event.binds, key[1:], strict=True))
         wanted = {(domain, key)} if event.creates and key not in self._known[domain].slices else set()
         order = [*wanted]
@@ -450,7 +447,6 @@ class Slices:
 
     @property
     def due(self) -> Slice:
-        """Return the slice with this deadline."""
         return self._deadlines[0][2]
 
     def _await(self, slice_: Slice) -> None:
@@ -539,7 +535,6 @@ class Slices:
     # Queries
 
     def is_whole(self, slice_: Slice) -> bool:
-        """Return whether a slice has all parameters."""
         return slice_.domain == self._all
 
     def mark(self, slice_: Slice) -> Callable[[], None]:
@@ -660,7 +655,6 @@ def of_nan(key: Key) -> Key:
 
 
 def _states(runs: Sequence[Run]) -> list[int]:
-    """Return the states of automata."""
     return [run.state for run in runs]  # type: ignore[attr-defined]  # runs over tables
 
 

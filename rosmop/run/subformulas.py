@@ -74,7 +74,6 @@ class Meaning:
         self._plain: dict[int, Formula] = {}
 
     def holds(self, formula: Formula, at: int) -> bool:
-        """Return whether a formula holds at a position."""
         key = id(formula), at
         if key not in self._known:
             self._known[key] = self._value(formula, at)

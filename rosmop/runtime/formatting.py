@@ -67,7 +67,6 @@ def to_text_moment(nanoseconds: int) -> bytes:
 
 
 def join_all(context: Context, pieces: tuple[bytes, ...], site: int) -> bytes:
-    """Return the concatenated pieces."""
     size = sum(map(len, pieces))
     if size > _LONG:
         context.allocate(size, site)

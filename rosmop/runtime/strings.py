@@ -22,7 +22,6 @@ _FLOATING = re.compile(
 
 
 def join(context: Context, left: bytes, right: bytes, site: int) -> bytes:
-    """Return `left + right`."""
     size = len(left) + len(right)
     if size > _LONG:
         context.allocate(size, site)
@@ -70,7 +69,6 @@ def with_character(context: Context, text: bytes, index: int, value: int, site: 
 
 
 def substring(context: Context, text: bytes, start: int, count: int, site: int) -> bytes:
-    """Return `text.substr(start, count)`."""
     if start > len(text):
         raise FaultError(site, f"substr from {start}, past the end of a string of {len(text)} characters")
     result = text[start : start + count]
@@ -80,7 +78,6 @@ def substring(context: Context, text: bytes, start: int, count: int, site: int) 
 
 
 def find(context: Context, text: bytes, wanted: bytes, start: int, site: int) -> int:
-    """Return `text.find(wanted, start)`."""
     context.spend(len(text) // 16, site)
     found = text.find(wanted, start) if start <= len(text) else -1
     return NOT_FOUND if found < 0 else found
@@ -193,7 +190,6 @@ def _cut(buffer: bytes) -> bytes:
 
 
 def _allocate(context: Context, buffer: bytes, site: int) -> None:
-    """Charge for a new buffer."""
     if len(buffer) > _LONG:
         context.allocate(len(buffer), site, len(buffer))
 

@@ -97,7 +97,6 @@ class ValueCodec:
         return 4
 
     def measure(self, kind: Type) -> Callable[[Any], int]:
-        """Return a function that measures a value."""
         return self._once(ValueCodec._measure, kind)
 
     def _measure(self, kind: Type) -> Callable[[Any], int]:

@@ -15,7 +15,6 @@ LARGE = 1024  # bytes; reading a smaller value is not charged
 
 
 def element(values: Values, index: int, site: int) -> Any:
-    """Return `values[index]`."""
     if 0 <= index < len(values):
         return values[index]
     raise FaultError(site, f"index {index} is past the end of a vector of {len(values)}")

@@ -218,7 +218,6 @@ def _hint(before: str, piece: str, accepted: Set[str]) -> str:
 
 
 def _open_braces(text: str, offset: int) -> list[int]:
-    """Return the offsets of the braces that are open at `offset`."""
     opened: list[int] = []
     for piece in _PIECE.finditer(text, 0, offset):
         if piece[0] == "{":

@@ -66,7 +66,6 @@ class ReplayReport:
         return rows
 
     def _printed(self, rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Return the rows, which are printed with --json."""
         printed = list(rows)
         for row in printed if self._as_json else ():
             say_json(row)

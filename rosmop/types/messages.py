@@ -119,7 +119,6 @@ class MessageTypes:
 
 
 def field_type(field: Field) -> Type:
-    """Return the type of a field's value."""
     element = PRIMITIVES.get(field.type) or value_types.RecordType(field.type)
     return value_types.VectorType(element, field.length) if field.is_array else element
 

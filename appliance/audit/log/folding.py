@@ -87,7 +87,6 @@ class RecordFolder:
         return len(self._kinds)
 
     def state(self, key: Key) -> FoldState | None:
-        """Return the counts of a key, or None."""
         kind = self._kinds.get(key)
         return kind.state if kind is not None and kind.state.count else None
 

@@ -96,7 +96,6 @@ def subject(record: AuditRecord) -> Key:
 
 
 def kind_of(record: AuditRecord) -> Key:
-    """Return the key of the narrowest kind of a record."""
     if record.unknown:
         asked = (str(record.detail.get(name)) for name in ("call", "method", "status"))
         return (UNKNOWN, record.host, record.event, record.decision, *asked, _plain_words(record.reason))

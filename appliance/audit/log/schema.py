@@ -39,7 +39,6 @@ FIELDS: dict[str, tuple[dict[str, Any], str]] = {
 
 
 def json_schema() -> dict[str, Any]:
-    """Return the JSON schema (2020-12) of a record."""
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": f"ROSRV audit record, version {SCHEMA_VERSION}",

@@ -27,7 +27,6 @@ class KeyUnreadableError(Exception):
 
 
 def pinned_key_path(log: Path) -> Path:
-    """Return the path of a log's pinned public key."""
     return log.with_name(log.stem + ".pub")
 
 

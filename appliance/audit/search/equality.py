@@ -55,7 +55,6 @@ class EqualRecords:
 
 
 def equal_key(record: AuditRecord) -> EqualKey:
-    """Return what equal records share."""
     detail, rule = record.detail, record.rule
     event = str(detail.get("of")) if _continues(record) else record.event
     fields = (

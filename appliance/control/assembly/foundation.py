@@ -92,7 +92,6 @@ class Foundation:
     role: ActiveRole
 
     def port(self, name: str) -> int:
-        """Return the port of a listener."""
         return int(self.sockets[name].getsockname()[1])
 
 

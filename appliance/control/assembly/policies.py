@@ -112,7 +112,6 @@ class Policies(Revisions[RevisionRow]):
 
     @property
     def current(self) -> Policy:
-        """Return the policy in force."""
         if self._current is None:
             raise RuntimeError("no policy is loaded yet")
         return self._current
@@ -237,7 +236,6 @@ class Policies(Revisions[RevisionRow]):
             return answers.PolicyConfirmed(waited, self.revision)
 
     async def revisions(self, _request: admin.PolicyRevisions) -> answers.PolicyRevisionList:
-        """Return the kept revisions."""
         rows = [self._described(row) for row in await self._kept()]
         return answers.PolicyRevisionList(msgspec.convert(rows, list[answers.PolicyRevision]))
 

@@ -102,7 +102,6 @@ class ControlLifeline:
         self._early[key] = (message, descriptors)
 
     def api_channel(self, descriptor: int) -> Channel:
-        """Return the channel of a link to the api."""
         return Channel(socket.socket(fileno=descriptor), ApiLink, limit=16 << 20, longest=8 << 20)
 
     def say(self, message: messages.Message) -> None:

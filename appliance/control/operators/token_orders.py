@@ -61,7 +61,6 @@ class TokenOrders:
         return [kept_by_api(row) for row in self._rows.values() if row.usable(self._ends)]
 
     def usable_row(self, token_id: str) -> TokenRow | None:
-        """Return the token with this id, if it is usable now."""
         row = self._rows.get(token_id)
         return row if row is not None and row.usable(self._ends) else None
 

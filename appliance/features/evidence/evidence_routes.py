@@ -27,7 +27,6 @@ _Moment = Annotated[str, Query(max_length=64, description="1h (ago), a date, or 
 
 
 def routes(services: Services) -> Routes:
-    """Return the routes."""
     router = Routes(prefix="/v1", tags=["evidence"])
 
     @router.get("/evidence", responses=_ZIP, response_class=Response)

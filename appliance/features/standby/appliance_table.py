@@ -68,7 +68,6 @@ class ApplianceTable(Appliances):
             self._save(row._replace(pin=pin))
 
     def note_own(self, key: str) -> None:
-        """Note which tunnel key is this appliance's own."""
         self._own = key
         self.is_served(self._pin)
 

@@ -112,7 +112,6 @@ class LeaseClient:
             raise HandOverError(reason)
 
     def heard(self, message: Any) -> None:
-        """Take a message of the lease."""
         match message:
             case lease_link.LeaseState():
                 self.state = message

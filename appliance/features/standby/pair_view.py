@@ -20,19 +20,16 @@ class StandbyPairView(PairView):
         return standby_troubles(state, PATIENCE_SECONDS)
 
     def samples(self, state: StandbyState) -> Mapping[str, Samples]:
-        """Return the samples of each metric of a pair."""
         from appliance.features.standby.samples import samples_of  # noqa: PLC0415  only the api needs it
 
         return samples_of(state)
 
     def line(self, state: StandbyState) -> Any:
-        """Return the state in a line, for rich."""
         from appliance.features.standby.standby_view import standby_line  # noqa: PLC0415  only the command needs it
 
         return standby_line(state)
 
     def status(self, state: StandbyState) -> Any:
-        """Return the `StatusView` of a standby."""
         from appliance.features.standby.standby_view import standby_view  # noqa: PLC0415  only the command needs it
 
         return standby_view(state)

@@ -53,7 +53,6 @@ class ReplicatedTokens:
         return False
 
     def usable_row(self, token_id: str) -> TokenRow | None:
-        """Return the token with this id, if it is usable now."""
         row = (self._rows or {}).get(token_id)
         return row if row is not None and row.usable(self._ends) else None
 

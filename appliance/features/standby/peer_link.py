@@ -28,7 +28,6 @@ class PeerChannel:
         self._last: PromiseRequest | None = None
 
     def write(self, message: PeerMessage) -> bytes:
-        """Return the datagram of a message."""
         return seal(PURPOSES[type(message)], self._name, self._key, msgspec.to_builtins(message))
 
     def read(self, datagram: bytes) -> PeerMessage | None:

@@ -113,7 +113,6 @@ class LeaseProcess:
     # --- the lease ---
 
     def tick(self) -> None:
-        """Do what is due."""
         lease, report, now = self._lease, self._report, clock.since_boot()
         current = report.permission == self._permission
         waiting = report.waiting_since
@@ -230,7 +229,6 @@ class LeaseProcess:
         self._wake.set()
 
     def control_said(self, message: Any) -> None:
-        """Take a message of control."""
         match message:
             case lease_link.ReplicationReported():
                 self._report = message

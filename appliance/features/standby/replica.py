@@ -106,7 +106,6 @@ class Replica:
             self._roll_back()
 
     def close(self) -> None:
-        """Close the file."""
         with self._lock:
             self._roll_back()
             self._connection.close()

@@ -49,7 +49,6 @@ class RobotAdmission:
         self._gap_ended = gap_ended
 
     def note_answer(self, at: float) -> None:
-        """Note an answer of the witness."""
         gap = at - self._answered > _GAP_SECONDS
         self._answered = max(self._answered, at)
         if gap:
@@ -102,7 +101,6 @@ def state_of(
     other: OtherAppliance,
     obstacle: str,
 ) -> StandbyState:
-    """Return the state of this appliance for operators."""
     now = clock.since_boot()
     return StandbyState(
         name=membership.name,

@@ -186,7 +186,6 @@ class ReplicationLink(Generic[M]):
             raise ReplicationError(f"a message is malformed: {error}") from error
 
     async def close(self) -> None:
-        """Close the link at once."""
         self._writer.transport.abort()
         with contextlib.suppress(OSError):
             await self._writer.wait_closed()

@@ -73,7 +73,6 @@ class ServiceWatch:
         return f"control {what} for {silent:.1f} s"
 
     def given_away(self) -> None:
-        """Note that the lease was given away."""
         if self._cold:
             return  # the other one stands by, and nothing was tried here
         steady = self._ready is not None and self._served - self._ready > STEADY_SECONDS

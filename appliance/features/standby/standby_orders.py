@@ -60,7 +60,6 @@ class ActiveAppliance:
         self._staying = staying
 
     def state(self) -> StandbyState:
-        """Return the state of both appliances."""
         return self._replication.state()
 
     async def hand_over(self) -> None:

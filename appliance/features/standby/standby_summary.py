@@ -42,7 +42,6 @@ def both_active(state: StandbyState) -> bool:
 
 
 def is_silent(witness: WitnessSeen) -> bool:
-    """Whether the witness does not answer."""
     return witness.answered_seconds is None or witness.answered_seconds >= SILENT_SECONDS
 
 

@@ -171,7 +171,6 @@ class TakeoverLog:
         return row[0].hex() if row is not None and isinstance(row[0], bytes) else None
 
     def checkpoint_text(self, number: int) -> bytes | None:
-        """Return the text of a checkpoint, or None if the log does not have it."""
         row = self._connection.execute("SELECT text FROM checkpoint WHERE number = ?", (number,)).fetchone()
         return None if row is None else row[0]
 

@@ -41,7 +41,6 @@ class WitnessChannel:
         self._pending: dict[int, WitnessRequest] = {}
 
     def write(self, request: WitnessRequest) -> bytes:
-        """Return the datagram of a request."""
         self._number += 1
         self._pending[self._number] = request
         if len(self._pending) > _MOST_PENDING:

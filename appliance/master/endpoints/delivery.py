@@ -127,7 +127,6 @@ class Delivery:
         return self._held.total
 
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
-        """Queue a call for a node."""
         queue = self._queues.setdefault(incarnation.key, _Queue(incarnation))
         weight = call.weight
         queue.put(call, weight)

@@ -230,7 +230,6 @@ class AdvertisedAddresses:
         self._routes: dict[Address, str | None] = {}
 
     def address_for(self, peer: Peer) -> str:
-        """Return the appliance's address for this peer."""
         for network, address in self._advertised:
             if peer.host in network:
                 return str(address)

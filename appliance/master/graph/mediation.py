@@ -25,7 +25,6 @@ class Mediation:
     stand_ins: bool = True
 
     def carries_topic(self, topic: str) -> bool:
-        """Whether the relay carries a topic."""
         return (
             self.relay_all
             or topic in self.policy().monitored_topics
@@ -34,7 +33,6 @@ class Mediation:
         )
 
     def carries_service(self, service: str) -> bool:
-        """Whether the relay carries a service."""
         return (
             self.relay_all
             or service in self.policy().monitored_services

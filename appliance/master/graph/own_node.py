@@ -27,5 +27,4 @@ PARAMETERS = frozenset(
 
 
 def rosout_may_have(kind: Kind, resource: str) -> bool:
-    """Whether rosout may register a resource of this kind."""
     return resource in _RESOURCES.get(kind, ())

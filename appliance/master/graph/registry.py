@@ -113,7 +113,6 @@ class Incarnation:
 
     @property
     def relay_ports(self) -> tuple[int, ...]:
-        """Return the incarnation's port on each relay process."""
         return (self.relay_port, *self.more_relay_ports)
 
     @property
@@ -207,7 +206,6 @@ class Registry:
     # --- looking ---
 
     def by_key(self, key: str) -> Incarnation | None:
-        """Return the incarnation with this key, live or not."""
         return self._by_key.get(key)
 
     def find(self, name: str, host: Address, api_text: str) -> Incarnation | None:
@@ -229,7 +227,6 @@ class Registry:
         return list(self._live.values())
 
     def all(self) -> list[Incarnation]:
-        """Return all known incarnations."""
         return list(self._by_key.values())
 
     def registered(self, kind: Kind, resource: str) -> Iterable[Incarnation]:

@@ -114,7 +114,6 @@ class Watchlist:
         return list(nodes.values())
 
     def has_missed(self, node: Incarnation) -> bool:
-        """Whether a node missed an update."""
         missed = self._missed.get(node.key)
         return missed is not None and bool(missed.topics or missed.parameters)
 

@@ -87,7 +87,6 @@ class PortRange:
         return cls(port, port)
 
     def overlaps(self, other: "PortRange") -> bool:
-        """Whether the ranges share a port."""
         return self.first <= other.last and other.first <= self.last
 
     def __str__(self) -> str:
@@ -300,7 +299,6 @@ class FirewallSettings:
 
     @property
     def api_ports(self) -> PortRange | None:
-        """Return the REST port as a range, or None."""
         return None if self.api_port is None else PortRange.one(self.api_port)
 
 

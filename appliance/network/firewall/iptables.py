@@ -155,7 +155,6 @@ def _tables_in_use(family: Family) -> list[str]:
 
 
 def render_rule(rule: PacketRule) -> list[RenderedRule]:
-    """Return the rule for each of its families."""
     return [
         RenderedRule(rule.chain.value, family, _header(rule), _matches(rule, family), _target(rule))
         for family in rule.families()

@@ -127,7 +127,6 @@ class RefusedConnection:
         self.close()
 
     def close(self) -> None:
-        """Close the connection now."""
         if self.live:
             self.live = False
             self._timer.cancel()

@@ -28,7 +28,6 @@ class LatchedMessage:
 
     @property
     def size(self) -> int:
-        """Return its bytes."""
         return 0 if self.batch is None else len(self.batch.view)
 
     @property

@@ -66,7 +66,6 @@ class ListeningPorts:
             self._loop.discard(sock)
 
     def close_all(self) -> None:
-        """Stop listening."""
         for key in list(self._listening):
             self.close(key)
 

@@ -44,7 +44,6 @@ class PendingConnections:
         self._with_long_headers: Queue[str, PendingConnection] = Queue(quota_class)
 
     def enter(self, guest: PendingConnection, host: str) -> None:
-        """Add a connection."""
         self._hosts[guest] = host
         self._waiting.put(guest, host, self._clock())
 

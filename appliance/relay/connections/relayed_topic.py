@@ -204,7 +204,6 @@ class RelayedTopic:
             self.upstream.connect()
 
     def untap(self, tap: Callable[[Batch], None]) -> None:
-        """Remove a tap."""
         self._taps = tuple(other for other in self._taps if other != tap)
         self.differs()
         self._spare_unwanted()

@@ -97,7 +97,6 @@ class ServedSubscribers:
         return 0 if self._waits is None else len(self._waits[0].view)
 
     def deliver(self, batch: Batch, member: TopicSubscriber) -> None:
-        """Send one subscriber a batch."""
         self._dropped += member.deliver(batch)
 
     def send(self, batch: Batch, *, divided: bool) -> bool:

@@ -125,7 +125,6 @@ class ServiceClient:
 
     @property
     def grant(self) -> PeerGrant:
-        """Return the grant that it uses."""
         return "service", self.service.key, self.service.service, self.host, self.caller_id
 
     def start(self, rest: bytes) -> None:

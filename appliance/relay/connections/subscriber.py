@@ -64,7 +64,6 @@ class Subscriber:
 
     @property
     def grant(self) -> PeerGrant:
-        """Return the grant that this subscriber uses."""
         return "topic", self.topic.key, self.topic.topic, self.host, self.caller_id
 
     def greet(self, header: Mapping[str, str]) -> bool:
@@ -137,7 +136,6 @@ class Subscriber:
         return -1 if self._writing or self._flow is not None else self._socket.fileno()
 
     def limit(self, flow: RateAllowance | None) -> None:
-        """Set the rate limit of this subscriber."""
         self._flow = flow
         self.topic.differs()
 

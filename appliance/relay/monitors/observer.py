@@ -173,7 +173,6 @@ class Observer:
         time: int,
         observed: ObservedMessage | None = None,
     ) -> None:
-        """Report a line of output."""
         self._observations.note(
             f"{self._prefix}log",
             monitor,

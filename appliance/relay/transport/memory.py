@@ -67,7 +67,6 @@ class MemoryPool(Pool[str]):
     """A pool of bytes, divided among hosts."""
 
     def of(self, host: str) -> HostMemory:
-        """Return the memory of the host with this address."""
         return HostMemory(self, host)
 
 

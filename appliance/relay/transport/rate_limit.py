@@ -150,7 +150,6 @@ class SharedRateLimit:
 
     @property
     def held(self) -> bool:
-        """Whether the limit has a holder."""
         return bool(self._shares)
 
     def paid(self, now: float) -> bool:
