@@ -140,7 +140,7 @@ def load_config(path: Path) -> FleetConfig:
             advice = f"let user {os.geteuid()} read it, for example: chmod 644 {path.name}"
         raise FleetConfigError(f"{path}: {error.strerror}; {advice}") from error
     except (yaml.YAMLError, ValueError) as error:
-        raise FleetConfigError(f"{path}: {error}; see docs/fleet.md") from error
+        raise FleetConfigError(f"{path}: {error}; see docs/reference/fleet.md") from error
     folder = path.absolute().parent
     bundles = found.bundles and BundlesConfig(
         folder=folder / found.bundles.folder, timestamp_key=folder / found.bundles.timestamp_key

@@ -11,7 +11,7 @@ import { createStore } from "./store.js";
 const KEPT = 400;
 const NEAR = "1d";
 
-/** @typedef {Record<string, any>} AuditRecord as docs/audit.md describes it */
+/** @typedef {Record<string, any>} AuditRecord as docs/reference/audit-log.md describes it */
 
 export const notable = createStore({
   denials: /** @type {AuditRecord[] | null} */ (null),

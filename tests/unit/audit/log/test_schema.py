@@ -9,7 +9,7 @@ from appliance.audit.log.schema import json_schema
 from appliance.audit.proof.chain_proofs import ChainProof
 from distribution.audit_record_page import CHAIN, markdown
 
-_PAGE = Path(__file__).parents[4] / "docs" / "audit.md"
+_PAGE = Path(__file__).parents[4] / "docs" / "reference" / "audit-log.md"
 
 
 def test_the_page_matches_the_code() -> None:
