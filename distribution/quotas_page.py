@@ -53,10 +53,7 @@ def _tables() -> Iterator[str]:
         ("resource", "rule"),
         lambda row: (row.counting,) if row.counting else None,
     )
-    yield "Each resource is exhausted by the tests below. Paths begin in `tests/`, or with `rosmop/tests/`.\n"
-    yield _table(
-        "Tests", ("resource", "tests"), lambda row: (" ".join(f"`{test}`" for test in row.shown_by),)
-    )
+    yield "The field `shown_by` of each row in `appliance/quotas/table.py` names the tests that exhaust the resource.\n"
 
 
 def _table(title: str, columns: tuple[str, ...], cells: Callable[[QuotaRow], tuple[str, ...] | None]) -> str:
