@@ -1,0 +1,275 @@
+"""Launch a robot beside plain `rosmaster`: python -m benchmarks.launch [--nodes 40] [--rounds 5] [--rospy] [--busy]
+
+`roslaunch` starts nodes; each reads 20 private parameters, publishes five topics, subscribes to five of the next node,
+and is up when all five bring messages. Both masters are new in each round and take turns: `rosmaster` with `rosout`,
+and the appliance that `rosrv up` has started. Measured are
+
+- the time until the last node is up, and the processor time of the master's processes until then;
+- the delays of a `getParam` and of a `registerPublisher` that another client makes, each over a new connection, every
+  20 ms during the start;
+- the time until a killed node works again, and the time of three tools.
+
+Figures are medians of the rounds; a ratio is the median of the rounds' ratios, above 1 where the appliance is slower.
+With `--busy`, a program for each processor works half of the time.
+"""
+
+import argparse
+import contextlib
+import os
+import shutil
+import signal
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import xmlrpc.client
+import xmlrpc.server
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.control_plane import descendants, processor_seconds
+from tests.support.appliance import Appliance
+from tests.support.nodes import BUILD, ROOT, RosSession
+from tests.support.rosmaster import PlainMaster, free_port
+
+HERE = Path(__file__).parent / "nodes"
+PARAMETERS = 20
+LIMIT = 180.0  # seconds until a start counts as failed
+PAUSE = 0.02  # seconds between two calls of the other client
+BUSY = """import time
+while True:
+    end = time.monotonic() + 0.05
+    while time.monotonic() < end: pass
+    time.sleep(0.05)
+"""
+TOOLS = (("rostopic", "list"), ("rosnode", "info", "/node_0"), ("rosparam", "dump"))
+
+
+@dataclass
+class Start:
+    """The measured figures of one start, in seconds."""
+
+    figures: dict[str, float] = field(default_factory=dict)
+
+
+class Reports:
+    """Receive the nodes' reports that they are up."""
+
+    def __init__(self) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self.port = int(self._socket.getsockname()[1])
+
+    def wait(self, numbers: set[int]) -> float:
+        """Return the time (monotonic) at which the last of these nodes is up. Raises `TimeoutError`."""
+        last, deadline = 0.0, time.monotonic() + LIMIT
+        while numbers:
+            self._socket.settimeout(max(0.001, deadline - time.monotonic()))
+            try:
+                number, at = self._socket.recv(64).split()
+            except TimeoutError:
+                raise TimeoutError(f"not up in {LIMIT:.0f} s: nodes {sorted(numbers)}") from None
+            numbers.discard(int(number))
+            last = max(last, float(at))
+        return last
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+class OtherClient:
+    """Make calls from another node during the start, each over a new connection."""
+
+    def __init__(self, uri: str) -> None:
+        self.delays: dict[str, list[float]] = {"getParam": [], "registerPublisher": []}
+        self._uri = uri
+        self._over = threading.Event()
+        self._node = xmlrpc.server.SimpleXMLRPCServer(("127.0.0.1", 0), logRequests=False, allow_none=True)
+        self._node.register_instance(_Node())
+        self._threads = [
+            threading.Thread(target=self._node.serve_forever),
+            threading.Thread(target=self._call),
+        ]
+
+    def _call(self) -> None:
+        number, own = 0, f"http://127.0.0.1:{self._node.server_address[1]}/"
+        while not self._over.wait(PAUSE):
+            number += 1
+            self._timed("getParam", f"/node_{number % 7}/gain_{number % PARAMETERS}")
+            self._timed("registerPublisher", f"/other/t{number}", "std_msgs/String", own)
+
+    def _timed(self, method: str, *params: str) -> None:
+        began = time.perf_counter()
+        with xmlrpc.client.ServerProxy(self._uri) as master:
+            getattr(master, method)("/other", *params)
+        self.delays[method].append(time.perf_counter() - began)
+
+    def __enter__(self) -> "OtherClient":
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._over.set()
+        self._threads[1].join()
+        self._node.shutdown()
+        self._threads[0].join()
+        self._node.server_close()
+
+
+class _Node:
+    def _dispatch(self, method: str, _params: object) -> list[object]:
+        return [1, "", os.getpid() if method == "getPid" else 0]
+
+
+def package(folder: Path, nodes: int, port: int, *, rospy: bool) -> Path:
+    """Write a ROS package with the node and a launch file; return the launch file."""
+    made = folder / "launched"
+    made.mkdir()
+    (made / "package.xml").write_text(
+        "<package><name>launched</name><version>1.0.0</version><description>launched</description>"
+        "<maintainer email='nobody@example.org'>nobody</maintainer><license>BSD</license></package>"
+    )
+    if rospy:
+        shutil.copy(HERE / "launched_node.py", made / "node")
+    else:
+        BUILD.mkdir(parents=True, exist_ok=True)
+        target = BUILD / "launched_node"
+        subprocess.run([ROOT / "scripts" / "build-roscpp", HERE / "launched_node.cpp", target], check=True)
+        shutil.copy(target, made / "node")
+    (made / "node").chmod(0o755)
+    gains = "".join(f'<param name="gain_{one}" value="{one}.5"/>' for one in range(PARAMETERS))
+    file = folder / "robot.launch"
+    file.write_text(
+        "<launch>"
+        + "".join(
+            f'<node pkg="launched" type="node" name="node_{one}" args="{one} {nodes} {port}">{gains}</node>'
+            for one in range(nodes)
+        )
+        + "</launch>"
+    )
+    return file
+
+
+def start(session: RosSession, master: int, nodes: int, *, rospy: bool) -> Start:
+    """Launch the robot at a master whose processes are `master` and its descendants, and measure."""
+    reports, measured = Reports(), Start()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        file = package(folder, nodes, reports.port, rospy=rospy)
+        path = {"ROS_PACKAGE_PATH": f"{folder}:/usr/share"}
+        used = {pid: processor_seconds([pid]) for pid in descendants(master)}
+        with OtherClient(session.master_uri) as other:
+            began = time.monotonic()
+            launch = session.start(["/usr/bin/roslaunch", "--disable-title", str(file)], **path)
+            last = reports.wait(set(range(nodes)))
+        measured.figures["last node is up"] = last - began
+        now = {pid: processor_seconds([pid]) for pid in descendants(master)}
+        measured.figures["processor time"] = sum(now[pid] - used.get(pid, 0.0) for pid in now)
+        for method, delays in other.delays.items():
+            measured.figures[f"one {method}"] = statistics.median(delays)
+        measured.figures["killed node works again"] = killed(session, folder, reports, nodes, path)
+        for tool in TOOLS:
+            taken = time.monotonic()
+            session.run(*tool)
+            measured.figures[" ".join(tool[:2])] = time.monotonic() - taken
+        launch.stop(with_signal=signal.SIGINT, timeout=60)
+    reports.close()
+    return measured
+
+
+def killed(session: RosSession, folder: Path, reports: Reports, nodes: int, path: dict[str, str]) -> float:
+    """Kill the first node and start it again; return the seconds until it is up."""
+    [found] = [
+        int(entry.name)
+        for entry in Path("/proc").iterdir()
+        if entry.name.isdigit() and _is_first(entry, str(folder))
+    ]
+    os.kill(found, signal.SIGKILL)
+    began = time.monotonic()
+    command = [str(folder / "launched" / "node"), "0", str(nodes), str(reports.port), "__name:=node_0"]
+    node = session.start(command, **path)
+    taken = reports.wait({0}) - began
+    node.stop(with_signal=signal.SIGINT)
+    return taken
+
+
+def _is_first(entry: Path, folder: str) -> bool:
+    with contextlib.suppress(OSError):
+        words = (entry / "cmdline").read_bytes().split(b"\0")
+        return b"__name:=node_0" in words and any(word.startswith(folder.encode()) for word in words)
+    return False
+
+
+@contextlib.contextmanager
+def plain() -> Iterator[tuple[RosSession, int]]:
+    """Run rosmaster with rosout."""
+    with (
+        tempfile.TemporaryDirectory() as home,
+        PlainMaster(Path(home)) as master,
+        RosSession(master.master_uri, Path(home)) as session,
+    ):
+        yield session, master.processes[0].pid
+
+
+@contextlib.contextmanager
+def deployed() -> Iterator[tuple[RosSession, int]]:
+    """Run the appliance as `rosrv up` does."""
+    options = ("--api", "off", "--listen", f"127.0.0.1:{free_port()}")
+    with Appliance(options=options) as appliance, tempfile.TemporaryDirectory() as home:
+        assert appliance.process is not None
+        with RosSession(appliance.master_uri, Path(home)) as session:
+            yield session, appliance.process.pid
+
+
+def main() -> None:
+    """Run both and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--nodes", type=int, default=40)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--rospy", action="store_true")
+    parser.add_argument("--busy", action="store_true")
+    given = parser.parse_args()
+    load = os.getloadavg()[0]
+    programs = [
+        subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(os.cpu_count() or 1) if given.busy
+    ]
+    runs: list[tuple[Start, Start]] = []
+    try:
+        for number in range(given.rounds):
+            found: dict[str, Start] = {}
+            for side in (plain, deployed) if number % 2 else (deployed, plain):
+                with side() as (session, pid):
+                    found[side.__name__] = start(session, pid, given.nodes, rospy=given.rospy)
+            runs.append((found["plain"], found["deployed"]))
+    finally:
+        for program in programs:
+            program.kill()
+            program.wait()
+    title = f"{given.nodes} nodes, {given.rounds} rounds, load average {load:.1f}"
+    table = Table("", "rosmaster", "appliance", "ratio (least to greatest)", title=title)
+    for what in runs[0][0].figures:
+        pairs = [(ours.figures[what], theirs.figures[what]) for theirs, ours in runs]
+        ratios = [ours / theirs for ours, theirs in pairs if theirs]
+        ratio = f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})" if ratios else ""
+        ours, theirs = (statistics.median(side) for side in zip(*pairs, strict=True))
+        table.add_row(what, _seconds(theirs), _seconds(ours), ratio)
+    Console(width=110).print(table)
+
+
+def _seconds(value: float) -> str:
+    return f"{value * 1000:.1f} ms" if value < 1 else f"{value:.2f} s"
+
+
+if __name__ == "__main__":
+    main()
