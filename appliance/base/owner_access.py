@@ -17,10 +17,16 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import ClassVar
 
+from appliance.base.user_errors import UserError
+
 OPENING = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 """The flags with which a named file is opened: a pipe or a device does not block the caller."""
 
 _PASSING = os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC
+
+
+class MissingRightError(UserError, PermissionError):
+    """Root lacks a right that a container can take away, and nothing else can replace it."""
 
 
 class FileLender:
@@ -84,7 +90,7 @@ def acting_as(uid: int) -> Iterator[None]:
     setfsuid(uid)
     try:
         if setfsuid(-1) != uid:  # setfsuid reports no error; -1 only queries
-            raise PermissionError(f"cannot act as user id {uid}: CAP_SETUID is missing")
+            raise MissingRightError(f"cannot act as user id {uid}: CAP_SETUID is missing")
         yield
     finally:
         setfsuid(0)

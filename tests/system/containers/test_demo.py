@@ -102,7 +102,7 @@ def test_the_story_ends_with_the_denials_and_the_console(
     demo.wait_for_log("story", "Explore:", timeout=120)
     said = demo("logs", "--no-color", "story").stdout
     token = demo.exec("appliance", "cat", "/var/lib/rosrv/first-token").stdout.strip()
-    assert f"{TABLET}  " in said
+    assert f"({TABLET})  " in said
     assert "[Commands]" in said
     assert "https://127.0.0.1:8443/console/" in said
     assert f"Token:    {token}" in said
