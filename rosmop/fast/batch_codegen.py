@@ -9,7 +9,8 @@ interpreter.
 - A message is either processed, with all consequences, or left. `TopicCode.undo` lists the data to restore for a
   message that is left. After a trap, that message begins at the address stored at `POSITION`. If the address is 0, no
   message had begun.
-- A dropped message does not change the states of properties that suppress it (`nodes.Advance.suppresses`).
+- A message that is dropped or replaced by the safe one does not change the states of properties that suppress it
+  (`nodes.Advance.suppresses`). Later events process the safe message.
 - The options for all messages are stored at `Cells.source`, in this order: their sender; *told*, the events (bit N for
   the topic's event N) whose drops are left, and with `LOUD` also all changes; *enabled*, bits of the topic's enabled
   specifications; *counted*, the verdicts (bit N for `TopicCode.verdicts[N]`) that are only counted. A message with any
@@ -39,7 +40,7 @@ from rosmop.fast.abi import (
     CompiledModule,
     TopicCode,
 )
-from rosmop.fast.codegen import CHANGED, DROPPED, HAPPENED, RESET, ModuleCodegen, WasmFunction
+from rosmop.fast.codegen import CHANGED, DROPPED, HAPPENED, REPLACED, RESET, ModuleCodegen, WasmFunction
 from rosmop.fast.function_parts import ELSEWHERE
 from rosmop.fast.memory_layout import NotCompiledError, reason_of
 from rosmop.fast.wasm import (
@@ -177,7 +178,9 @@ def written(
     for component, own in zip(components, cells, strict=True):
         for topic, events in component.topics:
             try:
-                walks[topic] = TopicCodegen(writer, own, tables, effects, events, stamped=topic in stamped)
+                walks[topic] = TopicCodegen(
+                    writer, own, tables, effects, events, topic=topic, stamped=topic in stamped
+                )
             except (NotCompiledError, RecursionError) as error:
                 refused[topic] = reason_of(error)
     settled = [writer.settling(own) for own in cells if own.kept]
@@ -287,6 +290,7 @@ class TopicCodegen:
         effects: int,
         events: Sequence[nodes.Event],
         *,
+        topic: str,
         stamped: bool,
     ) -> None:
         if len(events) > MAX_EVENTS:
@@ -295,7 +299,7 @@ class TopicCodegen:
         self._events = events
         self._effects = effects
         self._writer = writer
-        self._written = [writer.event(event.function) for event in events]
+        self._written = [writer.event(event.function, topic) for event in events]
         self._known_tables = tables
         self._handlers: dict[tuple[int | None, int], tuple[int, WasmFunction | None]] = {}
         self.verdicts: list[tuple[int, int, int]] = []
@@ -318,6 +322,9 @@ class TopicCodegen:
             raise NotCompiledError("keeps an array, and changes an element of one")
         addresses = [cells.variables[name][0] for name in assigned]
         self._settles = not set(addresses).isdisjoint(cells.kept)
+        self._replaces = any(written.replaces for written in self._written)
+        if self._replaces and self._settles and any(map(self._reads_in_place, events)):
+            raise NotCompiledError("keeps a string or an array, and sends the safe message")
         self._undo = tuple((address, writer.take(8)) for address in addresses)
         self._log = writer.take(16 * sum(written.writes for written in self._written))
         properties = {
@@ -343,6 +350,11 @@ class TopicCodegen:
         """The local variables of each property with a clock: its start, its time, and its number of steps."""
         self._telling = self._following + 3 + 3 * len(clocked)
         """The first of the local variables of handlers."""
+
+    def _reads_in_place(self, event: nodes.Event) -> bool:
+        """Return whether an event reads strings or arrays where they are in the message."""
+        body = self._writer.functions[event.function].body
+        return any(isinstance(node, nodes.ReadValue) for node in nodes.walk(body))
 
     def feed(self, name: str) -> TopicCode:
         """Return the data about this code."""
@@ -485,10 +497,17 @@ class TopicCodegen:
             loud = local_get(_TOLD) + constant(I64, 0) + I64_LT_S
             changed = self._is(bits, CHANGED) + constant(I32, 0) + I32_NE
             code += changed + loud + I32_AND + left
-            which = changed + I64_EXTEND_I32_U + constant(I64, number) + I64_SHL
+            wrote = (
+                changed
+                if not written.replaces
+                else self._is(bits, CHANGED | REPLACED) + constant(I32, 0) + I32_NE
+            )
+            which = wrote + I64_EXTEND_I32_U + constant(I64, number) + I64_SHL
             code += _set(_WHO, local_get(_WHO) + which + I64_OR)
         if written.drops:
             code += self._drop(number, self._is(bits, DROPPED))
+        if written.replaces:
+            code += self._is(bits, REPLACED) + IF + NOTHING + self._suppressed() + END
         gone = self._telling + 3
         steps = [
             self._advance(advance, table)
@@ -496,7 +515,10 @@ class TopicCodegen:
             if table is not None
         ]
         if steps:
-            code += self._is(bits, HAPPENED) + IF + NOTHING + b"".join(steps) + END
+            happened = self._is(bits, HAPPENED)
+            if written.replaces:
+                happened = self._is(bits, HAPPENED | REPLACED) + constant(I32, HAPPENED) + I32_EQ
+            code += happened + IF + NOTHING + b"".join(steps) + END
         if any(written.drops for advance in event.advances for _, written in self._handled(advance)):
             code = _set(gone, constant(I32, 0)) + code + self._drop(number, local_get(gone))
         return code + END
@@ -623,6 +645,8 @@ class TopicCodegen:
         again = last + last + i64_load(8) + one + I64_ADD + i64_store(8)
         new = self._next_effect() + last + local_get(_WHO) + i64_store(0) + last + one + i64_store(8)
         counted = same + IF + NOTHING + again + ELSE + new + END
+        if self._replaces:  # the message may have been the safe one already
+            counted = load(I32, UNDO) + constant(I32, entry) + I32_NE + IF + NOTHING + counted + END
         return local_get(_WHO) + I64_EQZ + I32_EQZ + IF + NOTHING + unsure + counted + END
 
     def _next_effect(self) -> bytes:
@@ -636,17 +660,20 @@ class TopicCodegen:
         same += last + i32_load(12) + local_get(_AT) + I32_EQ + I32_AND
         new = self._next_effect() + last + constant(I64, -1) + i64_store(0)
         new += last + local_get(_AT) + i32_store(8)
+        code = self._suppressed() + _set(_LAST, load(I32, EFFECT)) + same + I32_EQZ + IF + NOTHING + new + END
+        return code + last + local_get(_NEXT) + i32_store(12)
+
+    def _suppressed(self) -> bytes:
+        """Restore the states of the properties that suppress the message."""
         code = b"".join(
             _set(local, load(I32, self._state(number)))
             for number, local in self._states.items()
             if number in self._suppressing
         )
-        code += b"".join(
+        return code + b"".join(
             _set(local, load(I64, at)) for number, local, at in self._clock_cells()
             if number in self._suppressing and at != self._cells.clocks[number] + 8
         )  # fmt: skip
-        code += _set(_LAST, load(I32, EFFECT)) + same + I32_EQZ + IF + NOTHING + new + END
-        return code + last + local_get(_NEXT) + i32_store(12)
 
     def _done(self) -> bytes:
         """Store the effects of the message."""

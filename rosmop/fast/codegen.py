@@ -7,7 +7,8 @@ call. `batch_codegen.py` writes the loop over the frames that were received toge
 
 - The function of an event or handler takes the address of the message and its size (i32, i32), and returns flags (i32):
   `HAPPENED` (the event happened), `DROPPED` (the message is dropped), `CHANGED` (bytes of the message were changed),
-  `ELSEWHERE` (the interpreter must process the message), `RESET` (the handler restarts the property).
+  `ELSEWHERE` (the interpreter must process the message), `RESET` (the handler restarts the property), `REPLACED` (the
+  safe message has taken the place of the message).
 - `ELSEWHERE` is returned at each fault and at each node that is not compiled. The effects of the message are undone,
   and the interpreter processes the message. Functions that events and handlers call trap instead of returning
   `ELSEWHERE`. An event is not compiled at all if every message would reach such a node; `NotCompiledError` gives the
@@ -101,6 +102,7 @@ from rosmop.fast.wasm import (
     store,
 )
 from rosmop.form import nodes
+from rosmop.runtime import safe_messages
 from rosmop.runtime.values import ValueCodec, struct_code, struct_size
 from rosmop.runtime.wire import FEW
 from rosmop.types import value_types
@@ -111,10 +113,13 @@ _MOVES = {
 }  # fmt: skip
 """Instructions that load and store a number of bytes unchanged."""
 
-HAPPENED, DROPPED, CHANGED, RESET = 1, 2, 4, 16
+HAPPENED, DROPPED, CHANGED, RESET, REPLACED = 1, 2, 4, 16, 32
 
 EARLY = 16
 """The first bytes of a message, in which the fields of a header begin."""
+
+MOST_SAFE = 1024
+"""The maximum number of bytes of a safe message that the module sends."""
 
 
 @dataclass(frozen=True)
@@ -123,8 +128,8 @@ class WasmFunction:
 
     `brief`: it has no loops. `passes`: conditions may end it early for some messages. `says`: it may print lines.
     `early`: it may write to the first bytes of the message, where a header is. `changes_elements`: it may change an
-    element of an array. `references` pairs each reference parameter with the address where the function stores its
-    value before it returns.
+    element of an array. `replaces`: it may replace the message by the safe one. `references` pairs each reference
+    parameter with the address where the function stores its value before it returns.
     """
 
     number: int
@@ -139,6 +144,7 @@ class WasmFunction:
     says: bool
     early: bool
     changes_elements: bool
+    replaces: bool = False
     references: tuple[tuple[str, int], ...] = ()
 
 
@@ -158,10 +164,10 @@ class ModuleCodegen(MemoryLayout):
         """Note a place at which a function leaves the message."""
         self.left.setdefault(function, []).append(error)
 
-    def event(self, name: str) -> WasmFunction:
-        """Return the function of an event, or of a handler. Raises `NotCompiledError`."""
+    def event(self, name: str, channel: str = "") -> WasmFunction:
+        """Return the function of an event on a topic, or of a handler. Raises `NotCompiledError`."""
         function = self.functions[name]
-        return self.function(function, {"at": I32, "size": I32}, I32, function.context)
+        return self.function(function, {"at": I32, "size": I32}, I32, function.context, channel=channel)
 
     def function(
         self,
@@ -169,11 +175,13 @@ class ModuleCodegen(MemoryLayout):
         parameters: Mapping[str, int],
         result: int,
         context: str,
+        *,
+        channel: str = "",
     ) -> WasmFunction:
         """Return a function, which is written on first use. `context` names the budget that pays for it."""
-        key = (function.name, tuple(parameters), result, context)
+        key = (function.name, tuple(parameters), result, context, channel)
         if key not in self._numbers:
-            written = _FunctionCodegen(self, function, parameters, result, context).written()
+            written = _FunctionCodegen(self, function, parameters, result, context, channel=channel).written()
             self._numbers[key] = written
             self.written.append(written)
         return self._numbers[key]
@@ -212,6 +220,8 @@ class _FunctionCodegen(StringCodegen):
         parameters: Mapping[str, int],
         result: int,
         context: str,
+        *,
+        channel: str,
     ) -> None:
         answers = isinstance(function, nodes.Function) and function.parameters == ("m",)
         super().__init__(writer, parameters, context, answers=answers)
@@ -228,10 +238,15 @@ class _FunctionCodegen(StringCodegen):
         self._says = False
         self._early = False
         self._changes_elements = False
+        self._channel = channel
+        self._safe: nodes.SafeMessage | None = None
+        """The safe message that may replace the message."""
         self._bits: tuple[tuple[str, int], ...] = ()
         """The bits of the result besides `HAPPENED`: local variables, and the shift of each."""
         if answers:
             self._bits = (("dropped", 1), ("changed", 2), *([("reset", 4)] if self._is_handler else ()))
+            if any(isinstance(node, nodes.StopMessage) for node in nodes.walk(function.body)):
+                self._bits += (("replaced", 5),)
         for name, _ in self._bits:
             self._local(name, I32)
 
@@ -256,6 +271,7 @@ class _FunctionCodegen(StringCodegen):
             self._says,
             self._early,
             self._changes_elements,
+            self._safe is not None,
             tuple(self._references.items()),
         )
 
@@ -366,6 +382,29 @@ class _FunctionCodegen(StringCodegen):
         self._drops = True
         return constant(I32, 1) + self._set("dropped")
 
+    def _stop(self, node: nodes.StopMessage) -> bytes:
+        """Note that the safe message takes the place of the message. A frame keeps its size."""
+        safe = next((one for one in node.safes if one.topic == self._channel), None)
+        if safe is None:
+            raise NotCompiledError("publishes safe messages")
+        if len(safe.data) > MOST_SAFE:
+            raise NotCompiledError(f"sends a safe message of more than {MOST_SAFE} bytes")
+        self._safe, self._depends = safe, True
+        differs = self._length() + constant(I64, len(safe.data)) + compare(I64, "!=")
+        return self._when(differs, self._elsewhere) + constant(I32, 1) + self._set("replaced")
+
+    def _put_safe(self, safe: nodes.SafeMessage, site: int) -> bytes:
+        """Write the safe message over the message, except for `seq` and `stamp`."""
+        code, offset = b"", safe_messages.HEAD if safe.stamped else 0
+        self._early = self._early or offset < EARLY
+        while offset < len(safe.data):
+            size = next(size for size in _MOVES if offset + size <= len(safe.data))
+            number = int.from_bytes(safe.data[offset : offset + size], "little")
+            self._writes += 1
+            code += self._put_bits(self._get("at"), offset, size, constant(I64 if size == 8 else I32, number))
+            offset += size
+        return code + self._leave(nodes.Leave(site, True))
+
     def _reset(self, _node: nodes.Reset) -> bytes:
         return constant(I32, 1) + self._set("reset")
 
@@ -400,6 +439,8 @@ class _FunctionCodegen(StringCodegen):
 
     def _write_back(self, node: nodes.WriteBack) -> bytes:
         code = self._when(self._get("dropped"), lambda: self._leave(nodes.Leave(node.site, True)))
+        if (safe := self._safe) is not None:
+            code += self._when(self._get("replaced"), lambda: self._put_safe(safe, node.site))
         for write in sorted(node.writes, key=lambda write: write.end is not None):
             self._early = self._early or (write.at.base is None and write.at.offset < EARLY)
             self._changes_elements = self._changes_elements or any(
@@ -827,7 +868,7 @@ STATEMENTS: Mapping[type[nodes.FormNode], Callable[[_FunctionCodegen, Any], byte
             nodes.LimitDepth: nodes.Left("calls a recursive function"),
             nodes.Drop: _FunctionCodegen._drop,
             nodes.Reset: _FunctionCodegen._reset,
-            nodes.StopMessage: nodes.Left("sends the safe message"),
+            nodes.StopMessage: _FunctionCodegen._stop,
             nodes.Publish: nodes.Left("publishes a message"),
             nodes.AfterText: _FunctionCodegen._after_text,
             nodes.Count: _FunctionCodegen._count,

@@ -5,7 +5,7 @@ every state. They are equal if the function leaves the message to Python, which 
 all of these hold:
 
 - the form does not fault,
-- both agree on whether the event happened, dropped the message, and changed it,
+- both agree on whether the event happened, dropped or replaced the message, and changed it,
 - the bytes of the message, the variables and the rest of the budget are the same,
 - the lines of output are the same, in order.
 
@@ -57,7 +57,7 @@ PATIENCE = 5.0
 """The default time limit for each event, in seconds."""
 
 _NOW, _REST = 16, 32  # addresses of the time and of the number of bytes that are not shown
-_HAPPENED, _DROPPED, _CHANGED, _ELSEWHERE = 1, 2, 4, 8
+_HAPPENED, _DROPPED, _CHANGED, _ELSEWHERE, _REPLACED = 1, 2, 4, 8, 32
 _LATEST = 1 << 62
 
 
@@ -137,7 +137,7 @@ class Validation:
     def _compared(self, name: str, number: int, topic: str) -> str:
         begin, cells, known = self._beginning()
         module = self._module
-        meant = FormTerms(self._forms, self._values, begin, name, module.lines).result()
+        meant = FormTerms(self._forms, self._values, begin, name, topic=topic, lines=module.lines).result()
         done = ModuleExecution(self.codes, number, begin.message, begin.size, cells, self._strings).done()
         self._check_undone(done, topic)
         left = either(done.trapped, done.bits == _ELSEWHERE)
@@ -149,9 +149,10 @@ class Validation:
         others = {
             "whether it happened": _bit(done.bits, _HAPPENED) != meant.happened,
             "whether the message is dropped": _bit(done.bits, _DROPPED) != meant.dropped,
+            "whether the safe message takes its place": _bit(done.bits, _REPLACED) != meant.replaced,
             "whether the message is changed": _bit(done.bits, _CHANGED) != meant.changed,
             "the message": done.message != meant.message,
-            "no other bits": z3.UGT(done.bits, _HAPPENED | _DROPPED | _CHANGED),
+            "no other bits": done.bits & ~(_HAPPENED | _DROPPED | _CHANGED | _REPLACED) != 0,
             **{
                 f"the variable at {place}": opposite(_same(done.cells[place], value))
                 for place, value in self._ends(meant)
@@ -177,9 +178,12 @@ class Validation:
         """Return why the two are not known to be equal; None if they are equal. Raises `DiffersError`."""
         begun = self._clock()
         undecided = False
-        for text, condition in wrong.items():
-            if z3.is_false(z3.simplify(condition)):
-                continue
+        possible = {
+            text: simple for text, one in wrong.items() if not z3.is_false(simple := z3.simplify(one))
+        }
+        if self._asked(abstracted([*known, either(*possible.values())]), begun)[0] == z3.unsat:
+            return None
+        for text, condition in possible.items():
             question = [*known, condition]
             answer, guess = self._asked(abstracted(question), begun)
             if answer != z3.unsat:

@@ -45,12 +45,15 @@ from rosmop.prove.terms import (
 )
 from rosmop.runtime import times
 from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION, UNMEASURED
+from rosmop.runtime.safe_messages import HEAD as SAFE_HEAD
 from rosmop.runtime.values import ValueCodec, struct_code, struct_size
 from rosmop.runtime.wire import MAX_EMPTY
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
-_MESSAGE, _DROPPED, _CHANGED, _BUDGET, _SAID = "message", "dropped", "changed", "budget", "said"
+_MESSAGE, _DROPPED, _REPLACED, _CHANGED, _BUDGET, _SAID = (
+    "message", "dropped", "replaced", "changed", "budget", "said",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,7 @@ def _word(value: Term, kind: Type) -> Term:
 
 
 class FormTerms:
-    """Translates one event.
+    """Translates one event on a topic.
 
     `functions` are the functions of its set, `values` the types of its messages. `lines` has the module's lines of
     output, by number.
@@ -109,6 +112,8 @@ class FormTerms:
         values: ValueCodec,
         beginning: StartTerms,
         name: str,
+        *,
+        topic: str,
         lines: Sequence[OutputLine] = (),
     ) -> None:
         self._lines = lines
@@ -117,6 +122,8 @@ class FormTerms:
         self._functions = functions
         self._values = values
         self._beginning = beginning
+        self._topic = topic
+        self._safe: nodes.SafeMessage | None = None
         self._function = functions[name]
         self._left: list[Term] = []
         self._unknown: dict[str, list[Term]] = {}
@@ -130,8 +137,8 @@ class FormTerms:
         """Return the result. Raises `NotProvedError` for a loop."""
         begin, no = self._beginning, z3.BoolVal(False)
         budget = begin.budgets[self._function.context]
-        slots: dict[Any, Any] = {_MESSAGE: begin.message, _DROPPED: no, _CHANGED: no, _BUDGET: budget}
-        slots[_SAID] = integer(0, 32)
+        slots: dict[Any, Any] = {_MESSAGE: begin.message, _DROPPED: no, _REPLACED: no, _CHANGED: no}
+        slots |= {_BUDGET: budget, _SAID: integer(0, 32)}
         slots |= {("shared", name): value for name, value in begin.variables.items()}
         state = State(z3.BoolVal(True), slots)
         self._block(self._function.body, state)
@@ -143,8 +150,8 @@ class FormTerms:
         unknown = {name: either(*conditions) for name, conditions in self._unknown.items()}
         variables = {name: end["shared", name] for name in begin.variables}
         return FormResult(
-            either(*self._left), unknown, happened, end[_DROPPED], end[_CHANGED], end[_MESSAGE], variables,
-            {**begin.budgets, self._function.context: end[_BUDGET]}, end[_SAID], self._noted,
+            either(*self._left), unknown, happened, end[_DROPPED], end[_REPLACED], end[_CHANGED], end[_MESSAGE],
+            variables, {**begin.budgets, self._function.context: end[_BUDGET]}, end[_SAID], self._noted,
         )  # fmt: skip
 
     # Ends
@@ -229,6 +236,31 @@ class FormTerms:
 
     def _drop(self, _node: nodes.Drop, state: State) -> None:
         state.slots[_DROPPED] = z3.BoolVal(True)
+
+    def _stop(self, node: nodes.StopMessage, state: State) -> None:
+        safe = next((one for one in node.safes if one.topic == self._topic), None)
+        if safe is None:
+            raise UnknownError("a safe message that is published")
+        other = self._beginning.size != len(safe.data)
+        self._ignore(state.where(other), "a safe message of another size than the message")
+        state.require(opposite(other))
+        self._safe = safe
+        state.slots[_REPLACED] = z3.BoolVal(True)
+
+    def _put_safe(self, safe: nodes.SafeMessage, state: State) -> None:
+        """Replace the message, except for `seq` and `stamp` of its header."""
+        message, changed = state.slots[_MESSAGE], state.slots[_CHANGED]
+        place = SAFE_HEAD if safe.stamped else 0
+        while place < len(
+            safe.data
+        ):  # the largest numbers that fit, as in the module, so that terms are alike
+            size = next(size for size in (8, 4, 2, 1) if place + size <= len(safe.data))
+            new = integer(int.from_bytes(safe.data[place : place + size], "little"), 8 * size)
+            differs = opposite(number_at(message, integer(place, 32), size) == new)
+            message = choice(differs, with_number(message, integer(place, 32), new), message)
+            changed = either(changed, differs)
+            place += size
+        state.slots |= {_MESSAGE: message, _CHANGED: changed}
 
     def _log(self, node: nodes.Log, state: State) -> None:
         """Charge the highest possible cost of a line."""
@@ -367,6 +399,12 @@ class FormTerms:
         dropped = state.slots[_DROPPED]
         self._exit(state.where(dropped), True)
         state.require(opposite(dropped))
+        if self._safe is not None:
+            replaced = state.slots[_REPLACED]
+            stopped = state.where(replaced)
+            self._put_safe(self._safe, stopped)
+            self._exit(stopped, True)
+            state.require(opposite(replaced))
         puts = []
         for write in node.writes:
             flag = state.slots[self._frame, write.flag]
@@ -816,7 +854,7 @@ STATEMENTS: Mapping[type[nodes.FormNode], Callable[[FormTerms, Any, State], None
             nodes.LimitDepth: nodes.Left("recursion"),
             nodes.Drop: FormTerms._drop,
             nodes.Reset: nodes.Left("a reset"),
-            nodes.StopMessage: nodes.Left("the safe message"),
+            nodes.StopMessage: FormTerms._stop,
             nodes.Publish: nodes.Left("a message to publish"),
             nodes.AfterText: FormTerms._after_text,
             nodes.Count: FormTerms._count,

@@ -181,6 +181,7 @@ class FormResult:
     unknown: Mapping[str, Term]
     happened: Term
     dropped: Term
+    replaced: Term
     changed: Term
     message: Term
     variables: Mapping[str, Any]

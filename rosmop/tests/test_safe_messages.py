@@ -243,13 +243,56 @@ def test_a_stopped_message_has_not_happened_for_formulas(formula: str) -> None:
         assert passed(load(stopping(formula)), trace) == projected(property_, trace), trace
 
 
-def test_the_module_and_the_interpreter_stop_the_same_messages() -> None:
-    """Random batches, with stops in actions and in handlers, and messages of another size than the safe one."""
-    text = """s() { int n; safe own/Plain {count:5} on /plain every 1s;
-        event e(int c) /plain own/Plain '{count:c}' { n += c; if (c > 6) { STOP; n++; } c = c + 1; }
-        ere: (e e e)*
-        @fail { STOP; __RESET; } @match { if (n % 3 == 0) { STOP; } } }"""
-    both, random = BothWays(text, text.replace("s()", "t()")), seeded(32)
-    for _ in range(40):
-        both.check([plain(random.randint(0, 9), rest=bytes(random.randint(0, 3))) for _ in range(8)])
+ON_PLAIN = "safe own/Plain {count:5} on /plain every 1s;"
+STOPPING = [
+    f"""s() {{ int n; {ON_PLAIN}
+        event e(int c) /plain own/Plain '{{count:c}}' {{
+            n += c; if (c > 6) {{ STOP; n++; c = 9; if (n % 7 == 0) {{ return; }} }} else {{ c = c + n % 2; }} }}
+        event f(int c) /plain own/Plain '{{count:c}}' when (c == 5) {{ n += 100; if (n % 3 == 0) {{ STOP; }} }}
+        pattern: globally: e forbids f @violation {{ n++; }} ltl: [](e => o f) @violation {{ n += 3; }} }}""",
+    f"""s() {{ int n; std::string last; {ON_PLAIN}
+        event e(int c) /plain own/Plain '{{count:c}}' {{
+            n += c; last = "a"; if (c > 6) {{ STOP; last = "b"; }} c = 5; }}
+        tfsm: a [ e -> b ] b [ e -> a, timeout 2ms -> a ] @timeout {{ n += 1000; }}
+        fsm: a [ e -> b ] b [ e -> a ] @b {{ n++; }} }}""",
+    f"""s() {{ int n; {ON_PLAIN} event e(int c) /plain own/Plain '{{count:c}}' {{ n += c; if (c > 6) {{ STOP; }} }}
+        ere: (e e e)* @fail {{ STOP; __RESET; }} @match {{ if (n % 3 == 0) {{ STOP; }} }} }}""",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", STOPPING)
+def test_the_module_and_the_interpreter_stop_the_same_messages(text: str) -> None:
+    """Random batches for three monitors in a row, and messages of another size than the safe one."""
+    others = [
+        text.replace("s()", f"{name}()").replace("> 6", limit) for name, limit in (("t", "> 4"), ("u", "< 2"))
+    ]
+    both = BothWays(text, *others)
+    random, time = seeded(32), 1
+    for _ in range(examples(60)):
+        time += random.choice((0, 1, 10**6, 10**9))
+        sizes = [random.choice((0, 0, 0, 3)) for _ in range(8)]
+        both.check([plain(random.randint(0, 9), rest=bytes(size)) for size in sizes], time=time)
     assert both.came["together"] and both.came["changed"]
+
+
+STAMPED = f"""s() {{ int n; {SAFE} event e(double v) /cmd_vel {TWIST} '{{twist.linear.x:v}}' {{
+    if (v > 6) {{ STOP; }} v = n++ % 3; }} }}"""
+
+
+def test_the_module_sends_the_safe_message() -> None:
+    """Only messages of another size go to the engine; `seq` and `stamp` stay."""
+    both, random = BothWays(STAMPED), seeded(33)
+    alike = [command(float(random.randint(0, 9)), "bose", random.choice((0.5, 1.0))) for _ in range(100)]
+    both.check(alike, "/cmd_vel")
+    assert both.came["together"] == 1
+    both.check([*alike, command(9, "joystick")], "/cmd_vel")
+    assert both.came["together"] == 2
+
+
+def test_a_string_of_the_message_is_kept_before_it_is_replaced() -> None:
+    """The engine processes topics whose events keep a part of the message that the safe one would overwrite."""
+    both = BothWays(f"""s() {{ std::vector<uint8_t> kept; {ON_PLAIN}
+        event e(int c, std::vector<uint8_t> r) /plain own/Plain '{{count:c, rest:r}}' {{
+            kept = r; if (c > 6) {{ STOP; }} }} }}""")  # fmt: skip
+    both.check([plain(number, rest=b"abc") for number in range(10)])
+    assert not both.came["together"]

@@ -78,6 +78,11 @@ PROVED = {
     ),
     "a string": """s() { int n = 0;
         event e(std::string f) /stamped own/Stamped '{frame:f}' when (f == "base_link") { n += f.size(); } }""",
+    "a stop": """s() { int n = 0; safe own/Plain { count: 5, x: 0.5 } on /plain every 100ms;
+        event e(double y) /plain own/Plain '{x:y}' { if (!(y <= 3)) { STOP; n++; if (n == 7) { return; } }
+        y = -y; } }""",
+    "a stop that keeps the stamp": """s() { safe std_msgs/Header { frame_id: "base" } on /h every 100ms;
+        event e(int n) /h std_msgs/Header '{seq:n}' { if (n % 3 == 0) { STOP; } } }""",
     "functions of the library, and the age of an event": event(
         "if (age(e) < 1 || !seen(e)) { y = clamp(hypot(sin(y), cos(n)), -n, n); }", "double y", "x:y", "double n = 0;"
     ),
