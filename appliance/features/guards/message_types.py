@@ -22,6 +22,8 @@ class TypeRow:
     """Whether a message can stop the robot. If not, a command is dropped and all goals of its action are cancelled."""
     parameters: str = ""
     local: str = ""
+    element: str = ""
+    """The type of the elements of `values`, in variables that keep them; empty: as in the text."""
 
 
 def _twist(before: str = "") -> TypeRow:
@@ -34,7 +36,8 @@ def _listed(*paths: str) -> TypeRow:
     return TypeRow(
         dict(zip(names, paths, strict=True)),
         parameters=", ".join(f"double {name}" for name in names),
-        local=f"double values[] = {{{', '.join(names)}}};",
+        local=f"std::vector<double> values = {{{', '.join(names)}}};",
+        element="double",
     )
 
 
@@ -92,7 +95,7 @@ SENSORS = {
         *(f"pose.pose.position.{axis}" for axis in "xyz"),
         *(f"pose.pose.orientation.{axis}" for axis in "xyzw"),
     ),
-    "sensor_msgs/JointState": TypeRow({"values": "position"}, parameters="double[] values"),
+    "sensor_msgs/JointState": TypeRow({"values": "position"}, parameters="double[] values", element="double"),
 }
 _SCAN = {
     "start": "angle_min", "step": "angle_increment", "low": "range_min", "high": "range_max", "ranges": "ranges",
@@ -106,6 +109,7 @@ _EVENT = re.compile(
 _SAFE = re.compile(r"safe (?P<type>\w+/\w+) \{ \} on command every 100ms;")
 _COMMAND = re.compile(r"topic command = ([^;]+);")
 _STOP = re.compile(r"\bSTOP;")
+_KEPT = re.compile(r"std::vector<float> ")
 _WIDTH = 110
 
 
@@ -119,6 +123,8 @@ def text_for(text: str, topic: str, kind: str, row: TypeRow) -> str:
             if topic == "command" and not row.stops:
                 body = _STOP.sub("DROP;", body)
             text = text[: found.start()] + header + body + text[end:]
+    if row.element:
+        text = _KEPT.sub(f"std::vector<{row.element}> ", text)
     if topic != "command" or not _SAFE.search(text):
         return text
     return _SAFE.sub(f"safe {kind} {{ }} on command every 100ms;", text) if row.stops else _cancelling(text)

@@ -45,8 +45,11 @@ def test_a_preset_is_valid_as_it_is_and_for_each_of_its_types(preset: Preset) ->
             continue
         made = compiled(text_of(Guard("mine", preset, {"command": "/base/goal"}, types)))
         assert made.specifications[0].name == "mine"
-        lane = MonitorSet.of(made, fast=fast_path_of(made)).lane("/base/goal")
-        assert (lane is None) == (preset.name in INTERPRETED)
+        running = MonitorSet.of(made, fast=fast_path_of(made))
+        assert (running.lane("/base/goal") is None) == (preset.name in INTERPRETED)
+        assert (
+            types.get("by") != "sensor_msgs/LaserScan" or running.lane(preset.given_topics["by"]) is not None
+        )
 
 
 def test_a_guard_is_an_ordinary_text_with_its_topics_types_and_values() -> None:
