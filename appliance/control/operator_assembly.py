@@ -14,7 +14,7 @@ from appliance.control.operators.alarm_orders import AlarmOrders, HandledAlarms
 from appliance.control.operators.block_orders import BlockOrders
 from appliance.control.operators.clock_check import ClockCheck
 from appliance.control.operators.limit_use import LimitQueries
-from appliance.control.operators.overview import hosts_connected
+from appliance.control.operators.overview import graph_of, hosts_connected
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.switched_off import SwitchedOffWatch
@@ -119,6 +119,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         hosts=hosts,
         processes=lambda: base.lifeline.surroundings.processes,
         received=base.receipts.received,
+        graph=partial(graph_of, parts),
     )
     handled = HandledAlarms(base.store)
     looks = Queries(

@@ -20,6 +20,7 @@ from appliance.supervisor.role import Role, SharedMemory
 if TYPE_CHECKING:
     from appliance.audit.log.log import AuditLog
     from appliance.channel.admin import AdminRequest
+    from appliance.channel.answers.graph_answers import Graph
     from appliance.channel.answers.limit_answers import LimitUse
     from appliance.channel.answers.standby_answers import StandbyState
     from appliance.channel.answers.status import BundlesState, ForwardingState, ProcessInfo, RecorderState
@@ -65,7 +66,8 @@ class OperatorContext:
     """Hold the objects of control that exist later, and that parts of features use for operators' work.
 
     `appliance` is the name of one of two appliances, empty on a single one. `processes` returns the processes of the
-    appliance. `received` notes that another machine has all records up to a sequence.
+    appliance. `received` notes that another machine has all records up to a sequence. `graph` returns the present
+    graph.
     """
 
     core: FeatureContext
@@ -76,6 +78,7 @@ class OperatorContext:
     hosts: HostDeclarations
     processes: "Callable[[], Sequence[ProcessInfo]]"
     received: Callable[[int], None]
+    graph: "Callable[[], Graph]"
 
 
 @dataclass(frozen=True)

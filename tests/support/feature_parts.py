@@ -1,6 +1,7 @@
 """Make the parts of features for tests that do not call them."""
 
 from appliance.audit.log.log import AuditLog
+from appliance.channel.answers.graph_answers import Graph
 from appliance.configuration.sections import DEFAULTS
 from appliance.control.assembly.policies import Policies
 from appliance.features.feature import FeatureContext
@@ -22,6 +23,6 @@ def idle_parts() -> FeatureParts:
     parts = FeatureParts(early)
     parts.operate(
         appliance="", store=store, policies=idle(Policies), monitors=monitors, hosts=hosts, processes=tuple,
-        received=lambda _sequence: None,
+        received=lambda _sequence: None, graph=lambda: Graph([], [], []),
     )  # fmt: skip
     return parts

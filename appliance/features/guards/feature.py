@@ -1,12 +1,33 @@
 """The feature guards: `rosrv guard` makes specifications from presets, and changes them."""
 
+from typing import TYPE_CHECKING, Any
+
 from appliance.cli.verb_table import Group, Verb
-from appliance.features.feature import Feature
+from appliance.features.feature import Feature, FeaturePart, OperatorContext
+
+if TYPE_CHECKING:
+    from appliance.channel.admin import AdminRequest
 
 _VERBS = "appliance.features.guards.verbs"
 
+
+def _operations() -> "tuple[type[AdminRequest[Any]], ...]":
+    from appliance.features.guards.guard_requests import REQUESTS  # noqa: PLC0415  few processes need it
+
+    return REQUESTS
+
+
+def _operate(context: OperatorContext) -> FeaturePart:
+    from appliance.features.guards.guard_orders import GuardOrders  # noqa: PLC0415  only control needs it
+
+    orders = GuardOrders(context.monitors, context.graph)
+    return FeaturePart(methods=orders.methods(), work={"the guards": orders.watch})
+
+
 GUARDS = Feature(
     "guards",
+    operations=_operations,
+    operate=_operate,
     verbs={
         "guard": Group(
             "Stop a robot that runs away: monitors from presets, without editing a file.",

@@ -32,6 +32,7 @@ _WHOLE = re.compile(r"[-+]?\d+")
 _DECIMAL = re.compile(_NUMBER)
 _CORNERS = re.compile(rf"\s*{_NUMBER}\s*,\s*{_NUMBER}(?:\s+{_NUMBER}\s*,\s*{_NUMBER}){{2,99}}\s*")
 _JOINTS = re.compile(rf"\s*[\w/]+:{_NUMBER}\.\.{_NUMBER}(?:\s+[\w/]+:{_NUMBER}\.\.{_NUMBER})*\s*")
+_TIMEOUT = re.compile(r"(timeout )(\d+(?:\.\d+)?m?s)")
 _SPAN = re.compile(r"(\d+(?:\.\d+)?)(ms|s)")
 
 
@@ -212,6 +213,38 @@ def preset_of(text: str) -> Preset | None:
     return PRESETS.get(found["preset"]) if found else None
 
 
+def described(text: str) -> str:
+    """Return the first line of a guard, which names its preset and its topics."""
+    return text.split("\n", 1)[0].removeprefix("// ")
+
+
+def types_in(text: str) -> dict[str, str]:
+    """Return the message types that a guard was made for, by the names of its topics."""
+    topics = described(text).partition(": ")[2].split(", ")
+    return {one.split("=", 1)[0]: one.rsplit(" ", 1)[1] for one in topics if " " in one}
+
+
+def loaded_values(text: str) -> dict[str, str]:
+    """Return the values of a guard that are in its text, not given: a polygon, limits of joints, a deadline."""
+    preset = preset_of(text)
+    return {one.name: _in_text(text, one) for one in (preset.parameters if preset else ()) if one.loads}
+
+
+def _in_text(text: str, parameter: Parameter) -> str:
+    tables = {found[2]: found[0].partition("{")[2].split(", ") for found in _TABLE.finditer(text)}
+    match parameter.kind:
+        case "corners":
+            cells = tables["POLYGON"]
+            return " ".join(f"{x},{y}" for x, y in zip(cells[::2], cells[1::2], strict=True))
+        case "joints":
+            rows = zip(tables["NAMES"], tables["LOW"], tables["HIGH"], strict=True)
+            return " ".join(
+                f"{joint.strip(chr(34))}:{low}..{high}" for joint, low, high in rows if joint != '""'
+            )
+    found = _TIMEOUT.search(text)
+    return found[2] if found else parameter.default
+
+
 def with_values(text: str, values: Mapping[str, str]) -> str:
     """Return the text of a guard with other values. Raises `GuardError`."""
     preset = preset_of(text)
@@ -247,7 +280,7 @@ def _with_value(text: str, parameter: Parameter, value: str) -> str:
         case "corners":
             return _with_table(text, "POLYGON", re.split("[ ,]+", value))
         case "time":
-            return re.sub(r"(timeout )\d+(?:\.\d+)?m?s", rf"\g<1>{value}", text)
+            return _TIMEOUT.sub(rf"\g<1>{value}", text)
         case "joints":
             rows = [re.split(r":|\.\.", row) for row in value.split()]
             for table, place in (("NAMES", 0), ("LOW", 1), ("HIGH", 2)):

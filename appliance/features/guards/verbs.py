@@ -1,15 +1,13 @@
 """`rosrv guard list|suggest|new|set|enforce|remove`: guards from presets, without editing a file."""
 
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from appliance.base.atomic_files import write_where_told
 from appliance.channel import admin
-from appliance.channel.answers.graph_answers import Graph
 from appliance.channel.answers.monitor_answers import Monitors, MonitorState, Replacement
 from appliance.channel.messages import GivenValue
 from appliance.cli import completion
@@ -17,18 +15,20 @@ from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor.in_force import say_replaced
 from appliance.cli.output import say_json
+from appliance.features.guards.guard_facts import facts_of, preset_row
 from appliance.features.guards.plans import planned
 from appliance.features.guards.presets import (
     PRESETS,
     GuardError,
     Preset,
+    described,
     file_of,
     preset_named,
     preset_of,
     text_of,
     with_values,
 )
-from appliance.features.guards.suggestions import TopicFacts, proposals
+from appliance.features.guards.suggestions import proposals
 from rosmop.tool.tables import say_table, table_of
 from rosmop.tool.terminal import say
 
@@ -50,7 +50,7 @@ def list_guards(appliance: Appliance) -> None:
     """
     for preset in PRESETS.values():
         if appliance.as_json:
-            say_json(_as_json(preset))
+            say_json(preset_row(preset))
         else:
             _say_preset(preset)
     if not appliance.said and not _runs(appliance):
@@ -73,7 +73,7 @@ def suggest(appliance: Appliance) -> None:
 
     Example: rosrv guard suggest
     """
-    found = proposals(_facts(appliance.ask_or_exit(admin.GraphWanted())))
+    found = proposals(facts_of(appliance.ask_or_exit(admin.GraphWanted())))
     for one in found:
         if appliance.as_json:
             say_json({"preset": one.preset, "name": one.name, "topics": dict(one.topics),
@@ -132,7 +132,7 @@ def new(
     """
     chosen = preset_named(preset)
     topics = {"command": topic, **({} if by is None else {"by": by}), **_pairs(further, "--topic NAME=TOPIC")}
-    graph = _facts(appliance.ask_or_exit(admin.GraphWanted()))
+    graph = facts_of(appliance.ask_or_exit(admin.GraphWanted()))
     guard = planned(chosen, name or preset, topics, graph, _pairs(values, "PARAMETER=VALUE"),
                     _pairs(kinds, "--type NAME=TYPE"))  # fmt: skip
     text = text_of(guard)
@@ -223,16 +223,6 @@ def _runs(appliance: Appliance) -> bool:
         return False
 
 
-def _facts(graph: Graph) -> list[TopicFacts]:
-    return [
-        TopicFacts(
-            one.name, one.type, tuple(each.node for each in one.publishers), tuple(one.subscribers),
-            sum(each.messages_per_second for each in one.publishers),
-        )
-        for one in graph.topics
-    ]  # fmt: skip
-
-
 def _pairs(texts: list[str] | None, form: str) -> dict[str, str]:
     found = {}
     for text in texts or []:
@@ -268,7 +258,7 @@ def _load(
     appliance: Appliance, file: str, text: str, *, shadow: bool, hold: bool, confirm_within: str | None = None
 ) -> Replacement:
     within = seconds_within(confirm_within, "guard")
-    note = text.split("\n", 1)[0].removeprefix("// ")
+    note = described(text)
     order = admin.MonitorLoad({file: text}, note=note, confirm_within=within, shadow=shadow, hold=hold)
     return appliance.answer_or_exit(order)
 
@@ -309,15 +299,6 @@ def _say_preset(preset: Preset) -> None:
             span = f"{one.least}..{one.most}" if one.least else ""
             table.add_row(f"    {one.name}", f"{one.default} {one.unit}".strip(), span, one.what)
         say_table(table)
-
-
-def _as_json(preset: Preset) -> Mapping[str, Any]:
-    return {
-        "preset": preset.name, "version": preset.version, "what": preset.what, "topics": preset.given_topics,
-        "types": {given: list(rows) for given, rows in preset.topics.items()},
-        "parameters": [{"name": one.name, "kind": one.kind, "default": one.default, "unit": one.unit,
-                        "least": one.least, "most": one.most, "what": one.what} for one in preset.parameters],
-    }  # fmt: skip
 
 
 def _state(row: MonitorState) -> str:

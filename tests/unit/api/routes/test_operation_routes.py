@@ -69,6 +69,10 @@ REQUESTS: list[tuple[str, str, Any]] = [
     ("PATCH", "/v1/monitors", {"names": ["a", "b"], "enabled": True}),
     ("PATCH", "/v1/monitors", {"names": ["a"], "held": False}),
     ("PATCH", "/v1/monitors/a/given", {"values": {"vMax": 0.3}}),
+    ("POST", "/v1/guards", {"preset": "speed", "topics": {"command": "/cmd_vel"}}),
+    ("POST", "/v1/guards?confirm_within=9&hold=1", {"preset": "fence", "topics": {"command": "/a", "by": "/odom"},
+                                                    "values": {"margin": "1"}, "name": "yard", "shadow": True}),
+    ("PATCH", "/v1/guards/fence?hold=1", {"values": {"margin": "0.5"}}),
     ("POST", "/v1/recordings", {}),
     ("POST", "/v1/recordings", {"before": 30, "after": 2.5, "note": "n"}),
     ("POST", "/v1/recordings/memory", {}),
@@ -109,7 +113,7 @@ LEAST = {
             "status", "alarms", "inventory", "limits",
             "policy_revisions", "policy_revision", "graph", "monitors", "monitor_revisions",
             "monitor_revision",
-            "recordings", "recording", "hosts", "host_blocks", "challenge", "standby",
+            "recordings", "recording", "guards", "guard_suggestions", "hosts", "host_blocks", "challenge", "standby",
         ),
         "viewer",
     ),
@@ -126,7 +130,7 @@ LEAST = {
         (
             "load_policy", "load_monitors", "replace_monitor", "remove_monitors", "remove_monitor",
             "roll_back_monitors", "remove_recording", "tokens", "revoke_token", "enrol_host", "host_token",
-            "new_host_kit", "revoke_host", "promote_standby",
+            "new_host_kit", "revoke_host", "promote_standby", "new_guard", "set_guard",
         ),
         "admin",
     ),
@@ -268,7 +272,7 @@ def test_a_rejection_by_control_is_a_problem(
     error: Exception, status: int, kind: str, request_: tuple[str, str, Any]
 ) -> None:
     method, target, body = request_
-    if kind == "refused" and target.startswith("/v1/monitors"):
+    if kind == "refused" and target.startswith(("/v1/monitors", "/v1/guards")):
         kind = "specifications-refused"
     world().carried.error = error
     try:

@@ -1,0 +1,30 @@
+"""Convert between the graph, presets and the rows of answers, for control and for `rosrv guard`."""
+
+from appliance.channel.answers.graph_answers import Graph
+from appliance.features.guards.guard_answers import PresetParameter, PresetRow
+from appliance.features.guards.presets import Preset
+from appliance.features.guards.suggestions import TopicFacts
+
+
+def facts_of(graph: Graph) -> list[TopicFacts]:
+    """Return the topics of a graph as presets need them."""
+    return [
+        TopicFacts(
+            one.name, one.type, tuple(each.node for each in one.publishers), tuple(one.subscribers),
+            sum(each.messages_per_second for each in one.publishers),
+        )
+        for one in graph.topics
+    ]  # fmt: skip
+
+
+def preset_row(preset: Preset) -> PresetRow:
+    """Describe a preset."""
+    return PresetRow(
+        preset.name,
+        preset.version,
+        preset.what,
+        preset.given_topics,
+        {given: list(rows) for given, rows in preset.topics.items()},
+        [PresetParameter(one.name, one.kind, one.default, one.unit, one.least, one.most, one.what, one.loads)
+         for one in preset.parameters],
+    )  # fmt: skip

@@ -1,0 +1,188 @@
+"""Answer the requests about guards in control: their states, proposals, new guards and new values.
+
+A guard is an ordinary monitor, so a request becomes the requests of monitors that `rosrv guard` sends.
+"""
+
+import asyncio
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from appliance.base import clock
+from appliance.channel import admin
+from appliance.channel.answers.graph_answers import Graph
+from appliance.channel.answers.monitor_answers import Replacement
+from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.control.operators.request_method import RequestMethod
+from appliance.features.guards import guard_requests
+from appliance.features.guards.guard_answers import (
+    GuardRow,
+    Guards,
+    Suggestion,
+    Suggestions,
+)
+from appliance.features.guards.guard_facts import facts_of, preset_row
+from appliance.features.guards.plans import planned
+from appliance.features.guards.presets import (
+    PRESETS,
+    GuardError,
+    Preset,
+    described,
+    loaded_values,
+    preset_named,
+    preset_of,
+    text_of,
+    types_in,
+    with_values,
+)
+from appliance.features.guards.suggestions import proposals
+from appliance.specifications.specification_manager import SpecificationManager
+
+STOPPING_SECONDS = 2.0
+"""A guard is stopping if it acted in these last seconds; relays report once a second."""
+_LOOK_SECONDS = 0.5
+_ACTS = ("drop", "change", "publish", "call")
+
+
+def _suggestions_of(graph: Graph) -> list[Suggestion]:
+    """Return guards that fit a graph."""
+    return [
+        Suggestion(one.preset, one.name, PRESETS[one.preset].what, dict(one.topics), dict(one.measured),
+                   dict(one.values), one.command)
+        for one in proposals(facts_of(graph))
+    ]  # fmt: skip
+
+
+class GuardOrders:
+    """Answers requests about guards; `graph()` returns the present graph."""
+
+    def __init__(self, monitors: SpecificationManager, graph: Callable[[], Graph]) -> None:
+        self._monitors, self._graph = monitors, graph
+        self._acts: dict[str, int] = {}
+        self._acted_at: dict[str, float] = {}
+
+    def methods(self) -> tuple[RequestMethod[Any], ...]:
+        """Return the method that answers each request."""
+        return (
+            RequestMethod(guard_requests.GuardsWanted, self.guards, order=False),
+            RequestMethod(guard_requests.GuardSuggestionsWanted, self.suggestions, order=False),
+            RequestMethod(guard_requests.GuardNew, self.new, who=True),
+            RequestMethod(guard_requests.GuardSet, self.set, who=True),
+        )
+
+    async def watch(self) -> None:
+        """Note when each guard last acted."""
+        while True:
+            self.look()
+            await asyncio.sleep(_LOOK_SECONDS)
+
+    def look(self) -> None:
+        """Compare the counts of acts with those before."""
+        guards = self._guards()
+        self._acted_at = {name: at for name, at in self._acted_at.items() if name in guards}
+        for name in guards:
+            acts = self._acts_of(name)
+            if acts > self._acts.get(name, acts):
+                self._acted_at[name] = clock.now()
+            self._acts[name] = acts
+        self._acts = {name: acts for name, acts in self._acts.items() if name in guards}
+
+    async def guards(self, _request: guard_requests.GuardsWanted) -> Guards:
+        """Return all presets and guards."""
+        rows = [self._row(name, preset) for name, preset in self._guards().items()]
+        return Guards(
+            self._monitors.revision, self._monitors.tag, [preset_row(one) for one in PRESETS.values()], rows
+        )
+
+    async def suggestions(self, _request: guard_requests.GuardSuggestionsWanted) -> Suggestions:
+        """Return guards that fit the present graph."""
+        return Suggestions(_suggestions_of(self._graph()))
+
+    async def new(self, request: guard_requests.GuardNew, who: str) -> Replacement:
+        """Make a guard and load it. Raises `SenselessError`, and the errors of a load."""
+        try:
+            if "command" not in request.topics:
+                raise GuardError("topics has no `command`: name the topic to guard, such as /cmd_vel")
+            name, graph = request.name or request.preset, facts_of(self._graph())
+            preset = preset_named(request.preset)
+            guard = planned(preset, name, request.topics, graph, request.values, request.types)
+            text = text_of(guard)
+            file = f"{name}.rv"
+            if name in self._monitors.checked.monitors or file in self._monitors.sources.files:
+                raise GuardError(f"a monitor {name} is loaded: give another name, or set its values")
+        except GuardError as error:
+            raise SenselessError(str(error)) from error
+        order = admin.MonitorLoad(
+            {file: text}, note=described(text), expected=request.expected, confirm_within=request.confirm_within,
+            shadow=request.shadow, hold=request.hold,
+        )  # fmt: skip
+        return await self._monitors.load(order, who)
+
+    async def set(self, request: guard_requests.GuardSet, who: str) -> Guards:
+        """Set values of a guard. Raises `UnknownThingError`, `SenselessError`, and the errors of monitors."""
+        monitors, name = self._monitors, request.name
+        preset, text = self._guard(name)
+        try:
+            checked = {each: preset.parameter(each).checked(value) for each, value in request.values.items()}
+            in_text = {each: value for each, value in checked.items() if preset.parameter(each).loads}
+            changed = with_values(text, in_text)
+        except GuardError as error:
+            raise SenselessError(str(error)) from error
+        constants = {each: value for each, value in checked.items() if each not in in_text}
+        given = {name: dict(constants)} if constants else {}
+        if changed != text:  # one change of both, so that none of them is in force without the other
+            order = admin.MonitorLoad(
+                {monitors.checked.monitors[name]: changed}, note=described(changed), expected=request.expected,
+                shadow=monitors.switches.in_shadow(name), hold=request.hold, given=given,
+            )  # fmt: skip
+            await monitors.load(order, who)
+        elif constants:
+            await monitors.give(admin.MonitorGive(name, dict(constants), request.expected), who)
+        return await self.guards(guard_requests.GuardsWanted())
+
+    def _guards(self) -> Mapping[str, Preset]:
+        files = self._monitors.sources.files
+        found = {
+            name: preset_of(files.get(file, "")) for name, file in self._monitors.checked.monitors.items()
+        }
+        return {name: preset for name, preset in found.items() if preset is not None}
+
+    def _guard(self, name: str) -> tuple[Preset, str]:
+        guards = self._guards()
+        if name not in guards:
+            raise UnknownThingError(f"no guard is named {name}; there are: {', '.join(guards) or 'none'}")
+        return guards[name], self._monitors.sources.files[self._monitors.checked.monitors[name]]
+
+    def _acts_of(self, name: str) -> int:
+        """Return how many messages a guard changed, dropped or published; or would have, in shadow mode."""
+        before = "shadow " if self._monitors.switches.in_shadow(name) else ""
+        return sum(self._monitors.records.counts[f"{before}{kind}", name] for kind in _ACTS)
+
+    def _state(self, name: str) -> str:
+        monitors = self._monitors
+        if name in monitors.rollout.held:
+            return "holding"
+        if monitors.switches.in_shadow(name):
+            return "shadow"
+        if not monitors.switches.enabled(name):
+            return "off"
+        acted = self._acted_at.get(name)
+        return "free" if acted is None or clock.now() - acted > STOPPING_SECONDS else "stopping"
+
+    def _row(self, name: str, preset: Preset) -> GuardRow:
+        monitors = self._monitors
+        file = monitors.checked.monitors[name]
+        text = monitors.sources.files[file]
+        given = monitors.givens.states(monitors.checked, name)
+        return GuardRow(
+            name=name,
+            preset=preset.name,
+            file=file,
+            state=self._state(name),
+            topics={one.name: str(one.value) for one in given if one.kind == "topic"},
+            types=types_in(text),
+            given=given,
+            loads=loaded_values(text),
+            stops=self._acts_of(name),
+            why_held=monitors.rollout.why_held.get(name, ""),
+            off_until=monitors.returns.until(name),
+        )

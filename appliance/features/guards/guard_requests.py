@@ -1,0 +1,82 @@
+"""The requests of operators' tools about guards.
+
+A guard is a monitor, so the operations of monitors bring it into force, confirm, disable, resume and remove it.
+"""
+
+from typing import Annotated
+
+import msgspec
+
+from appliance.channel.admin import MONITORS, AdminRequest, Confirm, Hold, OneMonitor, WaitingRequest
+from appliance.channel.answers.field_docs import doc
+from appliance.channel.answers.monitor_answers import Replacement
+from appliance.channel.rest_operation import rest
+from appliance.features.guards.guard_answers import Guards, Suggestions
+
+_NO_GUARD = {404: "There is no such guard."}
+_Text = Annotated[str, msgspec.Meta(max_length=4096)]
+_Name = Annotated[str, msgspec.Meta(max_length=256)]
+_Values = Annotated[dict[_Name, _Text], msgspec.Meta(max_length=50)]
+
+
+class NewGuard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A guard to make: its preset, its topics, and values of its parameters."""
+
+    preset: _Name
+    topics: Annotated[_Values, doc("by the names that the preset has for them; `command` is needed")]
+    values: Annotated[_Values, doc("by parameter, as text")] = {}
+    types: Annotated[_Values, doc("types of topics that no node has yet, by the names of the topics")] = {}
+    name: Annotated[_Name, doc("empty: that of the preset")] = ""
+    shadow: Annotated[bool, doc("only record what it would have done")] = False
+
+
+class GuardValues(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """New values of a guard's parameters, as text."""
+
+    values: _Values
+
+
+@rest("viewer", "GET", "/v1/guards", name="guards")
+class GuardsWanted(WaitingRequest[Guards], frozen=True, tag="guards"):
+    """The presets with their parameters, and the guards with their states."""
+
+
+@rest("viewer", "GET", "/v1/guards/suggestions", name="guard_suggestions")
+class GuardSuggestionsWanted(WaitingRequest[Suggestions], frozen=True, tag="guard suggestions"):
+    """Guards that fit the topics of the running robot; nothing changes."""
+
+
+@rest(
+    "admin", "POST", "/v1/guards", ("confirm_within", "hold"), name="new_guard", body=NewGuard, of=MONITORS,
+)  # fmt: skip
+class GuardNew(AdminRequest[Replacement], frozen=True, tag="guard new"):
+    """Make a guard from a preset and load it; refused if a monitor has its name, or a topic another type."""
+
+    preset: str
+    topics: dict[str, str]
+    values: dict[str, str] = msgspec.field(default_factory=dict)
+    types: dict[str, str] = msgspec.field(default_factory=dict)
+    name: str = ""
+    shadow: bool = False
+    expected: str | None = None
+    confirm_within: Confirm = None
+    hold: Hold = False
+
+
+@rest(
+    "admin", "PATCH", "/v1/guards/{name}", ("hold",), name="set_guard", body=GuardValues, of=MONITORS,
+    problems=_NO_GUARD,
+)  # fmt: skip
+class GuardSet(AdminRequest[Guards], frozen=True, tag="guard set"):
+    """Set parameters of a guard. Its state stays, except for a polygon, limits of joints or a deadline.
+
+    Operators set constants with `PATCH /v1/monitors/{name}/given`.
+    """
+
+    name: OneMonitor
+    values: dict[str, str]
+    expected: str | None = None
+    hold: Hold = False
+
+
+REQUESTS = (GuardsWanted, GuardSuggestionsWanted, GuardNew, GuardSet)

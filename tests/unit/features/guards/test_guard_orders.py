@@ -1,0 +1,138 @@
+"""Control answers requests about guards: their states and values, new guards, and proposals."""
+
+from collections import Counter
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from appliance.channel import admin
+from appliance.channel.answers.graph_answers import Graph
+from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.features.guards import guard_requests
+from appliance.features.guards.guard_orders import GuardOrders
+from appliance.features.guards.presets import PRESETS, Guard, text_of
+from tests.support.virtual_clock import let_time_pass
+
+pytestmark = pytest.mark.anyio
+TYPES = {"command": "geometry_msgs/Twist", "by": "nav_msgs/Odometry"}
+FENCE = Guard("fence", PRESETS["fence"], types=TYPES, values={"polygon": "0,0 1,0 1,1"})
+
+
+class Manager:
+    """Specifications with a fence and a monitor that is not a guard; it keeps the orders that it gets."""
+
+    revision, tag = 2, "2.0"
+
+    def __init__(self) -> None:
+        self.orders: list[Any] = []
+        self.sources = SimpleNamespace(files={"fence.rv": text_of(FENCE), "other.rv": "other() { }"})
+        self.checked = SimpleNamespace(monitors={"fence": "fence.rv", "other": "other.rv"})
+        self.rollout = SimpleNamespace(held=set(), why_held={})
+        self.switches = SimpleNamespace(
+            in_shadow=lambda _name: self.shadow, enabled=lambda _name: not self.shadow
+        )
+        self.givens = SimpleNamespace(states=lambda _checked, _name: [])
+        self.returns = SimpleNamespace(until=lambda _name: None, confirm_by=lambda _name: None)
+        self.records = SimpleNamespace(counts=Counter())
+        self.shadow = False
+
+    async def load(self, request: Any, _who: str) -> Any:
+        self.orders.append(request)
+        return request
+
+    give = load
+
+
+@pytest.fixture
+def manager() -> Manager:
+    return Manager()
+
+
+@pytest.fixture
+def orders(manager: Manager) -> GuardOrders:
+    return GuardOrders(manager, lambda: Graph([], [], []))  # type: ignore[arg-type]  # as much of it as guards need
+
+
+async def row(orders: GuardOrders) -> Any:
+    """Return the only guard."""
+    [found] = (await orders.guards(guard_requests.GuardsWanted())).guards
+    return found
+
+
+async def test_a_guard_is_stopping_while_it_acts(manager: Manager, orders: GuardOrders) -> None:
+    """Whether it drops, changes or publishes; acts before the start do not count."""
+    manager.records.counts["change", "fence"] = 5
+    orders.look()
+    assert (await row(orders)).state == "free"
+    for kind in ("drop", "change", "publish"):
+        manager.records.counts[kind, "fence"] += 1
+        orders.look()
+        assert (await row(orders)).state == "stopping"
+        let_time_pass(2.5)
+        orders.look()
+        assert (await row(orders)).state == "free"
+    assert (await row(orders)).stops == 8
+    manager.shadow = True
+    assert ((await row(orders)).state, (await row(orders)).stops) == ("shadow", 0)
+    manager.rollout.held.add("fence")
+    assert (await row(orders)).state == "holding"
+
+
+async def test_a_guard_is_shown_with_the_values_in_its_text(orders: GuardOrders) -> None:
+    """And with the types that it was made for."""
+    found = await row(orders)
+    assert (found.loads, found.types) == ({"polygon": "0,0 1,0 1,1"}, TYPES)
+
+
+async def test_values_are_set_in_one_change(manager: Manager, orders: GuardOrders) -> None:
+    """A polygon and a constant come into force together, and a guard in shadow mode stays there."""
+    manager.shadow = True
+    values = {"polygon": "0,0 2,0 2,2", "margin": "0.5"}
+    await orders.set(guard_requests.GuardSet("fence", values, "2.0"), "eve")
+    [load] = manager.orders
+    assert "{0, 0, 2, 0, 2, 2}" in load.files["fence.rv"]
+    assert (load.given, load.shadow, load.expected) == ({"fence": {"margin": "0.5"}}, True, "2.0")
+    manager.orders.clear()
+    await orders.set(guard_requests.GuardSet("fence", {"margin": "0.5"}), "eve")
+    assert manager.orders == [admin.MonitorGive("fence", {"margin": "0.5"})]
+
+
+@pytest.mark.parametrize(
+    ("request_", "why"),
+    [
+        (guard_requests.GuardNew("fence", {"command": "/cmd_vel", "by": "/odom"}, types=TYPES), "is loaded"),
+        (guard_requests.GuardNew("fance", {"command": "/cmd_vel"}), "no preset"),
+        (guard_requests.GuardNew("speed", {}), "no `command`"),
+        (guard_requests.GuardNew("speed", {"command": "/cmd_vel"}), "no node has the topic"),
+        (
+            guard_requests.GuardNew(
+                "speed", {"command": "/c"}, {"vMax": "99"}, {"command": TYPES["command"]}
+            ),
+            "outside",
+        ),
+        (guard_requests.GuardSet("fence", {"margin": "99"}), "outside of"),
+    ],
+)
+async def test_an_order_without_sense_changes_nothing(
+    manager: Manager, orders: GuardOrders, request_: Any, why: str
+) -> None:
+    act = orders.new if isinstance(request_, guard_requests.GuardNew) else orders.set
+    with pytest.raises(SenselessError, match=why):
+        await act(request_, "eve")  # type: ignore[operator]  # the method of the request
+    assert not manager.orders
+
+
+async def test_a_monitor_that_is_not_a_guard_is_unknown(orders: GuardOrders) -> None:
+    with pytest.raises(UnknownThingError, match="there are: fence"):
+        await orders.set(guard_requests.GuardSet("other", {"margin": "1"}), "eve")
+
+
+async def test_a_new_guard_is_loaded(manager: Manager, orders: GuardOrders) -> None:
+    """In shadow mode if wanted, with the time limit of the order."""
+    request = guard_requests.GuardNew("speed", {"command": "/c"}, {"vMax": "0.3"}, {"command": TYPES["command"]},
+                                      shadow=True, confirm_within=300.0)  # fmt: skip
+    await orders.new(request, "eve")
+    [load] = manager.orders
+    assert "double vMax = 0.3 m/s" in load.files["speed.rv"]
+    assert (load.shadow, load.confirm_within, load.note[:14]) == (True, 300.0, "preset speed 1")
