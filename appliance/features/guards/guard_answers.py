@@ -11,12 +11,12 @@ from appliance.channel.answers.monitor_answers import GivenState, Tag
 class PresetParameter(msgspec.Struct, frozen=True):
     """A parameter of a preset. `least` and `most` are empty for values that are not numbers."""
 
-    name: str
+    name: Annotated[str, doc("its name in the text")]
     kind: Annotated[str, doc("`int`, `double`, `bool`, `corners`, `joints` or `time`")]
-    default: str
-    unit: str
-    least: str
-    most: str
+    default: Annotated[str, doc("the value in the preset")]
+    unit: Annotated[str, doc("the unit of its values; empty: none")]
+    least: Annotated[str, doc("the least value; empty: not a number")]
+    most: Annotated[str, doc("the greatest value; empty: not a number")]
     what: Annotated[str, doc("its meaning, for a person")]
     loads: Annotated[bool, doc("it is in the text: a change loads the guard again, and for admins only")]
 
@@ -24,20 +24,20 @@ class PresetParameter(msgspec.Struct, frozen=True):
 class PresetRow(msgspec.Struct, frozen=True):
     """A preset: its topics with their defaults, and the message types of each topic that has several."""
 
-    preset: str
-    version: int
+    preset: Annotated[str, doc("the name of the preset")]
+    version: Annotated[int, doc("changes with its text")]
     what: Annotated[str, doc("its effect, for a person")]
-    topics: dict[str, str]
-    types: dict[str, list[str]]
-    parameters: list[PresetParameter]
+    topics: Annotated[dict[str, str], doc("the topics that are given to it, with their defaults")]
+    types: Annotated[dict[str, list[str]], doc("message types of each topic that has several")]
+    parameters: Annotated[list[PresetParameter], doc("the values that operators set")]
 
 
 class GuardRow(msgspec.Struct, frozen=True):
     """A loaded guard."""
 
-    name: str
-    preset: str
-    file: str
+    name: Annotated[str, doc("its name, which is that of its monitor")]
+    preset: Annotated[str, doc("the preset that it was made from")]
+    file: Annotated[str, doc("the specification file that defines it")]
     state: Annotated[
         str,
         doc(
@@ -62,23 +62,23 @@ class Guards(msgspec.Struct, frozen=True):
 
     revision: int
     tag: Tag
-    presets: list[PresetRow]
-    guards: list[GuardRow]
+    presets: Annotated[list[PresetRow], doc("all presets")]
+    guards: Annotated[list[GuardRow], doc("the loaded guards, in the order in which they see messages")]
 
 
 class Suggestion(msgspec.Struct, frozen=True):
     """A guard that fits the graph. `measured` are values from present rates; check all others."""
 
-    preset: str
-    name: str
-    what: str
-    topics: dict[str, str]
-    measured: dict[str, str]
-    values: dict[str, str]
+    preset: Annotated[str, doc("the preset")]
+    name: Annotated[str, doc("the name of the guard")]
+    what: Annotated[str, doc("its effect, for a person")]
+    topics: Annotated[dict[str, str], doc("its topics, by the names that the preset has for them")]
+    measured: Annotated[dict[str, str], doc("values from the present rates of topics, by parameter")]
+    values: Annotated[dict[str, str], doc("other values that fit the topics, by parameter")]
     command: Annotated[str, doc("the command line that makes it")]
 
 
 class Suggestions(msgspec.Struct, frozen=True):
     """Guards for each topic that commands a base or an arm, in the order in which they act."""
 
-    suggestions: list[Suggestion]
+    suggestions: Annotated[list[Suggestion], doc("the proposed guards")]

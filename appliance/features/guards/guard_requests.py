@@ -22,7 +22,7 @@ _Values = Annotated[dict[_Name, _Text], msgspec.Meta(max_length=50)]
 class NewGuard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A guard to make: its preset, its topics, and values of its parameters."""
 
-    preset: _Name
+    preset: Annotated[_Name, doc("the preset")]
     topics: Annotated[_Values, doc("by the names that the preset has for them; `command` is needed")]
     values: Annotated[_Values, doc("by parameter, as text")] = {}
     types: Annotated[_Values, doc("types of topics that no node has yet, by the names of the topics")] = {}
@@ -33,7 +33,7 @@ class NewGuard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class GuardValues(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """New values of a guard's parameters, as text."""
 
-    values: _Values
+    values: Annotated[_Values, doc("by parameter")]
 
 
 @rest("viewer", "GET", "/v1/guards", name="guards")
