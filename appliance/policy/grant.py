@@ -16,7 +16,7 @@ from appliance.policy.anonymous_names import key_of
 from appliance.policy.ini_reader import Entry, SectionText, Word, read
 from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.keys import levels
-from appliance.policy.model import Address, Category, Request, Rule
+from appliance.policy.model import Address, Category, Request, Rule, word_of
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import Findings, PolicyError
@@ -108,7 +108,7 @@ def _word(text: str, known: PolicyContext, host: Address) -> str:
     """Return the policy's word for the host: `host:NAME`, a group of this host alone, `robot`, or its address."""
     enrolled = next((name for name, address in known.hosts.items() if address == host), None)
     if enrolled is not None:
-        return f"host:{enrolled}"
+        return word_of(enrolled)
     groups = next((section for section in _sections(text) if section.name.text == GROUPS), None)
     for entry in groups.entries if groups is not None else ():
         if [word.text for word in entry.values] == [str(host)]:

@@ -1,4 +1,4 @@
-"""Read the right side of a rule: groups, addresses, networks, `host:NAME` and `*`, as atoms of `HostSets`."""
+"""Read the right side of a rule as atoms of `HostSets`: groups, addresses, networks, `host:NAME`, `door:NAME`, `*`."""
 
 import ipaddress
 import re
@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from appliance.base.validation_messages import meant
 from appliance.policy.host_sets import EVERYONE, Atom, HostSets, Network, canonical_network
 from appliance.policy.ini_reader import Entry, SectionText, Word
-from appliance.policy.model import Address
+from appliance.policy.model import DOOR, HOST, Address, known_name
 from appliance.policy.policy_findings import Findings, quoted
 
 ROBOT = "robot"
-_HOST = "host:"
 _GROUP_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*+", re.ASCII)
 _HOST_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,252}", re.ASCII)
 _SHOWN_LIMIT = 80
@@ -94,7 +93,7 @@ class HostGroups:
         if group is not None:
             group.used = True
             return group.atom
-        if text.startswith(_HOST):
+        if known_name(text) is not None:
             return self._enrolled(word)
         if text not in self._kept:
             network = self._network(word)
@@ -106,7 +105,10 @@ class HostGroups:
     def _network(self, word: Word) -> Network | None:
         text = word.text
         if not (text[0].isdigit() or ":" in text or "/" in text):
-            wanted = meant(text, self.groups) or "; a value is a group, an address, a network, host:NAME or *"
+            wanted = (
+                meant(text, self.groups)
+                or "; a value is a group, an address, a network, host:NAME, door:NAME or *"
+            )
             self._findings.error(word.line, word.column, f"no group {quoted(text)} is defined{wanted}")
             return None
         try:
@@ -135,17 +137,21 @@ class HostGroups:
         return f"here; the robot is {robot}: write robot if you mean it"
 
     def _enrolled(self, word: Word) -> Atom | None:
-        name = word.text.removeprefix(_HOST)
+        name = known_name(word.text) or ""
         address = self._hosts.get(name)
         if address is not None:
             return self._table.network(_as_network(address))
-        if not _HOST_NAME.fullmatch(name):
-            text = f"{quoted(word.text)} is not host:NAME with the name of a certificate"
-            self._findings.error(word.line, word.column, text)
+        door = word.text.startswith(DOOR)
+        if not _HOST_NAME.fullmatch(name.removeprefix(DOOR)):
+            form = "door:NAME with the name of a door" if door else "host:NAME with the name of a certificate"
+            self._findings.error(word.line, word.column, f"{quoted(word.text)} is not {form}")
         elif name not in self._warned_hosts:
             self._warned_hosts.add(name)
-            guess = meant(name, self._hosts.keys())
+            guess = meant(name, [one for one in self._hosts if one.startswith(DOOR) is door])
             text = f"no host {quoted(name)} is enrolled: host:{name} matches no host until it is{guess}"
+            if door:
+                text = f"there is no door {quoted(name.removeprefix(DOOR))}: {name} matches no host until it is added"
+                text += guess
             self._findings.warn(word.line, word.column, text)
         return None
 
@@ -192,9 +198,10 @@ class HostGroups:
 
     def _spelled_out(self, word: Word) -> str:
         text = word.text if len(word.text) <= _SHOWN_LIMIT else word.text[:_SHOWN_LIMIT] + "…"
-        if text.startswith(_HOST):
-            address = self._hosts.get(text.removeprefix(_HOST))
-            return f"{text} ({address})" if address else f"{text} (not enrolled)"
+        name = known_name(text)
+        if name is not None:
+            address = self._hosts.get(name)
+            return f"{text} ({address or ('not enrolled' if text.startswith(HOST) else 'not added')})"
         if text == ROBOT:
             members = ", ".join(str(member).removesuffix("/32").removesuffix("/128") for member in self.robot)
             return f"robot ({members})" if 0 < len(members) <= 40 else text
@@ -223,7 +230,7 @@ def _address_fault(text: str) -> str:
     try:
         ipaddress.ip_address(address)
     except ValueError:
-        hint = "; an enrolled host is host:NAME" if ":" in text else ""
+        hint = "; an enrolled host is host:NAME, a door is door:NAME" if ":" in text else ""
         return f"{quoted(text)} is not an IP address{hint}"
     if not slash:
         return f"{quoted(text)} is not an IP address"

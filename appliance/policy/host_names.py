@@ -3,7 +3,7 @@
 Invariants:
 
 1. A name means every network of its group, at any depth, and the address of the enrolled host of this name. `host:NAME`
-   means the enrolled host only.
+   means the enrolled host only, `door:NAME` the door.
 2. The label of an address is the name of the smallest network that contains it: of an enrolled host before `robot`, and
    of `robot` before the group with the fewest networks. A network of all addresses gives no label.
 """
@@ -16,14 +16,13 @@ from appliance.base.validation_messages import meant
 from appliance.policy.groups import ROBOT
 from appliance.policy.host_sets import Network, canonical_address, canonical_network
 from appliance.policy.ini_reader import read
-from appliance.policy.model import Address
+from appliance.policy.model import DOOR, HOST, Address, known_name
 from appliance.policy.policy_findings import Findings, quoted
 from appliance.policy.sections import GROUPS
 
 HostInWords = Callable[[str], str]
 """A function that returns a host as text for people: `tablet (10.0.0.7)`, or the address alone if it has no name."""
 
-_HOST = "host:"
 _MOST_NAMED = 20
 _EVERY = tuple(map(ipaddress.ip_network, ("0.0.0.0/0", "::/0")))
 
@@ -58,7 +57,7 @@ class HostNames:
         try:
             return (canonical_network(ipaddress.ip_network(text)),)
         except ValueError:
-            name = text.removeprefix(_HOST)
+            name = known_name(text) or text
         found = dict.fromkeys(self.groups.get(text, ()))
         if name in self.enrolled:
             found[_network_of(self.enrolled[name])] = None
@@ -69,7 +68,9 @@ class HostNames:
     def _unknown(self, text: str, name: str) -> str:
         if text in self.groups:
             return f"the address of {text} is not known"
-        if name != text:
+        if text.startswith(DOOR):
+            return f"there is no door {quoted(text.removeprefix(DOOR))}{meant(name, self.enrolled)}"
+        if text.startswith(HOST):
             return f"no host {quoted(name)} is enrolled{meant(name, self.enrolled)}"
         known = [*self.groups, *self.enrolled]
         guess = meant(text, known) or f"; the names are {', '.join(known[:_MOST_NAMED])}"
@@ -128,8 +129,9 @@ def _define(
 def _meant_by(word: str, enrolled: Mapping[str, Address]) -> tuple[Network, ...]:
     if word == "*":
         return _EVERY
-    if word.startswith(_HOST):
-        address = enrolled.get(word.removeprefix(_HOST))
+    known = known_name(word)
+    if known is not None:
+        address = enrolled.get(known)
         return () if address is None else (_network_of(address),)
     try:
         return (canonical_network(ipaddress.ip_network(word)),)

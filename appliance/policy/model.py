@@ -37,6 +37,22 @@ class _IPv6(_Stored, ipaddress.IPv6Address):
     pass
 
 
+HOST, DOOR = "host:", "door:"
+"""The beginnings of the words for enrolled hosts and for doors. Mappings of names have doors as `door:NAME`."""
+
+
+def known_name(word: str) -> str | None:
+    """Return the name that `host:NAME` or `door:NAME` has in mappings of names; None for any other word."""
+    if word.startswith(DOOR):
+        return word
+    return word.removeprefix(HOST) if word.startswith(HOST) else None
+
+
+def word_of(name: str) -> str:
+    """Return the policy's word for a name in a mapping of names."""
+    return name if name.startswith(DOOR) else f"{HOST}{name}"
+
+
 @lru_cache(4096)
 def address_of(text: str) -> Address:
     """Parse the address of a host. Return the same object for the same text, to speed up the look-ups of every call.

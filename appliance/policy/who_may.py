@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 from appliance.policy.host_sets import Network
-from appliance.policy.model import Address, Category, Decision, Request
+from appliance.policy.model import Address, Category, Decision, Request, word_of
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, decide_right, rights_of
 
@@ -69,7 +69,7 @@ def _answer(policy: Policy, network: Network | None, request: Request) -> HostAn
 
 
 def _names(policy: Policy, network: Network | None) -> tuple[str, ...]:
-    names = [f"host:{name}" for name, at in policy.enrolled.items() if network == ipaddress.ip_network(at)]
+    names = [word_of(name) for name, at in policy.enrolled.items() if network == ipaddress.ip_network(at)]
     return tuple((["robot"] if network in policy.robot else []) + sorted(names))
 
 

@@ -34,7 +34,11 @@ Robot = Annotated[
 ]
 Enrolled = Annotated[
     list[str] | None,
-    typer.Option("--enrolled", metavar="NAME=ADDRESS", help="An enrolled host, for host:NAME (repeatable)"),
+    typer.Option(
+        "--enrolled",
+        metavar="NAME=ADDRESS",
+        help="An enrolled host, for host:NAME, or a door as door:NAME (repeatable)",
+    ),
 ]
 
 
@@ -116,7 +120,11 @@ def asking_host(text: str, policy: Policy) -> Address:
     try:
         return find_host(text, policy)
     except BadWordError as error:
-        for word, option in (("robot", "--robot ADDRESS"), ("host:", "--enrolled NAME=ADDRESS")):
+        for word, option in (
+            ("robot", "--robot ADDRESS"),
+            ("host:", "--enrolled NAME=ADDRESS"),
+            ("door:", "--enrolled door:NAME=ADDRESS"),
+        ):
             if text.startswith(word):
                 raise BadWordError(f"{error}; give it with {option}") from None
         raise

@@ -17,7 +17,11 @@ default = all
 """
 NAMES = HostNames.of(
     TEXT,
-    {"laptop": ip_address("10.113.0.5"), "tablet": ip_address("10.113.0.9")},
+    {
+        "laptop": ip_address("10.113.0.5"),
+        "tablet": ip_address("10.113.0.9"),
+        "door:alice": ip_address("198.18.0.2"),
+    },
     [ip_network("10.88.0.10/32")],
 )
 
@@ -33,6 +37,7 @@ NAMES = HostNames.of(
         ("laptop", "10.113.0.5/32"),
         ("tablet", "10.77.0.66/32 10.113.0.9/32"),
         ("host:tablet", "10.113.0.9/32"),
+        ("door:alice", "198.18.0.2/32"),
     ],
 )
 def test_a_name_means_all_its_networks(text: str, networks: str) -> None:
@@ -45,6 +50,7 @@ def test_a_name_means_all_its_networks(text: str, networks: str) -> None:
     [
         ("tabled", "did you mean .?tablet"),
         ("host:labtop", "laptop"),
+        ("door:alicf", "no door .*alice"),
         ("nobody", "names are robot, tablet"),
         ("", "not an"),
     ],
@@ -64,9 +70,10 @@ def test_an_address_has_the_narrowest_label() -> None:
         "::ffff:10.113.0.5",
         "10.88.0.10",
         "10.113.0.9",
+        "198.18.0.2",
         "192.0.2.1",
         "local",
     )
     assert [label_of(one, labels) for one in addresses] == [
-        "tablet", "guests", "laptop", "robot", "tablet", "", "",
+        "tablet", "guests", "laptop", "robot", "tablet", "door:alice", "", "",
     ]  # fmt: skip

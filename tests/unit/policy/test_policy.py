@@ -129,6 +129,19 @@ def test_robot_and_enrolled_hosts_come_from_outside() -> None:
     assert [(w.line, w.column) for w in policy.warnings if '"gone"' in w.text] == [(2, 28)]
 
 
+def test_a_door_is_a_host_of_a_group() -> None:
+    """A word for a door never means an enrolled host of the same name; a door that is not added matches no host."""
+    text = "[Groups]\nalice = door:alice door:gone\n[Nodes]\ndefault = alice\n"
+    given: dict[str, Address] = {
+        "door:alice": ipaddress.ip_address("198.18.0.2"),
+        "alice": ipaddress.ip_address("10.77.0.11"),
+    }
+    policy = compiled(text, hosts=given)
+    assert ask(policy, "198.18.0.2", "node", "/n").allowed
+    assert not ask(policy, "10.77.0.11", "node", "/n").allowed
+    assert [(w.line, w.column) for w in policy.warnings if 'no door "gone"' in w.text] == [(2, 20)]
+
+
 @pytest.mark.parametrize("category", ["node", "publish", "subscribe", "command"])
 def test_missing_section_of_the_thesis_denies(category: str) -> None:
     resource = "getPid" if category == "command" else "/x"
