@@ -17,6 +17,7 @@ IFNAMSIZ = 15  # characters
 _IFA_F_NODAD = 0x02
 _MAIN_TABLE, _UNICAST = 254, 1  # RT_TABLE_MAIN, RTN_UNICAST
 _LINK_SCOPE = 253  # RT_SCOPE_LINK
+_HOST_SCOPE, _LOCAL_TABLE = 254, 255  # RT_SCOPE_HOST, RT_TABLE_LOCAL
 
 T = TypeVar("T")
 
@@ -137,6 +138,29 @@ def add_near_route(namespace: Namespace, name: str, destination: str, *, source:
             metrics={"hoplimit": hop_limit},
         ),
     )
+
+
+def add_local_route(namespace: Namespace, network: str) -> None:
+    """Make all addresses of a network this machine's own, without an interface for each."""
+    _netlink(
+        namespace,
+        f"adding the own network {network}",
+        lambda route: route.route("replace", **_local_route(route, network)),
+    )
+
+
+def delete_local_route(namespace: Namespace, network: str) -> None:
+    """Remove what `add_local_route` added."""
+    _netlink(
+        namespace,
+        f"removing the own network {network}",
+        lambda route: route.route("del", **_local_route(route, network)),
+    )
+
+
+def _local_route(route: Any, network: str) -> dict[str, Any]:
+    kind = {"type": "local", "table": _LOCAL_TABLE, "scope": _HOST_SCOPE}
+    return {"family": socket.AF_INET, "dst": network, "oif": _index(route, "lo"), **kind}
 
 
 def links(namespace: Namespace) -> list[str]:

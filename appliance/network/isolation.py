@@ -29,7 +29,7 @@ import ipaddress
 import itertools
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -151,6 +151,8 @@ class Isolation:
         self.ends: dict[Family, LinkAddresses] = {}
         self._backend = NftBackend(host)
         self._rules: tuple[PacketRule, ...] = ()
+        self._udp: tuple[PortRange, ...] = ()
+        self._tcp: tuple[PortRange, ...] = ()
         self._routers: tuple[Family, ...] = ()
         self._forwarding = _IpForwarding(host)
         self._lock: int | None = None
@@ -183,6 +185,7 @@ class Isolation:
         finally:
             self.ends.clear()
             self._rules = ()
+            self._udp = self._tcp = ()
             os.close(self._lock)
             self._lock = None
 
@@ -214,8 +217,7 @@ class Isolation:
 
     def forward_tunnels(self) -> None:
         """Also forward IKE and ESP (UDP 500 and 4500). Raises `NetworkError` if the host uses these ports."""
-        rules = isolation_rules(self.settings, self.ends, self._routers, udp=_TUNNELS)
-        if rules == self._rules:
+        if self._udp == _TUNNELS:
             return
         used = self._host.run(udp_ports_in_use) & {port.first for port in _TUNNELS}
         if used:
@@ -224,7 +226,26 @@ class Isolation:
                 " tunnels: stop it (strongSwan's own service: systemctl mask --now strongswan), or run the appliance"
                 " in a container"
             )
-        self._install(rules)
+        self._udp = _TUNNELS
+        self._install(self._wanted())
+
+    def require_free(self, ports: Iterable[int]) -> None:
+        """Raise `NetworkError` if a program of the host listens on one of these TCP ports that is not forwarded."""
+        used = self._host.run(listening_ports) & ({*ports} - {one.first for one in self._tcp})
+        if used:
+            raise NetworkError(
+                f"a program of the host listens on TCP {', '.join(map(str, sorted(used)))}: stop it, or choose"
+                " another port"
+            )
+
+    def forward_also(self, ports: tuple[PortRange, ...]) -> None:
+        """Forward these TCP ports besides those of the settings."""
+        if self._tcp != ports:
+            self._tcp = ports
+            self._install(self._wanted())
+
+    def _wanted(self) -> tuple[PacketRule, ...]:
+        return isolation_rules(self.settings, self.ends, self._routers, tcp=self._tcp, udp=self._udp)
 
     def put_rules_back(self) -> None:
         """Install the rules on the host again."""
@@ -352,11 +373,12 @@ def isolation_rules(
     ends: dict[Family, LinkAddresses],
     routers: tuple[Family, ...],
     *,
+    tcp: tuple[PortRange, ...] = (),
     udp: tuple[PortRange, ...] = (),
 ) -> tuple[PacketRule, ...]:
     """Return the rules on the host; `routers` are the address families for which the host was already a router.
 
-    `udp` ports are forwarded besides the TCP ports of the settings.
+    `tcp` and `udp` ports are forwarded besides those of the settings.
     """
     inward, outward = Interface(settings.link), Interface(settings.link, other=True)
     forwarded = partial(PacketRule, chain=Chain.FORWARD)
@@ -389,7 +411,7 @@ def isolation_rules(
             no_router = partial(forwarded, family=family, arrives_on=outward, leaves_on=outward)
             rules.append(no_router(f"the host is no IPv{family} router", PacketVerdict.DROP))
         rules += [_loopback(family, inward), *_true_sources(family, end, inward)]
-        rules += [_forward("TCP", ports, end, outward) for ports in settings.ports]
+        rules += [_forward("TCP", ports, end, outward) for ports in (*settings.ports, *tcp)]
         rules += [_forward("UDP", ports, end, outward) for ports in (*settings.datagrams, *udp)]
         masqueraded = partial(PacketRule, chain=Chain.SOURCE_NAT, source=end.network, leaves_on=outward)
         rules.append(masqueraded(f"the appliance's own connections, IPv{family}", PacketVerdict.MASQUERADE))

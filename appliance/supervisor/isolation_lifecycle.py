@@ -29,6 +29,7 @@ from appliance.network.close_ports import local_port_range
 from appliance.network.esp import Esp, choose_esp, lend_tun
 from appliance.network.firewall.firewall import Firewall
 from appliance.network.firewall.firewall_rules import (
+    MAX_PORT,
     FirewallSettings,
     ForwarderAccess,
     OwnNodeAccess,
@@ -50,6 +51,7 @@ from appliance.supervisor.role import RemoteReceiver
 from appliance.supervisor.users import account_of
 
 _TUNNELS = "rosrv-ipsec"  # the user of charon
+_FIRST_FREE_PORT = 1024
 _PATIENCE_SECONDS = 5.0  # longest wait of `remove` for a call that hangs
 
 log = structlog.get_logger()
@@ -104,6 +106,16 @@ class NoIsolation:
             " use isolation netns or container"
         )
 
+    def open_own_network(self, network: str, ports: list[int]) -> None:  # noqa: ARG002  the same everywhere
+        """Let only the appliance's processes use the addresses of a network, and open these TCP ports.
+
+        Raises `NetworkError`.
+        """
+        raise NetworkError(
+            f"isolation {self.kind} has no namespace of its own, so any program of this machine could use the address"
+            " of a door: use isolation netns or container"
+        )
+
     def clear_tunnels(self) -> None:
         """Remove the IPsec states and policies that an ended charon left. Raises `NetworkError`, `LeftoversError`."""
 
@@ -142,6 +154,8 @@ class ContainerIsolation(NoIsolation):
         self.firewall: Firewall | None = None
         self._tunnels: tuple[str, Esp] | None = None  # the pool, and where ESP runs
         self._own: str | None = None  # the appliance's address in the tunnels
+        self._own_network: str | None = None
+        self._own_ports: tuple[PortRange, ...] = ()  # of doors
         self._owed = False  # whether the kernel rejected the last rules, so they must be installed again
         self._changing = threading.RLock()
         self._ending = False
@@ -196,6 +210,8 @@ class ContainerIsolation(NoIsolation):
             try:
                 if self._own is not None:
                     self._end_tunnels(self._own)
+                if self._own_network is not None:
+                    interfaces.delete_local_route(self._namespace, self._own_network)
                 self.firewall.remove()
             except NetworkError as error:
                 log.error("firewall rules may remain", error=str(error))
@@ -238,6 +254,35 @@ class ContainerIsolation(NoIsolation):
                 interfaces.add_address(self._namespace, "lo", own)
             self._own = own
             return esp
+
+    def open_own_network(self, network: str, ports: list[int]) -> None:
+        """Close the network to other machines before its addresses become the appliance's."""
+        # Control is not trusted: accept only a network that was not in use before, and ports without a privilege.
+        wanted, opened = str(ipaddress.IPv4Network(network)), tuple(map(PortRange.one, sorted(set(ports))))
+        if any(port.first < _FIRST_FREE_PORT for port in opened):
+            raise NetworkError(f"the ports of doors are {_FIRST_FREE_PORT} to {MAX_PORT}")
+        with self._standing():
+            if self.firewall is None:
+                raise NetworkError("the firewall is not in force")
+            if self._own_network not in (None, wanted):
+                raise NetworkError(f"the network of doors is {self._own_network} until the next start")
+            self._require_unused(ipaddress.IPv4Network(wanted))
+            before, self._own_network, self._own_ports = self._own_ports, wanted, opened
+            try:
+                self.firewall.update(self._settings())
+                interfaces.add_local_route(self._namespace, wanted)
+            except NetworkError:
+                self._own_ports = before
+                raise
+
+    def _require_unused(self, network: ipaddress.IPv4Network) -> None:
+        """Raise `NetworkError` if an interface of the namespace has an address in the network."""
+        for text in interfaces.addresses(self._namespace):
+            held = ipaddress.ip_interface(text).network
+            if held.version == 4 and held.overlaps(network):
+                raise NetworkError(
+                    f"doors.network {network} overlaps {text} of this machine: set another network"
+                )
 
     def clear_tunnels(self) -> None:
         """Remove what an ended charon left; its addresses stay closed to clear text."""
@@ -313,6 +358,8 @@ class ContainerIsolation(NoIsolation):
             tunnel_only=(self._tunnels[0],) if self._tunnels else (),
             forwarders=self._forwarders(),
             peer=self._ports.peer,
+            own_network=self._own_network,
+            own_ports=self._own_ports,
             tunnel_interface=USER_SPACE_INTERFACE
             if self._tunnels and self._tunnels[1] == "user space"
             else None,
@@ -376,6 +423,13 @@ class NetnsIsolation(ContainerIsolation):
             esp = super().open_tunnels(pool, address)
             self._isolation.forward_tunnels()
             return esp
+
+    def open_own_network(self, network: str, ports: list[int]) -> None:
+        """Do the same as in a container, then forward the ports to the namespace."""
+        with self._standing():
+            self._isolation.require_free(ports)
+            super().open_own_network(network, ports)
+            self._isolation.forward_also(self._own_ports)
 
     def build(self) -> None:
         """Make the namespace, its link to the host's networks, and the firewall. Raises `StartError`."""

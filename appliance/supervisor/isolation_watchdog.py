@@ -91,6 +91,18 @@ class IsolationWatchdog:
         log.info("addresses are taken through tunnels only", pool=pool, esp=esp)
         return messages.TunnelsEnclosed(esp)
 
+    async def open_own_network(self, network: str, ports: list[int]) -> str:
+        """Add a network of the appliance's own and open ports; return why that is not possible, or an empty text."""
+        try:
+            async with self._one_at_a_time:
+                await in_thread(lambda: self.isolation.open_own_network(network, ports))
+                report = await in_thread(self.isolation.report)
+        except Exception as error:  # noqa: BLE001  see the invariant
+            return _words(error)
+        self._report = messages.FirewallReported(isolation=self.isolation.kind, report=report)
+        self._tell(self._report)
+        return ""
+
     async def clear_tunnels(self, passive: Callable[[], bool]) -> None:
         """Remove what an ended charon left in the kernel, while this appliance is passive and runs no other charon."""
         try:

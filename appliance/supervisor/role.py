@@ -68,7 +68,8 @@ class ExternalProgram:
 class Role:
     """One row of the table.
 
-    Start: `path` returns the last argument of `entry`. `indexed` roles get their number. `after` is the role that must
+    Start: `path` returns the last argument of `entry`. `indexed` roles get their number; they have
+    `most` processes, or one for each relay (None). `after` is the role that must
     be ready first. `outlives_takeover`: the role goes on when this appliance becomes passive. `stands_by`: a role with
     `after` also runs while this appliance is passive. `listens`: each process of the role gets the listening socket
     that the supervisor keeps for it. `on_demand`: the role starts when control requests it, and does not restart after
@@ -101,6 +102,7 @@ class Role:
     program: Callable[[Facts], ExternalProgram] | None = None
     path: Callable[[Facts], Path] | None = None
     indexed: bool = False
+    most: int | None = None
     links: tuple[str, ...] = ()
     network: bool = True
     asks: bool = False

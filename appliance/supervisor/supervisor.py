@@ -78,6 +78,8 @@ _FROM_CONTROL: tuple[type[messages.Message], ...] = (
     messages.LogHeld,
     messages.TunnelsWanted,
     messages.CompilerWanted,
+    messages.ProcessWanted,
+    messages.OwnNetworkWanted,
 )
 
 log = structlog.get_logger()
@@ -122,7 +124,9 @@ class Supervisor:
         """
         self._facts = facts
         self.slots = [
-            ProcessSlot(role, index) for role in roles for index in range(relays if role.indexed else 1)
+            ProcessSlot(role, index)
+            for role in roles
+            for index in range((role.most or relays) if role.indexed else 1)
         ]
         self.kept = InheritedListeners()
         self.kept.keep(ADMIN, admin.detach())
@@ -366,6 +370,10 @@ class Supervisor:
                 self._free_log(processes)
             case messages.CompilerWanted():
                 self._demand("compiler")
+            case messages.ProcessWanted(role, index):
+                self._demand(role, index)
+            case messages.OwnNetworkWanted(network, ports):
+                self._answer(process, self._open_own_network(process, network, ports))
             case messages.ApplianceStopRequested(reason):
                 log.warning("control requests the shutdown of the appliance", reason=reason)
                 self.stop()
@@ -532,9 +540,12 @@ class Supervisor:
             self._demand("charon")
         process.send(answer)
 
-    def _demand(self, role: str) -> None:
+    async def _open_own_network(self, process: ProcessHandle, network: str, ports: list[int]) -> None:
+        process.send(messages.OwnNetworkOpened(await self._watchdog.open_own_network(network, ports)))
+
+    def _demand(self, role: str, index: int = 0) -> None:
         for slot in self.slots:
-            if slot.role.name == role:
+            if slot.role.name == role and slot.index == index and slot.role.on_demand:
                 slot.wanted = slot.process is not None
                 if slot.is_free:
                     self.start(slot)

@@ -179,6 +179,29 @@ class CompilerWanted(Message):
     """Control has specifications to compile. The supervisor starts the compiler if it is not running."""
 
 
+class ProcessWanted(Message):
+    """Control asks the supervisor to start a process of a role on demand, if it is not running."""
+
+    role: str
+    index: int
+
+
+class OwnNetworkWanted(Message):
+    """Control asks for a network whose addresses only the appliance itself may use, and for open TCP ports.
+
+    Each request replaces the earlier ports. The network cannot change while the appliance runs.
+    """
+
+    network: str
+    ports: list[int]
+
+
+class OwnNetworkOpened(Message):
+    """The supervisor answers `OwnNetworkWanted`: empty, or the reason of the failure."""
+
+    reason: str = ""
+
+
 class ApplianceStopRequested(Message):
     """Control asks the supervisor to end the appliance, after a granted `shutdown` call of the Master API."""
 
@@ -242,7 +265,7 @@ Lifeline = (
     Ping | Pong | Stop | Walled | Ready | Failed | LinkOpened | SocketKept | SocketDropped | SocketRestored
     | SocketsRestored | Announced | ProcessesChanged | ClockRead | FirewallReported | ProbeFailed | ProbePassed
     | PolicyReloadRequested | RouteWanted | EndpointWanted | EndpointFound
-    | TunnelsWanted | TunnelsEnclosed
+    | TunnelsWanted | TunnelsEnclosed | ProcessWanted | OwnNetworkWanted | OwnNetworkOpened
     | MemoryGiven | StateGiven | RouteFound | LogHeld | CompilerWanted | ApplianceStopRequested
     | SignatureWanted | SignatureMade
     | LeaseHeld | LeaseEnded | Activated | ServicePaused

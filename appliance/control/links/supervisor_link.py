@@ -69,6 +69,7 @@ class ControlLifeline:
         self._routes: dict[str, list[asyncio.Future[str | None]]] = {}  # unanswered queries
         self._free_questions = asyncio.Semaphore(ROUTES_AT_ONCE)
         self._endpoints: list[asyncio.Future[messages.EndpointFound]] = []
+        self._own_networks: list[asyncio.Future[str]] = []
         self._early: dict[tuple[object, ...], tuple[Any, tuple[int, ...]]] = {}
         self._heard: Heard = self.queue
 
@@ -149,6 +150,13 @@ class ControlLifeline:
         self.say(messages.EndpointWanted())
         return await future
 
+    async def open_own_network(self, network: str, ports: list[int]) -> str:
+        """Have the supervisor add a network of the appliance's own, and open ports; return the reason of a failure."""
+        future: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._own_networks.append(future)
+        self.say(messages.OwnNetworkWanted(network, ports))
+        return await future
+
     def _send(self, message: messages.Message, descriptors: tuple[int, ...]) -> None:
         try:
             self.channel.send(message, descriptors)
@@ -180,6 +188,9 @@ class ControlLifeline:
                 self.surroundings.firewall = message
             case messages.TunnelsEnclosed() | messages.EndpointFound() | messages.RouteFound():
                 self._answered(message)
+            case messages.OwnNetworkOpened(reason):
+                if self._own_networks and not (waiter := self._own_networks.pop(0)).done():
+                    waiter.set_result(reason)
             case _:
                 self._note(message)
                 self._heard(message, descriptors)

@@ -265,7 +265,8 @@ class FirewallSettings:
     `rosmaster_port` and `inner_port` may be unknown (None) until their processes run. Hosts in `tunnel_only` are
     accepted through IPsec only: by the kernel's policy, or on `tunnel_interface` if ESP runs in user space.
     `api_networks` and loopback may reach the REST port. `neighbours` are addresses of the machine at the other end of
-    the link (isolation netns); only packets from that machine itself, which arrive with a full TTL, may have them.
+    the link (isolation netns): `own_network` has addresses of the appliance's own doors, and `own_ports` the ports of
+    doors. Only packets from that machine itself, which arrive with a full TTL, may have them.
     `client_ports` is the kernel's local port range; there the own node (rosout) listens on every address, even with
     ROS_IP.
     """
@@ -285,6 +286,8 @@ class FirewallSettings:
     tunnel_interface: str | None = None
     forwarders: tuple[ForwarderAccess, ...] = ()
     peer: PeerAccess | None = None
+    own_network: str | None = None
+    own_ports: tuple[PortRange, ...] = ()
     new_connections: RateLimit | None = RateLimit(per_second=1000, burst=2000)
 
     def __post_init__(self) -> None:
@@ -329,6 +332,7 @@ def appliance_rules(settings: FirewallSettings) -> tuple[PacketRule, ...]:
             for network in settings.tunnel_only
             for rule in _tunnel_only(network, settings.tunnel_interface)
         ),
+        *_own_network(settings.own_network),
         *inner_port("ROSMaster port", settings.rosmaster_port, "control", settings.control_uid),
         *inner_port("inner node face", settings.inner_port, "rosmaster", settings.rosmaster_uid),
         *_rosmaster(settings),
@@ -427,6 +431,17 @@ def _tunnel_only(network: str, interface: str | None) -> tuple[PacketRule, ...]:
     )
 
 
+def _own_network(network: str | None) -> tuple[PacketRule, ...]:
+    """Drop packets from other machines that have an address of the appliance's own network."""
+    if network is None:
+        return ()
+    outside = partial(PacketRule, verdict=PacketVerdict.DROP, chain=Chain.IN, arrives_on=OUTSIDE)
+    return (
+        outside(f"{network}: doors have no other machine's packets", source=network),
+        outside(f"{network}: no other machine reaches a door's node", destination=network),
+    )
+
+
 def _forwarding(forwarder: ForwarderAccess) -> tuple[PacketRule, ...]:
     """Let a forwarder's user send to its receiver only."""
     sending = partial(_sending, uid=forwarder.uid)
@@ -478,6 +493,7 @@ def _rate_limits(settings: FirewallSettings) -> tuple[PacketRule, ...]:
     return (
         *_rate_limit(limit, "RVMaster port", PortRange.one(settings.master_port)),
         *(_rate_limit(limit, "node and relay ports", nodes) if nodes is not None else ()),
+        *(rule for port in settings.own_ports for rule in _rate_limit(limit, f"door's port {port}", port)),
     )
 
 
@@ -489,6 +505,7 @@ def _chosen_by_the_kernel(settings: FirewallSettings) -> Iterator[PacketRule]:
         "RVMaster port": PortRange.one(settings.master_port),
         "node and relay ports": settings.node_ports,
         "REST port": settings.api_ports,
+        **{f"door's port {port}": port for port in settings.own_ports},
     }
     for name, ports in chosen.items():
         if ports is not None and ports.overlaps(settings.client_ports):
