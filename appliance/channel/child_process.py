@@ -26,17 +26,19 @@ class Child:
         said: Callable[[Any], None],
         linked: Callable[[], None] = lambda: None,
         lost: Callable[[str], None] = lambda _reason: None,
+        took: Callable[[Any, tuple[int, ...]], None] | None = None,
         memory_given: Callable[[MemoryGiven, int], None] = lambda _given, descriptor: os.close(descriptor),
     ) -> None:
         """Make the channels. `link` is the union of the messages on the link to control.
 
-        `lost(reason)` is called when control closes the link or ends. `memory_given` takes over the descriptor.
+        `lost(reason)` is called when control closes the link or ends. `took(message, descriptors)` gets control's
+        messages with descriptors. `memory_given` takes over the descriptor.
         """
         self._lifeline = lifeline
         self._link = link
         self._linked = linked
         self._memory_given = memory_given
-        self._control = Link(said, lost)
+        self._control = Link(said, lost, took)
         self.ended = asyncio.Event()
 
     def attach(self, ready: Ready) -> None:

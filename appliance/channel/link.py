@@ -2,6 +2,7 @@
 
 import asyncio
 import itertools
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -12,16 +13,22 @@ from appliance.channel.messages import Message
 class Link:
     """The link to the present process. `heard(message)` gets its messages, but no messages of an earlier process.
 
+    `took(message, descriptors)` gets the messages with descriptors, which it then owns; without it, they are closed.
+
     `lost(reason)` is called when the process is gone and has no successor yet. The reason is empty unless the process
     sent an invalid message.
     """
 
     def __init__(
-        self, heard: Callable[[Any], None], lost: Callable[[str], None] = lambda _reason: None
+        self,
+        heard: Callable[[Any], None],
+        lost: Callable[[str], None] = lambda _reason: None,
+        took: Callable[[Any, tuple[int, ...]], None] | None = None,
     ) -> None:
         self.channel: Channel | None = None  # None: not connected
         self._heard = heard
         self._lost = lost
+        self._took = took
         self._numbers = itertools.count(1)
         self._asked: dict[int, asyncio.Future[Any]] = {}
 
@@ -35,7 +42,12 @@ class Link:
         self.close()
         self.channel = channel
 
-        def received(message: Any, _descriptors: tuple[int, ...]) -> None:
+        def received(message: Any, descriptors: tuple[int, ...]) -> None:
+            if descriptors and self._took is not None and self.channel is channel:
+                self._took(message, descriptors)
+                return
+            for descriptor in descriptors:
+                os.close(descriptor)
             if self.channel is channel:
                 self._heard(message)
 

@@ -107,7 +107,10 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         trail,
         live=core.revocation.live,
         connected=partial(hosts_connected, parts),
-        enrolled=lambda: {row.name: row.address for row in base.table.enrolled()},
+        enrolled=lambda: {
+            **{row.name: row.address for row in base.table.enrolled()},
+            **{name: str(address) for name, address in base.features.addresses().items()},
+        },
         remotes=lambda: {name: seen.remote for name, seen in base.tunnels.seen.items()},
         carried_out=ends.relay.carried_out,
     )

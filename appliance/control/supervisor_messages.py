@@ -83,10 +83,10 @@ class SupervisorMessages:
             case "charon":
                 self._base.tunnels.attach(Channel(sock, messages.TunnelLink))
             case _:
-                self._feature_link(role, sock)
+                self._feature_link(role, index, sock)
 
-    def _feature_link(self, role: str, sock: socket.socket) -> None:
-        found = self._base.features.link(role)
+    def _feature_link(self, role: str, index: int, sock: socket.socket) -> None:
+        found = self._base.features.link(role, index)
         if found is None:
             _log.error("a link leads to a process unknown to control", role=role)
             sock.close()

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
     from appliance.control.assembly.policies import Policies
     from appliance.control.operators.request_method import RequestMethod
+    from appliance.policy.model import Address
     from appliance.specifications.specification_manager import SpecificationManager
     from appliance.store.state_file import StateStore
     from appliance.supervisor.service_gate import Pairing
@@ -43,6 +44,13 @@ class HostDeclarations(Protocol):
 
     async def take_bundle(self, text: str, who: str) -> object:
         """Bring the hosts of a bundle into force; empty: those of the file. Raises `HostRefusedError`."""
+
+
+class KeptHosts(Protocol):
+    """Hosts of a feature that the policy names."""
+
+    def addresses(self) -> "Mapping[str, Address]":
+        """Return the addresses of the names in the policy, such as `door:alice`."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +96,9 @@ class FeaturePart:
     `links` are control's ends of the links to the feature's roles, with the messages that control accepts, and
     `longest` limits the bytes of a message. `methods` answer the feature's `operations`. `work` runs until control
     ends; its names go into error messages. `limits` returns how much of its resources is used.
-    `details` returns what it adds to the details of a record (`RecordDetails`). `called` answers nodes' calls of its
-    service.
+    `connected(door, ticket, peer, descriptor)` passes a WebSocket of the api on; it returns why it is refused, or an
+    empty text. `details` returns what it adds to the details of a record (`RecordDetails`). `called` answers nodes'
+    calls of its service.
 
     These return a state, or None if there is none: `forwarding` that of the forwarding of the audit log, `collector`
     that of its segments, `bundles` that of the fleet's bundles, `recorder` that of the flight recorder, and `pair` that
@@ -106,6 +115,7 @@ class FeaturePart:
     recorder: "Callable[[], RecorderState | None]" = lambda: None
     pair: "Callable[[], StandbyState | None]" = lambda: None
     work: Mapping[str, Callable[[], Awaitable[None]]] = field(default_factory=dict)
+    connected: "Callable[[str, str, str, int], str] | None" = None
     collector: "Callable[[], ForwardingState | None]" = lambda: None
     bundles: "Callable[[], BundlesState | None]" = lambda: None
 
@@ -124,7 +134,8 @@ class Feature:
     `pairing(state)` returns what the start of one of two appliances needs; it raises `StartError`. `state_files` are
     files in the state directory that the feature may write before the first start.
     Hooks of control are named by `module:name`, so that their modules may import what imports the table. `may_start` is
-    a class of `control.assembly.active_role.StartGate`. `inherit(foundation, parts)` returns a `FeaturePart` once
+    a class of `control.assembly.active_role.StartGate`. `keep(sections, store, lifeline)` returns `KeptHosts`, before
+    the policy comes into force. `inherit(foundation, parts)` returns a `FeaturePart` once
     control may serve and has its parts, before it serves.
     """
 
@@ -142,4 +153,5 @@ class Feature:
     pairing: "Callable[[Path], Pairing | None] | None" = None
     state_files: tuple[str, ...] = ()
     may_start: str | None = None
+    keep: str | None = None
     inherit: str | None = None

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appliance.configuration.sections import Sections
+from appliance.features.doors.feature import DOORS
 from appliance.features.evidence.feature import EVIDENCE
-from appliance.features.feature import Feature, FeatureContext, FeaturePart, OperatorContext
+from appliance.features.feature import Feature, FeatureContext, FeaturePart, KeptHosts, OperatorContext
 from appliance.features.fleet.feature import FLEET
 from appliance.features.guards.feature import GUARDS
 from appliance.features.recorder.feature import RECORDER
@@ -26,12 +27,13 @@ if TYPE_CHECKING:
     from appliance.channel.link import Link
     from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
     from appliance.control.operators.request_method import RequestMethod
+    from appliance.policy.model import Address
     from appliance.supervisor.service_gate import Pairing
 
 LONGEST = 64 << 20
 """The most bytes of a message on a link of a feature, unless its part has a smaller limit."""
 
-FEATURES: tuple[Feature, ...] = (SYSLOG, EVIDENCE, RECORDER, STANDBY, FLEET, GUARDS)
+FEATURES: tuple[Feature, ...] = (SYSLOG, EVIDENCE, RECORDER, STANDBY, FLEET, GUARDS, DOORS)
 
 
 def memories(sections: Sections, relays: int) -> tuple[SharedMemory, ...]:
@@ -49,7 +51,24 @@ class FeatureParts:
 
     def __init__(self, core: FeatureContext) -> None:
         self._core = core
+        self.kept: dict[str, KeptHosts] = {}
         self._parts = [feature.make(core) for feature in FEATURES if feature.make is not None]
+
+    async def keep(self, store: Any, lifeline: Any) -> None:
+        """Read the hosts that features keep in the state, before the policy comes into force."""
+        for feature in FEATURES:
+            if feature.keep is not None:
+                keep = pkgutil.resolve_name(feature.keep)
+                self.kept[feature.name] = await keep(self._core.sections, store, lifeline)
+
+    def addresses(self) -> "dict[str, Address]":
+        """Return the addresses of the features' hosts, by their names in the policy."""
+        return {name: address for kept in self.kept.values() for name, address in kept.addresses().items()}
+
+    def connected(self, door: str, ticket: str, peer: str, descriptor: int) -> str:
+        """Pass a WebSocket of the api on; return why it is refused, or an empty text."""
+        (connected,) = filter(None, (part.connected for part in self._parts))
+        return connected(door, ticket, peer, descriptor)
 
     def operate(self, **later: Any) -> None:
         """Add the parts that need objects of control that exist now: the fields of `OperatorContext`."""
@@ -63,9 +82,13 @@ class FeatureParts:
                 part: FeaturePart = await pkgutil.resolve_name(feature.inherit)(foundation, parts)
                 self._parts.append(part)
 
-    def link(self, role: str) -> "tuple[Link, Any] | None":
-        """Return control's end of the link to a role, with the accepted messages; None for an unknown role."""
-        return next((part.links[role] for part in self._parts if role in part.links), None)
+    def link(self, role: str, index: int = 0) -> "tuple[Link, Any] | None":
+        """Return control's end of the link to a process, with the accepted messages; None for an unknown one.
+
+        The second process of a role has the name `ROLE-2`.
+        """
+        name = f"{role}-{index + 1}" if index else role
+        return next((part.links[name] for part in self._parts if name in part.links), None)
 
     def longest(self, role: str) -> int:
         """Return the most bytes of a message of a role."""

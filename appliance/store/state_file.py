@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from appliance.signing.request_signing import TokenKeys
-from appliance.store import host_tables
+from appliance.store import door_tables, host_tables
 from appliance.store.access_tokens import TokenRow
 from appliance.store.writer_thread import Database
 
@@ -52,7 +52,7 @@ CREATE TABLE IF NOT EXISTS monitor_state (
     relay INTEGER PRIMARY KEY, epoch INTEGER NOT NULL, content BLOB NOT NULL
 );
 CREATE TABLE IF NOT EXISTS setting (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-{host_tables.SCHEMA}"""
+{host_tables.SCHEMA}{door_tables.SCHEMA}"""
 
 
 REVISION_TABLES = frozenset({"policy_revision", "policy_signature", "monitor_revision"})
@@ -135,6 +135,7 @@ class StateStore:
     ) -> None:
         self.database = kind(directory / "state.db", SCHEMA, failed=failed)
         self.hosts = host_tables.HostTables(self.database)
+        self.doors = door_tables.DoorTables(self.database)
         self._parameter_changes = 0  # the number of the last change
         self._largest_change: int | None = LARGEST_CHANGE
         self._noted: dict[str, list[int]] = {}  # the changes of each key since the tree was stored, by number

@@ -23,6 +23,7 @@ NUMERIC_IDS = {
     "rosrv-lease": 61021,
     "rosrv-bundles": 61022,
     "rosrv-fleet": 61023,
+    "rosrv-doors": 61024,
 }
 
 

@@ -4,6 +4,7 @@ import asyncio
 import json
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
+from functools import partial
 from typing import Any
 
 import cbor2
@@ -116,8 +117,8 @@ class DoorWorld:
         sight = MasterSight(self.node, lambda: (7, 8))
         self.door = DoorNode(self.node, self.types, Rosapi(sight, self.types).answer, most_topics=50)
         self.lookout = Lookout(sight, self.types, self.door.learn)
-        connections = DoorConnections(self.serve, self.limits)
-        self.network.listen(DOOR[0], connections.serve, DOOR[1])
+        connections = DoorConnections(self.limits)
+        self.network.listen(DOOR[0], partial(connections.serve, self.serve), DOOR[1])
 
     async def robot(self, address: str, name: str) -> RosNode:
         """Start another node."""

@@ -23,7 +23,7 @@ from appliance.features.doors.values import ValueLimits
 from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.definitions import Definitions
 from roswire.node import NodeLimits, RosNode, SourceNetwork
-from roswire.node.network import ByteWriter
+from roswire.node.network import ByteWriter, Serve
 from roswire.standard import standard_definitions
 
 NAME = "/door"
@@ -62,10 +62,10 @@ async def real_door(
             options=SessionOptions(),
         ).run()
 
-    connections = DoorConnections(serve, ConnectionLimits())
+    connections = DoorConnections(ConnectionLimits())
     with socket.create_server((source, port)) as listener:
         listener.setblocking(False)
-        accepting = asyncio.ensure_future(_accept(listener, connections))
+        accepting = asyncio.ensure_future(_accept(listener, connections, serve))
         try:
             yield listener.getsockname()[1]
         finally:
@@ -74,12 +74,12 @@ async def real_door(
             await door.close()
 
 
-async def _accept(listener: socket.socket, connections: DoorConnections) -> None:
+async def _accept(listener: socket.socket, connections: DoorConnections, serve: Serve) -> None:
     """Pass each connection on as a descriptor, as the front process does."""
     while True:
         connection, _address = await asyncio.get_running_loop().sock_accept(listener)
         with connection:
-            connections.adopt(os.dup(connection.fileno()))
+            connections.adopt(os.dup(connection.fileno()), serve)
 
 
 async def main(master_uri: str, source: str, port: str, *files: str) -> None:

@@ -153,6 +153,7 @@ async def make_foundation(
     age = AgeClock(settings.state / "control" / "age")
     role.inherit(store, age)
     blocks = BlockTable(store, age)
+    await features().keep(store, lifeline)
     # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
     # start the tunnels before the policy.
     table = make_host_table(settings, store)
@@ -165,7 +166,7 @@ async def make_foundation(
         store,
         trail,
         robot=robot_addresses(settings, role.robot),
-        hosts=lambda: tunnels().addresses,
+        hosts=lambda: {**tunnels().addresses, **features().addresses()},
         blocks=lambda: blocks.reasons,
         live=lambda: enforcement().revocation.live(),  # noqa: PLW0108  it is assembled later
         changed=lambda before, policy: enforcement().policy_changed(before, policy),

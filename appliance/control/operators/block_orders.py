@@ -49,8 +49,8 @@ class BlockOrders:
     """The operators' requests about blocked hosts.
 
     `live()` returns the rights that a change of the policy may end, `connected()` the two hosts of each connection
-    through the relay. `enrolled()` returns the addresses of enrolled hosts by name, `remotes()` the real addresses of
-    hosts in tunnels by name. `carried_out()` waits until the relays have carried out all orders.
+    through the relay. `enrolled()` returns the addresses of enrolled hosts and doors by name, `remotes()` the real
+    addresses of hosts in tunnels by name. `carried_out()` waits until the relays have carried out all orders.
     """
 
     def __init__(
@@ -91,7 +91,8 @@ class BlockOrders:
         """Block a host. Raises `SenselessError`, `HostRefusedError` and `StoreError`."""
         address = self._address(request.address)
         _require_sensible(request)
-        _require_possible(address)
+        if str(address) not in self._enrolled().values():
+            _require_possible(address)
         await self._read_clock()
         before = self._held_by(address)
         if not request.force:

@@ -6,11 +6,10 @@ An agent that makes a connection for each call is normal; a client that connects
 import asyncio
 import socket
 from collections import deque
-from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from http import HTTPStatus
 
-from roswire.node.network import BUFFER_BYTES, ByteWriter, OwnedTasks
+from roswire.node.network import BUFFER_BYTES, ByteWriter, OwnedTasks, Serve
 
 _REFUSAL_SECONDS = 5.0
 
@@ -26,26 +25,25 @@ class ConnectionLimits:
 class DoorConnections:
     """Serves connections, each in a task of its own; `refused` counts those that came in excess."""
 
-    def __init__(
-        self, serve: Callable[[asyncio.StreamReader, ByteWriter], Awaitable[None]], limits: ConnectionLimits
-    ) -> None:
+    def __init__(self, limits: ConnectionLimits) -> None:
         self.refused = 0
-        self._serve = serve
         self._limits = limits
         self._open = 0
         self._recent: deque[float] = deque()
         self._tasks = OwnedTasks()
 
-    def adopt(self, descriptor: int) -> None:
+    def adopt(self, descriptor: int, serve: Serve) -> None:
         """Serve the connection behind a descriptor, which this object then owns."""
-        self._tasks.start(self._adopt(socket.socket(fileno=descriptor)))
+        self._tasks.start(self._adopt(socket.socket(fileno=descriptor), serve))
 
-    async def _adopt(self, connection: socket.socket) -> None:
+    async def _adopt(self, connection: socket.socket, serve: Serve) -> None:
         connection.setblocking(False)
-        reader, writer = await asyncio.open_connection(sock=connection, limit=BUFFER_BYTES)
-        await self.serve(reader, writer)
+        local = connection.family == socket.AF_UNIX
+        opening = asyncio.open_unix_connection if local else asyncio.open_connection
+        reader, writer = await opening(sock=connection, limit=BUFFER_BYTES)
+        await self.serve(serve, reader, writer)
 
-    async def serve(self, reader: asyncio.StreamReader, writer: ByteWriter) -> None:
+    async def serve(self, serve: Serve, reader: asyncio.StreamReader, writer: ByteWriter) -> None:
         """Serve a connection, or refuse it with HTTP 503 and the reason."""
         reason = self._excess()
         if reason:
@@ -54,7 +52,7 @@ class DoorConnections:
             return
         self._open += 1
         try:
-            await self._serve(reader, writer)
+            await serve(reader, writer)
         finally:
             self._open -= 1
 

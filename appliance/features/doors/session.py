@@ -111,6 +111,7 @@ class DoorSession:
         options: SessionOptions,
     ) -> None:
         self.end = ""
+        self.received = self.sent = 0  # frames
         self._reader, self._writer = reader, writer
         self._door = door
         self._lookout = lookout
@@ -241,6 +242,7 @@ class DoorSession:
 
     async def _carry_out(self, frame: Frame) -> None:
         """Carry out the requests of a frame; after a refusal, drop the rest."""
+        self.received += 1
         requests = self._protocol.receive(frame)
         self._wake.set()
         for request in requests:
@@ -280,6 +282,7 @@ class DoorSession:
             else:
                 self._socket.send_binary(frame)
             size += len(frame)
+            self.sent += 1
         return size
 
     async def _flush(self) -> None:
@@ -290,6 +293,10 @@ class DoorSession:
             if data:
                 self._writer.write(data)
         await self._writer.drain()
+
+    def disconnect(self, reason: str) -> None:
+        """End the connection with a reason."""
+        self._disconnect(CloseCode.POLICY_VIOLATION, reason)
 
     def _disconnect(self, code: CloseCode, reason: str) -> None:
         self.end = self.end or reason

@@ -31,6 +31,7 @@ def test_without_a_user_of_that_name_the_numeric_id_is_used(monkeypatch: pytest.
         "rosrv-lease": (61021, 61021),
         "rosrv-bundles": (61022, 61022),
         "rosrv-fleet": (61023, 61023),
+        "rosrv-doors": (61024, 61024),
     }
 
 

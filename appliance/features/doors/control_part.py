@@ -1,0 +1,238 @@
+"""The part of control for doors: operators' orders, tickets, and people's connections."""
+
+import asyncio
+import contextlib
+from typing import Any
+
+import structlog
+
+from appliance.base.withdrawal import take_effect
+from appliance.channel.answers.limit_answers import LimitUse
+from appliance.configuration.sections import Sections
+from appliance.control.assembly.foundation import Foundation
+from appliance.control.errors import SenselessError, UnavailableError
+from appliance.control.links.supervisor_link import ControlLifeline
+from appliance.control.operators.request_method import RequestMethod
+from appliance.features.doors import door_requests
+from appliance.features.doors.door_link import node_name
+from appliance.features.doors.door_processes import DoorProcesses
+from appliance.features.doors.door_table import DoorTable
+from appliance.features.doors.door_tickets import DoorTickets
+from appliance.features.doors.settings import MOST_DOORS, Doors
+from appliance.features.feature import FeaturePart
+from appliance.policy.model import address_of
+from appliance.store.door_tables import DoorRow, TicketRow
+from appliance.store.state_file import StateStore
+from appliance.store.stored_deadlines import StoredDeadlines
+
+_LOOK_SECONDS = 1.0
+_RETRY_SECONDS = 10
+_log = structlog.get_logger()
+
+
+async def keep(sections: Sections, store: StateStore, lifeline: ControlLifeline) -> DoorTable:
+    """Return the table of doors, with addresses that no other program can use, before the policy names them."""
+    settings = sections.of(Doors)
+    table = DoorTable(store, settings)
+    if table.live() and not table.problem:
+        table.problem = await lifeline.open_own_network(settings.network, table.ports())
+    if table.problem:
+        _log.error("doors cannot be used", reason=table.problem)
+    return table
+
+
+async def inherit(base: Foundation, parts: Any) -> FeaturePart:
+    """Return the part."""
+    table = base.features.kept["doors"]
+    assert isinstance(table, DoorTable)  # noqa: S101  `keep` made it
+    ends = StoredDeadlines(base.store)
+    processes = DoorProcesses(base, table)
+    orders = DoorOrders(base, parts, table, DoorTickets(base.store, ends), processes)
+    return FeaturePart(
+        links=processes.links(),
+        methods=(
+            RequestMethod(door_requests.DoorsWanted, orders.listed),
+            RequestMethod(door_requests.DoorAdd, orders.add, who=True),
+            RequestMethod(door_requests.DoorRemove, orders.remove, who=True, full_disk=True),
+            RequestMethod(door_requests.DoorTicket, orders.ticket, who=True),
+        ),
+        limits=orders.limits,
+        connected=orders.enter,
+        work={"the doors": orders.watch, "the ends of tickets of doors": ends.watch},
+    )
+
+
+class DoorOrders:
+    """The operators' requests about doors."""
+
+    def __init__(
+        self, base: Foundation, parts: Any, table: DoorTable, tickets: DoorTickets, processes: DoorProcesses
+    ) -> None:
+        self._base = base
+        self._parts = parts
+        self._table = table
+        self._tickets = tickets
+        self._processes = processes
+        self._one = asyncio.Lock()
+        self._used: dict[str, str] = {}  # by ticket: the door to which connections were passed
+
+    async def listed(self, _request: door_requests.DoorsWanted) -> door_requests.DoorList:
+        return door_requests.DoorList([self._shown(row) for row in self._table.live()])
+
+    async def add(self, request: door_requests.DoorAdd, who: str) -> door_requests.Door:
+        """Add a door. Raises `SenselessError`, `UnavailableError` and `StoreError`."""
+        async with self._one:
+            row = self._table.planned(request.name, request.port, request.source)
+            if row.port is not None and row.port in self._base.policies.current.ports:
+                raise SenselessError(f"port {row.port} is in [Ports] range of the policy: choose another one")
+            ports = [*self._table.ports(), *([row.port] if row.port is not None else [])]
+            network = self._base.settings.of(Doors).network
+            problem = await self._base.lifeline.open_own_network(network, ports)
+            if problem:
+                raise UnavailableError(problem)
+            self._table.problem = ""
+            take_effect()
+            self._table.save(row)
+            self._base.policies.hosts_changed()
+            self._processes.start()
+            self._base.trail.happened(
+                "door added",
+                f"{row.name} has the address {row.address}",
+                host=row.address,
+                whole=True,
+                resource=row.name,
+                who=who,
+                port=row.port,
+                source=row.source,
+            )
+            await self._base.store.settled()
+            return self._shown(row)
+
+    async def remove(self, request: door_requests.DoorRemove, who: str) -> door_requests.Door:
+        """Remove a door. Raises `UnknownThingError` and `StoreError`."""
+        async with self._one:
+            shown = self._shown(self._table.of(request.name))
+            take_effect()
+            row = self._table.remove(request.name)
+            self._tickets.forget(row.name)
+            self._processes.end(row)
+            self._base.policies.hosts_changed()
+            enforcement = self._parts.endpoints.enforcement
+            revoked = enforcement.expel(address_of(row.address), f"the door {row.name} was removed")
+            self._base.trail.happened(
+                "door removed",
+                f"{row.name} was removed; {row.address} stays reserved for this name",
+                host=row.address,
+                whole=True,
+                resource=row.name,
+                who=who,
+                revoked=revoked,
+            )
+            network = self._base.settings.of(Doors).network
+            if row.port is not None and (
+                problem := await self._base.lifeline.open_own_network(network, self._table.ports())
+            ):
+                _log.error("the port of a door stays open in the firewall", port=row.port, reason=problem)
+            await self._base.store.settled()
+            await self._parts.endpoints.relay.carried_out()
+            return shown
+
+    async def ticket(self, request: door_requests.DoorTicket, who: str) -> door_requests.NewTicket:
+        """Make a ticket. Raises `UnknownThingError`, `SenselessError` and `StoreError`."""
+        door = self._table.of(request.name)
+        take_effect()
+        row, text = self._tickets.make(door.name, request.seconds, who)
+        self._base.trail.happened(
+            "door ticket made",
+            f"ticket {row.id} opens the door {door.name} for {request.seconds:g} s",
+            host=door.address,
+            whole=True,
+            resource=door.name,
+            who=who,
+            ticket=row.id,
+            expires=row.expires,
+        )
+        await self._base.store.settled()
+        return door_requests.NewTicket(
+            id=row.id,
+            created=row.created,
+            expires=row.expires,
+            who=who,
+            door=door.name,
+            ticket=text,
+            path=f"/door/{door.name}?ticket={text}",
+        )
+
+    def enter(self, door: str, ticket: str, peer: str, descriptor: int) -> str:
+        """Pass a person's connection to a door; return why it is refused, or an empty text."""
+        row = next((one for one in self._table.live() if one.name == door), None)
+        found = self._tickets.find(door, ticket)
+        if row is None or found is None:
+            self._base.trail.happened(
+                "door entry refused",
+                "the ticket is wrong, over, or for another door",
+                host=peer,
+                decision="deny",
+                category="rest",
+                resource=door[:31],
+            )
+            return "the ticket is wrong or over: ask the operator for a new one (rosrv door ticket NAME)"
+        if not self._processes.pass_on(row, descriptor, peer, found.id):
+            return self._processes.state(row)[1] or "the door is busy: try again"
+        self._used[found.id] = row.name
+        return ""
+
+    async def watch(self) -> None:
+        """Start the processes of doors, end connections whose tickets are over, and retry what failed."""
+        self._processes.start()
+        for number in range(1 << 62):
+            await asyncio.sleep(_LOOK_SECONDS)
+            for ticket in [one for one in self._used if self._tickets.ended(one)]:
+                name = self._used.pop(ticket)
+                for row in [one for one in self._table.live() if one.name == name]:
+                    self._processes.end_ticket(row, ticket)
+            if number % _RETRY_SECONDS == 0:
+                self._tickets.valid()
+                with contextlib.suppress(OSError):
+                    self._processes.retry()
+
+    def limits(self) -> tuple[LimitUse, ...]:
+        """Return how many doors exist, and how many connections they have."""
+        rows = self._table.live()
+        counts = {row.address: self._processes.state(row)[0].connections for row in rows}
+        most = max(counts, key=lambda address: counts[address], default="")
+        allowed = self._base.settings.of(Doors).connections
+        return (
+            LimitUse("doors", len(rows), MOST_DOORS, ""),
+            LimitUse(
+                "connections of doors",
+                sum(counts.values()),
+                None,
+                "doors.connections",
+                most,
+                counts.get(most, 0),
+                allowed,
+            ),
+        )
+
+    def _shown(self, row: DoorRow) -> door_requests.Door:
+        counts, trouble = self._processes.state(row)
+        return door_requests.Door(
+            name=row.name,
+            address=row.address,
+            node=node_name(row.name),
+            added=row.added,
+            port=row.port,
+            source=row.source,
+            trouble=trouble,
+            connections=counts.connections,
+            received=counts.received,
+            sent=counts.sent,
+            dropped=counts.dropped,
+            refused=counts.refused,
+            tickets=[_ticket(one) for one in self._tickets.valid(row.name)],
+        )
+
+
+def _ticket(row: TicketRow) -> door_requests.Ticket:
+    return door_requests.Ticket(row.id, row.created, row.expires, row.who)

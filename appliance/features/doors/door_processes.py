@@ -1,0 +1,229 @@
+"""Control's side of the processes of doors: which door each serves, its sockets, and its reports.
+
+Invariants:
+
+1. A process gets only sockets with the address of its door. It connects to RVMaster's port and to ports of proxy
+   endpoints and relays, and to no other port.
+2. A process of a door that was removed, or that another door replaced, is told to end.
+3. A process has at most `_MOST_PENDING` requests for sockets at once; further ones are refused.
+"""
+
+import asyncio
+import socket
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+from appliance.channel import messages
+from appliance.channel.channel import ChannelFullError
+from appliance.channel.link import Link
+from appliance.control.assembly.foundation import RVMASTER, Foundation
+from appliance.features.doors import door_link
+from appliance.features.doors.door_table import DoorTable
+from appliance.features.doors.settings import MOST_DOORS, Doors
+from appliance.rpc.server import listen
+from appliance.store.door_tables import DoorRow
+
+ROLE = "door"
+_CONNECT_SECONDS = 5.0
+_MOST_PENDING = 64
+_BACKLOG = 128
+_EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104  compared only
+
+
+@dataclass(slots=True)
+class _Slot:
+    link: Link
+    counts: door_link.DoorCounted = field(default_factory=lambda: door_link.DoorCounted(0, 0, 0, 0, 0))
+    trouble: str = ""
+    started: bool = False
+    pending: int = 0
+
+
+class DoorProcesses:
+    """The processes of all doors."""
+
+    def __init__(self, base: Foundation, table: DoorTable) -> None:
+        self._base = base
+        self._table = table
+        self._settings = base.settings.of(Doors)
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._slots = [
+            _Slot(Link(partial(self._heard, number), partial(self._lost, number)))
+            for number in range(MOST_DOORS)
+        ]
+        host = base.settings.listen_address[0]
+        self._appliance = self._settings.gateway if host in _EVERYWHERE else host
+
+    def links(self) -> dict[str, tuple[Link, Any]]:
+        """Return control's ends of the links, by the process's title."""
+        return {
+            f"{ROLE}-{number + 1}" if number else ROLE: (slot.link, door_link.DoorLink)
+            for number, slot in enumerate(self._slots)
+        }
+
+    def state(self, row: DoorRow) -> tuple[door_link.DoorCounted, str]:
+        """Return the counts of a door, and why it does not serve."""
+        slot = self._slots[row.slot or 0]
+        trouble = self._table.problem or slot.trouble
+        return slot.counts, trouble or ("" if slot.started else "its process is starting")
+
+    def start(self) -> None:
+        """Have the processes of all doors run."""
+        for row in self._table.live():
+            slot = self._slots[row.slot or 0]
+            if not self._table.problem and slot.link.channel is None:
+                self._base.lifeline.say(messages.ProcessWanted(ROLE, row.slot or 0))
+
+    def end(self, row: DoorRow) -> None:
+        """End the process of a door that was removed."""
+        slot = self._slots[row.slot or 0]
+        slot.counts, slot.trouble, slot.started = door_link.DoorCounted(0, 0, 0, 0, 0), "", False
+        self._send(slot, door_link.DoorEnded())
+
+    def end_ticket(self, row: DoorRow, ticket: str) -> None:
+        """End the connections of a ticket."""
+        self._send(self._slots[row.slot or 0], door_link.TicketEnded(ticket))
+
+    def pass_on(self, row: DoorRow, descriptor: int, peer: str, ticket: str) -> bool:
+        """Give a person's connection to the process of a door; return whether the process runs."""
+        slot = self._slots[row.slot or 0]
+        return slot.started and self._send(slot, door_link.ViewerGiven(peer, ticket), descriptor)
+
+    def _send(self, slot: _Slot, message: messages.Message, *descriptors: int) -> bool:
+        try:
+            return slot.link.send(message, descriptors)
+        except ChannelFullError:
+            slot.link.close()
+            return False
+
+    # --- messages of a process ---
+
+    def _heard(self, number: int, message: Any) -> None:
+        slot, row = self._slots[number], self._table.in_slot(number)
+        if row is None or self._table.problem:
+            self._send(slot, door_link.DoorEnded())
+            return
+        match message:
+            case door_link.DoorStarted(name, port):
+                self._begin(slot, row, name, port)
+            case door_link.SocketWanted(request, port):
+                self._make(slot, row, request, port)
+            case door_link.DoorCounted():
+                slot.counts = message
+            case door_link.ConnectionsChanged():
+                self._record(row, message)
+            case _:
+                slot.link.close()
+
+    def _lost(self, number: int, _reason: str) -> None:
+        slot, row = self._slots[number], self._table.in_slot(number)
+        slot.started = False
+        slot.counts = door_link.DoorCounted(0, 0, 0, 0, 0)
+        if row is not None and not self._table.problem:
+            self._failed(row, f"the process of the door {row.name} ended; its connections ended with it")
+
+    def _begin(self, slot: _Slot, row: DoorRow, name: str, port: int | None) -> None:
+        if name not in ("", row.name) or (port is not None and port != row.port):
+            self._send(slot, door_link.DoorEnded())  # it served another door of this slot
+            self._base.lifeline.say(messages.ProcessWanted(ROLE, row.slot or 0))
+            return
+        slot.started, slot.trouble = True, ""
+        given = door_link.DoorGiven(
+            row.name,
+            row.address,
+            self._base.port(RVMASTER),
+            [*self._settings.origins, *self._own_origins()],
+            self._settings.connections,
+            self._settings.connections_in_ten_seconds,
+        )
+        if self._send(slot, given) and row.port is not None and port is None:
+            self._listen(slot, row, row.port)
+
+    def _own_origins(self) -> list[str]:
+        address = self._base.settings.api_address
+        if address is None:
+            return []
+        scheme = "https" if self._base.settings.api_tls else "http"
+        return [f"{scheme}://{name}:{address[1]}" for name in self._base.settings.rest_names]
+
+    def _listen(self, slot: _Slot, row: DoorRow, port: int) -> None:
+        try:
+            listener = listen(self._base.settings.listen_address[0], port)
+        except OSError as error:
+            if not slot.trouble:
+                slot.trouble = (
+                    f"port {port} cannot be listened on: {error.strerror}; add the door with another port"
+                )
+                self._failed(row, f"door {row.name}: {slot.trouble}")
+            return
+        slot.trouble = ""
+        with listener:
+            self._send(slot, door_link.AgentListener(port, row.source), listener.fileno())
+
+    def _failed(self, row: DoorRow, reason: str) -> None:
+        self._base.trail.happened("door failed", reason, host=row.address, resource=row.name)
+
+    def retry(self) -> None:
+        """Listen again on ports that were taken, and start processes that do not run."""
+        for row in self._table.live():
+            slot = self._slots[row.slot or 0]
+            if slot.started and slot.trouble and row.port is not None:
+                self._listen(slot, row, row.port)
+        self.start()
+
+    # --- sockets ---
+
+    def _make(self, slot: _Slot, row: DoorRow, request: int, port: int) -> None:
+        allowed = port in (0, self._base.port(RVMASTER)) or port in self._base.policies.current.ports
+        if not allowed or slot.pending >= _MOST_PENDING:
+            reason = "too many connections are being made" if allowed else "doors do not connect to this port"
+            self._send(slot, door_link.SocketRefused(request, reason))
+            return
+        slot.pending += 1
+        task = asyncio.get_running_loop().create_task(self._given(slot, row, request, port))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _given(self, slot: _Slot, row: DoorRow, request: int, port: int) -> None:
+        channel = slot.link.channel
+        made = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        try:
+            made.setblocking(False)
+            made.bind((row.address, 0))
+            if port:
+                async with asyncio.timeout(_CONNECT_SECONDS):
+                    await asyncio.get_running_loop().sock_connect(made, (self._appliance, port))
+            else:
+                made.listen(_BACKLOG)
+            message: messages.Message = door_link.SocketGiven(request)
+        except OSError as error:  # TimeoutError is one
+            message = door_link.SocketRefused(request, error.strerror or "the appliance does not answer")
+        finally:
+            slot.pending -= 1
+        with made:
+            if channel is slot.link.channel:
+                self._send(slot, message, *([made.fileno()] if message.descriptors else []))
+
+    # --- records ---
+
+    def _record(self, row: DoorRow, change: door_link.ConnectionsChanged) -> None:
+        happened = partial(
+            self._base.trail.happened, host=row.address, resource=row.name, peer=change.peer[:64]
+        )
+        ticket = {"ticket": change.ticket[:12]} if change.ticket else None
+        if change.began:
+            happened(
+                "door connected",
+                f"{change.began} connections to {row.name} began",
+                more=ticket,
+                count=change.began,
+            )
+        if change.ended:
+            reason = change.reason or "the client left"
+            happened(
+                "door disconnected",
+                f"{change.ended} connections to {row.name} ended: {reason}",
+                more=ticket,
+                count=change.ended,
+            )

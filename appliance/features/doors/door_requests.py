@@ -1,0 +1,109 @@
+"""The requests of operators' tools about doors, and the answers."""
+
+from typing import Annotated
+
+import msgspec
+
+from appliance.channel.admin import AdminRequest, WaitingRequest
+from appliance.channel.answers.field_docs import Moment, doc
+from appliance.channel.rest_operation import parameter, rest
+
+_NO_DOOR = {404: "There is no such door."}
+DoorName = Annotated[
+    str,
+    parameter("name of the door", name="door_name", pattern="^[a-z][a-z0-9_-]{0,30}$", examples=["alice"]),
+]
+
+
+class Ticket(msgspec.Struct, frozen=True):
+    """A ticket that can be used now."""
+
+    id: Annotated[str, doc("its name in records")]
+    created: Moment
+    expires: Moment
+    who: Annotated[str, doc("who made it")]
+
+
+class Door(msgspec.Struct, frozen=True, kw_only=True):
+    """The door of one identity. The policy names it `door:NAME`."""
+
+    name: str
+    address: Annotated[str, doc("its source address inside the appliance, as in records")]
+    node: Annotated[str, doc("the name of its ROS node")]
+    added: Moment
+    port: Annotated[int | None, doc("the port of an agent; null: only tickets open this door")]
+    source: Annotated[str, doc("the address or network of the agent; empty: any")]
+    trouble: Annotated[str, doc("why it does not serve; empty: it serves")]
+    connections: Annotated[int, doc("at present")]
+    received: Annotated[int, doc("frames from clients since the start of its process")]
+    sent: Annotated[int, doc("frames to clients since the start of its process")]
+    dropped: Annotated[int, doc("messages for clients that read too slowly")]
+    refused: Annotated[int, doc("connections in excess of the limits")]
+    tickets: list[Ticket]
+
+
+class DoorList(msgspec.Struct, frozen=True):
+    """All doors, the oldest first."""
+
+    doors: list[Door]
+
+
+class NewTicket(Ticket, frozen=True, kw_only=True):
+    """A new ticket with its text, which is shown only here."""
+
+    door: str
+    ticket: Annotated[str, doc("the secret; whoever has it uses the door")]
+    path: Annotated[str, doc("of the WebSocket at the REST port, with the ticket")]
+
+
+class NewDoor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A door; an agent's door has a port, and may have the agent's address or network."""
+
+    name: Annotated[str, msgspec.Meta(max_length=31)]
+    port: Annotated[int, msgspec.Meta(ge=1024, le=65_535)] | None = None
+    source: Annotated[
+        str, doc("address or network of the agent; empty: any"), msgspec.Meta(max_length=64)
+    ] = ""
+
+
+class TicketTime(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How long a ticket is valid."""
+
+    seconds: Annotated[float, doc("from now on"), msgspec.Meta(ge=1, le=30 * 86_400)]
+
+
+@rest("viewer", "GET", "/v1/doors", name="doors")
+class DoorsWanted(AdminRequest[DoorList], frozen=True, tag="doors"):
+    """All doors, with their connections and valid tickets."""
+
+
+@rest(
+    "admin", "POST", "/v1/doors", name="add_door", body=NewDoor, status=201, good="The door was added.",
+)  # fmt: skip
+class DoorAdd(WaitingRequest[Door], frozen=True, tag="door add"):
+    """Add a door for one identity. Its rights are those of the host `door:NAME` in the policy."""
+
+    name: str
+    port: int | None = None
+    source: str = ""
+
+
+@rest("admin", "DELETE", "/v1/doors/{door_name}", name="remove_door", problems=_NO_DOOR)
+class DoorRemove(WaitingRequest[Door], frozen=True, tag="door remove"):
+    """Remove a door: its connections and its tickets end. Its address stays reserved for its name."""
+
+    name: DoorName
+
+
+@rest(
+    "operator", "POST", "/v1/doors/{door_name}/tickets", name="make_door_ticket", body=TicketTime, status=201,
+    good="The ticket was made.", problems=_NO_DOOR,
+)  # fmt: skip
+class DoorTicket(WaitingRequest[NewTicket], frozen=True, tag="door ticket"):
+    """Make a ticket, with which a person's browser or viewer opens a door."""
+
+    name: DoorName
+    seconds: float
+
+
+REQUESTS = (DoorsWanted, DoorAdd, DoorRemove, DoorTicket)

@@ -1,0 +1,124 @@
+"""The table of doors: identities, their addresses and processes. It only keeps state.
+
+1. A name keeps its address for good, also after the removal of its door: records name hosts by address.
+2. The policy gets no address of a door unless the firewall reserves the network (`problem` is empty): otherwise another
+   program could use the address.
+"""
+
+import ipaddress
+import itertools
+import re
+from collections.abc import Mapping
+
+from appliance.base import clock
+from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.features.doors.door_link import node_name
+from appliance.features.doors.settings import MOST_DOORS, Doors
+from appliance.policy.model import DOOR, Address, address_of
+from appliance.store.door_tables import DoorRow
+from appliance.store.state_file import StateStore
+
+_NAME = re.compile(r"[a-z][a-z0-9_-]{0,30}", re.ASCII)
+_MOST_NAMES = 2000  # including removed ones
+
+
+class DoorTable:
+    """All doors that were ever added; `problem` is why none of them can be used now."""
+
+    def __init__(self, store: StateStore, settings: Doors) -> None:
+        self._store = store
+        self._network = ipaddress.IPv4Network(settings.network)
+        self._gateway = settings.gateway
+        self._rows = {row.name: row for row in store.doors.doors()}
+        self.problem = ""
+        strange = next((row for row in self.live() if address_of(row.address) not in self._network), None)
+        if strange is not None:
+            self.problem = (
+                f"door {strange.name} has the address {strange.address}, outside of doors.network {self._network}:"
+                " set the earlier network, or remove the door"
+            )
+
+    def live(self) -> list[DoorRow]:
+        """Return the doors that exist, the oldest first."""
+        return [row for row in self._rows.values() if row.removed is None]
+
+    def ports(self) -> list[int]:
+        """Return the ports of agents."""
+        return [row.port for row in self.live() if row.port is not None]
+
+    def addresses(self) -> Mapping[str, Address]:
+        """Return the addresses of `door:NAME` in the policy."""
+        return {} if self.problem else {f"{DOOR}{row.name}": address_of(row.address) for row in self.live()}
+
+    def of(self, name: str) -> DoorRow:
+        """Return a door. Raises `UnknownThingError`."""
+        row = self._rows.get(name)
+        if row is None or row.removed is not None:
+            known = ", ".join(row.name for row in self.live()[:20]) or "none"
+            raise UnknownThingError(f"there is no door {name[:80]!r}; the doors are: {known}")
+        return row
+
+    def in_slot(self, slot: int) -> DoorRow | None:
+        """Return the door of a process."""
+        return next((row for row in self.live() if row.slot == slot), None)
+
+    def planned(self, name: str, port: int | None, source: str) -> DoorRow:
+        """Return the row of a new door, which is not stored yet. Raises `SenselessError`."""
+        self._require_name(name)
+        if source and port is None:
+            raise SenselessError("--from needs --port: only agents are known by their address")
+        if port is not None and not 1024 <= port <= 65_535:
+            raise SenselessError(f"{port} is not a port of an agent: use 1024 to 65535")
+        taken = next((row for row in self.live() if port is not None and row.port == port), None)
+        if taken is not None:
+            raise SenselessError(f"port {port} is the port of the door {taken.name}: choose another one")
+        slots = {row.slot for row in self.live()}
+        slot = next((number for number in range(MOST_DOORS) if number not in slots), None)
+        if slot is None:
+            raise SenselessError(
+                f"there are {MOST_DOORS} doors, the limit: remove one (rosrv door remove NAME)"
+            )
+        earlier = self._rows.get(name)
+        address = earlier.address if earlier is not None else self._free_address()
+        return DoorRow(name, address, clock.wall(), None, slot, port, _network(source) if source else "")
+
+    def _require_name(self, name: str) -> None:
+        if not _NAME.fullmatch(name):
+            raise SenselessError(
+                f"{name[:80]!r} is not a name of a door: at most 31 of a-z, 0-9, _ and -, a letter first"
+            )
+        if name in self._rows and self._rows[name].removed is None:
+            raise SenselessError(f"there is a door {name} already: choose another name, or remove it first")
+        twin = next((one for one in self._rows if one != name and node_name(one) == node_name(name)), None)
+        if twin is not None:
+            raise SenselessError(f"{name} differs from {twin} only in - and _, which ROS names do not allow")
+        if name not in self._rows and len(self._rows) >= _MOST_NAMES:
+            raise SenselessError(
+                f"{_MOST_NAMES} names of doors were used, the limit: use an earlier name again"
+            )
+
+    def _free_address(self) -> str:
+        taken = {row.address for row in self._rows.values()} | {self._gateway}
+        for candidate in itertools.islice(self._network.hosts(), _MOST_NAMES + 2):
+            if str(candidate) not in taken:
+                return str(candidate)
+        raise SenselessError(f"no address of {self._network} is free: set a larger doors.network")
+
+    def save(self, row: DoorRow) -> None:
+        """Store a door."""
+        self._rows.pop(row.name, None)
+        self._rows[row.name] = row
+        self._store.doors.save(row)
+
+    def remove(self, name: str) -> DoorRow:
+        """Remove a door; return its last row."""
+        row = self.of(name)
+        self.save(row._replace(removed=clock.wall(), slot=None))
+        return row
+
+
+def _network(text: str) -> str:
+    try:
+        return str(ipaddress.ip_network(text))
+    except ValueError as error:
+        raise SenselessError(f"--from: {text[:80]!r} is not an address or network: {error}") from None

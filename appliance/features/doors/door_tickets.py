@@ -1,0 +1,77 @@
+"""The tickets with which people's viewers open a door. A viewer can carry nothing but a URL.
+
+A ticket is `ID.SECRET`: 48 bits that name it in records, and 256 random bits. The secret is stored as its hash only:
+nobody can guess 256 bits, so a fast hash is enough. A ticket ends by `StoredDeadlines`, as tokens do: neither a step of
+the clock nor a restart gives it more time.
+"""
+
+import hashlib
+import hmac
+import re
+import secrets
+
+from appliance.base import clock
+from appliance.base.deadlines import Deadlines
+from appliance.control.errors import SenselessError
+from appliance.store.door_tables import TicketRow
+from appliance.store.state_file import StateStore
+
+_FORM = re.compile(r"([0-9a-f]{12})\.([A-Za-z0-9_-]{43})", re.ASCII)
+_MOST = 1000
+LONGEST_SECONDS = 30 * 86_400.0
+
+
+class DoorTickets:
+    """All tickets that are not over; `ends` has their ends since they are known."""
+
+    def __init__(self, store: StateStore, ends: Deadlines) -> None:
+        self._store = store
+        self._ends = ends
+        self._rows = {row.id: row for row in store.doors.tickets()}
+        self.valid()  # from now on, no step of the clock postpones an end
+
+    def valid(self, door: str | None = None) -> list[TicketRow]:
+        """Return the tickets (of one door) that can be used now, and forget those that are over."""
+        for row in [*self._rows.values()]:
+            if self._ends.passed(row.id, row.expires):
+                self._forget(row.id)
+        return [row for row in self._rows.values() if door in (None, row.door)]
+
+    def make(self, door: str, seconds: float, who: str) -> tuple[TicketRow, str]:
+        """Make a ticket; return its row and its text, which is stored nowhere. Raises `SenselessError`."""
+        if not 1 <= seconds <= LONGEST_SECONDS:
+            raise SenselessError("a ticket is valid for one second to 30 days: write 8h or 7d")
+        if len(self.valid()) >= _MOST:
+            raise SenselessError(f"there are {_MOST} tickets, the limit: wait until some are over")
+        number, secret = secrets.token_hex(6), secrets.token_urlsafe(32)
+        now = clock.wall()
+        row = self._rows[number] = TicketRow(number, door, _hash(secret), now, now + seconds, who)
+        self._ends.passed(row.id, row.expires)
+        self._store.doors.save_tickets(row)
+        return row, f"{number}.{secret}"
+
+    def find(self, door: str, text: str) -> TicketRow | None:
+        """Return the valid ticket for this door with this text, or None."""
+        parts = _FORM.fullmatch(text)
+        row = self._rows.get(parts[1]) if parts is not None else None
+        if parts is None or row is None or not hmac.compare_digest(row.hash, _hash(parts[2])):
+            return None
+        return None if row.door != door or self._ends.passed(row.id, row.expires) else row
+
+    def ended(self, ticket: str) -> bool:
+        """Whether a ticket that was valid is over."""
+        row = self._rows.get(ticket)
+        return row is None or self._ends.passed(row.id, row.expires)
+
+    def forget(self, door: str) -> None:
+        """Forget all tickets of a door."""
+        for row in self.valid(door):
+            self._forget(row.id)
+
+    def _forget(self, ticket: str) -> None:
+        del self._rows[ticket]
+        self._store.doors.forget_ticket(ticket)
+
+
+def _hash(secret: str) -> bytes:
+    return hashlib.sha256(secret.encode("ascii")).digest()

@@ -1,0 +1,112 @@
+"""`rosrv door add|list|ticket|remove`: doors for browsers, viewers and agents."""
+
+from typing import Annotated
+
+import typer
+
+from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.durations import span_given
+from appliance.cli.output import moment, say_json
+from appliance.features.doors.door_requests import Door, DoorAdd, DoorRemove, DoorsWanted, DoorTicket
+from rosmop.tool.terminal import counted, say
+
+_Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the door", show_default=False)]
+
+
+@speaks
+def add(
+    appliance: Appliance,
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME", help="Name of the identity, `door:NAME` in the policy", show_default=False
+        ),
+    ],
+    *,
+    port: Annotated[
+        int | None,
+        typer.Option(help="Port for an agent, which needs no ticket (1024 to 65535)", show_default=False),
+    ] = None,
+    source: Annotated[
+        str,
+        typer.Option("--from", metavar="ADDRESS", help="Address or network of the agent", show_default=False),
+    ] = "",
+) -> None:
+    """Add a door for one person, viewer or agent. Its rights are those of the host `door:NAME` in the policy.
+
+    Without --port, only tickets open the door. With --port, whoever connects to the port from the given address has
+    the rights of the door.
+
+    Example: rosrv door add agent-1 --port 9091 --from 10.0.0.7
+    """
+    body = appliance.answer_or_exit(DoorAdd(name, port, source))
+    say(f"{body.name} has the address {body.address}, and the node {body.node}")
+    if body.port is None:
+        say(f"Next: rosrv door ticket {body.name} --for 8h")
+    elif not body.source:
+        say(
+            f"! every host that reaches port {body.port} has the rights of door:{body.name}: add --from",
+            "yellow",
+        )
+    say(f"It may do what the policy lets door:{body.name} do: rosrv policy explain --host door:{body.name}")
+
+
+@speaks
+def list_doors(appliance: Appliance) -> None:
+    """List the doors: address, clients, tickets, and why a door does not serve.
+
+    Example: rosrv door list
+    """
+    doors = appliance.ask_or_exit(DoorsWanted()).doors
+    for row in doors:
+        if appliance.as_json:
+            say_json(row)
+        else:
+            say(f"{row.name:<20}  {row.address:<15}  {_entry(row)}, {counted(row.connections, 'connection')}")
+            for one in row.tickets:
+                say(f"    ticket {one.id} until {moment(one.expires)}, by {one.who}")
+            if row.trouble:
+                say(f"    ! {row.trouble}", "yellow")
+    if not doors and not appliance.as_json:
+        say("no doors; add one: rosrv door add NAME")
+
+
+@speaks
+def ticket(
+    appliance: Appliance,
+    name: _Name,
+    *,
+    time: Annotated[
+        str, typer.Option("--for", metavar="TIME", help="How long it is valid (30m, 8h, 7d)")
+    ] = "8h",
+) -> None:
+    """Make a ticket: a URL with which a person's browser or viewer opens the door. It is shown only here.
+
+    Whoever has the URL has the rights of the door until the ticket is over.
+
+    Example: rosrv door ticket alice --for 8h
+    """
+    seconds = span_given("--for", time, "30s, 10m, 1h or 2d", "rosrv door")
+    body = appliance.answer_or_exit(DoorTicket(name, seconds))
+    say(f"wss://ADDRESS:8443{body.path}")
+    typer.echo(
+        f"rosrv: ticket {body.id} is valid until {moment(body.expires)}; put the appliance's address and REST port in"
+        " place of ADDRESS:8443",
+        err=True,
+    )
+
+
+@speaks
+def remove(appliance: Appliance, name: _Name) -> None:
+    """Remove a door. Its connections and tickets end at once; its address stays reserved for its name.
+
+    Example: rosrv door remove agent-1
+    """
+    body = appliance.answer_or_exit(DoorRemove(name))
+    say(f"{body.name} ({body.address}) is removed")
+
+
+def _entry(row: Door) -> str:
+    if row.port is None:
+        return "by ticket"
+    return f"port {row.port} from {row.source or 'anywhere'}"

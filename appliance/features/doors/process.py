@@ -1,0 +1,291 @@
+"""Run the process of a door: its lifeline, its link to control, its node, and its clients' connections.
+
+The process has no network: control gives it every socket (`door_link.py`). It outlives control. While control is away,
+present connections go on, and no new one of the node can be made. The process ends when its door is removed.
+"""
+
+import asyncio
+import ipaddress
+import socket
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import structlog
+import uvloop
+
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.channel.child_process import Child
+from appliance.features.doors import door_link
+from appliance.features.doors.connections import ConnectionLimits, DoorConnections
+from appliance.features.doors.door_link import node_name
+from appliance.features.doors.door_node import DoorNode, present_time
+from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
+from appliance.features.doors.given_network import GivenNetwork
+from appliance.features.doors.known_types import KnownTypes
+from appliance.features.doors.lookout import Lookout
+from appliance.features.doors.rosapi import MasterSight, Rosapi
+from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
+from appliance.features.doors.session import ClientProtocol, DoorSession, SessionOptions
+from appliance.features.doors.values import ValueLimits
+from appliance.features.doors.viewer_queue import ViewerQueue
+from roswire.node import NodeLimits, RosNode
+from roswire.node.network import ByteWriter, OwnedTasks
+from roswire.standard import standard_definitions
+
+_MOST_TOPICS = 500
+_AGAIN_SECONDS = 1.0
+_REPORT_SECONDS = 1.0
+_MOST_PEERS = 256  # in one report
+_log = structlog.get_logger()
+
+
+def main(lifeline_fd: int, _index: int) -> None:
+    """Serve a door until it is removed, or the supervisor ends the process."""
+    uvloop.run(_Process(lifeline_fd).run())
+
+
+@dataclass(slots=True)
+class _Change:
+    began: int = 0
+    ended: int = 0
+    reason: str = ""
+
+
+@dataclass(slots=True)
+class _Totals:
+    """The counts of connections that ended."""
+
+    received: int = 0
+    sent: int = 0
+    dropped: int = 0
+
+
+@dataclass(slots=True, eq=False)
+class _Client:
+    session: DoorSession
+    ticket: str
+    queues: list[ViewerQueue[Any]] = field(default_factory=list)
+
+    @property
+    def dropped(self) -> int:
+        return sum(queue.dropped for queue in self.queues)
+
+
+@dataclass(slots=True)
+class _Door:
+    """The parts that exist once the door's node listens."""
+
+    node: DoorNode
+    lookout: Lookout
+    connections: DoorConnections
+
+
+class _Process:
+    """Connects the supervisor, control, the node and the clients."""
+
+    def __init__(self, lifeline_fd: int) -> None:
+        self._child = Child(
+            Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline),
+            door_link.DoorLink,
+            said=self._heard,
+            linked=self._linked,
+            lost=lambda _reason: self._network.lost() if self._network is not None else None,
+            took=self._took,
+        )
+        self._given: door_link.DoorGiven | None = None
+        self._network: GivenNetwork | None = None
+        self._door: _Door | None = None
+        self._started = asyncio.Event()
+        self._over = asyncio.Event()
+        self._failure = ""
+        self._port: int | None = None
+        self._clients: set[_Client] = set()
+        self._changes: dict[tuple[str, str], _Change] = {}
+        self._totals = _Totals()
+        self._counted = door_link.DoorCounted(0, 0, 0, 0, 0)
+        self._tasks = OwnedTasks()
+
+    async def run(self) -> None:
+        """Serve; raises `SystemExit` if the door must start again."""
+        self._child.attach(messages.Ready())
+        self._tasks.start(self._report())
+        ended = asyncio.ensure_future(self._child.ended.wait())
+        await asyncio.wait(
+            (ended, asyncio.ensure_future(self._over.wait())), return_when=asyncio.FIRST_COMPLETED
+        )
+        await self._tasks.close()
+        if self._door is not None:
+            await self._door.connections.close()
+            if not ended.done():
+                await self._door.node.close()
+        self._child.close()
+        if self._failure:
+            self._child.fail(self._failure, [])
+            raise SystemExit(1)
+
+    # --- control ---
+
+    def _linked(self) -> None:
+        self._child.tell(
+            door_link.DoorStarted(self._given.name if self._given is not None else "", self._port)
+        )
+
+    def _heard(self, message: Any) -> None:
+        match message:
+            case door_link.DoorGiven():
+                if self._given is None:
+                    self._network = GivenNetwork(message.address, self._child.tell)
+                    self._tasks.start(self._start(message, self._network))
+                elif self._given.name != message.name:  # the slot has another door now
+                    self._over.set()
+                self._given = message
+            case door_link.DoorEnded():
+                self._over.set()
+            case door_link.TicketEnded(ticket):
+                for client in [one for one in self._clients if one.ticket == ticket]:
+                    client.session.disconnect("the ticket is over; ask the operator for a new one")
+            case door_link.SocketRefused(number, reason):
+                if self._network is not None:
+                    self._network.refused(number, reason)
+
+    def _took(self, message: Any, descriptors: tuple[int, ...]) -> None:
+        match message:
+            case door_link.SocketGiven(number) if self._network is not None:
+                self._network.given(number, descriptors[0])
+            case door_link.AgentListener(port, source):
+                self._port = port
+                self._tasks.start(self._accept(socket.socket(fileno=descriptors[0]), source))
+            case door_link.ViewerGiven(peer, ticket):
+                self._tasks.start(self._view(descriptors[0], peer, ticket))
+
+    # --- the node ---
+
+    async def _start(self, given: door_link.DoorGiven, network: GivenNetwork) -> None:
+        name = node_name(given.name)
+        while self._door is None:
+            node = RosNode(
+                name,
+                f"http://{given.address}:{given.master_port}/",  # control connects to the appliance, whatever it is
+                network,
+                limits=NodeLimits(),
+                shut_down=self._shut_down,
+            )
+            try:
+                await node.start()
+            except OSError as error:
+                _log.warning("the door's node cannot listen; it tries again", reason=str(error))
+                await asyncio.sleep(_AGAIN_SECONDS)
+                continue
+            types = KnownTypes(standard_definitions(), ValueLimits())
+            sight = MasterSight(node, present_time)
+            door = DoorNode(node, types, Rosapi(sight, types).answer, most_topics=_MOST_TOPICS)
+            limits = ConnectionLimits(given.connections, given.in_ten_seconds)
+            self._door = _Door(door, Lookout(sight, types, door.learn), DoorConnections(limits))
+        self._started.set()
+
+    def _shut_down(self, reason: str) -> None:
+        self._failure = f"the master ended the node of the door: {reason}"
+        self._over.set()
+
+    # --- connections ---
+
+    async def _accept(self, listener: socket.socket, source: str) -> None:
+        await self._started.wait()
+        allowed = ipaddress.ip_network(source) if source else None
+        loop = asyncio.get_running_loop()
+        listener.setblocking(False)
+        with listener:
+            while self._door is not None:
+                try:
+                    connection, address = await loop.sock_accept(listener)
+                except OSError as error:
+                    _log.error("no connection can be accepted", reason=str(error))
+                    await asyncio.sleep(_AGAIN_SECONDS)
+                    continue
+                peer = _plain(address[0])
+                if allowed is not None and peer not in allowed:
+                    connection.close()
+                    self._changed(str(peer), "", ended=1, reason=f"the agent's address is {source}")
+                else:
+                    self._door.connections.adopt(connection.detach(), partial(self._serve, str(peer), ""))
+
+    async def _view(self, descriptor: int, peer: str, ticket: str) -> None:
+        connection = socket.socket(fileno=descriptor)
+        await self._started.wait()
+        if self._door is not None:
+            self._door.connections.adopt(connection.detach(), partial(self._serve, peer, ticket))
+
+    async def _serve(self, peer: str, ticket: str, reader: asyncio.StreamReader, writer: ByteWriter) -> None:
+        door, given = self._door, self._given
+        if door is None or given is None:
+            return
+        queues: list[ViewerQueue[Any]] = []
+        session = DoorSession(
+            reader,
+            writer,
+            door=door.node,
+            lookout=door.lookout,
+            protocols=partial(_protocol, node_name(given.name), queues),
+            subprotocols=SUBPROTOCOLS,
+            options=SessionOptions(origins=tuple(given.origins)),
+        )
+        client = _Client(session, ticket, queues)
+        self._clients.add(client)
+        self._changed(peer, ticket, began=1)
+        try:
+            await session.run()
+        finally:
+            self._clients.discard(client)
+            self._totals.received += session.received
+            self._totals.sent += session.sent
+            self._totals.dropped += client.dropped
+            self._changed(peer, ticket, ended=1, reason=session.end)
+
+    # --- reports ---
+
+    def _changed(self, peer: str, ticket: str, *, began: int = 0, ended: int = 0, reason: str = "") -> None:
+        key = (peer, ticket)
+        if key not in self._changes and len(self._changes) >= _MOST_PEERS:
+            key = ("", "")
+        change = self._changes.setdefault(key, _Change())
+        change.began += began
+        change.ended += ended
+        change.reason = reason or change.reason
+
+    async def _report(self) -> None:
+        while True:
+            await asyncio.sleep(_REPORT_SECONDS)
+            changes, self._changes = self._changes, {}
+            for (peer, ticket), one in changes.items():
+                message = door_link.ConnectionsChanged(peer, ticket, one.began, one.ended, one.reason[:300])
+                if not self._child.tell(message):
+                    self._changes.setdefault((peer, ticket), one)
+            counted = self._counts()
+            if counted != self._counted and self._child.tell(counted):
+                self._counted = counted
+
+    def _counts(self) -> door_link.DoorCounted:
+        totals, clients = self._totals, self._clients
+        return door_link.DoorCounted(
+            connections=len(clients),
+            received=totals.received + sum(one.session.received for one in clients),
+            sent=totals.sent + sum(one.session.sent for one in clients),
+            dropped=totals.dropped + sum(one.dropped for one in clients),
+            refused=self._door.connections.refused if self._door is not None else 0,
+        )
+
+
+def _protocol(node: str, queues: list[ViewerQueue[Any]], subprotocol: str | None) -> ClientProtocol:
+    """Return the protocol that a client speaks; its queue is added to `queues`."""
+    queue: ViewerQueue[Any] = ViewerQueue()
+    queues.append(queue)
+    if subprotocol is None:
+        return Rosbridge(node, RosbridgeLimits(), queue)
+    return Foxglove(node, FoxgloveLimits(), queue)
+
+
+def _plain(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
+    address = ipaddress.ip_address(text.partition("%")[0])
+    return getattr(address, "ipv4_mapped", None) or address

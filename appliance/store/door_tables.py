@@ -1,0 +1,74 @@
+"""The tables of doors: identities with their addresses, and the tickets of people."""
+
+from typing import NamedTuple
+
+from appliance.store.writer_thread import Database
+
+SCHEMA = """
+CREATE TABLE IF NOT EXISTS door (
+    name TEXT PRIMARY KEY, address TEXT NOT NULL UNIQUE, added REAL NOT NULL, removed REAL, slot INTEGER,
+    port INTEGER, source TEXT NOT NULL
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS door_ticket (
+    id TEXT PRIMARY KEY, door TEXT NOT NULL, hash BLOB NOT NULL, created REAL NOT NULL, expires REAL NOT NULL,
+    who TEXT NOT NULL
+) WITHOUT ROWID;
+"""
+
+
+class DoorRow(NamedTuple):
+    """The door of one identity; times are seconds since the epoch.
+
+    A name always keeps its address, also after its removal. `slot` is the number of its process; None if it is
+    removed. `port` is the port of an agent (None: only tickets), and `source` its address or network (empty: any).
+    """
+
+    name: str
+    address: str
+    added: float
+    removed: float | None
+    slot: int | None
+    port: int | None
+    source: str
+
+
+class TicketRow(NamedTuple):
+    """A ticket for a door, without its secret; times are seconds since the epoch."""
+
+    id: str
+    door: str
+    hash: bytes
+    created: float
+    expires: float
+    who: str
+
+
+class DoorTables:
+    """The rows of doors and tickets in the state file."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def save(self, row: DoorRow) -> None:
+        """Store a door, or its removal."""
+        self._database.put("door", *row)
+
+    def doors(self) -> list[DoorRow]:
+        """Return all doors that were ever added, the oldest first."""
+        return [DoorRow(*row) for row in self._database.query("SELECT * FROM door ORDER BY added, name")]
+
+    def save_tickets(self, *rows: TicketRow) -> None:
+        """Store tickets."""
+        with self._database.together():
+            for row in rows:
+                self._database.put("door_ticket", *row)
+
+    def forget_ticket(self, ticket: str) -> None:
+        """Remove a ticket."""
+        self._database.delete("door_ticket", id=ticket)
+
+    def tickets(self) -> list[TicketRow]:
+        """Return all tickets, the oldest first."""
+        return [
+            TicketRow(*row) for row in self._database.query("SELECT * FROM door_ticket ORDER BY created, id")
+        ]
