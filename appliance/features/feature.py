@@ -11,7 +11,7 @@ Invariants:
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 from appliance.cli.verb_table import Group
 from appliance.configuration.sections import FeatureSection, Sections
@@ -120,6 +120,20 @@ class FeaturePart:
     bundles: "Callable[[], BundlesState | None]" = lambda: None
 
 
+class ConsolePart(NamedTuple):
+    """A component of the console: its name in a file of the feature's folder `console`, and where it is shown.
+
+    A `view` is a page with this title. The others are parts of the core's pages: `banner` is above every view, `now`
+    and `robot` are on these pages, `record` is in an audit record, and `standby` is the page of an appliance that is
+    not active.
+    """
+
+    place: Literal["view", "banner", "now", "record", "robot", "standby"]
+    file: str
+    component: str
+    title: str = ""
+
+
 @dataclass(frozen=True)
 class Feature:
     """All that a feature adds: a section of `appliance.yaml`, processes, requests, verbs, and a part of control.
@@ -129,6 +143,7 @@ class Feature:
     `verbs` are commands of `rosrv`.
     `quotas` names the tuple of rows (`module:name`) that the table of quotas lists.
     `recorded` is the function (`module:function`) that gives `rosrv monitor replay` the recorded messages of a period.
+    `console` are components of the console; all style sheets of the folder are part of its style.
     `memory` makes the memory that the supervisor shares with this number of relays; None if none is configured.
 
     `pairing(state)` returns what the start of one of two appliances needs; it raises `StartError`. `state_files` are
@@ -147,6 +162,7 @@ class Feature:
     verbs: Mapping[str, Group] = field(default_factory=dict)
     quotas: str | None = None
     recorded: str | None = None
+    console: tuple[ConsolePart, ...] = ()
     memory: Callable[[Sections, int], SharedMemory | None] = lambda _sections, _relays: None
     make: Callable[[FeatureContext], FeaturePart] | None = None
     operate: Callable[[OperatorContext], FeaturePart] | None = None

@@ -113,7 +113,7 @@ def test_options_that_the_product_names_exist() -> None:
         name: {one for each in verb.params for one in (*each.opts, *each.secondary_opts, "--help")}
         for name, verb in commands()
     }
-    files = [*(ROOT / "appliance").rglob("*.py"), *(ROOT / "appliance/api/console/js").rglob("*.js")]
+    files = [*(ROOT / "appliance").rglob("*.py"), *(ROOT / "appliance").glob("**/console/**/*.js")]
     files += [
         *(ROOT / "examples").rglob("*.y*ml"),
         *(ROOT / "examples").rglob("*.sh"),
@@ -177,7 +177,7 @@ def test_variables_that_the_product_names_exist() -> None:
     sources = [file for one in folders for kind in ("py", "sh") for file in (ROOT / one).rglob(f"*.{kind}")]
     compose = [*ROOT.glob("compose*.yaml"), *(ROOT / "fleet").glob("*.y*ml")]
     read = set(_VARIABLE.findall("".join(file.read_text() for file in (*sources, *compose))))
-    naming = [*WITH_LINKS[:-1], *compose, *(ROOT / "appliance/api/console/js").rglob("*.js")]
+    naming = [*WITH_LINKS[:-1], *compose, *(ROOT / "appliance").glob("**/console/**/*.js")]
     naming += (ROOT / "examples").rglob("*.y*ml")
     named = set(_VARIABLE.findall("".join(file.read_text() for file in naming)))
     assert {name for name in named - read if not _is_setting(name)} == set()

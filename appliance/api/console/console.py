@@ -15,6 +15,7 @@ Invariants:
 import gzip
 import hashlib
 import html
+import json
 import mimetypes
 import re
 from collections.abc import Iterable
@@ -28,11 +29,13 @@ from starlette.responses import Response
 from appliance.api.console.console_bundle import ModuleError, join_modules, join_styles
 from appliance.api.front.problems import ProblemError
 from appliance.configuration.settings import Settings
+from appliance.features.feature import Feature
+from appliance.features.table import FEATURES
 
-VIEWS = ("now", "graph", "audit", "policy", "monitors", "hosts", "recordings")
+_VIEWS = ("now", "graph", "audit", "policy", "monitors", "hosts", "robot")
 _PREFIX = "/console/static/"
 _SERVED = ("css", "icon.svg", "index.html", "js", "vendor")  # the other files of the folder are Python
-_PAGE, _SCRIPT, _STYLE = "index.html", "js/main.js", "css/main.css"
+_PAGE, _SCRIPT, _STYLE, _PARTS = "index.html", "js/main.js", "css/main.css", "js/features.js"
 _ADDRESS = re.compile(rf"{_PREFIX}([\w./-]++)")
 _GZIP = re.compile(r"\bgzip\b(?!\s*+;\s*+q=0(?:\.0*+)?\s*+(?:,|$))", re.IGNORECASE)
 _LEVEL = 9  # of gzip; the files are compressed once
@@ -66,9 +69,18 @@ def routes(settings: Settings) -> APIRouter:
     """
     router = APIRouter(include_in_schema=False)
     served = _collect((files(__package__) / name for name in _SERVED), "")
+    for feature in FEATURES:
+        if feature.console:
+            folder = files(f"appliance.features.{feature.name}") / "console"
+            served |= _collect(folder.iterdir(), f"features/{feature.name}/")
     texts = {name: served[name].body.decode() for name in served if name.endswith((".js", ".css", ".html"))}
+    texts[_PARTS] = _parts(FEATURES)
+    styles = [name for name in texts if name.startswith("features/") and name.endswith(".css")]
     addresses: dict[str, str] = {}
-    joined = {_SCRIPT: join_modules(texts, _SCRIPT), _STYLE: join_styles(texts, _STYLE)}
+    joined = {
+        _SCRIPT: join_modules(texts, _SCRIPT),
+        _STYLE: "".join(join_styles(texts, one) for one in (_STYLE, *styles)),
+    }
 
     def named(found: re.Match[str]) -> str:
         """Return the lasting address of a file that a text names."""
@@ -108,10 +120,31 @@ def routes(settings: Settings) -> APIRouter:
     router.add_api_route(_PREFIX + "{name:path}", file, methods=methods)
     for path in ("/", "/console", "/console/"):
         router.add_api_route(path, index, methods=methods)
-    for view in VIEWS:
+    for view in views():
         router.add_api_route(f"/console/{view}", index, methods=methods)
         router.add_api_route(f"/console/{view}/{{rest:path}}", index, methods=methods)
     return router
+
+
+def views() -> tuple[str, ...]:
+    """Return the names of all views, as in their addresses."""
+    parts = (part for feature in FEATURES for part in feature.console if part.place == "view")
+    return (*_VIEWS, *(part.title.lower() for part in parts))
+
+
+def _parts(features: Iterable[Feature]) -> str:
+    """Return the module that lists the features' components."""
+    imports, rows = [], []
+    for feature in features:
+        for part in feature.console:
+            alias = f"part{len(rows)}"
+            imports.append(
+                f'import {{ {part.component} as {alias} }} from "../features/{feature.name}/{part.file}";\n'
+            )
+            rows.append(
+                f"{{ place: {json.dumps(part.place)}, title: {json.dumps(part.title)}, Part: {alias} }},\n"
+            )
+    return "".join([*imports, "export const PARTS = [", *rows, "];\n"])
 
 
 def _answer(request: Request, found: _File) -> Response:

@@ -2,7 +2,8 @@
 
 The sources stay plain modules, and no build tool is needed. In exchange they use a small part of the module syntax:
 
-- `import { a, b as c } from "./x.js";`, or from an absolute address, which stays a separate file;
+- `import { a, b as c } from "./x.js";`, in a feature also from `"#console/x.js"`, a module of the console; from an
+  absolute address, which stays a separate file;
 - `export function`, `export async function`, `export class`, `export const NAME`;
 - `export { a, b } from "…";`
 
@@ -32,6 +33,7 @@ _BEFORE_A_VALUE = frozenset({
     "return", "typeof", "case", "of", "in", "await", "yield", "void", "delete", "throw", "else", "do", "instanceof",
 })  # fmt: skip
 _LINE_BREAK = re.compile(r"[\n\r\u2028\u2029]")
+_CONSOLE = "#console/"
 _RELATIVE = ('"./', "'./", "`./", '"../', "'../", "`../")
 _OPENING = {")": "(", "]": "[", "}": "{"}
 _AMBIGUOUS = re.compile(r"/(?![/*=\s])")
@@ -207,6 +209,8 @@ def _require_separate(path: str, token: _Token, following: list[_Token]) -> None
 
 
 def _path(of: str, address: str) -> str:
+    if address.startswith(_CONSOLE):
+        return f"js/{address.removeprefix(_CONSOLE)}"
     return posixpath.normpath(posixpath.join(posixpath.dirname(of), address))
 
 

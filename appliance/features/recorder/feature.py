@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from appliance.cli.verb_table import Group, Verb
 from appliance.configuration.sections import Sections
-from appliance.features.feature import Feature, FeatureContext, FeaturePart
+from appliance.features.feature import ConsolePart, Feature, FeatureContext, FeaturePart
 from appliance.features.recorder.settings import RecorderRules
 from appliance.supervisor.role import Role, SharedMemory
 from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
@@ -53,6 +53,10 @@ RECORDER = Feature(
     quotas="appliance.features.recorder.quotas:ROWS",
     recorded="appliance.features.recorder.recorder_input:recorded_messages",
     make=_make,
+    console=(
+        ConsolePart("view", "view.js", "Recordings", "Recordings"),
+        ConsolePart("record", "taking.js", "OnTimeline"),
+    ),
     verbs={
         "record": Group(
             "Use the flight recorder: messages before and after an event.",

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from appliance.cli.verb_table import Group, Verb
-from appliance.features.feature import Feature
+from appliance.features.feature import ConsolePart, Feature
 from appliance.features.standby.membership import FILE, FOLDER, LEASE_FILE, LEASE_NICE, LEFT_FILE
 from appliance.features.standby.settings import Availability
 from appliance.supervisor.role import Role
@@ -45,6 +45,11 @@ STANDBY = Feature(
             after="host",
         ),
     },
+    console=(
+        ConsolePart("banner", "pair.js", "PairBanner"),
+        ConsolePart("now", "pair.js", "PairNow"),
+        ConsolePart("standby", "page.js", "StandbyPage"),
+    ),
     pairing=_pairing,
     state_files=(f"{FOLDER}/{FILE}", f"{FOLDER}/{LEFT_FILE}"),
     may_start=f"{_PLACE}start_gate:StandbyGate",

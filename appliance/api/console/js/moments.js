@@ -26,6 +26,12 @@ function shown(/** @type {Date} */ date, /** @type {"day" | undefined} */ always
   return date.toDateString() === new Date().toDateString() ? CLOCK.format(date) : WITHIN.format(date);
 }
 
+/** RFC 3339, rounded down to a microsecond. @param {number} time nanoseconds since the epoch (a number here: exact to a microsecond) */
+export function iso(time) {
+  const micro = String(Math.floor(time / 1000) % 1000).padStart(3, "0");
+  return new Date(Math.floor(time / 1e6)).toISOString().replace("Z", `${micro}Z`);
+}
+
 /** A text of the appliance, its times in the user's zone. @param {string} text */
 export function inOwnZone(text) {
   return text.replace(/\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(Z|\+00:00)/g, (time) => shown(new Date(time), undefined));

@@ -4,14 +4,13 @@ import { html } from "./html.js";
 import { live } from "./live.js";
 import { Given } from "./parts/given.js";
 import { Icon, Mark } from "./parts/icon.js";
-import { Link, place, VIEWS } from "./router.js";
+import { Link, place } from "./router.js";
 import { end, ROBOT, session } from "./session.js";
 import { Pulse } from "./standing.js";
 import { listKeys } from "./shortcuts.js";
 import { useStore } from "./store.js";
 import { switchTheme, theme } from "./theme.js";
-
-export const TITLES = { now: "Now", graph: "Graph", audit: "Audit", policy: "Policy", monitors: "Monitors", hosts: "Hosts", recordings: "Recordings" };
+import { VIEWS } from "./views.js";
 
 export function Nav() {
   const { view } = useStore(place);
@@ -20,9 +19,9 @@ export function Nav() {
   const { current } = useStore(session);
   return html`<header class="side">
     <div class="brand"><${Mark} /><div><div class="brand-name">${ROBOT || "ROSRV"}</div><div class="brand-sub">${[ROBOT ? "ROSRV" : "Appliance", version].filter(Boolean).join(" ")}</div></div></div>
-    <nav class="nav" aria-label="Views"><ul>${VIEWS.map((name, index) => html`<li key=${name}>
+    <nav class="nav" aria-label="Views"><ul>${VIEWS.map(({ name, title }, index) => html`<li key=${name}>
       <${Link} to=${`/console/${name}`} class="fades" aria-current=${name === view ? "page" : undefined} aria-keyshortcuts=${String(index + 1)}>
-        <${Icon} name=${name} /><span>${TITLES[/** @type {keyof typeof TITLES} */ (name)]}</span>
+        <${Icon} name=${name} /><span>${title}</span>
         ${name === "now" && alarms > 0 && html`<span class="count" title="open alarms">${alarms}<span class="sr-only"> open alarms</span></span>`}
         <span class="key" aria-hidden="true">${index + 1}</span>
       </${Link}></li>`)}</ul></nav>

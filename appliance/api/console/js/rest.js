@@ -3,7 +3,7 @@
 import { proof, readingKey } from "./keys.js";
 import { Problem } from "./problem.js";
 import { end, session, unlocked } from "./session.js";
-import { passive } from "./standby/passive.js";
+import { passive } from "./passive.js";
 
 /**
  * @typedef {{query?: Record<string, any>, json?: any, text?: string, match?: string, token?: string,

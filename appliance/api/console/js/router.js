@@ -3,8 +3,6 @@
 import { html } from "./html.js";
 import { createStore } from "./store.js";
 
-export const VIEWS = ["now", "graph", "audit", "policy", "monitors", "hosts", "recordings"];
-
 /** @typedef {{view: string, rest: string, query: URLSearchParams}} Place */
 
 export const place = createStore(read());
@@ -30,9 +28,9 @@ export function Link(/** @type {any} */ { to, children, ...more }) {
 
 /** @returns {Place} */
 function read() {
-  const [, , view = "", ...rest] = location.pathname.split("/");
+  const [, , view, ...rest] = location.pathname.split("/");
   return {
-    view: VIEWS.includes(view) ? view : "now",
+    view: view || "now",
     rest: decoded(rest.join("/")),
     query: new URLSearchParams(location.search),
   };

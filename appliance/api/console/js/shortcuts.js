@@ -10,7 +10,7 @@ import { createStore, useStore } from "./store.js";
 
 const KEPT = "rosrv.keys";
 const LIST = /** @type {[string, string][]} */ ([
-  ["1 … 7", "Now, Graph, Audit, Policy, Monitors, Hosts, Recordings"],
+  ["1 … 8", "The views, in their order"],
   ["/", "Search in the view"],
   ["j, k", "Next and previous entry (Now), record (Audit) or event (recordings)"],
   ["Enter, Esc", "Open; close the open record or dialog, leave the editor"],

@@ -11,7 +11,7 @@ import pytest
 from fastapi import FastAPI, Request
 
 import appliance.api
-from appliance.api.console.console import VIEWS, routes
+from appliance.api.console.console import routes, views
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.request_gate import is_console
 from appliance.configuration.settings import Settings
@@ -21,7 +21,8 @@ from tests.support.asgi import requested
 
 FILES = Path(appliance.api.__file__).parent / "console"
 VENDOR = FILES / "vendor"
-SOURCES = sorted(path for path in (FILES / "js").rglob("*.js"))
+OF_FEATURES = FILES.parents[1] / "features"
+SOURCES = sorted([*(FILES / "js").rglob("*.js"), *OF_FEATURES.glob("*/console/*.js")])
 IMPORT = re.compile(r"""(?:from|import)\s+"([^"]+)"|import\("([^"]+)"\)""")
 # Names of XML vocabularies; nothing is fetched from them.
 NAMESPACES = re.compile(
@@ -50,7 +51,7 @@ def client() -> Client:
 
 
 def test_the_page_is_served_at_every_view(client: Client) -> None:
-    paths = ["/", "/console", "/console/", *(f"/console/{view}" for view in VIEWS), "/console/audit/813"]
+    paths = ["/", "/console", "/console/", *(f"/console/{view}" for view in views()), "/console/audit/813"]
     [page] = {client.get(path).text for path in paths}
     assert '<meta name="rosrv:lock-seconds" content="900">' in page
     assert client.get("/console/elsewhere").status_code == 404
@@ -110,6 +111,16 @@ def test_the_files_of_the_page_are_cached_for_good_and_compressed(client: Client
     }  # fmt: skip
 
 
+def test_every_module_is_included_once(client: Client) -> None:
+    """The script has each module of the console and of the features, and imports vendored files only."""
+    [name] = re.findall(r"/console/static/js/main\.\w+\.js", client.get("/console").text)
+    script = client.get(name).text
+    assert script.count("=(()=>{") == len(SOURCES) - len({"early.js"})
+    assert "@param" not in script
+    assert [one for one in script.splitlines() if one.startswith("import ") and "/vendor/" not in one] == []
+    assert script.count("function GraphView(") == script.count("function OnTimeline(") == 1
+
+
 @pytest.mark.parametrize(
     "path",
     [
@@ -154,12 +165,17 @@ def test_no_file_names_another_host(path: Path) -> None:
     assert re.findall(r"(?:https?:|wss?:)?//[a-z0-9-]+\.[a-z]{2,}[^\s\"'`]*", text) == []
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(FILES)))
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(FILES.parents[1])))
 def test_sources_import_served_files_and_make_no_markup(path: Path) -> None:
     text = path.read_text()
     for relative, dynamic in IMPORT.findall(text):
         name = relative or dynamic
-        target = FILES / name.removeprefix("/console/static/") if name.startswith("/") else path.parent / name
+        if name.startswith("#console/"):
+            target = FILES / "js" / name.removeprefix("#console/")
+        else:
+            target = (
+                FILES / name.removeprefix("/console/static/") if name.startswith("/") else path.parent / name
+            )
         assert target.resolve().is_file(), name
     for word in (
         "innerHTML",

@@ -1,25 +1,8 @@
 """Tests of `console_bundle`; tests/system/console/test_load_time.py runs joined modules in a browser."""
 
-from pathlib import Path
-
 import pytest
 
-import appliance.api
 from appliance.api.console.console_bundle import ModuleError, join_modules, join_styles
-
-FILES = Path(appliance.api.__file__).parent / "console"
-
-
-def test_every_module_of_the_console_is_included_once() -> None:
-    sources = {str(path.relative_to(FILES)): path.read_text() for path in FILES.rglob("*.js")}
-    joined = join_modules(sources, "js/main.js")
-    modules = [name for name in sources if name.startswith("js/") and name != "js/early.js"]
-    assert joined.count("=(()=>{") == len(modules)
-    assert "@param" not in joined
-    assert [
-        line for line in joined.splitlines() if line.startswith("import ") and "/vendor/" not in line
-    ] == []
-    assert joined.count("function GraphView(") == joined.count("function createStore(") == 1
 
 
 def test_only_comments_and_indentation_are_removed() -> None:

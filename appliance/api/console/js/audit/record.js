@@ -3,7 +3,7 @@
 import { isDecided } from "../categories.js";
 import { Block } from "../hosts/block.js";
 import { html, useEffect, useRef, useState } from "../html.js";
-import { Moment } from "../moments.js";
+import { iso, Moment } from "../moments.js";
 import { Badge, Outcome, requested } from "../parts/badge.js";
 import { Given } from "../parts/given.js";
 import { Host } from "../parts/host.js";
@@ -11,8 +11,7 @@ import { Icon } from "../parts/icon.js";
 import { Failure, Loading } from "../parts/notice.js";
 import { useResource } from "../parts/resource.js";
 import { Rule } from "../parts/rule.js";
-import { OnTimeline } from "../recordings/taking.js";
-import { iso } from "../recordings/times.js";
+import { FeatureParts } from "../parts/features.js";
 import { get } from "../rest.js";
 import { go, Link } from "../router.js";
 import { plain } from "../words.js";
@@ -62,7 +61,7 @@ function Shown(/** @type {{shown: any, filter: Record<string, string>}} */ { sho
     <div class="row">${record.decision && isDecided(record.category) && html`<${Link} class="button" to=${explain(record)}>Explain in the policy</${Link}>`}
       ${record.host && isDenial(record) && html`<${Block} host=${record.host}>Block this host…</${Block}>`}</div>
     ${isDenial(record) && (isDecided(record.category) || GIVEN.has(record.event)) && html`<${Grant} key=${record.id} id=${record.id} />`}
-    <${OnTimeline} key=${`t${record.id}`} record=${record} />
+    <${FeatureParts} key=${`t${record.id}`} place="record" record=${record} />
     ${(record.detail.before || record.detail.after) && html`<div><h3>Message</h3><${Change} detail=${record.detail} /></div>`}
     ${detail.length > 0 && html`<div><h3>Details</h3><dl class="facts">${detail.map(([name, value]) => html`<dt key=${name}><${Given} value=${name} most=${40} /></dt><dd><${Detail} name=${name} value=${value} filter=${filter} /></dd>`)}</dl></div>`}
     <${Around} title="Before it, by the same host or node" records=${before} filter=${filter} /><${Around} title="After it, by the same host or node" records=${after} filter=${filter} />

@@ -6,11 +6,11 @@ import { inOwnZone, lasting, Moment, useNow } from "../moments.js";
 import { notable } from "../notable.js";
 import { count, counted, growth, lately } from "../numbers.js";
 import { Badge } from "../parts/badge.js";
+import { FeatureParts } from "../parts/features.js";
 import { By, Given } from "../parts/given.js";
 import { Loading } from "../parts/notice.js";
 import { Plot } from "../parts/plot.js";
 import { Link } from "../router.js";
-import { Pair } from "../standby/pair.js";
 import { useKeys } from "../shortcuts.js";
 import { useStore } from "../store.js";
 import { Alarms, placeOf } from "./alarms.js";
@@ -38,7 +38,7 @@ export function Now() {
     <div class="now-grid">
       <div class="now-alarms"><${Alarms} alarms=${alarms} incidents=${incidents} /></div>
       <div class="now-main stack"><${Curves} /><${Refusals} /><${Doings} /></div>
-      <div class="now-processes stack">${status.standby && html`<${Pair} state=${status.standby} orders />`}<${Processes} status=${status} /></div>
+      <div class="now-processes stack"><${FeatureParts} place="now" status=${status} /><${Processes} status=${status} /></div>
     </div>`;
 }
 

@@ -1,17 +1,16 @@
 /** Actions on a recording: download its messages, export evidence, remove it. */
 
-import { html, useEffect, useState } from "../html.js";
-import { take } from "../audit/proof.js";
-import { isDenial } from "../audit/rows.js";
-import { Moment } from "../moments.js";
-import { Button } from "../parts/button.js";
-import { Dialog } from "../parts/dialog.js";
-import { Icon } from "../parts/icon.js";
-import { done, failed } from "../parts/toast.js";
-import { ask, get, queryText } from "../rest.js";
-import { Link } from "../router.js";
-import { fileName, may } from "../session.js";
-import { iso } from "./times.js";
+import { html, useEffect, useState } from "#console/html.js";
+import { take } from "#console/audit/proof.js";
+import { isDenial } from "#console/audit/rows.js";
+import { iso, Moment } from "#console/moments.js";
+import { Button } from "#console/parts/button.js";
+import { Dialog } from "#console/parts/dialog.js";
+import { Icon } from "#console/parts/icon.js";
+import { done, failed } from "#console/parts/toast.js";
+import { ask, get, queryText } from "#console/rest.js";
+import { Link } from "#console/router.js";
+import { fileName, may } from "#console/session.js";
 
 /** @param {{row: any, small?: boolean}} given `row`: as `/v1/recordings` has it */
 export function Taking({ row, small = false }) {

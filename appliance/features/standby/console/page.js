@@ -1,15 +1,15 @@
 /** The page of a standby: its state, and the way to the active appliance's console. */
 
-import { html, useEffect } from "../html.js";
-import { Given } from "../parts/given.js";
-import { Mark } from "../parts/icon.js";
-import { Failure, Loading } from "../parts/notice.js";
-import { useResource } from "../parts/resource.js";
-import { get } from "../rest.js";
-import { end, entitle } from "../session.js";
-import { useStore } from "../store.js";
+import { html, useEffect } from "#console/html.js";
+import { Given } from "#console/parts/given.js";
+import { Mark } from "#console/parts/icon.js";
+import { Failure, Loading } from "#console/parts/notice.js";
+import { useResource } from "#console/parts/resource.js";
+import { get } from "#console/rest.js";
+import { end, entitle } from "#console/session.js";
+import { useStore } from "#console/store.js";
 import { Pair } from "./pair.js";
-import { passive } from "./passive.js";
+import { passive } from "#console/passive.js";
 
 const EVERY = 3000; // milliseconds
 

@@ -1,10 +1,10 @@
 /** The time line: events above, a lane for each topic below, on one axis, with the selected time. */
 
-import { html, useState } from "../html.js";
-import { clock } from "../moments.js";
-import { count, counted } from "../numbers.js";
-import { Given } from "../parts/given.js";
-import { plain } from "../words.js";
+import { html, useState } from "#console/html.js";
+import { clock } from "#console/moments.js";
+import { count, counted } from "#console/numbers.js";
+import { Given } from "#console/parts/given.js";
+import { plain } from "#console/words.js";
 import { kindOf } from "./times.js";
 
 export const COLUMNS = 160;

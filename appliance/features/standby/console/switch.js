@@ -1,13 +1,13 @@
 /** The planned switchover, after confirmation. */
 
-import { html, useState } from "../html.js";
-import { Button } from "../parts/button.js";
-import { Dialog } from "../parts/dialog.js";
-import { Given } from "../parts/given.js";
-import { Failure } from "../parts/notice.js";
-import { done } from "../parts/toast.js";
-import { Problem } from "../problem.js";
-import { ask } from "../rest.js";
+import { html, useState } from "#console/html.js";
+import { Button } from "#console/parts/button.js";
+import { Dialog } from "#console/parts/dialog.js";
+import { Given } from "#console/parts/given.js";
+import { Failure } from "#console/parts/notice.js";
+import { done } from "#console/parts/toast.js";
+import { Problem } from "#console/problem.js";
+import { ask } from "#console/rest.js";
 
 /** The button that opens the dialog. @param {{state: any}} given */
 export function SwitchOver({ state }) {

@@ -1,10 +1,4 @@
-/** Times of recordings, which are nanoseconds since the epoch (a number here: exact to a microsecond). */
-
-/** RFC 3339, rounded down to a microsecond. @param {number} time */
-export function iso(time) {
-  const micro = String(Math.floor(time / 1000) % 1000).padStart(3, "0");
-  return new Date(Math.floor(time / 1e6)).toISOString().replace("Z", `${micro}Z`);
-}
+/** Kinds of triggers and events of recordings. */
 
 /** The name and colour of a trigger or event. */
 export const KINDS = {

@@ -1,22 +1,22 @@
 /** One recording: its triggers, its time line, and the messages and events at the selected time. */
 
-import { html, useEffect, useRef, useState } from "../html.js";
-import { clock, lasting, Moment } from "../moments.js";
-import { bytes, counted } from "../numbers.js";
-import { Badge } from "../parts/badge.js";
-import { Given } from "../parts/given.js";
-import { Host } from "../parts/host.js";
-import { Icon } from "../parts/icon.js";
-import { Failure, Loading, Notice } from "../parts/notice.js";
-import { useResource } from "../parts/resource.js";
-import { get } from "../rest.js";
-import { go, Link, place } from "../router.js";
-import { useKeys } from "../shortcuts.js";
-import { useStore } from "../store.js";
+import { html, useEffect, useRef, useState } from "#console/html.js";
+import { clock, iso, lasting, Moment } from "#console/moments.js";
+import { bytes, counted } from "#console/numbers.js";
+import { Badge } from "#console/parts/badge.js";
+import { Given } from "#console/parts/given.js";
+import { Host } from "#console/parts/host.js";
+import { Icon } from "#console/parts/icon.js";
+import { Failure, Loading, Notice } from "#console/parts/notice.js";
+import { useResource } from "#console/parts/resource.js";
+import { get } from "#console/rest.js";
+import { go, Link, place } from "#console/router.js";
+import { useKeys } from "#console/shortcuts.js";
+import { useStore } from "#console/store.js";
 import { COLUMNS, Lanes } from "./lanes.js";
 import { Messages } from "./messages.js";
 import { Remove, Taking } from "./taking.js";
-import { iso, kindOf } from "./times.js";
+import { kindOf } from "./times.js";
 
 const SHORTEST = 1e8; // shortest shown period, in nanoseconds
 const SHOWN = 100; // most shown events

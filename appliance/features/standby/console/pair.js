@@ -1,17 +1,22 @@
 /** The two appliances and the witness: a panel, and a banner on every view while something is wrong. */
 
-import { html } from "../html.js";
-import { live } from "../live.js";
-import { lasting, Moment } from "../moments.js";
-import { counted } from "../numbers.js";
-import { Badge } from "../parts/badge.js";
-import { Given } from "../parts/given.js";
-import { Icon } from "../parts/icon.js";
-import { useStore } from "../store.js";
+import { html } from "#console/html.js";
+import { live } from "#console/live.js";
+import { lasting, Moment } from "#console/moments.js";
+import { counted } from "#console/numbers.js";
+import { Badge } from "#console/parts/badge.js";
+import { Given } from "#console/parts/given.js";
+import { Icon } from "#console/parts/icon.js";
+import { useStore } from "#console/store.js";
 import { SwitchOver } from "./switch.js";
 
 const SILENT = 5; // seconds, as in features/standby/standby_summary.py
 const GRAVE = ["both-active", "standby-unready", "standby-away", "standby-behind", "witness-silent", "standby-blind", "witness-disk"];
+
+/** The panel on Now. @param {{status: any}} given */
+export function PairNow({ status }) {
+  return status.standby && html`<${Pair} state=${status.standby} orders />`;
+}
 
 /** The panel. @param {{state: any, orders?: boolean}} given `orders`: with the button for the switchover */
 export function Pair({ state, orders = false }) {

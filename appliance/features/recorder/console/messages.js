@@ -1,13 +1,12 @@
 /** Decoded messages around a point in time, for investigators. The audit log records each request. */
 
-import { html, useEffect, useState } from "../html.js";
-import { clock } from "../moments.js";
-import { bytes } from "../numbers.js";
-import { Button } from "../parts/button.js";
-import { Given } from "../parts/given.js";
-import { Failure } from "../parts/notice.js";
-import { get } from "../rest.js";
-import { iso } from "./times.js";
+import { html, useEffect, useState } from "#console/html.js";
+import { clock, iso } from "#console/moments.js";
+import { bytes } from "#console/numbers.js";
+import { Button } from "#console/parts/button.js";
+import { Given } from "#console/parts/given.js";
+import { Failure } from "#console/parts/notice.js";
+import { get } from "#console/rest.js";
 
 const PAUSE = 250; // milliseconds after the last step on the time line
 const EACH = 5;
