@@ -134,7 +134,8 @@ def views() -> tuple[str, ...]:
 
 def _parts(features: Iterable[Feature]) -> str:
     """Return the module that lists the features' components."""
-    imports, rows = [], []
+    imports: list[str] = []
+    rows: list[str] = []
     for feature in features:
         for part in feature.console:
             alias = f"part{len(rows)}"
