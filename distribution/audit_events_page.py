@@ -72,8 +72,8 @@ _HEAD = """\
 # Audit events
 
 Every event by its stable name (`rosrv audit search --event NAME`), what it means, the severities it is recorded
-with, and the fields of its `detail`. The fields that every record has are in [audit-log.md](audit-log.md). A name is never
-renamed or given another meaning.
+with, and the fields of its `detail`. The fields that every record has are in [audit-log.md](audit-log.md). A name is
+never renamed or given another meaning.
 
 | event | meaning | severity | fields of `detail` |
 |---|---|---|---|

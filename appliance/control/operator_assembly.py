@@ -1,11 +1,8 @@
 """Make the parts that serve operators on the admin socket and over REST: tunnels, tokens, queries and orders."""
 
-import asyncio
-import contextlib
 from dataclasses import dataclass
 from functools import partial
 
-from appliance.base.deadlines import Deadlines
 from appliance.channel.answers.status import AuditState
 from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.foundation import Current, Foundation
@@ -24,35 +21,7 @@ from appliance.control.rest.rest_certificate import RestCertificate
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment import HostEnrolment, find_endpoint
 from appliance.hosts.rest_address import rest_address
-from appliance.store.state_file import StateStore
-from appliance.store.writer_thread import StoreError
-
-_SAVE_SECONDS = 30.0
-
-
-class StoredDeadlines(Deadlines):
-    """Ends whose remaining time is stored, so that no token has more time left after a restart than before."""
-
-    def __init__(self, store: StateStore) -> None:
-        super().__init__()
-        self._store = store
-        self._stored = store.time_left()
-        self.limit(self._stored)
-
-    def save(self) -> None:
-        """Store the remaining times that have changed. Raises `StoreError`."""
-        changed = {name: left for name, left in self.left().items() if self._stored.get(name) != left}
-        if changed:
-            self._store.database.require_room()
-            self._store.save_time_left(changed)
-            self._stored |= changed
-
-    async def watch(self) -> None:
-        """Store the remaining times every half a minute."""
-        while True:
-            await asyncio.sleep(_SAVE_SECONDS)
-            with contextlib.suppress(StoreError):  # a full disk: the next save tries again
-                self.save()
+from appliance.store.stored_deadlines import StoredDeadlines
 
 
 @dataclass(frozen=True, slots=True)

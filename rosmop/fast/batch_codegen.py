@@ -177,12 +177,18 @@ def written(
     tables = _Tables(writer)
     for component, own in zip(components, cells, strict=True):
         for topic, events in component.topics:
-            try:
-                walks[topic] = TopicCodegen(
-                    writer, own, tables, effects, events, topic=topic, stamped=topic in stamped
-                )
-            except (NotCompiledError, RecursionError) as error:
-                refused[topic] = reason_of(error)
+            # If the module cannot send safe messages of a topic, the interpreter takes only the messages that stop.
+            for channel in (topic, ""):
+                try:
+                    walks[topic] = TopicCodegen(
+                        writer, own, tables, effects, events, topic=channel, stamped=topic in stamped
+                    )
+                    refused.pop(topic, None)
+                    break
+                except (NotCompiledError, RecursionError) as error:
+                    refused[topic] = reason_of(error)
+                    if not any(map(writer.stops, events)):
+                        break
     settled = [writer.settling(own) for own in cells if own.kept]
     codes: list[bytes] = []
     for topic, walk in walks.items():
@@ -280,7 +286,10 @@ def _set(local: int, value: bytes) -> bytes:
 
 
 class TopicCodegen:
-    """Writes the code for one topic. Raises `NotCompiledError` if it would leave every message."""
+    """Writes the code for one topic. Raises `NotCompiledError` if it would leave every message.
+
+    Without `topic`, it leaves the messages that a safe message replaces.
+    """
 
     def __init__(
         self,

@@ -169,6 +169,10 @@ class ModuleCodegen(MemoryLayout):
         function = self.functions[name]
         return self.function(function, {"at": I32, "size": I32}, I32, function.context, channel=channel)
 
+    def stops(self, event: nodes.Event) -> bool:
+        """Whether the action of an event may send the safe message."""
+        return any(isinstance(one, nodes.StopMessage) for one in nodes.walk(self.functions[event.function].body))
+
     def function(
         self,
         function: nodes.Function | nodes.Skipper,

@@ -1,12 +1,12 @@
-"""Tests of `appliance.control.operator_assembly`."""
+"""Tests of `appliance.store.stored_deadlines`."""
 
 from pathlib import Path
 
 import pytest
 
 from appliance.base import clock
-from appliance.control.operator_assembly import StoredDeadlines
 from appliance.store.state_file import StateStore
+from appliance.store.stored_deadlines import StoredDeadlines
 from appliance.store.writer_thread import StoreError
 from tests.support.engines import InlineDatabase
 from tests.support.virtual_clock import VirtualClock

@@ -1,0 +1,35 @@
+"""Keep the ends of tokens over restarts, although the system clock may be set back while the appliance is off."""
+
+import asyncio
+import contextlib
+
+from appliance.base.deadlines import Deadlines
+from appliance.store.state_file import StateStore
+from appliance.store.writer_thread import StoreError
+
+_SAVE_SECONDS = 30.0
+
+
+class StoredDeadlines(Deadlines):
+    """Ends whose remaining time is stored, so that no token has more time left after a restart than before."""
+
+    def __init__(self, store: StateStore) -> None:
+        super().__init__()
+        self._store = store
+        self._stored = store.time_left()
+        self.limit(self._stored)
+
+    def save(self) -> None:
+        """Store the remaining times that have changed. Raises `StoreError`."""
+        changed = {name: left for name, left in self.left().items() if self._stored.get(name) != left}
+        if changed:
+            self._store.database.require_room()
+            self._store.save_time_left(changed)
+            self._stored |= changed
+
+    async def watch(self) -> None:
+        """Store the remaining times every half a minute."""
+        while True:
+            await asyncio.sleep(_SAVE_SECONDS)
+            with contextlib.suppress(StoreError):  # a full disk: the next save tries again
+                self.save()
