@@ -1,4 +1,8 @@
-"""Decide the service calls of monitors by the policy, as those of the appliance's own node on the loopback."""
+"""Decide the service calls of monitors by the policy, as those of a client at the appliance's own address.
+
+Relays connect to themselves, so this is the address that they listen on: 127.0.0.1, unless `listen:` names another one.
+The decision, the grant and its revocation are about the host that the relay sees.
+"""
 
 import ipaddress
 from collections.abc import Callable
@@ -12,15 +16,21 @@ from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reconcile.enactor import Enactor
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, request_of, rights_of_call
+from appliance.rpc.front import plain_address
 from appliance.telemetry.audit_trail import NOT_RECORDED, Asker, AuditTrail
 
-LOOPBACK = "127.0.0.1"
 _CALL = "lookupService"
+
+
+def own_host(listen: str) -> str:
+    """Return the address from which relays connect to a port that they open at the address `listen`."""
+    address = plain_address(listen)
+    return "127.0.0.1" if address.is_unspecified else str(address)
 
 
 @dataclass(frozen=True, slots=True)
 class MonitorCallGate:
-    """Decides for the node `name`, which makes the calls, and grants them like those of another client.
+    """Decides for the node `name` at `host`, which makes the calls, and grants them like those of another client.
 
     `port(provider, kind, service)` returns the port of a service on its relay.
     """
@@ -33,6 +43,7 @@ class MonitorCallGate:
     mediation: Mediation
     port: Callable[[Incarnation, Kind, str], int]
     name: str
+    host: str
 
     async def answer(self, wanted: MonitorCallWanted) -> MonitorCallAnswered:
         """Decide, record and grant a call."""
@@ -42,16 +53,16 @@ class MonitorCallGate:
             refused = "no node offers the service"
         if refused or provider is None:
             return MonitorCallAnswered(wanted.number, "", 0, "", refused)
-        host = ipaddress.ip_address(LOOPBACK)
+        host = ipaddress.ip_address(self.host)
         self.enactor.carry_out(self.graph.service_granted(provider, wanted.service, host, self.name))
         port = self.port(provider, Kind.SERVICE, wanted.service)
-        return MonitorCallAnswered(wanted.number, LOOPBACK, port, self.name, "")
+        return MonitorCallAnswered(wanted.number, self.host, port, self.name, "")
 
     async def _refused(self, service: str) -> str:
         """Return why the call is denied; empty if it is allowed."""
-        request = request_of(_CALL, ipaddress.ip_address(LOOPBACK), self.name, service)
+        request = request_of(_CALL, ipaddress.ip_address(self.host), self.name, service)
         decision = decide(self.policy(), rights_of_call(request, _CALL))
-        asker = Asker(LOOPBACK, self.name, clock.now_ns(), None)
+        asker = Asker(self.host, self.name, clock.now_ns(), None)
         record = self.trail.decided(asker, _CALL, request.category.value, service, decision)
         if not decision.allowed:
             return f"denied: {decision.reason} [{record}]"

@@ -8,7 +8,7 @@ from appliance.channel import messages
 from appliance.control.assembly.core import Core
 from appliance.control.assembly.foundation import INNER, RVMASTER, Current, Foundation
 from appliance.control.assembly.listener_limits import value_limits
-from appliance.control.monitor_call_gate import MonitorCallGate
+from appliance.control.monitor_call_gate import MonitorCallGate, own_host
 from appliance.master import rosout
 from appliance.master.endpoints.delivery import Delivery
 from appliance.master.endpoints.node_api import NodeApiClient
@@ -111,6 +111,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
             core.mediation,
             relay.port,
             settings.publish_as,
+            own_host(base.sockets[RVMASTER].getsockname()[0]),
         )
     )
     enforcement = Enforcement(core.revocation, enactor)

@@ -5,7 +5,8 @@ on its relay. The relay then connects to this port as any client does. So the ca
 request and response are events of the service.
 
 Invariants:
-- At most `MOST` calls are under way, and each ends after `RelayLimits.service_seconds` at the latest.
+- At most `MOST` calls are under way, and `MOST_OF_MONITOR` of one monitor. Each ends after `RelayLimits.service_seconds`
+  at the latest.
 - Each call that does not get a successful response is reported once, as a fault of its monitor.
 """
 
@@ -25,8 +26,8 @@ from roswire.tcpros import HeaderParser, ServiceReplyParser, encode_frame, encod
 if TYPE_CHECKING:
     from rosmop.run.outcomes import Published
 
-MOST = 16
-"""The maximum number of calls under way in a relay."""
+MOST, MOST_OF_MONITOR = 64, 4
+"""The maximum number of calls under way in a relay, and of one monitor, so that none takes the calls of the others."""
 
 
 @dataclass(eq=False, slots=True)
@@ -55,9 +56,14 @@ class ServiceCalls:
 
     def call(self, wanted: Published) -> None:
         """Begin a call; nothing of it happens before the next turn of the loop."""
-        if len(self._calls) >= MOST:
-            self._failed(wanted, f"{MOST} calls of monitors are under way; the call was not made")
-            return
+        own = sum(call.wanted.monitor == wanted.monitor for call in self._calls.values())
+        for number, most, whose in (
+            (own, MOST_OF_MONITOR, wanted.monitor),
+            (len(self._calls), MOST, "all monitors"),
+        ):
+            if number >= most:
+                self._failed(wanted, f"{most} calls of {whose} are under way; the call was not made")
+                return
         self._number += 1
         number, loop = self._number, self._context.loop
         seconds = self._context.limits.service_seconds

@@ -6,7 +6,7 @@ from typing import Any, cast
 import pytest
 
 from appliance.channel.messages import MonitorCallAnswered, MonitorCallWanted
-from appliance.control.monitor_call_gate import MonitorCallGate
+from appliance.control.monitor_call_gate import MonitorCallGate, own_host
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.policy.model import address_of
 from appliance.policy.policy_compiler import compile_policy
@@ -21,7 +21,13 @@ class Control:
     strict = False
 
     def __init__(
-        self, policy: str, *, offered: bool = True, carries: bool = True, full: bool = False
+        self,
+        policy: str,
+        *,
+        offered: bool = True,
+        carries: bool = True,
+        full: bool = False,
+        host: str = "127.0.0.1",
     ) -> None:
         self.records: list[tuple[str, str, bool]] = []
         self.granted: list[str] = []
@@ -32,7 +38,9 @@ class Control:
         if offered:
             registry.register(node, Kind.SERVICE, "/arm", "4001")
         compiled, own = compile_policy(policy, file="p.ini"), cast(Any, self)
-        self.gate = MonitorCallGate(registry, own, own, lambda: compiled, own, own, lambda *_: 4711, "/rosrv")
+        self.gate = MonitorCallGate(
+            registry, own, own, lambda: compiled, own, own, lambda *_: 4711, "/rosrv", host
+        )
 
     def decided(self, asker: Any, method: str, _category: str, resource: str, decision: Any) -> str:
         self.records.append((f"{asker.host} {asker.caller_id} {method}", resource, decision.allowed))
@@ -61,6 +69,21 @@ def test_an_allowed_call_is_recorded_and_granted() -> None:
     assert control.answer() == MonitorCallAnswered(7, "127.0.0.1", 4711, "/rosrv", "")
     assert control.records == [("127.0.0.1 /rosrv lookupService", "/arm", True)]
     assert control.granted == ["key 127.0.0.1 /rosrv /arm"]
+
+
+@pytest.mark.parametrize(
+    ("listen", "host"),
+    [("0.0.0.0", "127.0.0.1"), ("::", "127.0.0.1"), ("10.0.0.9", "10.0.0.9"), ("::1", "::1")],
+)
+def test_the_client_is_the_address_that_a_relay_connects_from(listen: str, host: str) -> None:
+    """A relay that listens on one address cannot be reached on the loopback, and sees this address as the client."""
+    assert own_host(listen) == host
+    control = Control(ALLOWED.replace("127.0.0.1", host), host=host)
+    assert control.answer() == MonitorCallAnswered(7, host, 4711, "/rosrv", "")
+    assert (control.records[0][0], control.granted) == (
+        f"{host} /rosrv lookupService",
+        [f"key {host} /rosrv /arm"],
+    )
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from appliance.channel.messages import (
     NodePlaced,
     ServicePlaced,
 )
-from appliance.relay.connections.monitor_calls import MOST, ServiceCalls
+from appliance.relay.connections.monitor_calls import MOST, MOST_OF_MONITOR, ServiceCalls
 from rosmop.run.outcomes import Published
 from roswire.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
 from tests.unit.relay.monitors.monitored import SET_BOOL_MD5, Monitored, string
@@ -23,7 +23,11 @@ from tests.unit.relay.world import LIMITS, LOOPBACK, Peer
 REACT = """react() { std_srvs::SetBoolRequest r;
     event said(std::string t) /chatter std_msgs/String '{data:t}' { r.data = true; CALL(/arm, std_srvs/SetBool, r); }
     event ok(bool s) service /arm std_srvs/SetBool response '{success:s}' { ROS_WARN("answer %d", s); } }"""
-WANTED = Published("react", "/arm", "std_srvs/SetBool", b"\x01", 0, True)
+
+
+def wanted(monitor: str = "react") -> Published:
+    """Return a call that a monitor wants."""
+    return Published(monitor, "/arm", "std_srvs/SetBool", b"\x01", 0, True)
 
 
 class Calls:
@@ -77,7 +81,7 @@ def test_each_call_that_does_not_succeed_is_one_fault(
 ) -> None:
     """Whatever comes later, a call fails once, and the next one can be made."""
     calls = Calls(connected=connected)
-    calls.calls.call(WANTED)
+    calls.calls.call(wanted())
     happens(calls)
     denied(calls)
     calls.run()
@@ -87,15 +91,17 @@ def test_each_call_that_does_not_succeed_is_one_fault(
 
 
 def test_the_number_of_calls_under_way_is_bounded() -> None:
-    """A monitor that calls with each message costs a bounded number of connections."""
+    """A monitor that calls with each message takes no calls of other monitors, and all together are bounded."""
     calls = Calls()
-    for _ in range(MOST + 3):
-        calls.calls.call(WANTED)
+    for _ in range(MOST_OF_MONITOR + 3):
+        calls.calls.call(wanted())
+    assert (len(calls.sent), calls.faults) == (MOST_OF_MONITOR, 3)
+    for number in range(MOST):
+        calls.calls.call(wanted(f"other{number}"))
     assert len(calls.sent) == MOST
-    assert calls.faults == 3
     calls.run()
-    assert calls.faults == 3 + MOST
-    calls.calls.call(WANTED)
+    assert calls.faults == 3 + MOST_OF_MONITOR
+    calls.calls.call(wanted())
     assert len(calls.sent) == MOST + 1
 
 
