@@ -5,8 +5,8 @@ on its relay. The relay then connects to this port as any client does. So the ca
 request and response are events of the service.
 
 Invariants:
-- At most `MOST` calls are under way, and `MOST_OF_MONITOR` of one monitor. Each ends after `RelayLimits.service_seconds`
-  at the latest.
+- At most `MOST` calls are under way, and `MOST_OF_MONITOR` of one monitor. Each ends after
+  `RelayLimits.service_seconds` at the latest.
 - Each call that does not get a successful response is reported once, as a fault of its monitor.
 """
 
