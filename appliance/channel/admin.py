@@ -407,15 +407,19 @@ class MonitorSwitch(AdminRequest[monitor_answers.Switched], frozen=True, tag="mo
     for_seconds: float | None = None
 
 
-@rest("operator", "PATCH", _SEVERAL, ("force",), of=MONITORS)
-@rest("operator", "PATCH", _ONE, ("force",), of=MONITORS)
+@rest("operator", "PATCH", _SEVERAL, ("force", "confirm_within"), of=MONITORS)
+@rest("operator", "PATCH", _ONE, ("force", "confirm_within"), of=MONITORS)
 class MonitorShadow(AdminRequest[monitor_answers.Switched], frozen=True, tag="monitor shadow"):
-    """Put these monitors into shadow mode, or (false) bring those in shadow mode into force; `force` as of a load."""
+    """Put these monitors into shadow mode, or (false) bring those in shadow mode into force.
+
+    `force` as of a load. With `confirm_within` they return to shadow mode unless confirmed.
+    """
 
     names: SomeMonitors
     shadow: bool
     expected: str | None = None
     force: Force = False
+    confirm_within: Confirm = None
 
 
 @rest(

@@ -156,6 +156,9 @@ def _monitors(status: Status) -> Iterator[_Condition]:
     if monitors.confirm_by is not None:
         text = _rolls_back("the specifications roll", monitors.confirm_by, "monitor")
         yield "warning", "monitors-unconfirmed", "monitors", text
+    for name, deadline in monitors.unconfirmed.items():
+        text = f"{name} returns to shadow mode at {_moment(deadline)} unless confirmed: rosrv monitor confirm"
+        yield "warning", f"monitor-unconfirmed:{name}", "monitors", text
     if monitors.differs_from_folder:
         text = f"revision {monitors.revision} of the specifications differs from their folder"
         yield "notice", "monitors-differ", "monitors", text

@@ -59,7 +59,7 @@ from appliance.specifications.specification_revisions import (
     unknown_monitors,
 )
 from appliance.specifications.switches import Switches, require_whole
-from appliance.specifications.timed_disables import LONGEST, TimedDisables
+from appliance.specifications.timed_switches import LONGEST, TimedSwitches
 from appliance.store.revisions import LIMITS, Revisions, reloaded_by
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
@@ -165,7 +165,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         )  # fmt: skip
         self._acts = 0  # number of all switches and resumptions so far
         self._attempting: set[str] = set()  # clients with a dry run under way
-        self.returns = TimedDisables(store, self._come_back)
+        self.returns = TimedSwitches(store, self._come_back)
         self.sources = Sources()
         self.checked = CheckedSpecifications()
         self.records = MonitorRecords(trail, lambda topic, data: self.checked.fields(topic, data), told)  # noqa: PLW0108 - of whatever is in force then
@@ -211,7 +211,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             self._say_unbuilt(name, error)
         for file, error in checked.left_out.items():
             self._say_left_out(file, error)
-        self.returns.start(self._disabled())
+        self.returns.start(self.switches.states)
         unknown = sorted(self.switches.named - self.checked.monitors.keys())
         if unknown:  # the monitors were removed while the robot ran
             _log.warning("--enable names monitors that are not loaded", monitors=unknown)
@@ -404,12 +404,15 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.MonitorsConfirmed:
         """Keep an unconfirmed change, if there is one."""
         async with self._changing(request.expected):
-            waited = self.confirm_by is not None
+            promoted = self.returns.unconfirmed()
+            waited = self.confirm_by is not None or bool(promoted)
             if waited:
                 self._end_limit()
+                self.returns.end(promoted)
+                also = f": {', '.join(promoted)} in force" if promoted else ""
                 self._trail.happened(
                     "specifications confirmed",
-                    f"revision {self.revision} of the specifications was confirmed",
+                    f"revision {self.revision} of the specifications was confirmed{also}",
                     category="monitor",
                     resource="",
                     who=who,
@@ -439,7 +442,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     async def shadow(self, request: admin.MonitorShadow, who: str) -> Switched:
         """Put monitors into shadow mode, or from shadow mode into force; return the monitors that changed.
 
-        Raises the errors of `switch`. Raises `SpecificationsRefusedError` also for a disabled monitor that should come
+        With `confirm_within`, monitors return to shadow mode after that many seconds unless confirmed. Raises the
+        errors of `switch`. Raises `SpecificationsRefusedError` also for a disabled monitor that should come
         into force, and for a monitor that would cut a topic.
         """
         async with self._changing(request.expected):
@@ -451,21 +455,47 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             if not request.shadow:
                 others = set(self.switches.shadowed()) - set(request.names)
                 self._judged(self.checked, others, _Consent(request.force), promoted=request.names)
-            names = await self._switch(request.names, SHADOW if request.shadow else True, who)
-            return self._switched(names, self.rollout.began(names))
+            self._check_limit(request)
+            names = await self._switch(
+                request.names, SHADOW if request.shadow else True, who, request.confirm_within
+            )
+            return self._switched(
+                names, self.rollout.began(names), confirm_by=self.returns.confirm_by(request.names[0])
+            )
+
+    def _check_limit(self, request: admin.MonitorShadow) -> None:
+        """Raise `SpecificationsRefusedError` if a monitor would have no shadow mode to return to."""
+        if request.confirm_within is None:
+            return
+        if request.shadow:
+            raise SpecificationsRefusedError(["shadow mode has no time limit: leave out confirm_within"])
+        confirmed = [
+            name
+            for name in request.names
+            if self.switches.enabled(name) and self.returns.confirm_by(name) is None
+        ]
+        if confirmed:
+            text = f"{', '.join(confirmed)} is in force already, so it cannot wait for a confirmation"
+            raise SpecificationsRefusedError([text])
 
     async def _come_back(self, back: Mapping[str, Switch]) -> None:
-        """Switch monitors back when their disabled period is over. Raises `SpecificationsRefusedError`."""
+        """Switch monitors back when their time is over. Raises `SpecificationsRefusedError`."""
         async with self._one_change:
             for to in (True, SHADOW):
-                names = [name for name in self._disabled() if back.get(name) == to]
-                await self._switch(names, to, "its disabled period is over")
+                names = [name for name in self.switches.states if back.get(name) == to]
+                unconfirmed = [name for name in names if self.returns.confirm_by(name) is not None]
+                disabled = [name for name in names if name not in unconfirmed]
+                await self._switch(disabled, to, "its disabled period is over")
+                await self._switch(unconfirmed, to, UNCONFIRMED)
 
-    def _disabled(self) -> list[str]:
-        return [name for name, state in self.switches.states.items() if state is False]
-
-    def _switched(self, names: list[str], began: Sequence[str] = (), until: float | None = None) -> Switched:
-        return Switched(names, self.revision, self.tag, [*began], until)
+    def _switched(
+        self,
+        names: list[str],
+        began: Sequence[str] = (),
+        until: float | None = None,
+        confirm_by: float | None = None,
+    ) -> Switched:
+        return Switched(names, self.revision, self.tag, [*began], until, confirm_by)
 
     async def _switch(
         self, names: Sequence[str], to: Switch, who: str, seconds: float | None = None
@@ -474,7 +504,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         changed = [
             name
             for name in dict.fromkeys(names)
-            if switches.states[name] != to or (to is False and (seconds is not None or name in self.returns))
+            if switches.states[name] != to or seconds is not None or (to is False and name in self.returns)
         ]
         if not changed:
             return changed
@@ -491,12 +521,12 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             except (SpecificationsRefusedError, WithdrawnError):
                 switches.said = before
                 raise
-        # Killed between the two, control leaves a limit without a disabled monitor, never the reverse.
+        # Killed between the two, control leaves a limit without its switch, never the reverse.
         if seconds is None:
             self.store.save_setting(_SWITCHES, json.dumps(switches.said))
             self.returns.end(changed)
         else:
-            self.returns.begin({name: switches.states[name] or True for name in changed}, seconds)
+            self.returns.begin({name: switches.states[name] or True for name in changed}, seconds, to)
             self.store.save_setting(_SWITCHES, json.dumps(switches.said))
         for name in changed:
             switches.states[name] = to
@@ -537,8 +567,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self._trail.happened("monitor not built", f"{text}; {fix}", category="monitor", resource=file)
 
     def _say_switched(self, name: str, to: Switch, who: str, why: str = "") -> None:
-        until = self.returns.until(name)
-        end = "" if until is None else f" until {_moment(until)}"
+        until = self.returns.until(name) or self.returns.confirm_by(name)
+        end = "" if until is None else f" until {_moment(until)}{' unless confirmed' if to is True else ''}"
         self._trail.happened(
             _EVENTS[to],
             f"{name} is {_WORDS[to]}{end}{why}",
@@ -855,7 +885,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self.sources, self.checked = sources, checked
         for name in self.switches.enforce(checked):
             self._say_switched(name, SHADOW, self.in_force.who, ": it shares variables with one that is")
-        self.returns.keep(self._disabled())
+        self.returns.keep(self.switches.states)
         for text in self.givens.enforce(checked):
             self._trail.happened(
                 "monitor set",

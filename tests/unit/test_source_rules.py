@@ -306,7 +306,7 @@ WALL_CLOCK = {
     ],
     "a span that goes on over restarts of the machine, which has no other clock": [
         "control/operators/alarm_orders.py", "features/standby/stored_times.py",
-        "control/operators/switched_off.py", "hosts/self_service.py", "specifications/timed_disables.py",
+        "control/operators/switched_off.py", "hosts/self_service.py", "specifications/timed_switches.py",
         "store/revisions.py",
     ],
     "whether the wall clock can be believed, and where it is read": [

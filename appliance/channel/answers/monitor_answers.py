@@ -60,6 +60,9 @@ class MonitorState(msgspec.Struct, frozen=True):
     ] = False
     off_until: Annotated[Moment | None, doc("when it is enabled again automatically; null: no end")] = None
     given: Annotated[list[GivenState], doc("constants and topics that are given to it")] = []
+    confirm_by: Annotated[
+        Moment | None, doc("when it returns to shadow mode unless confirmed; null: it stays as it is")
+    ] = None
 
 
 class Monitors(msgspec.Struct, frozen=True):
@@ -135,9 +138,9 @@ class Replacement(msgspec.Struct, frozen=True):
     changed: list[str]
     removed: list[str]
     warnings: list[str]
-    moved: list[str]
-    began: list[str]
-    kept: list[str]
+    moved: Annotated[list[str], doc("monitors that began because another relay process has them now")]
+    began: Annotated[list[str], doc("monitors that began in their initial state")]
+    kept: Annotated[list[str], doc("files that a reload left in force although the folder lacks them")]
     confirm_by: Moment | None
 
 
@@ -184,3 +187,6 @@ class Switched(msgspec.Struct, frozen=True):
         list[str], doc("monitors that entered or left shadow mode and are in their initial state")
     ] = []
     until: Annotated[Moment | None, doc("when they are enabled again automatically; null: no end")] = None
+    confirm_by: Annotated[
+        Moment | None, doc("when they return to shadow mode unless confirmed; null: they stay in force")
+    ] = None

@@ -114,6 +114,9 @@ class MonitorsState(msgspec.Struct, frozen=True):
         dict[str, str],
         doc("files that the start left out, because their topics are not known, with the error"),
     ] = {}
+    unconfirmed: Annotated[
+        dict[str, float], doc("monitors that return to shadow mode unless confirmed, with the time")
+    ] = {}
 
 
 class ForwardingState(msgspec.Struct, frozen=True):

@@ -99,14 +99,19 @@ def enable(
 
 
 @speaks
-def promote(appliance: Appliance, names: _Names, *, force: _Force = False) -> None:
+def promote(
+    appliance: Appliance, names: _Names, *, force: _Force = False, confirm_within: ConfirmWithin = None
+) -> None:
     """Enable monitors that are in shadow mode. They keep their state.
+
+    With --confirm-within they return to shadow mode after this time, even if the appliance restarts.
 
     A monitor that missed messages in shadow mode starts in its initial state; the output names it.
 
     Example: rosrv monitor promote safeTrigger
     """
-    _switch(appliance, admin.MonitorShadow(names, False, force=force), "enabled")
+    seconds = seconds_within(confirm_within, "monitor")
+    _switch(appliance, admin.MonitorShadow(names, False, force=force, confirm_within=seconds), "enabled")
 
 
 @speaks
@@ -314,6 +319,13 @@ def _switch(appliance: Appliance, order: admin.AdminRequest[Switched], word: str
     say(f"{word}: {', '.join(body.names) or 'no change'}{end}")
     if body.began:
         say(f"{', '.join(body.began)} started in the initial state", "yellow")
+    say_shadow_deadline(body.confirm_by)
+
+
+def say_shadow_deadline(confirm_by: float | None) -> None:
+    """Print when monitors return to shadow mode unless confirmed; print nothing if they stay in force."""
+    if confirm_by is not None:
+        say(f"back to shadow mode at {moment(confirm_by)} unless you run: rosrv monitor confirm", "yellow")
 
 
 def _state(row: MonitorState) -> str:
@@ -324,7 +336,11 @@ def _state(row: MonitorState) -> str:
     if row.failing:
         return "failing"
     if row.enabled:
-        return "enabled"
+        return (
+            "enabled"
+            if row.confirm_by is None
+            else f"enabled until {moment(row.confirm_by)} unless confirmed"
+        )
     return "disabled" if row.off_until is None else f"disabled until {moment(row.off_until)}"
 
 

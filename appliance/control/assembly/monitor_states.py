@@ -48,6 +48,7 @@ def monitors_status(monitors: SpecificationManager) -> MonitorsState:
         shadow=[row.name for row in rows if row.shadow],
         why_held={row.name: row.why_held for row in rows if row.why_held},
         left_out=monitors.checked.left_out,
+        unconfirmed={row.name: row.confirm_by for row in rows if row.confirm_by is not None},
     )
 
 
@@ -82,6 +83,7 @@ def _state(monitors: SpecificationManager, name: str) -> answers.MonitorState:
         slice_limit=row.slice_limit,
         why_held=monitors.rollout.why_held.get(name, ""),
         given=monitors.givens.states(checked, name),
+        confirm_by=monitors.returns.confirm_by(name),
     )
 
 

@@ -11,6 +11,7 @@ from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Graph
 from appliance.channel.answers.monitor_answers import Replacement
+from appliance.channel.messages import GivenValue
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.guards import guard_requests
@@ -128,7 +129,7 @@ class GuardOrders:
         except GuardError as error:
             raise SenselessError(str(error)) from error
         constants = {each: value for each, value in checked.items() if each not in in_text}
-        given = {name: dict(constants)} if constants else {}
+        given: dict[str, dict[str, GivenValue]] = {name: dict(constants)} if constants else {}
         if changed != text:  # one change of both, so that none of them is in force without the other
             order = admin.MonitorLoad(
                 {monitors.checked.monitors[name]: changed}, note=described(changed), expected=request.expected,
@@ -184,5 +185,6 @@ class GuardOrders:
             loads=loaded_values(text),
             stops=self._acts_of(name),
             why_held=monitors.rollout.why_held.get(name, ""),
+            confirm_by=monitors.returns.confirm_by(name),
             off_until=monitors.returns.until(name),
         )

@@ -13,7 +13,7 @@ from appliance.channel.messages import GivenValue
 from appliance.cli import completion
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.monitor.in_force import say_replaced
+from appliance.cli.monitor.in_force import say_replaced, say_shadow_deadline
 from appliance.cli.output import say_json
 from appliance.features.guards.guard_facts import facts_of, preset_row
 from appliance.features.guards.plans import planned
@@ -187,16 +187,20 @@ def set_values(
 
 
 @speaks
-def enforce(appliance: Appliance, name: _Name) -> None:
+def enforce(appliance: Appliance, name: _Name, confirm_within: ConfirmWithin = None) -> None:
     """Bring a guard from shadow mode into force. It keeps its state.
 
-    Example: rosrv guard enforce fence
+    With --confirm-within it returns to shadow mode after this time unless you run `rosrv monitor confirm`.
+
+    Example: rosrv guard enforce fence --confirm-within 5m
     """
     _guard(appliance, name)
-    body = appliance.answer_or_exit(admin.MonitorShadow([name], False))
+    order = admin.MonitorShadow([name], False, confirm_within=seconds_within(confirm_within, "guard"))
+    body = appliance.answer_or_exit(order)
     say(f"in force: {', '.join(body.names) or 'no change'}")
     if body.began:
         say(f"{', '.join(body.began)} started in the initial state", "yellow")
+    say_shadow_deadline(body.confirm_by)
 
 
 @speaks

@@ -17,7 +17,7 @@ import msgspec
 
 from appliance.base import clock
 from appliance.features.standby.replication import Pair
-from appliance.specifications.timed_disables import returns_moved
+from appliance.specifications.timed_switches import returns_moved
 from appliance.store.revisions import LIMITS, limit_moved
 from appliance.store.state_file import StateStore
 

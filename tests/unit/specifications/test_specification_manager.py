@@ -65,7 +65,7 @@ async def test_a_monitor_that_is_disabled_for_a_time_comes_back(desk: Desk) -> N
 
 def killed() -> None:
     for task in asyncio.all_tasks() - {asyncio.current_task()}:
-        if "TimedDisables" in str(task.get_coro()):
+        if "TimedSwitches" in str(task.get_coro()):
             task.cancel()
 
 
@@ -383,3 +383,36 @@ async def test_a_first_start_leaves_out_a_file_that_it_cannot_use(
         (desk.folder / "b.rv.sig").write_text(signed(B))
         monitors = await desk.monitors(site_keys=[LINE])
         assert (monitors.names(), monitors.checked.left_out) == ([*"ab"][-1 - len(others) :], {})
+
+
+async def test_an_unconfirmed_promotion_returns_to_shadow_mode(desk: Desk) -> None:
+    """Also after a restart; a confirmation, shadow mode or a disabled period of its own ends the limit."""
+    monitors = await desk.monitors()
+    promote = partial(admin.MonitorShadow, ["a"], False)
+
+    async def shadowed(now: Any) -> None:
+        async with asyncio.timeout(30):
+            while not now.switches.in_shadow("a"):
+                await asyncio.sleep(0.01)
+        assert now.returns.confirm_by("a") is None
+
+    with pytest.raises(SpecificationsRefusedError, match="in force already"):
+        await monitors.shadow(promote(confirm_within=60), "eve")
+    await monitors.shadow(admin.MonitorShadow(["a"], True), "eve")
+    done = await monitors.shadow(promote(confirm_within=0.05), "eve")
+    assert done.confirm_by == monitors.returns.confirm_by("a") and monitors.returns.until("a") is None
+    await shadowed(monitors)
+    assert desk.trail.heard[-1][0] == "monitor in shadow mode"
+    await monitors.shadow(promote(confirm_within=3600), "eve")
+    killed()
+    again = await desk.monitors(restarted=True)
+    assert again.switches.enabled("a") and again.returns.confirm_by("a") is not None
+    await again.shadow(promote(confirm_within=0.05), "eve")  # a shorter limit, and still back to shadow mode
+    await shadowed(again)
+    await again.shadow(promote(confirm_within=3600), "eve")
+    await again.switch(admin.MonitorSwitch(["a"], False, for_seconds=0.05), "eve")
+    await shadowed(again)
+    await again.shadow(promote(confirm_within=3600), "eve")
+    assert (await again.confirm(admin.MonitorConfirm(), "eve")).confirmed
+    assert again.switches.enabled("a") and again.returns.confirm_by("a") is None
+    assert not (await again.confirm(admin.MonitorConfirm(), "eve")).confirmed

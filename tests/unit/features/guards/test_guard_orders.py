@@ -22,7 +22,7 @@ FENCE = Guard("fence", PRESETS["fence"], types=TYPES, values={"polygon": "0,0 1,
 class Manager:
     """Specifications with a fence and a monitor that is not a guard; it keeps the orders that it gets."""
 
-    revision, tag = 2, "2.0"
+    revision, tag, shadow = 2, "2.0", False
 
     def __init__(self) -> None:
         self.orders: list[Any] = []
@@ -35,7 +35,6 @@ class Manager:
         self.givens = SimpleNamespace(states=lambda _checked, _name: [])
         self.returns = SimpleNamespace(until=lambda _name: None, confirm_by=lambda _name: None)
         self.records = SimpleNamespace(counts=Counter())
-        self.shadow = False
 
     async def load(self, request: Any, _who: str) -> Any:
         self.orders.append(request)
@@ -119,7 +118,7 @@ async def test_an_order_without_sense_changes_nothing(
 ) -> None:
     act = orders.new if isinstance(request_, guard_requests.GuardNew) else orders.set
     with pytest.raises(SenselessError, match=why):
-        await act(request_, "eve")  # type: ignore[operator]  # the method of the request
+        await act(request_, "eve")
     assert not manager.orders
 
 

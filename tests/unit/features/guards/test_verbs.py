@@ -107,7 +107,8 @@ def test_a_guard_is_brought_into_force_and_removed(tmp_path: Path) -> None:
     """Its file goes with it, unless the removal may roll back; a monitor that is not a guard is not touched."""
     robot = Robot(tmp_path, FENCE)
     (tmp_path / "fence.rv").write_text("x")
-    assert run(verbs.enforce, robot, "fence") == admin.MonitorShadow(["fence"], False)
+    order = run(verbs.enforce, robot, "fence", confirm_within="5m")
+    assert order == admin.MonitorShadow(["fence"], False, confirm_within=300)
     run(verbs.remove, robot, "fence", confirm_within="5m")
     assert (tmp_path / "fence.rv").exists()
     run(verbs.remove, robot, "fence")

@@ -1,17 +1,17 @@
-"""Disable monitors for a limited time.
+"""Switch monitors for a limited time: disable them, or bring them from shadow mode into force until confirmed.
 
 Invariants:
 
-1. The time is stored before its monitor is disabled, and survives restarts of control and of the appliance.
-2. A monitor is disabled for at most the ordered time plus the time for which the appliance did not run, even if the
+1. The time is stored before its monitor is switched, and survives restarts of control and of the appliance.
+2. A monitor is switched for at most the ordered time plus the time for which the appliance did not run, even if the
    clock was set back.
-3. Enabling can be refused, because the monitor now shares variables with monitors in shadow mode. It is then tried
-   again until it succeeds or an operator switches the monitor.
+3. Switching back can be refused, because the monitor now shares variables with monitors of another switch. It is then
+   tried again until it succeeds or an operator switches the monitor.
 """
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 
 import msgspec
 import structlog
@@ -24,7 +24,7 @@ from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 
 LONGEST = 30 * 86_400.0
-"""The most seconds for which a monitor may be disabled with a time limit."""
+"""The most seconds of a time limit."""
 
 _SETTING = "monitor returns"
 _AGAIN_SECONDS = 5.0
@@ -32,11 +32,14 @@ _log = structlog.get_logger()
 
 
 class _Return(msgspec.Struct, frozen=True):
-    """A time limit: its end (`until`, seconds since the epoch), its length (`seconds`), and the switch `back`."""
+    """The time limit of the switch `of`: its end (`until`, seconds since the epoch), its length (`seconds`), and the
+    switch `back`.
+    """
 
     until: float
     seconds: float
     back: Switch
+    of: Switch = False
 
 
 def returns_moved(store: StateStore, seconds: float) -> None:
@@ -46,7 +49,7 @@ def returns_moved(store: StateStore, seconds: float) -> None:
     store.save_setting(_SETTING, msgspec.json.encode(moved).decode())
 
 
-class TimedDisables:
+class TimedSwitches:
     """The time limits of monitors; when one ends, `come_back(back)` is called, which calls `end` like every switch."""
 
     def __init__(
@@ -63,27 +66,41 @@ class TimedDisables:
         return name in self._kept
 
     def until(self, name: str) -> float | None:
-        """Return when a monitor's time limit ends, in seconds since the epoch; None without a limit."""
-        found = self._kept.get(name)
-        return found.until if found is not None else None
+        """Return when a disabled monitor is enabled again, in seconds since the epoch; None without a limit."""
+        return self._end_of(name, False)
 
-    def start(self, disabled: Collection[str]) -> None:
-        """Resume the time limits of monitors that are still disabled after a start."""
+    def confirm_by(self, name: str) -> float | None:
+        """Return when a monitor in force returns to shadow mode unless confirmed; None without a limit."""
+        return self._end_of(name, True)
+
+    def unconfirmed(self) -> list[str]:
+        """Return the monitors that return to shadow mode unless confirmed."""
+        return [name for name, one in self._kept.items() if one.of is True]
+
+    def _end_of(self, name: str, of: Switch) -> float | None:
+        found = self._kept.get(name)
+        return found.until if found is not None and found.of == of else None
+
+    def start(self, states: Mapping[str, Switch]) -> None:
+        """Resume the time limits of monitors that still have the limited switch after a start."""
         text = self._store.settings().get(_SETTING, "{}")
         kept = msgspec.json.decode(text, type=dict[str, _Return])
         now = clock.wall()
         self._kept = {
             name: msgspec.structs.replace(one, until=min(one.until, now + one.seconds))
             for name, one in kept.items()
-            if name in disabled
+            if states.get(name) == one.of
         }
         self._save()
 
-    def begin(self, back: Mapping[str, Switch], seconds: float) -> None:
-        """Limit the time of these monitors: after `seconds`, apply the switches in `back`."""
+    def begin(self, back: Mapping[str, Switch], seconds: float, of: Switch = False) -> None:
+        """Limit the time of the switch `of` of these monitors: after `seconds`, apply the switches in `back`.
+
+        A monitor that has a limit already goes back to the switch of that limit.
+        """
         until = clock.wall() + seconds
         self._kept |= {
-            name: _Return(until, seconds, self._kept[name].back if name in self._kept else to)
+            name: _Return(until, seconds, self._kept[name].back if name in self._kept else to, of)
             for name, to in back.items()
         }
         self._save()
@@ -95,9 +112,9 @@ class TimedDisables:
             self._kept = {name: one for name, one in self._kept.items() if name not in ended}
             self._save()
 
-    def keep(self, disabled: Collection[str]) -> None:
-        """Forget all but these disabled monitors."""
-        self.end(self._kept.keys() - set(disabled))
+    def keep(self, states: Mapping[str, Switch]) -> None:
+        """Forget monitors that are gone, or no longer have the limited switch."""
+        self.end([name for name, one in self._kept.items() if states.get(name) != one.of])
 
     def _save(self) -> None:
         self._store.save_setting(_SETTING, msgspec.json.encode(self._kept).decode())
@@ -120,11 +137,11 @@ class TimedDisables:
         try:
             await self._come_back(due)
         except SpecificationsRefusedError as error:
-            _log.error("a monitor cannot be enabled again yet", monitors=list(due), error=str(error))
+            _log.error("a monitor cannot be switched back yet", monitors=list(due), error=str(error))
             await asyncio.sleep(_AGAIN_SECONDS)
             return
         except StoreError as error:
             _log.error(
-                "a monitor is enabled again, but this is not saved", monitors=list(due), reason=str(error)
+                "a monitor is switched back, but this is not saved", monitors=list(due), reason=str(error)
             )
         self.end(due)

@@ -1,4 +1,4 @@
-"""Tests of `appliance.specifications.timed_disables`."""
+"""Tests of `appliance.specifications.timed_switches`."""
 
 import asyncio
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ import pytest
 
 from appliance.base import clock
 from appliance.specifications.rollout import Switch
-from appliance.specifications.timed_disables import TimedDisables
+from appliance.specifications.timed_switches import TimedSwitches
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase
 from tests.support.virtual_clock import set_wall
@@ -25,7 +25,7 @@ async def test_a_clock_that_is_set_back_does_not_extend_a_time_limit(tmp_path: P
         assert back == {"gun": True}
         enabled.put_nowait(clock.now())
 
-    limits, begin = TimedDisables(store, come_back), clock.now()
+    limits, begin = TimedSwitches(store, come_back), clock.now()
     limits.begin({"gun": True}, 600.0)
     await asyncio.sleep(300.0)
     set_wall(clock.wall() - 86_400.0)
