@@ -1,0 +1,95 @@
+"""Doors of a running appliance: agents and viewers with rights of their own, a real robot behind them."""
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.sync.client import ClientConnection, connect
+
+from examples.landshark.lab import Host, Lab
+from tests.support.appliance import Appliance
+from tests.support.nodes import RosSession
+from tests.support.waiting import eventually
+
+SECONDS = 20.0
+POLICY = """
+[Groups]
+site = 10.77.0.0/24
+agent = door:agent-1
+[Nodes]
+default = site agent
+[Publishers]
+default = site
+/answer = site agent
+[Subscribers]
+default = site agent
+/secret = site
+[Services]
+default = site
+[Clients]
+default = site
+/brake = site agent
+[Commands]
+default = site agent
+[Parameters]
+read default = site agent
+write default = site
+"""
+AGENT = "ws://10.77.0.2:9091"
+
+
+@pytest.fixture(scope="module")
+def appliance(common_lab: Lab) -> Iterator[Appliance]:
+    """An appliance with the door of an agent on the robot."""
+    host = common_lab.host("appliance", "10.77.0.2/24")
+    with Appliance(host, policy=POLICY, options=("--api", "10.77.0.2:8443")) as running:
+        running.rosrv("door", "add", "agent-1", "--port", "9091", "--from", "10.77.0.10")
+        yield running
+
+
+def on_robot(robot: Host, work: Callable[[], Any]) -> Any:
+    """Run a client on the robot."""
+    return robot.run(work)
+
+
+def frame(client: ClientConnection, **wanted: Any) -> Any:
+    """Return the next frame with these fields."""
+    while True:
+        found = json.loads(client.recv(SECONDS))
+        if all(found.get(name) == value for name, value in wanted.items()):
+            return found
+
+
+def test_an_agent_hears_publishes_and_calls_within_its_rights(
+    appliance: Appliance, common_robot: Host, tmp_path: Path
+) -> None:
+    """What its rights do not contain is refused in the words of the record, with the rule's line."""
+    with RosSession(appliance.master_uri, tmp_path, common_robot) as ros:
+        ros.talker("rospy", "/chatter")
+        listener = ros.listener("rospy", "/answer")
+        ros.service_server("roscpp", "/brake")
+        eventually(lambda: not appliance.row("door", "list")["trouble"], "the door serves")
+
+        def work() -> None:
+            with connect(AGENT) as client:
+                client.send(json.dumps({"op": "subscribe", "topic": "/chatter", "type": "std_msgs/String"}))
+                assert frame(client, op="publish")["msg"]["data"].startswith("hello ")
+                client.send(json.dumps({"op": "advertise", "topic": "/answer", "type": "std_msgs/String"}))
+                client.send(json.dumps({"op": "publish", "topic": "/answer", "msg": {"data": "first"}}))
+                client.send(json.dumps({"op": "call_service", "service": "/brake", "args": [True], "id": 1}))
+                assert frame(client, op="service_response", id=1)["result"] is True
+                client.send(json.dumps({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String", "id": "a"}))
+                denied = frame(client, op="status", id="a")
+                assert denied["level"] == "error"
+                assert "policy.ini:8" in denied["msg"], denied
+                client.send(json.dumps({"op": "call_service", "service": "/other", "id": 2}))
+                refused = frame(client, op="service_response", id=2)
+                assert refused["result"] is False
+                assert refused["values"]["message"]
+
+        on_robot(common_robot, work)
+        assert listener.wait_for(event="received")["data"] == "first"
+    [denial] = appliance.recorded("--deny", resource="/cmd")
+    assert denial["host"].startswith("198.19.240.")
