@@ -31,6 +31,7 @@ from appliance.api.front.journal import FOLD_SECONDS, Journal
 from appliance.api.front.listener import Listener
 from appliance.api.front.request_gate import RequestGate
 from appliance.api.front.services import Services
+from appliance.api.front.websockets import WebSocketHandover
 from appliance.base import clock
 from appliance.base.background import run_always
 from appliance.channel import messages
@@ -107,7 +108,8 @@ class _Api:
             tunnels=self._settings.ipsec.pool,
             networks=map(ip_network, self._settings.api_networks),
         )
-        listener = Listener(gate, self._settings.api_limits, self._doorkeeper.quota_class)
+        handover = WebSocketHandover(self._control, self._doorkeeper, gate)
+        listener = Listener(gate, self._settings.api_limits, self._doorkeeper.quota_class, handover)
         await self._given.wait()
         if self._socket is None:
             return

@@ -65,7 +65,9 @@ class Link:
         self.channel.send(message, descriptors, soon=soon)
         return True
 
-    async def ask(self, question: Callable[[int], Message], seconds: float) -> Any:
+    async def ask(
+        self, question: Callable[[int], Message], seconds: float, descriptors: tuple[int, ...] = ()
+    ) -> Any:
         """Send a question with a new number, and return the answer. Wait at most `seconds`.
 
         Raises `TimeoutError`, `ChannelFullError`, and `ChannelClosedError` if the process is gone.
@@ -73,7 +75,7 @@ class Link:
         number = next(self._numbers)
         answer = self._asked[number] = asyncio.get_running_loop().create_future()
         try:
-            if not self.send(question(number)):
+            if not self.send(question(number), descriptors):
                 raise ChannelClosedError("the link is not connected")
             async with asyncio.timeout(seconds):
                 return await answer

@@ -136,6 +136,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
             trail,
             served=certification.served_by,
             certified=RestCertificate(base.store, trail, base.role.name).stated,
+            connected=base.features.connected,
             require_proof=settings.api_require_proof,
         )
     )

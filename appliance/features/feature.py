@@ -96,9 +96,9 @@ class FeaturePart:
     `links` are control's ends of the links to the feature's roles, with the messages that control accepts, and
     `longest` limits the bytes of a message. `methods` answer the feature's `operations`. `work` runs until control
     ends; its names go into error messages. `limits` returns how much of its resources is used.
-    `connected(door, ticket, peer, descriptor)` passes a WebSocket of the api on; it returns why it is refused, or an
-    empty text. `details` returns what it adds to the details of a record (`RecordDetails`). `called` answers nodes'
-    calls of its service.
+    `connected(door, ticket, peer, descriptor)` passes a WebSocket of the api on; it returns an HTTP status and why it
+    is refused, or an empty text. `details` returns what it adds to the details of a record (`RecordDetails`). `called`
+    answers nodes' calls of its service.
 
     These return a state, or None if there is none: `forwarding` that of the forwarding of the audit log, `collector`
     that of its segments, `bundles` that of the fleet's bundles, `recorder` that of the flight recorder, and `pair` that
@@ -115,7 +115,7 @@ class FeaturePart:
     recorder: "Callable[[], RecorderState | None]" = lambda: None
     pair: "Callable[[], StandbyState | None]" = lambda: None
     work: Mapping[str, Callable[[], Awaitable[None]]] = field(default_factory=dict)
-    connected: "Callable[[str, str, str, int], str] | None" = None
+    connected: "Callable[[str, str, str, int], tuple[int, str]] | None" = None
     collector: "Callable[[], ForwardingState | None]" = lambda: None
     bundles: "Callable[[], BundlesState | None]" = lambda: None
 

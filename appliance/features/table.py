@@ -65,8 +65,8 @@ class FeatureParts:
         """Return the addresses of the features' hosts, by their names in the policy."""
         return {name: address for kept in self.kept.values() for name, address in kept.addresses().items()}
 
-    def connected(self, door: str, ticket: str, peer: str, descriptor: int) -> str:
-        """Pass a WebSocket of the api on; return why it is refused, or an empty text."""
+    def connected(self, door: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
+        """Pass a WebSocket of the api on; return an HTTP status and why it is refused, or an empty text."""
         (connected,) = filter(None, (part.connected for part in self._parts))
         return connected(door, ticket, peer, descriptor)
 

@@ -137,6 +137,17 @@ class TokenAuthenticator:
             self._recognised[digest] = kept.id
         return True
 
+    def require_patience(self, host: str) -> None:
+        """Raise `ProblemError` (429) if a peer sent too many wrong secrets."""
+        _require_patience(self._unknown, host)
+
+    def noted(self, host: str, *, valid: bool) -> None:
+        """Note a right or wrong secret of a peer that is not a token, such as a ticket."""
+        if valid:
+            self._remember(peer_key(host))
+        else:
+            self._unknown.take(host, clock.now())
+
     def _remember(self, peer: str) -> None:
         self._shown[peer] = clock.now()
         self._shown.move_to_end(peer)

@@ -23,6 +23,8 @@ from appliance.channel.admin import A, AdminAnswer, AdminRequest, decode, operat
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
 from appliance.channel.messages.api import (
+    ConnectionAnswered,
+    ConnectionPassed,
     RequestAnswered,
     RequestMade,
     RequestWithdrawn,
@@ -160,6 +162,18 @@ class ControlLink:
                 gone.remove_done_callback(withdraw)
         return answer
 
+    async def hand_over(self, door: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
+        """Pass a WebSocket on; return the status and why it is refused, or an empty text. Raises `ControlAwayError`."""
+        if self.paused:
+            raise ControlAwayError(self.paused)
+        try:
+            answer: ConnectionAnswered = await self._link.ask(
+                lambda number: ConnectionPassed(number, door, ticket, peer), ANSWER_SECONDS, (descriptor,)
+            )
+        except (TimeoutError, ChannelFullError, ChannelClosedError):
+            raise ControlAwayError("the appliance does not answer now: try again in a second") from None
+        return answer.status, answer.reason
+
     def token_used(self, token: str) -> None:
         """Report the use of a token to control; without control, a later use is reported."""
         with contextlib.suppress(ChannelFullError):
@@ -196,6 +210,8 @@ class ControlLink:
         match message:
             case RequestAnswered(number, answer):
                 self._link.answered(number, answer)
+            case ConnectionAnswered(number):
+                self._link.answered(number, message)
             case TokensStated(tokens):
                 self.known = True
                 self._tokens_stated(tokens)

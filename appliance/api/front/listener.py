@@ -27,6 +27,7 @@ from uvicorn.config import Config
 from uvicorn.server import ServerState
 
 from appliance.api.front.rates import peer_key
+from appliance.api.front.websockets import PREFIX, WebSocketHandover, WebSocketPassage
 from appliance.configuration.settings import ApiLimits
 from appliance.policy.model import Address
 from appliance.quotas.descriptors import connections_within
@@ -54,6 +55,10 @@ class _Connection(Front, asyncio.Protocol):
         self._listener = listener
         self._unanswered = 0  # requests without an answer whose head has arrived
         self._rests = False  # whether no byte has arrived since the last answer
+        self._head = bytearray()  # of the first request, which may open a WebSocket
+        self._target = b""
+        self._is_first = True
+        self._websocket: WebSocketPassage | None = None
 
     @property
     def is_quiet(self) -> bool:
@@ -72,27 +77,55 @@ class _Connection(Front, asyncio.Protocol):
 
     def connection_lost(self, error: Exception | None) -> None:
         self.leave()
+        if self._websocket is not None:
+            self._websocket.client_left()
         self._uvicorn.connection_lost(error)
 
     def data_received(self, data: bytes) -> None:
+        if self._websocket is not None:
+            self._websocket.from_client(data)
+            return
         if self._rests:
             self._rests = False
             self.allow(self.limits.head_seconds)
+        if self._is_first:
+            self._head += data
         self.parse(data)
-        if not self.closing:
+        if self.closing:
+            return
+        if not self._passed_on():
             self._uvicorn.data_received(data)
 
+    def _passed_on(self) -> bool:
+        """Pass the connection on if its request opens a WebSocket; return whether it does."""
+        if self._websocket is None:
+            return False
+        self._listener.pass_on(self._websocket, bytes(self._head))
+        return True
+
     def pause_writing(self) -> None:
+        if self._websocket is not None:
+            self._websocket.hold_door(held=True)
         self._uvicorn.pause_writing()
 
     def resume_writing(self) -> None:
+        if self._websocket is not None:
+            self._websocket.hold_door(held=False)
         self._uvicorn.resume_writing()
+
+    def on_url(self, url: bytes) -> None:
+        super().on_url(url)
+        if self._is_first:
+            self._target += url
 
     def on_headers_complete(self) -> None:
         super().on_headers_complete()
         self._unanswered += 1
         self.deadline = math.inf  # body and answer have their own deadlines (`api/request_gate`)
         self.connection_table.file(self, Stage.SERVED)
+        if self._is_first and self._listener.opens_websocket(self._target) and self.parser.should_upgrade():
+            self._websocket = WebSocketPassage(self.transport, self._target)
+        self._is_first = False
 
     def answered(self) -> None:
         self._unanswered -= 1
@@ -132,8 +165,15 @@ def _patience(quota_class: QuotaClass, stage: Stage, _own: bool) -> float:
 class Listener:
     """The server of `app` on a listening socket; `quota_class(peer)` distinguishes known from unknown peers."""
 
-    def __init__(self, app: ASGIApp, limits: ApiLimits, quota_class: Callable[[str], QuotaClass]) -> None:
+    def __init__(
+        self,
+        app: ASGIApp,
+        limits: ApiLimits,
+        quota_class: Callable[[str], QuotaClass],
+        websockets: WebSocketHandover | None = None,
+    ) -> None:
         self._app = app
+        self._websockets = websockets
         self._config = Config(
             self._serve,
             interface="asgi3",
@@ -158,6 +198,15 @@ class Listener:
         self._tasks: set[asyncio.Task[None]] = set()
         self._acceptor: Acceptor | None = None
         self._time = ProcessorTime(partial(_class_of, quota_class))
+
+    def opens_websocket(self, target: bytes) -> bool:
+        """Whether a request that wants an upgrade opens the WebSocket of a door."""
+        return self._websockets is not None and target.startswith(PREFIX)
+
+    def pass_on(self, passage: WebSocketPassage, head: bytes) -> None:
+        """Pass a WebSocket on."""
+        if self._websockets is not None:
+            self._begin(self._websockets.pass_on(passage, head))
 
     def protocol_of(self, connection: _Connection) -> asyncio.Protocol:
         """Make this connection's protocol for HTTP and ASGI, as uvicorn's server does."""

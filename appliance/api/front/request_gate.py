@@ -115,6 +115,13 @@ class RequestGate:
             if gone is not None:
                 gone.cancel()
 
+    def admit_websocket(self, host: str, path: str) -> None:
+        """Check the rate and the network of a client that opens a WebSocket. Raises `ProblemError`."""
+        wait = self._rate.take(host, clock.now())
+        if wait:
+            raise too_many("too-many-requests", "too many requests from this host", wait)
+        self._check_tunnel(host, path, renewal=False)
+
     async def _pass(self, scope: Scope, receive: Receive) -> tuple[Bearer | None, bytes]:
         host = scope["client"][0]
         rate = self._page_rate if is_console(scope["path"]) else self._rate

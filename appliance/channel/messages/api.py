@@ -4,7 +4,7 @@ The api's requests are the union `RestRequest`. No request in it can make a toke
 """
 
 import math
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import msgspec
 
@@ -49,6 +49,27 @@ class RequestAnswered(Message):
 
     number: int
     answer: bytes
+
+
+class ConnectionPassed(Message):
+    """The api passes on a WebSocket for a door, after TLS. It has read the head of the request, and sends it again.
+
+    `peer` is the client's address, and `ticket` what it showed.
+    """
+
+    descriptors: ClassVar[int] = 1
+    number: int
+    door: str
+    ticket: str
+    peer: str
+
+
+class ConnectionAnswered(Message):
+    """Control answers the `ConnectionPassed` with the same number: empty, or an HTTP status and why it is refused."""
+
+    number: int
+    status: int
+    reason: str
 
 
 class TokenKept(msgspec.Struct, frozen=True):
@@ -107,5 +128,13 @@ class RestServed(Message):
 
 
 ApiLink = (
-    RequestMade | RequestWithdrawn | RequestAnswered | TokensStated | TokenUsed | RestCalled | RestServed
+    RequestMade
+    | RequestWithdrawn
+    | RequestAnswered
+    | TokensStated
+    | TokenUsed
+    | RestCalled
+    | RestServed
+    | ConnectionPassed
+    | ConnectionAnswered
 )

@@ -13,6 +13,7 @@ These invariants ensure that a flooded or compromised api cannot block RVMaster:
 """
 
 import asyncio
+import os
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -27,6 +28,8 @@ from appliance.channel.admin import AdminAnswer, ChallengeWanted, WaitingRequest
 from appliance.channel.channel import Channel, ChannelFullError
 from appliance.channel.link import Link
 from appliance.channel.messages.api import (
+    ConnectionAnswered,
+    ConnectionPassed,
     RequestAnswered,
     RequestMade,
     RequestWithdrawn,
@@ -53,7 +56,8 @@ class RestLink:
     """The link to the api.
 
     `served(pin)` is called with the pin by which hosts recognise the api, and `certified(sha256)`
-    with the fingerprint of its certificate. `require_proof`: every change needs a signed
+    with the fingerprint of its certificate. `connected(door, ticket, peer, descriptor)` passes a WebSocket on, and
+    returns why it is refused. `require_proof`: every change needs a signed
     request, because a bare token is not enough.
     """
 
@@ -65,13 +69,15 @@ class RestLink:
         *,
         served: Callable[[str], None],
         certified: Callable[[str], None],
+        connected: Callable[[str, str, str, int], tuple[int, str]],
         require_proof: bool,
     ) -> None:
         self._administration = administration
         self._tokens = tokens
         self._askers = RequestAuthenticator(tokens, require_proof=require_proof)
         self._trail = trail
-        self._link = Link(self._received, self._lost)
+        self._link = Link(self._received, self._lost, self._took)
+        self._connected = connected
         self._waiting: deque[RequestMade] = deque()
         self._withdrawn: dict[int, bool] = {}  # unanswered requests of the present link, by number
         self._worker: asyncio.Task[None] | None = None  # the worker of the present link
@@ -113,6 +119,15 @@ class RestLink:
             case _:
                 self._link.close()
                 self._lost(f"it sent {type(message).__name__}")
+
+    def _took(self, message: object, descriptors: tuple[int, ...]) -> None:
+        try:
+            if isinstance(message, ConnectionPassed):
+                status, reason = self._connected(message.door, message.ticket, message.peer, descriptors[0])
+                self._send(ConnectionAnswered(message.number, status, reason))
+        finally:
+            for descriptor in descriptors:
+                os.close(descriptor)
 
     async def _work(self, channel: Channel | None) -> None:
         while self._waiting and channel is self._link.channel:

@@ -163,8 +163,8 @@ class DoorOrders:
             path=f"/door/{door.name}?ticket={text}",
         )
 
-    def enter(self, door: str, ticket: str, peer: str, descriptor: int) -> str:
-        """Pass a person's connection to a door; return why it is refused, or an empty text."""
+    def enter(self, door: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
+        """Pass a person's connection to a door; return an HTTP status and why it is refused, or an empty text."""
         row = next((one for one in self._table.live() if one.name == door), None)
         found = self._tickets.find(door, ticket)
         if row is None or found is None:
@@ -176,11 +176,11 @@ class DoorOrders:
                 category="rest",
                 resource=door[:31],
             )
-            return "the ticket is wrong or over: ask the operator for a new one (rosrv door ticket NAME)"
+            return 401, "the ticket is wrong or over: ask the operator for a new one (rosrv door ticket NAME)"
         if not self._processes.pass_on(row, descriptor, peer, found.id):
-            return self._processes.state(row)[1] or "the door is busy: try again"
+            return 503, self._processes.state(row)[1] or "the door is busy: try again"
         self._used[found.id] = row.name
-        return ""
+        return 101, ""
 
     async def watch(self) -> None:
         """Start the processes of doors, end connections whose tickets are over, and retry what failed."""

@@ -1,12 +1,15 @@
 """Doors of a running appliance: agents and viewers with rights of their own, a real robot behind them."""
 
 import json
+import ssl
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Subprotocol
 
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
@@ -44,7 +47,8 @@ AGENT = "ws://10.77.0.2:9091"
 def appliance(common_lab: Lab) -> Iterator[Appliance]:
     """An appliance with the door of an agent on the robot."""
     host = common_lab.host("appliance", "10.77.0.2/24")
-    with Appliance(host, policy=POLICY, options=("--api", "10.77.0.2:8443")) as running:
+    settings = "api_networks: [10.77.0.0/24]\n"
+    with Appliance(host, policy=POLICY, settings=settings, options=("--api", "10.77.0.2:8443")) as running:
         running.rosrv("door", "add", "agent-1", "--port", "9091", "--from", "10.77.0.10")
         yield running
 
@@ -80,7 +84,9 @@ def test_an_agent_hears_publishes_and_calls_within_its_rights(
                 client.send(json.dumps({"op": "publish", "topic": "/answer", "msg": {"data": "first"}}))
                 client.send(json.dumps({"op": "call_service", "service": "/brake", "args": [True], "id": 1}))
                 assert frame(client, op="service_response", id=1)["result"] is True
-                client.send(json.dumps({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String", "id": "a"}))
+                client.send(
+                    json.dumps({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String", "id": "a"})
+                )
                 denied = frame(client, op="status", id="a")
                 assert denied["level"] == "error"
                 assert "policy.ini:8" in denied["msg"], denied
@@ -93,3 +99,69 @@ def test_an_agent_hears_publishes_and_calls_within_its_rights(
         assert listener.wait_for(event="received")["data"] == "first"
     [denial] = appliance.recorded("--deny", resource="/cmd")
     assert denial["host"].startswith("198.19.240.")
+
+
+def test_a_ticket_opens_the_door_of_a_person_until_it_is_over(
+    appliance: Appliance, common_robot: Host, tmp_path: Path
+) -> None:
+    """The secret is in no record. A wrong ticket is refused, and the connection ends with its ticket."""
+    appliance.rosrv("door", "add", "alice")
+    made = appliance.rosrv("door", "ticket", "alice", "--for", "8s").stdout.strip()
+    url = made.replace("ADDRESS:8443", "10.77.0.2:8443")
+    trusting = ssl.create_default_context()
+    trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE
+    eventually(lambda: not appliance.rows("door", "list")[-1]["trouble"], "the door serves")
+
+    def refused() -> None:
+        for wrong in (
+            url[:-1] + ("A" if url[-1] != "A" else "B"),
+            url.replace("/alice", "/agent-1"),
+            url.partition("?")[0],
+        ):
+            with pytest.raises(InvalidStatus) as error, connect(wrong, ssl=trusting):
+                pass
+            assert error.value.response.status_code == 401
+
+    def work() -> None:
+        with connect(url, ssl=trusting, subprotocols=[Subprotocol("foxglove.sdk.v1")]) as client:
+            assert client.subprotocol == "foxglove.sdk.v1"
+            assert frame(client, op="serverInfo")
+            with pytest.raises(ConnectionClosed, match="ticket is over"):
+                while True:
+                    client.recv(SECONDS)
+
+    on_robot(common_robot, refused)
+    on_robot(common_robot, work)
+    secret = url.rpartition(".")[2]
+    assert appliance.recorded(event="door disconnected", resource="alice")
+    assert secret not in json.dumps(appliance.recorded())
+
+
+def test_doors_survive_a_restart_and_a_removed_one_ends(appliance: Appliance, common_robot: Host) -> None:
+    """Its address stays reserved for its name."""
+    before = appliance.rows("door", "list")
+    appliance.stop()
+    appliance.start()
+    eventually(lambda: not any(row["trouble"] for row in appliance.rows("door", "list")), "the doors serve")
+    after = appliance.rows("door", "list")
+    assert [(row["name"], row["address"]) for row in after] == [
+        (row["name"], row["address"]) for row in before
+    ]
+
+    def work() -> None:
+        with connect(AGENT) as client:
+            client.send(json.dumps({"op": "call_service", "service": "/rosapi/get_time", "id": 1}))
+            assert frame(client, op="service_response")["result"] is True
+            appliance.rosrv("door", "remove", "agent-1")
+            with pytest.raises(ConnectionClosed):
+                client.recv(SECONDS)
+        with pytest.raises(OSError, match="refused"):
+            eventually(lambda: not connect(AGENT).close(), "the port closes", 1)
+
+    on_robot(common_robot, work)
+    added = appliance.row("door", "list")
+    assert added["name"] == "alice"
+    new = appliance.rosrv("door", "add", "bob").stdout
+    assert before[0]["address"] not in new
+    again = appliance.rosrv("door", "add", "agent-1", "--port", "9091").stdout
+    assert before[0]["address"] in again

@@ -1,0 +1,162 @@
+"""Pass the WebSocket of a viewer on to the process of a door, after TLS.
+
+A viewer shows a ticket in the URL. Control checks it, and gives the door's process one end of a socket pair; this
+process copies bytes between the pair and the client. Invariants:
+
+1. Only the name of the door follows the request further: neither the door nor a log gets the ticket.
+2. Neither side is read while the other one does not read, so a client that stalls costs two small buffers.
+3. A peer that shows wrong tickets must wait, as with wrong tokens.
+"""
+
+import asyncio
+import socket
+from collections.abc import Callable
+from functools import partial
+from typing import cast
+from urllib.parse import parse_qs, urlsplit
+
+from appliance.api.front.access import TokenAuthenticator
+from appliance.api.front.control import ControlAwayError, ControlLink
+from appliance.api.front.problems import ProblemError
+from appliance.api.front.request_gate import RequestGate
+from appliance.base import clock
+
+PREFIX = b"/door/"
+_NOTE_SECONDS = 60.0
+_LONGEST = 200  # characters of a name or a ticket
+
+
+class WebSocketPassage(asyncio.Protocol):
+    """The way of one WebSocket between its client and its door; this protocol has the door's end."""
+
+    def __init__(self, client: asyncio.Transport, target: bytes) -> None:
+        self.client = client
+        self.target = target
+        self.note: Callable[[], None] = lambda: None
+        self._noted = clock.now()
+        self._door: asyncio.Transport | None = None
+        self._held: list[bytes] = []
+
+    @property
+    def peer(self) -> str:
+        """Return the client's address."""
+        return str(self.client.get_extra_info("peername")[0])
+
+    def from_client(self, data: bytes) -> None:
+        """Take bytes of the client."""
+        if self._door is None:
+            self.client.pause_reading()  # until the door takes the connection
+            self._held.append(data)
+        else:
+            self._door.write(data)
+            if clock.now() - self._noted > _NOTE_SECONDS:  # so that no flood of unknown peers displaces it
+                self._noted = clock.now()
+                self.note()
+
+    def client_left(self) -> None:
+        """End the door's end, after what the client sent."""
+        if self._door is not None:
+            self._door.close()
+
+    def hold_door(self, *, held: bool) -> None:
+        """Stop or continue reading from the door, because the client does not read, or reads again."""
+        if self._door is not None and not self._door.is_closing():
+            (self._door.pause_reading if held else self._door.resume_reading)()
+
+    def refuse(self, status: str, reason: str) -> None:
+        """Answer the client's handshake with an error."""
+        body = f"{reason}\n".encode()
+        head = f"HTTP/1.1 {status}\r\nContent-Type: text/plain; charset=utf-8\r\nConnection: close\r\n"
+        self.client.write(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body)
+        self.client.close()
+
+    # --- the door's end ---
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._door = cast(asyncio.Transport, transport)
+        if self.client.is_closing():
+            self._door.close()
+
+    def begin(self, head: bytes) -> None:
+        """Send the door the head of the request, and what came since."""
+        if self._door is None:
+            return
+        self._door.write(head)
+        for data in self._held:
+            self._door.write(data)
+        self._held.clear()
+        if not self.client.is_closing():
+            self.client.resume_reading()
+
+    def data_received(self, data: bytes) -> None:
+        self.client.write(data)
+
+    def connection_lost(self, _error: Exception | None) -> None:
+        self.client.close()
+
+    def pause_writing(self) -> None:
+        if not self.client.is_closing():
+            self.client.pause_reading()
+
+    def resume_writing(self) -> None:
+        if not self.client.is_closing():
+            self.client.resume_reading()
+
+
+class WebSocketHandover:
+    """Passes WebSockets on to control."""
+
+    def __init__(self, control: ControlLink, doorkeeper: TokenAuthenticator, gate: RequestGate) -> None:
+        self._control = control
+        self._doorkeeper = doorkeeper
+        self._gate = gate
+
+    async def pass_on(self, passage: WebSocketPassage, head: bytes) -> None:
+        """Pass one on, or refuse its handshake with the reason."""
+        host = passage.peer
+        try:
+            self._gate.admit_websocket(host, PREFIX.decode())
+            self._doorkeeper.require_patience(host)
+            door, ticket = _entry_of(passage.target)
+            here, there = socket.socketpair()
+            with there:
+                try:
+                    status, reason = await self._control.hand_over(door, ticket, host, there.fileno())
+                    if reason:
+                        raise ProblemError(status, "not-recognised", reason)
+                    here.setblocking(False)
+                    await asyncio.get_running_loop().create_unix_connection(lambda: passage, sock=here)
+                except BaseException:
+                    here.close()
+                    raise
+        except ProblemError as problem:
+            if problem.status == 401:
+                self._doorkeeper.noted(host, valid=False)
+            passage.refuse(f"{problem.status} Refused", problem.detail)
+            return
+        except ControlAwayError as error:
+            passage.refuse("503 Service Unavailable", str(error))
+            return
+        self._doorkeeper.noted(host, valid=True)
+        passage.note = partial(self._doorkeeper.noted, host, valid=True)
+        passage.begin(_without_ticket(head, door))
+
+
+def _entry_of(target: bytes) -> tuple[str, str]:
+    """Return the door and the ticket of a request target. Raises `ProblemError`."""
+    try:
+        parts = urlsplit(target.decode("ascii"))
+        ticket = parse_qs(parts.query).get("ticket", [""])[0]
+    except ValueError:
+        raise ProblemError(400, "bad-input", "the URL is not valid") from None
+    door = parts.path.removeprefix(PREFIX.decode())
+    if not ticket or max(len(ticket), len(door)) > _LONGEST:
+        raise ProblemError(
+            401, "not-recognised", "the URL has no ticket: use the one of `rosrv door ticket NAME`"
+        )
+    return door, ticket
+
+
+def _without_ticket(head: bytes, door: str) -> bytes:
+    _line, _end, rest = head.partition(b"\n")
+    return b"GET /door/" + door.encode("ascii") + b" HTTP/1.1\r\n" + rest
