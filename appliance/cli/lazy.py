@@ -55,13 +55,13 @@ def _group_of(verbs: Verbs, further: Callable[[], Verbs]) -> type[TyperGroup]:
         @functools.cached_property
         def own_commands(self) -> dict[str, Any]:
             """The commands of `verbs`."""
-            return {name: _command_of(verb, name) for name, verb in verbs.items()}
+            return {name: _command_of(verb, name, further) for name, verb in verbs.items()}
 
         @functools.cached_property
         def all_commands(self) -> dict[str, Any]:
             """The commands of `verbs` and `further`, in the order of the help."""
             own, table = self.own_commands, joined(verbs, further())
-            return {name: own.get(name) or _command_of(verb, name) for name, verb in table.items()}
+            return {name: own.get(name) or _command_of(verb, name, dict) for name, verb in table.items()}
 
         def get_command(self, ctx: Any, cmd_name: str) -> Any:
             """Return a command; import features only for a command that the core lacks."""
@@ -80,12 +80,20 @@ def _group_of(verbs: Verbs, further: Callable[[], Verbs]) -> type[TyperGroup]:
     return _Lazy
 
 
-def _command_of(verb: Verb | Group, name: str) -> Any:
+def _command_of(verb: Verb | Group, name: str, further: Callable[[], Verbs]) -> Any:
     match verb:
         case Group(help, inner):
-            return _named(typer.main.get_group(application(inner, help=help)), name)
+            more = functools.partial(_inner, further, name)
+            return _named(typer.main.get_group(application(inner, further=more, help=help)), name)
         case Verb():
             return _Deferred(verb, name)
+
+
+def _inner(further: Callable[[], Verbs], name: str) -> Verbs:
+    match further().get(name):
+        case Group(_help, verbs):
+            return verbs
+    return {}
 
 
 def _named(command: Any, name: str) -> Any:

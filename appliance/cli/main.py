@@ -1,6 +1,7 @@
 """Define the `rosrv` command: the table of the core's verbs, and the handling of errors that the verbs do not catch."""
 
 import errno
+import functools
 import os
 import sys
 import traceback
@@ -148,7 +149,7 @@ def feature_verbs() -> Verbs:
     """Return the verbs of all features."""
     from appliance.features.table import FEATURES  # noqa: PLC0415  most verbs of the core do not need it
 
-    return {name: group for feature in FEATURES for name, group in feature.verbs.items()}
+    return functools.reduce(joined, (feature.verbs for feature in FEATURES))
 
 
 def all_verbs() -> Verbs:

@@ -10,12 +10,14 @@ from pathlib import Path
 class Verb:
     """A verb's function (`module:function`); in the help, `first` precedes its docstring.
 
-    `module` is relative to this folder; a feature gives its whole name.
+    `module` is relative to this folder; a feature gives its whole name. The help lists a feature's verb `after` another
+    one.
     """
 
     place: str
     first: str = ""
     hidden: bool = False
+    after: str = ""
 
     @property
     def path(self) -> str:
@@ -32,7 +34,10 @@ class Verb:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """A command with its own verbs, such as `rosrv audit`. The help lists a feature's command `after` another one."""
+    """A command with its own verbs, such as `rosrv audit`. The help lists a feature's command `after` another one.
+
+    A feature adds verbs to a command of the core with a group of the same name, and leaves `help` empty.
+    """
 
     help: str
     verbs: "Verbs"
@@ -40,17 +45,31 @@ class Group:
 
 
 Verbs = Mapping[str, Verb | Group]
+FIRST = "(first)"
+"""In place of the name in `after`: before all others."""
 _PACKAGES = Path(__file__).parents[2]
 
 
 def joined(core: Verbs, features: Verbs) -> Verbs:
     """Return a table with the verbs of features, each at its place."""
     table = list(core.items())
-    for name, group in features.items():
+    for name, added in features.items():
         names = [known for known, _verb in table]
-        after = group.after if isinstance(group, Group) else ""
-        table.insert(names.index(after) + 1 if after in names else len(table), (name, group))
+        if name in names:
+            table[names.index(name)] = (name, _extended(name, dict(table)[name], added))
+        else:
+            table.insert(_place(names, added.after), (name, added))
     return dict(table)
+
+
+def _extended(name: str, known: Verb | Group, added: Verb | Group) -> Group:
+    if isinstance(known, Group) and isinstance(added, Group):
+        return Group(known.help or added.help, joined(known.verbs, added.verbs), known.after or added.after)
+    raise ValueError(f"the verb {name} of a feature is already defined")
+
+
+def _place(names: list[str], after: str) -> int:
+    return 0 if after == FIRST else names.index(after) + 1 if after in names else len(names)
 
 
 @functools.cache

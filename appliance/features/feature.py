@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
-from appliance.cli.verb_table import Group
+from appliance.cli.verb_table import Verbs
 from appliance.configuration.sections import FeatureSection, Sections
 from appliance.supervisor.role import Role, SharedMemory
 
@@ -159,7 +159,7 @@ class Feature:
     roles: tuple[Role, ...] = ()
     operations: "Callable[[], tuple[type[AdminRequest[Any]], ...]]" = lambda: ()
     routes: str | None = None
-    verbs: Mapping[str, Group] = field(default_factory=dict)
+    verbs: Verbs = field(default_factory=dict)
     quotas: str | None = None
     recorded: str | None = None
     console: tuple[ConsolePart, ...] = ()
