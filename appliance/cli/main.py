@@ -21,8 +21,6 @@ VERBS: Verbs = {
     "up": Verb("up:up"),
     "status": Verb("status_verb:status"),
     "limits": Verb("limits_verb:limits"),
-    "selftest": Verb("selftest.verb:selftest"),
-    "demo": Verb("demo:demo"),
     "alarm": Group(
         "List the present alarms, and record who takes care of them.",
         {

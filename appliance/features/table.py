@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appliance.configuration.sections import Sections
+from appliance.features.demo.feature import DEMO
 from appliance.features.doors.feature import DOORS
 from appliance.features.evidence.feature import EVIDENCE
 from appliance.features.feature import Feature, FeatureContext, FeaturePart, KeptHosts, OperatorContext
 from appliance.features.fleet.feature import FLEET
 from appliance.features.guards.feature import GUARDS
 from appliance.features.recorder.feature import RECORDER
+from appliance.features.selftest.feature import SELFTEST
 from appliance.features.standby.feature import STANDBY
 from appliance.features.syslog.feature import SYSLOG
 from appliance.supervisor.role import SharedMemory
@@ -33,7 +35,17 @@ if TYPE_CHECKING:
 LONGEST = 64 << 20
 """The most bytes of a message on a link of a feature, unless its part has a smaller limit."""
 
-FEATURES: tuple[Feature, ...] = (SYSLOG, EVIDENCE, RECORDER, STANDBY, FLEET, GUARDS, DOORS)
+FEATURES: tuple[Feature, ...] = (
+    SYSLOG,
+    EVIDENCE,
+    RECORDER,
+    STANDBY,
+    FLEET,
+    GUARDS,
+    DOORS,
+    SELFTEST,
+    DEMO,
+)
 
 
 def memories(sections: Sections, relays: int) -> tuple[SharedMemory, ...]:

@@ -1,4 +1,7 @@
-"""`rosrv` as its users see it: the transcripts (`*.txt`) of this folder; their form: `tests/support/transcript.py`."""
+"""`rosrv` as its users see it: the transcripts (`*.txt`) of this folder and of features' folders.
+
+Their form: `tests/support/transcript.py`.
+"""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -68,7 +71,11 @@ def transcript(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Tran
         yield Transcript(fake, more=more)
 
 
-@pytest.mark.parametrize("section", sections(*sorted(Path(__file__).parent.rglob("*.txt"))))
+_HERE = Path(__file__).parent
+_FILES = [*_HERE.rglob("*.txt"), *_HERE.parent.glob("features/*/*.txt")]
+
+
+@pytest.mark.parametrize("section", sections(*sorted(_FILES)))
 def test_transcript(transcript: Transcript, section: Section) -> None:
     """Each command makes the requests listed below it, and has the output and the exit status listed there."""
     assert section.played(transcript) == section.text

@@ -13,8 +13,8 @@ from appliance.audit.search.search import search
 from appliance.base import clock
 from appliance.base.input_files import read_given, read_given_text
 from appliance.base.shipped import SHIPPED, before_program
-from appliance.cli.selftest.selftest_findings import SelftestFinding, fail, ok, run_check, skip, warn
 from appliance.configuration.settings import Settings
+from appliance.features.selftest.selftest_findings import SelftestFinding, fail, ok, run_check, skip, warn
 from appliance.hosts.hosts_file import DeclaredHostsError, read_declared
 from appliance.policy.cases import run_cases
 from appliance.policy.judgement import PolicyContext, judge

@@ -13,8 +13,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from appliance.cli.selftest.selftest_findings import SelftestFinding, fail, ok, run_check, skip, warn
 from appliance.configuration.settings import Settings
+from appliance.features.selftest.selftest_findings import SelftestFinding, fail, ok, run_check, skip, warn
 from appliance.network import interfaces
 from appliance.network.esp import TUN, choose_esp
 from appliance.network.firewall.backend import BackendMissingError, FirewallError

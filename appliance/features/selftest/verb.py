@@ -15,9 +15,9 @@ from rich.text import Text
 from appliance.cli.connection.admin_client import ADMIN_SOCKET, AdminSocket
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json
-from appliance.cli.selftest.selftest_findings import SelftestFinding, fail
 from appliance.configuration.config_sources import ConfigError, resolve
 from appliance.configuration.settings import Settings, load_resolved
+from appliance.features.selftest.selftest_findings import SelftestFinding, fail
 from rosmop.tool.tables import say_table
 from rosmop.tool.terminal import counted, printable
 
@@ -66,7 +66,7 @@ def selftest(
 
 
 def _all(appliance: Appliance, config: Path | None) -> Iterator[SelftestFinding]:
-    from appliance.cli.selftest.live_checks import running  # noqa: PLC0415  slow to import
+    from appliance.features.selftest.live_checks import running  # noqa: PLC0415  slow to import
 
     if appliance.place is not None:
         yield from running(appliance)
@@ -77,8 +77,8 @@ def _all(appliance: Appliance, config: Path | None) -> Iterator[SelftestFinding]
 
 
 def _here(appliance: Appliance, config: Path | None) -> Iterator[SelftestFinding]:
-    from appliance.cli.selftest.file_checks import files  # noqa: PLC0415  slow to import
-    from appliance.cli.selftest.machine_checks import machine  # noqa: PLC0415  slow to import
+    from appliance.features.selftest.file_checks import files  # noqa: PLC0415  slow to import
+    from appliance.features.selftest.machine_checks import machine  # noqa: PLC0415  slow to import
 
     try:
         settings = _settings(appliance, config)

@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from appliance.cli.main import app
-from appliance.cli.selftest.selftest_findings import fail, ok, run_check
+from appliance.features.selftest.selftest_findings import fail, ok, run_check
 from appliance.network.namespaces import namespaces
 from tests.support.certificates import self_signed
 from tests.support.requirements import need_root

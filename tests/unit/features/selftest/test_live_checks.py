@@ -9,7 +9,7 @@ import pytest
 from appliance.base.clock import using
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance
-from appliance.cli.selftest import live_checks as selftest_running
+from appliance.features.selftest import live_checks as selftest_running
 from tests.support.virtual_clock import VirtualClock
 
 OURS = SimpleNamespace(

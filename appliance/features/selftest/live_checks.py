@@ -12,9 +12,9 @@ from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.status import ProcessInfo, Status
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance
-from appliance.cli.selftest.probe_nodes import TOPIC, ProbeError, call, message_through_the_relay
-from appliance.cli.selftest.selftest_findings import SelftestFinding, fail, ok, run_check, skip, warn
 from appliance.cli.status_verb import troubles_of
+from appliance.features.selftest.probe_nodes import TOPIC, ProbeError, call, message_through_the_relay
+from appliance.features.selftest.selftest_findings import SelftestFinding, fail, ok, run_check, skip, warn
 
 _CALLER = "/rosrv_selftest"  # a random number follows, because repeated reads of one caller are only counted
 _MANY_RESTARTS = 3
