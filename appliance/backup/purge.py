@@ -6,15 +6,12 @@ disk and destroy its key.
 
 import os
 import shutil
-import stat
 from pathlib import Path
 
 from appliance.backup.contents import BackupError
+from appliance.base.erasure import write_over
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.state_directory import StateDirectory, foreign
-
-_SMALL = 64 << 10
-"""The size in bytes up to which a file is overwritten."""
 
 
 def purge(state: Path) -> tuple[int, int]:
@@ -61,17 +58,3 @@ def _write_over(state: Path) -> tuple[int, int]:
             files += 1
             written += write_over(name, at)
     return files, written
-
-
-def write_over(name: str, folder: int) -> bool:
-    """Overwrite a small file of an open folder; return False for other files. Raises `OSError`."""
-    found = os.stat(name, dir_fd=folder, follow_symlinks=False)
-    if not stat.S_ISREG(found.st_mode) or found.st_nlink != 1 or not 0 < found.st_size <= _SMALL:
-        return False
-    descriptor = os.open(name, os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=folder)
-    try:
-        os.pwrite(descriptor, os.urandom(found.st_size), 0)
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-    return True

@@ -113,17 +113,8 @@ VERBS: Verbs = {
     "host": Group(
         "Block hosts; enrol, list and revoke hosts that connect through IPsec tunnels.",
         {
-            "add": Verb("host.host_verbs:add"),
-            "authority": Group(
-                "Replace the certificate authority of hosts.",
-                {"rotate": Verb("host.authority_verb:rotate")},
-            ),
             "block": Verb("host.block_verbs:block"),
             "blocks": Verb("host.block_verbs:list_blocks"),
-            "kit": Verb("host.host_verbs:kit"),
-            "list": Verb("host.host_verbs:list_hosts"),
-            "reload": Verb("host.host_verbs:reload"),
-            "revoke": Verb("host.host_verbs:revoke"),
             "unblock": Verb("host.block_verbs:unblock"),
         },
     ),

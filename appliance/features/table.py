@@ -19,6 +19,7 @@ from appliance.features.recorder.feature import RECORDER
 from appliance.features.selftest.feature import SELFTEST
 from appliance.features.standby.feature import STANDBY
 from appliance.features.syslog.feature import SYSLOG
+from appliance.features.tunnels.feature import TUNNELS
 from appliance.supervisor.role import SharedMemory
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ FEATURES: tuple[Feature, ...] = (
     DOORS,
     SELFTEST,
     DEMO,
+    TUNNELS,
 )
 
 

@@ -16,6 +16,7 @@ from typing import Any
 from appliance.channel.messages import APPLIANCE_NAME, Esp, TunnelHost, TunnelsStated
 from appliance.quotas.table import IKE_HANDSHAKES
 
+PROGRAM = Path("/usr/sbin/charon-systemd")
 USER_SPACE_INTERFACE = "ipsec0"
 IKE_PROPOSALS = ("aes256gcm16-prfsha384-x25519", "aes256gcm16-prfsha384-ecp384")
 ESP_PROPOSALS = ("aes256gcm16-x25519", "aes256gcm16-ecp384")

@@ -50,7 +50,7 @@ def _messages_at(ports: range | None) -> tuple[str, ...]:
 _ours = partial(Role, path=lambda facts: facts.config, links=("control",))
 _OF_FEATURES = tuple(role for feature in FEATURES for role in feature.roles)
 ROLES = (
-    *(role for role in _OF_FEATURES if role.after is None),
+    *(role for role in _OF_FEATURES if role.after is None and not role.on_demand),
     Role(
         "rosmaster", "rosmaster", "rosmaster",
         program=lambda facts: ExternalProgram(
@@ -79,7 +79,7 @@ ROLES = (
         "control", "rosrv", "control", "appliance.control.process:main",
         ended_early=100, files=65_536,
         links=(
-            "relay", "signer", "compiler", "api", "charon", *(role.name for role in _OF_FEATURES),
+            "relay", "signer", "compiler", "api", *(role.name for role in _OF_FEATURES),
         ),
         readable_by="rosrv-api", inputs=lambda facts: facts.control_reads,
         sandbox=lambda facts: SandboxPlan(
@@ -117,17 +117,7 @@ ROLES = (
             ),
         ),
     ),
-    _ours(
-        "charon", "rosrv-ipsec", "ipsec", "appliance.ipsec.process:main",
-        path=lambda facts: facts.part("ipsec"), dispensable=True, on_demand=True,
-        capabilities=("NET_ADMIN", "NET_BIND_SERVICE"),
-        sandbox=lambda _facts: SandboxPlan(
-            families=ROUTES,
-            programs=("/usr", "/lib", "/lib64"),
-            writes=("/dev/net", "/proc/sys/net"),
-        ),
-    ),
-    *(role for role in _OF_FEATURES if role.after is not None),
+    *(role for role in _OF_FEATURES if role.after is not None or role.on_demand),
 )  # fmt: skip
 """The roles in the order of their start."""
 

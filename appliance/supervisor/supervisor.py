@@ -30,7 +30,7 @@ import structlog
 
 from appliance.base import clock
 from appliance.channel import messages
-from appliance.ipsec.charon import PROGRAM as CHARON
+from appliance.ipsec.strongswan import PROGRAM as CHARON
 from appliance.supervisor import rosmaster_probe, signals
 from appliance.supervisor.clock_sync import clock_is_synchronised
 from appliance.supervisor.errors import StartError
@@ -529,6 +529,9 @@ class Supervisor:
         process.send(await self._watchdog.endpoint())
 
     async def _open_tunnels(self, process: ProcessHandle, pool: str, address: str) -> None:
+        if all(slot.role.name != "charon" for slot in self.slots):
+            process.send(messages.TunnelsEnclosed(None, "this appliance has no tunnels: install rosrv again"))
+            return
         if not CHARON.exists():
             reason = (
                 f"{CHARON} is missing: apt install charon-systemd strongswan-swanctl libcharon-extra-plugins"

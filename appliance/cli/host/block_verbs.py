@@ -1,5 +1,6 @@
 """`rosrv host block|unblock|blocks`: hosts that operators block during an incident."""
 
+import functools
 from typing import Annotated
 
 import typer
@@ -7,12 +8,13 @@ import typer
 from appliance.channel.admin import HostBlock, HostBlocks, HostUnblock
 from appliance.channel.answers.host_answers import BlockedHost, BlockEnded
 from appliance.channel.rest_bodies import LONGEST_BLOCK_SECONDS
+from appliance.cli import output
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
-from appliance.cli.host.private_output import usage_error
 from appliance.cli.output import moment, say_json, say_row
 from rosmop.tool.terminal import counted, say
 
+_usage_error = functools.partial(output.usage_error, verb="rosrv host")
 _Address = Annotated[
     str,
     typer.Argument(
@@ -49,7 +51,7 @@ def block(
     """
     seconds = None if time is None else span_given("--for", time, "30s, 10m, 1h or 2d", "rosrv host")
     if seconds is not None and not 1 <= seconds <= LONGEST_BLOCK_SECONDS:
-        raise usage_error(
+        raise _usage_error(
             f"--for {time}: a block lasts 1s to {LONGEST_BLOCK_SECONDS // 86_400}d; without --for it has no end"
         )
     body = running.answer_or_exit(HostBlock(address, seconds, note, force))

@@ -13,7 +13,7 @@ import pytest
 from vici.protocol import FiniteStream, Message, Packet
 
 from appliance.channel.messages import TunnelHost, TunnelsStated
-from appliance.ipsec.charon import CharonError, ViciClient
+from appliance.features.tunnels.charon import CharonError, ViciClient
 from appliance.ipsec.strongswan import connection_name
 
 pytestmark = pytest.mark.nightly

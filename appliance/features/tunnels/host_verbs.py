@@ -13,9 +13,9 @@ from appliance.channel.answers.host_answers import Host, PortsSeen
 from appliance.cli import completion
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
-from appliance.cli.host.kit_files import key_and_request, placed, wishes_of, write_kit, write_script
-from appliance.cli.host.private_output import new_output, usage_error
 from appliance.cli.output import moment, say_json, say_row
+from appliance.features.tunnels.kit_files import key_and_request, placed, wishes_of, write_kit, write_script
+from appliance.features.tunnels.private_output import new_output, usage_error
 from rosmop.tool.terminal import printable, say
 
 _Name = Annotated[

@@ -2,11 +2,12 @@
 
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from appliance.backup.contents import BackupError
-from appliance.backup.rotate_authority import rotate_authority
+from appliance.features.tunnels.rotate_authority import rotate_authority
 from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.supervisor.state_directory import StateDirectory
 
@@ -49,3 +50,11 @@ def test_it_needs_a_stopped_single_appliance_with_an_authority(state: Path, tmp_
         rotate_authority(state)
     with pytest.raises(BackupError, match="does not exist"):
         rotate_authority(state / "nowhere")
+
+
+def test_one_of_two_appliances_keeps_its_authority(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pair = SimpleNamespace(fixed_authority="end the pair first")
+    monkeypatch.setattr("appliance.features.tunnels.rotate_authority.pairing_in", lambda _state: pair)
+    with pytest.raises(BackupError, match="end the pair first"):
+        rotate_authority(state)
+    assert (state / "signer" / "ca.key").exists()

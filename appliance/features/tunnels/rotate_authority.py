@@ -9,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 
 from appliance.backup.contents import BackupError
-from appliance.backup.purge import write_over
+from appliance.base.erasure import write_over
 from appliance.base.owner_access import acting_as
 from appliance.features.table import pairing_in
 from appliance.ipsec.certificate_authority import CERTIFICATE_FILE, KEY_FILE

@@ -23,8 +23,8 @@ from appliance.channel.messages import (
     TunnelsReported,
     TunnelsStated,
 )
-from appliance.ipsec import process
-from appliance.ipsec.charon import ViciClient
+from appliance.features.tunnels import process
+from appliance.features.tunnels.charon import ViciClient
 from appliance.ipsec.requests import make_key
 
 pytestmark = pytest.mark.anyio

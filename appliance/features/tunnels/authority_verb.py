@@ -1,10 +1,10 @@
 """`rosrv host authority rotate`: another key for the authority of hosts."""
 
 from appliance.backup.contents import BackupError
-from appliance.backup.rotate_authority import rotate_authority
 from appliance.cli.connection.target import DEFAULT_STATE, State
 from appliance.cli.output import Json, say_json
 from appliance.cli.state_confirmation import Confirm, confirm_state
+from appliance.features.tunnels.rotate_authority import rotate_authority
 from rosmop.tool.terminal import refused, say
 
 

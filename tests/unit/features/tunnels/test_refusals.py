@@ -1,6 +1,6 @@
 """Tests of reading refused hosts from charon's log."""
 
-from appliance.ipsec.refusals import Refusal, RefusalParser
+from appliance.features.tunnels.refusals import Refusal, RefusalParser
 
 REVOKED = """\
 09[NET] received packet: from 10.88.0.20[4500] to 10.88.0.2[4500] (1184 bytes)

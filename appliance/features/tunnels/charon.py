@@ -19,7 +19,6 @@ from vici.exception import CommandException, DeserializationException, EventUnkn
 from appliance.channel.messages import TunnelHost, TunnelSeen, TunnelsStated
 from appliance.ipsec.strongswan import connection, connection_name, host_of, pool, proposals_of
 
-PROGRAM = Path("/usr/sbin/charon-systemd")
 _SECONDS = 10.0
 _LISTS = 3  # at most, until a rekeyed tunnel is in one
 # vici's own errors, and the errors that its packing raises for a value that is too long.

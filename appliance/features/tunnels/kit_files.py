@@ -11,8 +11,8 @@ from appliance.base.input_files import open_given
 from appliance.channel.admin import HostEndpoint
 from appliance.channel.answers.host_answers import EnrolmentToken, KitParts
 from appliance.cli.connection.target import Appliance
-from appliance.cli.host.private_output import Output, usage_error
 from appliance.cli.output import moment, say_json
+from appliance.features.tunnels.private_output import Output, usage_error
 from appliance.ipsec.enrolment_kit import archive
 from appliance.ipsec.requests import make_key, signing_request
 

@@ -30,12 +30,12 @@ from appliance.base.atomic_files import write_whole
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
-from appliance.ipsec.charon import PROGRAM, CharonError, ViciClient
+from appliance.features.tunnels.charon import CharonError, ViciClient
+from appliance.features.tunnels.refusals import Refusal, RefusalParser
 from appliance.ipsec.key_files import SignerKeyError, require_private
 from appliance.ipsec.leftovers import clear_leftovers
-from appliance.ipsec.refusals import Refusal, RefusalParser
 from appliance.ipsec.requests import fingerprint, make_key, signing_request
-from appliance.ipsec.strongswan import configuration
+from appliance.ipsec.strongswan import PROGRAM, configuration
 
 KEY_FILE = "appliance.key"
 TUN = Path("/dev/net/tun")

@@ -1,0 +1,1 @@
+"""Tunnels: the process that runs charon, and the commands that enrol hosts."""
