@@ -33,7 +33,6 @@ VERBS: Verbs = {
     "audit": Group(
         "Review the audit log and verify that it is complete.",
         {
-            "why": Verb("policy.grant_verb:why"),
             "search": Verb("audit.audit_verbs:search"),
             "summary": Verb("audit.summary_verb:summarise"),
             "tail": Verb("audit.audit_verbs:tail"),
@@ -46,7 +45,6 @@ VERBS: Verbs = {
     "policy": Group(
         "Check, explain, test, compare, learn and change access policies.",
         {
-            "learn": Verb("policy.learn_verb:learn_policy"),
             "show": Verb("policy.live_verbs:show"),
             "reload": Verb("policy.live_verbs:reload"),
             "rollback": Verb("policy.live_verbs:rollback", "Return to an earlier revision of the policy."),
@@ -54,12 +52,6 @@ VERBS: Verbs = {
             "revisions": Verb(
                 "policy.live_verbs:revisions", "List the kept revisions of the policy, newest first."
             ),
-            "grant": Verb("policy.grant_verb:grant"),
-            "check": Verb("policy.policy_verbs:check"),
-            "explain": Verb("policy.policy_verbs:explain_request"),
-            "who-may": Verb("policy.who_may_verb:list_who_may"),
-            "test": Verb("policy.policy_verbs:test"),
-            "diff": Verb("policy.diff_verb:compare"),
         },
     ),
     "monitor": Group(

@@ -15,6 +15,7 @@ from appliance.features.evidence.feature import EVIDENCE
 from appliance.features.feature import Feature, FeatureContext, FeaturePart, KeptHosts, OperatorContext
 from appliance.features.fleet.feature import FLEET
 from appliance.features.guards.feature import GUARDS
+from appliance.features.policy_tools.feature import POLICY_TOOLS
 from appliance.features.recorder.feature import RECORDER
 from appliance.features.selftest.feature import SELFTEST
 from appliance.features.standby.feature import STANDBY
@@ -37,6 +38,7 @@ LONGEST = 64 << 20
 """The most bytes of a message on a link of a feature, unless its part has a smaller limit."""
 
 FEATURES: tuple[Feature, ...] = (
+    TUNNELS,
     SYSLOG,
     EVIDENCE,
     RECORDER,
@@ -47,6 +49,7 @@ FEATURES: tuple[Feature, ...] = (
     SELFTEST,
     DEMO,
     TUNNELS,
+    POLICY_TOOLS,
 )
 
 

@@ -315,7 +315,7 @@ WALL_CLOCK = {
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
         "api/front/moments.py", "audit/search/filter_options.py",
         "features/evidence/evidence_verbs.py",
-        "cli/monitor/offline.py", "cli/policy/learn_verb.py", "cli/protect_verb.py", "cli/status_verb.py",
+        "cli/monitor/offline.py", "features/policy_tools/learn_verb.py", "cli/protect_verb.py", "cli/status_verb.py",
         "cli/topic_verbs.py", "features/recorder/recorder_input.py", "features/recorder/record_verbs.py",
     ],
 }  # fmt: skip

@@ -14,7 +14,7 @@ from msgspec.structs import asdict
 from appliance.base.owner_access import is_named_there
 from appliance.channel.admin import PolicyWanted
 from appliance.cli.connection.target import Appliance
-from appliance.cli.policy.policy_input import known_of, live_now, read_text
+from appliance.features.policy_tools.policy_input import known_of, live_now, read_text
 from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.live_rights import Ending, endings
 from appliance.policy.policy_findings import FindingSeverity, PolicyError, PolicyFinding

@@ -8,12 +8,12 @@ import typer
 
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json
-from appliance.cli.policy.policy_input import Enrolled, Robot, usage_error
-from appliance.cli.policy.policy_verbs import OptionalFile, compiled, decision_fields
+from appliance.features.policy_tools.policy_input import Enrolled, Robot, usage_error
+from appliance.features.policy_tools.policy_verbs import OptionalFile, compiled, decision_fields
+from appliance.features.policy_tools.who_may import HostAnswer, who_may
 from appliance.policy.actions import VERBS, BadWordError, parse_action
 from appliance.policy.model import Category, Request
 from appliance.policy.rights import needs_node
-from appliance.policy.who_may import HostAnswer, who_may
 from rosmop.tool.terminal import say
 
 

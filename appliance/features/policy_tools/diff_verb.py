@@ -13,7 +13,7 @@ from appliance.channel.admin import PolicyRevisions, PolicyRevisionWanted
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import by_host, say_diff, say_json
-from appliance.cli.policy.policy_input import (
+from appliance.features.policy_tools.policy_input import (
     Enrolled,
     Robot,
     known_of,
@@ -24,7 +24,7 @@ from appliance.cli.policy.policy_input import (
     requests_of_file,
     usage_error,
 )
-from appliance.cli.policy.policy_verbs import decision_fields
+from appliance.features.policy_tools.policy_verbs import decision_fields
 from appliance.policy.diff import Difference, diff
 from appliance.policy.host_names import HostNames, in_words
 from appliance.policy.judgement import PolicyContext

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.policy import who_may as module
+from appliance.features.policy_tools import who_may as module
+from appliance.features.policy_tools.who_may import who_may
 from appliance.policy.host_sets import Network
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.rights import decide, rights_of
-from appliance.policy.who_may import who_may
 from tests.support.examples import examples
 
 

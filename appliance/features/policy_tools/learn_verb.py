@@ -16,7 +16,13 @@ from appliance.base.timestamps import TimestampError, parse_timestamp
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json
-from appliance.cli.policy.policy_input import Robot, networks_of, request_of, running_robot, usage_error
+from appliance.features.policy_tools.policy_input import (
+    Robot,
+    networks_of,
+    request_of,
+    running_robot,
+    usage_error,
+)
 from appliance.policy.host_sets import Network
 from appliance.policy.learn import LearnedPolicy, Observation, covered, learn
 from appliance.policy.model import Category

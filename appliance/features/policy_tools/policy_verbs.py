@@ -14,8 +14,8 @@ from appliance.base.owner_access import is_named_there
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import Json, by_host, say_json
-from appliance.cli.policy.policy_impact import PolicyImpact, cases_beside, impact_of
-from appliance.cli.policy.policy_input import (
+from appliance.features.policy_tools.policy_impact import PolicyImpact, cases_beside, impact_of
+from appliance.features.policy_tools.policy_input import (
     Enrolled,
     Robot,
     asking_host,
