@@ -111,9 +111,6 @@ VERBS: Verbs = {
         },
     ),
     "certificate": Verb("certificate_verb:certificate"),
-    "backup": Verb("backup:backup"),
-    "restore": Verb("backup:restore"),
-    "purge": Verb("backup:purge"),
     "token": Group(
         "Create, rotate, list and revoke access tokens for REST.",
         {

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appliance.configuration.sections import Sections
+from appliance.features.backup.feature import BACKUP
 from appliance.features.demo.feature import DEMO
 from appliance.features.doors.feature import DOORS
 from appliance.features.evidence.feature import EVIDENCE
@@ -46,6 +47,8 @@ FEATURES: tuple[Feature, ...] = (
     FLEET,
     GUARDS,
     DOORS,
+    POLICY_TOOLS,
+    BACKUP,
     SELFTEST,
     DEMO,
     TUNNELS,

@@ -17,7 +17,6 @@ _TESTED = (
     "supervisor",
     "control",
     "channel",
-    "backup",
     "test_imports.py",
     "test_source_rules.py",
 )

@@ -7,11 +7,11 @@ import typer
 
 from appliance.backup.contents import BackupError
 from appliance.backup.create import back_up
-from appliance.backup.purge import purge as remove
-from appliance.backup.restore import restore as put_back
 from appliance.cli.connection.target import DEFAULT_STATE, State
 from appliance.cli.output import Json, say_json
 from appliance.cli.state_confirmation import Confirm, confirm_state
+from appliance.features.backup.purge import purge as remove
+from appliance.features.backup.restore import restore as put_back
 from rosmop.tool.terminal import printable, refused, say
 
 _NewState = Annotated[

@@ -7,8 +7,8 @@ import pytest
 from typer.testing import CliRunner
 
 from appliance.backup.contents import BackupError
-from appliance.backup.purge import purge
 from appliance.cli.main import app
+from appliance.features.backup.purge import purge
 from appliance.supervisor.state_directory import StateDirectory
 
 KEY = b"-----BEGIN PRIVATE KEY-----"

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from appliance.backup import restore as backup_restore
 from appliance.backup.contents import BackupError
-from appliance.backup.restore import restore
+from appliance.features.backup import restore as backup_restore
+from appliance.features.backup.restore import restore
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.restore_mark import refuse_half_restored
 from appliance.supervisor.state_directory import foreign

@@ -20,8 +20,8 @@ from appliance.audit.proof.verification import verify
 from appliance.backup import create as backup
 from appliance.backup.contents import BackupError
 from appliance.backup.create import back_up, copy_database
-from appliance.backup.restore import restore
 from appliance.base.clock import wall_ns
+from appliance.features.backup.restore import restore
 from appliance.ipsec.signed_checkpoints import CheckpointMemory
 from tests.support.audit import decision, settle
 from tests.support.engines import open_log

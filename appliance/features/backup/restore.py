@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from appliance.backup.archive import checked_archive
 from appliance.backup.contents import KEPT_PARTS, BackupError
+from appliance.features.backup.archive import checked_archive
 from appliance.supervisor.restore_mark import set_mark
 from appliance.supervisor.roles import ROLES
 from appliance.supervisor.users import account_of

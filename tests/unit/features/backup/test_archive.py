@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from appliance.backup.contents import BackupError
-from appliance.backup.restore import restore
+from appliance.features.backup.restore import restore
 from tests.support.backups import LOG, archive, header
 
 NOTHING = "nothing is restored"

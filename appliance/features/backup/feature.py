@@ -1,0 +1,15 @@
+"""The feature backup: `rosrv backup`, `restore` and `purge`."""
+
+from appliance.cli.verb_table import Verb
+from appliance.features.feature import Feature
+
+_VERBS = "appliance.features.backup.backup_verbs"
+
+BACKUP = Feature(
+    "backup",
+    verbs={
+        "backup": Verb(f"{_VERBS}:backup", after="certificate"),
+        "restore": Verb(f"{_VERBS}:restore", after="backup"),
+        "purge": Verb(f"{_VERBS}:purge", after="restore"),
+    },
+)
