@@ -1,7 +1,7 @@
 """Keep the ends of things by the system time, although its clock may step back."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from appliance.base import clock
 
@@ -28,6 +28,10 @@ class Deadlines:
         now = clock.since_boot()
         for name, seconds in left.items():
             self._limits[name] = min(now + seconds, self._limits.get(name, math.inf))
+
+    def retain(self, names: Collection[str]) -> None:
+        """Forget all ends but those of these names."""
+        self._deadlines = {name: known for name, known in self._deadlines.items() if name in names}
 
     def left(self) -> dict[str, float]:
         """Return the seconds until each end that was seen, by the time since the boot; 0: it has passed."""

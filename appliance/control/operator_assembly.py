@@ -63,7 +63,9 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         machines=parts.core.registry.machines,
     )
     rest = Current[RestLink]()
-    tokens = TokenOrders(base.store, trail, ends_of_tokens, lambda: rest().state_tokens())
+    tokens = TokenOrders(
+        base.store, trail, ends_of_tokens, lambda: rest().state_tokens(), sessions=base.features.sessions
+    )
     clock = ClockCheck(trail, lambda: base.audit.ids.ahead)
     switched_off = SwitchedOffWatch(
         parts.monitors, base.policies, base.store, trail, settings.forgotten_after
@@ -92,6 +94,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         processes=lambda: base.lifeline.surroundings.processes,
         received=base.receipts.received,
         graph=partial(graph_of, parts),
+        tokens_changed=lambda: rest().state_tokens(),
     )
     handled = HandledAlarms(base.store)
     looks = Queries(

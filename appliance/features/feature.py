@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
     from appliance.control.assembly.policies import Policies
     from appliance.control.operators.request_method import RequestMethod
+    from appliance.control.operators.sessions import Sessions
     from appliance.policy.model import Address
     from appliance.specifications.specification_manager import SpecificationManager
     from appliance.store.state_file import StateStore
@@ -75,7 +76,7 @@ class OperatorContext:
 
     `appliance` is the name of one of two appliances, empty on a single one. `processes` returns the processes of the
     appliance. `received` notes that another machine has all records up to a sequence. `graph` returns the present
-    graph.
+    graph. `tokens_changed` sends the api the usable tokens and sessions.
     """
 
     core: FeatureContext
@@ -87,6 +88,7 @@ class OperatorContext:
     processes: "Callable[[], Sequence[ProcessInfo]]"
     received: Callable[[int], None]
     graph: "Callable[[], Graph]"
+    tokens_changed: Callable[[], None]
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,8 @@ class FeaturePart:
     ends; its names go into error messages. `limits` returns how much of its resources is used.
     `connected(door, ticket, peer, descriptor)` passes a WebSocket of the api on; it returns an HTTP status and why it
     is refused, or an empty text. `details` returns what it adds to the details of a record (`RecordDetails`). `called`
-    answers nodes' calls of its service.
+    answers nodes' calls of its service. `sessions` are those of people whom the feature signs in; they count beside
+    tokens.
 
     These return a state, or None if there is none: `forwarding` that of the forwarding of the audit log, `collector`
     that of its segments, `bundles` that of the fleet's bundles, `recorder` that of the flight recorder, and `pair` that
@@ -118,6 +121,7 @@ class FeaturePart:
     connected: "Callable[[str, str, str, int], tuple[int, str]] | None" = None
     collector: "Callable[[], ForwardingState | None]" = lambda: None
     bundles: "Callable[[], BundlesState | None]" = lambda: None
+    sessions: "Sessions | None" = None
 
 
 class ConsolePart(NamedTuple):
@@ -140,6 +144,7 @@ class Feature:
 
     `operations` returns the requests of operators' tools; the admin socket, REST and the client follow from their
     rows. `routes` is the function (`module:function`) that returns further routes of the api for its `Services`.
+    `without_token` lists the paths of routes that need no token. `page` returns settings for the console's page.
     `verbs` are commands of `rosrv`.
     `quotas` names the tuple of rows (`module:name`) that the table of quotas lists.
     `recorded` is the function (`module:function`) that gives `rosrv monitor replay` the recorded messages of a period.
@@ -159,6 +164,8 @@ class Feature:
     roles: tuple[Role, ...] = ()
     operations: "Callable[[], tuple[type[AdminRequest[Any]], ...]]" = lambda: ()
     routes: str | None = None
+    without_token: tuple[str, ...] = ()
+    page: Callable[[Sections], Mapping[str, str]] = lambda _sections: {}
     verbs: Verbs = field(default_factory=dict)
     quotas: str | None = None
     recorded: str | None = None

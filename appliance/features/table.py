@@ -19,6 +19,7 @@ from appliance.features.guards.feature import GUARDS
 from appliance.features.policy_tools.feature import POLICY_TOOLS
 from appliance.features.recorder.feature import RECORDER
 from appliance.features.selftest.feature import SELFTEST
+from appliance.features.sso.feature import SSO
 from appliance.features.standby.feature import STANDBY
 from appliance.features.syslog.feature import SYSLOG
 from appliance.features.tunnels.feature import TUNNELS
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from appliance.channel.link import Link
     from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
     from appliance.control.operators.request_method import RequestMethod
+    from appliance.control.operators.sessions import Sessions
     from appliance.policy.model import Address
     from appliance.supervisor.service_gate import Pairing
 
@@ -53,6 +55,7 @@ FEATURES: tuple[Feature, ...] = (
     DEMO,
     TUNNELS,
     POLICY_TOOLS,
+    SSO,
 )
 
 
@@ -155,6 +158,10 @@ class FeatureParts:
     def pair(self) -> "StandbyState | None":
         """Return the state of both appliances, or None for a single appliance."""
         return next(filter(None, (part.pair() for part in self._parts)), None)
+
+    def sessions(self) -> "Sessions | None":
+        """Return the sessions of people, or None if nobody can sign in without a token."""
+        return next((part.sessions for part in self._parts if part.sessions is not None), None)
 
     def work(self) -> dict[str, Callable[[], Awaitable[None]]]:
         """Return the work that runs until control ends."""

@@ -24,6 +24,7 @@ NUMERIC_IDS = {
     "rosrv-bundles": 61022,
     "rosrv-fleet": 61023,
     "rosrv-doors": 61024,
+    "rosrv-sso": 61025,
 }
 
 

@@ -23,6 +23,6 @@ def idle_parts() -> FeatureParts:
     parts = FeatureParts(early)
     parts.operate(
         appliance="", store=store, policies=idle(Policies), monitors=monitors, hosts=hosts, processes=tuple,
-        received=lambda _sequence: None, graph=lambda: Graph([], [], []),
+        received=lambda _sequence: None, graph=lambda: Graph([], [], []), tokens_changed=lambda: None,
     )  # fmt: skip
     return parts

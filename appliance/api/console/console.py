@@ -102,6 +102,7 @@ def routes(settings: Settings) -> APIRouter:
                 "lock-seconds": f"{settings.api_lock_seconds:g}",
                 "notice": settings.api_notice,
                 "robot": settings.name,
+                **{name: text for one in FEATURES for name, text in one.page(settings.sections).items()},
             },
         ).encode(),
         served[_PAGE].media_type,

@@ -83,6 +83,7 @@ class TokenAuthenticator:
     def state(self, tokens: Iterable[TokenKept]) -> None:
         """Accept only these tokens from now on."""
         self._tokens = {token.id: token for token in tokens}
+        self._ends.retain(self._tokens)
         for token in self._tokens.values():
             self._ends.passed(token.id, token.expires)  # from now on, no step of the clock postpones an end
         self._stated = True

@@ -30,21 +30,25 @@ from appliance.base import clock
 from appliance.channel.messages.api import ClientRequest
 from appliance.channel.rest_meaning import is_dry_run
 from appliance.configuration.settings import ApiLimits
+from appliance.features.table import FEATURES
 from appliance.signing.request_signing import HEADER
 
 _log = structlog.get_logger()
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
-PUBLIC = frozenset({
+_OF_FEATURES = frozenset(path for feature in FEATURES for path in feature.without_token)
+PUBLIC = _OF_FEATURES | {
     "/healthz", "/readyz", "/v1/healthz", "/v1/readyz", "/v1/openapi.json", "/v1/openapi.html",
     "/v1/enrol", "/v1/revocations", "/v1/authority",
-})  # fmt: skip
+}  # fmt: skip
 BEARER = "rosrv.bearer"  # the key of the bearer in a request's scope
 _NOT_RECORDED = frozenset({"/healthz", "/readyz", "/v1/healthz", "/v1/readyz"})
 _QUESTIONS = frozenset({"/v1/policy/explain", "/v1/policy/test"})  # queries with a body
 _LOOKS = frozenset({"GET", "HEAD"})
 _BODY_SECONDS = 30.0
 _LONGEST_ANONYMOUS_BODY = 1024  # bytes of a body without a token
-_REQUEST_BODY = 24 << 10  # bytes of a body with a host's signing request
+_REQUEST_BODY = (
+    24 << 10
+)  # bytes of a body with a host's signing request, or of a feature's call without a token
 _RENEWAL = re.compile(r"/v1/hosts/[^/]{1,63}/renew(ed)?")  # for hosts, which their tunnels identify
 _IN_TUNNELS = frozenset({"/v1/revocations", "/v1/authority"})
 _SEND_SECONDS = 30.0
@@ -137,7 +141,7 @@ class RequestGate:
         if path not in PUBLIC and not renewal and not is_console(path):
             bearer = await self._doorkeeper.recognise(headers.get("authorization"), host)
         limit = int(self._limits.body_bytes) if bearer is not None else _LONGEST_ANONYMOUS_BODY
-        if renewal or path == "/v1/enrol":
+        if renewal or path == "/v1/enrol" or path in _OF_FEATURES:
             limit = _REQUEST_BODY
         body = await _read(headers, receive, limit)
         if bearer is not None and scope["method"] not in _LOOKS:

@@ -116,6 +116,10 @@ EVENTS: dict[str, str] = {
     "token revoked": "An access token for REST was revoked before its expiry.",
     "token rotated": "An access token for REST replaced the earlier ones of its name; `detail` has its name, role, id"
     " and expiry, the ids of the `earlier` ones, and their end in `earlier_until`.",
+    "signed on": "A person signed in at the provider of single sign-on; `detail` has the name in `who`, the provider's"
+    " `subject`, the role, the groups of doors, and the id and end of the session.",
+    "signed off": "A session of a person ended before its time; `detail` has who ended it, and the person's `name`.",
+    "sign-on refused": "A sign-on at the provider gave no session; `host` is the browser's address, `reason` says why.",
     "switchover ordered": "An operator ordered the active appliance to hand over to the standby; `detail` has who.",
     "switchover failed": "An ordered switchover did not happen; `reason` says why, `detail` has who ordered it.",
     "process started": "A process of the appliance started.",
@@ -179,7 +183,7 @@ SEVERITIES: dict[str, Severity] = {
             "appliance started", "appliance stopped", "bundle in force", "clock not synchronised", "clock synchronised",
             "evidence exported", "forwarding resumed", "handed over", "host awaited", "host awaited no longer",
             "host enrolled", "host renewed", "hosts reloaded", "monitor resumed", "monitor set", "policy loaded",
-            "recording closed", "door added", "door removed", "door ticket made",
+            "recording closed", "door added", "door removed", "door ticket made", "signed off", "signed on",
             "recording ordered", "recording fetched", "recording read", "recording removed", "specifications loaded",
             "switchover ordered", "token added", "token revoked", "token rotated", "took over", "topic looked into",
             "tunnel down", "tunnel moved", "tunnel up", "probe passed",
@@ -189,7 +193,7 @@ SEVERITIES: dict[str, Severity] = {
             "certificate ended", "certificate ends soon", "clock set back", "clock set forward", "enrolment refused",
             "door entry refused", "door failed", "forwarding failed", "host authority replaced",
             "host blocked", "host revoked", "limit exceeded", "malformed", "packets refused",
-            "policy refused", "recording missed", "renewal refused", "rest certificate replaced",
+            "policy refused", "recording missed", "renewal refused", "rest certificate replaced", "sign-on refused",
             "specifications refused", "switchover failed",
             "tunnel refused",
         ),

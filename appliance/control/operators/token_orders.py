@@ -2,6 +2,8 @@
 
 The api gets data to recognise tokens, but never their secrets. Every creation and revocation of a token is recorded.
 The api also reports uses of tokens; a compromised api can report wrong ones.
+
+People's sessions (`sessions.py`) are usable beside tokens. A session never replaces the token with its id.
 """
 
 import contextlib
@@ -13,6 +15,7 @@ from appliance.base.deadlines import Deadlines
 from appliance.channel import admin
 from appliance.channel.answers import token_answers as answers
 from appliance.channel.messages.api import TokenKept
+from appliance.control.operators.sessions import Sessions
 from appliance.store.access_tokens import BadTokenNameError, TokenRow, make_token
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
@@ -32,13 +35,20 @@ class TokenRefusedError(Exception):
 
 
 class TokenOrders:
-    """All tokens. `changed()` is called when the usable tokens have changed."""
+    """All tokens. `changed()` is called when the usable tokens have changed; `sessions()` returns people's sessions."""
 
     def __init__(
-        self, store: StateStore, trail: AuditTrail, ends: Deadlines, changed: Callable[[], None]
+        self,
+        store: StateStore,
+        trail: AuditTrail,
+        ends: Deadlines,
+        changed: Callable[[], None],
+        *,
+        sessions: Callable[[], Sessions | None] = lambda: None,
     ) -> None:
         self._store = store
         self._trail = trail
+        self._sessions = sessions
         self._ends = ends
         self._rows = {row.id: row for row in store.tokens()}
         self.usable()  # from now on, no step of the clock postpones an end
@@ -57,12 +67,20 @@ class TokenOrders:
         return answers.Tokens([self._shown(row) for row in self._rows.values()], self._uses_since)
 
     def usable(self) -> list[TokenKept]:
-        """Return the data by which the api recognises tokens. The api checks `expires`."""
-        return [kept_by_api(row) for row in self._rows.values() if row.usable(self._ends)]
+        """Return the data by which the api recognises tokens and sessions. The api checks `expires`."""
+        tokens = {row.id: row for row in self._rows.values() if row.usable(self._ends)}
+        return [kept_by_api(row) for row in ({row.id: row for row in self._session_rows()} | tokens).values()]
 
     def usable_row(self, token_id: str) -> TokenRow | None:
+        """Return the token or session with this id, if it is usable now."""
         row = self._rows.get(token_id)
-        return row if row is not None and row.usable(self._ends) else None
+        if row is not None and row.usable(self._ends):
+            return row
+        return next((row for row in self._session_rows() if row.id == token_id), None)
+
+    def _session_rows(self) -> list[TokenRow]:
+        sessions = self._sessions()
+        return [] if sessions is None else sessions.rows()
 
     def used(self, token_id: str) -> None:
         """Note that a token is used now. The time is stored unless the disk is full."""

@@ -9,6 +9,7 @@ import { Check, Field } from "./parts/field.js";
 import { Problem } from "./problem.js";
 import { ask } from "./rest.js";
 import { end, entitle, kept, open, ROBOT, session, stated, UNUSED } from "./session.js";
+import { begin, PROVIDER } from "./sign-on.js";
 import { useStore } from "./store.js";
 
 const FIRST_PAUSE = 1000; // milliseconds
@@ -42,7 +43,7 @@ export async function resume() {
 }
 
 export function Door() {
-  const { ended, checking, waiting, locked } = useStore(session);
+  const { ended, heading, checking, waiting, locked } = useStore(session);
   const [token, setToken] = useState("");
   const [keep, setKeep] = useState(true);
   const [error, setError] = useState(/** @type {unknown} */ (null));
@@ -59,20 +60,32 @@ export function Door() {
       setBusy(false);
     }
   };
+  const away = async () => {
+    setBusy(true);
+    setError(null);
+    try {
+      await begin(keep);
+    } catch (failure) {
+      setError(failure);
+      setBusy(false);
+    }
+  };
   const notice = stated("notice");
   if (waiting) return html`<${Waiting} error=${waiting} />`;
-  if (checking) return html`<main class="door" id="main"><p class="muted" role="status">Checking the token.</p></main>`;
+  if (checking) return html`<main class="door" id="main"><p class="muted" role="status">Signing in.</p></main>`;
   return html`<main class="door" id="main"><div class="door-box">
     <${Brand} />
     <form class="panel" onSubmit=${submit}>
       ${notice && html`<div class="site-notice" role="note" aria-label="Site notice">${notice}</div>`}
-      ${locked && !error && html`<${Notice} tone="warn" title="Locked" role="status">This page was not used for ${lasting(UNUSED / 1000)}. The work of <${Given} value=${locked.name} most=${40} /> is kept for that token; another token starts a new session.</${Notice}>`}
-      ${ended && !error && html`<${Notice} tone="warn" title="Signed out" role="status">${ended}</${Notice}>`}
+      ${locked && !error && html`<${Notice} tone="warn" title="Locked" role="status">This page was not used for ${lasting(UNUSED / 1000)}. The work of <${Given} value=${locked.name} most=${40} /> is kept for that token; another token starts a new session.${PROVIDER && ` Sign-in with ${PROVIDER} opens the page again, without unsaved work.`}</${Notice}>`}
+      ${ended && !error && html`<${Notice} tone="warn" title=${heading} role="status">${ended}</${Notice}>`}
       <${Failure} error=${error} />
       <${Field} label="Access token" type="password" mono value=${token} set=${setToken} placeholder="rosrv_…" autofocus required
         hint=${html`Create one with <code>rosrv token add NAME --role viewer</code>. The first token is in the file <code>first-token</code> of the state directory.`} />
       <${Check} label="Stay signed in until this tab is closed" on=${keep} set=${setKeep} />
       <button class="button primary" type="submit" disabled=${busy || !token.trim()}>${busy ? "Signing in" : "Sign in"}</button>
+      ${PROVIDER && html`<p class="or small muted">or</p>
+        <button class="button" type="button" disabled=${busy} onClick=${away}>Sign in with ${PROVIDER}</button>`}
     </form>
   </div></main>`;
 }

@@ -3,6 +3,8 @@
  *
  * The reading key is sent with every request. The signing key (Ed25519) signs each change together with a
  * challenge that the appliance accepts once.
+ *
+ * For single sign-on, the page makes a token itself, and the appliance gets only the verifiers of its keys.
  */
 
 import { Problem } from "./problem.js";
@@ -18,6 +20,21 @@ export async function readingKey(token) {
   return `rosrv-read_${id}_${text(await derived(token, "rosrv reading key 1"))}`;
 }
 
+/** Return a new token, as `rosrv token add` makes it. */
+export function newToken() {
+  return `rosrv_${hex(crypto.getRandomValues(new Uint8Array(6)).buffer)}_${text(crypto.getRandomValues(new Uint8Array(32)).buffer)}`;
+}
+
+/** The id of a token. @param {string} token */
+export const idOf = (token) => token.split("_")[1];
+
+/** Return a token's id and what verifies its keys. @param {string} token */
+export async function verifiersOf(token) {
+  const reading = text(await crypto.subtle.digest("SHA-256", bytes(await readingKey(token))));
+  const { x } = await crypto.subtle.exportKey("jwk", await signingKey(token, true));
+  return { id: idOf(token), reading, verifying: x };
+}
+
 /**
  * Return the header that proves a change; `target` is path and query.
  * @param {string} token @param {string} challenge
@@ -25,14 +42,17 @@ export async function readingKey(token) {
  */
 export async function proof(token, challenge, { method, target, match, type, body }) {
   const lines = ["rosrv order 1", challenge, method, target, match, type, hex(await crypto.subtle.digest("SHA-256", bytes(body)))];
+  const key = await signingKey(token, false);
+  return `${challenge} ${text(await crypto.subtle.sign("Ed25519", key, bytes(lines.join("\n"))))}`;
+}
+
+async function signingKey(/** @type {string} */ token, /** @type {boolean} */ extractable) {
   const seed = new Uint8Array(await derived(token, "rosrv signing key 1"));
-  let key;
   try {
-    key = await crypto.subtle.importKey("pkcs8", new Uint8Array([...PKCS8, ...seed]), "Ed25519", false, ["sign"]);
+    return await crypto.subtle.importKey("pkcs8", new Uint8Array([...PKCS8, ...seed]), "Ed25519", extractable, ["sign"]);
   } catch {
     throw new Problem(0, { detail: "This browser cannot sign changes (Ed25519). Use a newer browser, or `rosrv` on the command line." });
   }
-  return `${challenge} ${text(await crypto.subtle.sign("Ed25519", key, bytes(lines.join("\n"))))}`;
 }
 
 async function derived(/** @type {string} */ token, /** @type {string} */ label) {

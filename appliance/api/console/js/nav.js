@@ -5,7 +5,8 @@ import { live } from "./live.js";
 import { Given } from "./parts/given.js";
 import { Icon, Mark } from "./parts/icon.js";
 import { Link, place } from "./router.js";
-import { end, ROBOT, session } from "./session.js";
+import { ROBOT, session } from "./session.js";
+import { signOut } from "./sign-on.js";
 import { Pulse } from "./standing.js";
 import { listKeys } from "./shortcuts.js";
 import { useStore } from "./store.js";
@@ -29,7 +30,7 @@ export function Nav() {
       <div class="who"><span class="who-name"><${Given} value=${current?.name} most=${40} /></span><span class="muted small" data-role=${current?.role}>${current?.role}</span></div>
       <div class="side-buttons"><${ThemeSwitch} />
         <button class="button plain" onClick=${listKeys} aria-label="Keys" title="Keys" aria-keyshortcuts="?"><${Icon} name="keyboard" /></button>
-        <button class="button plain" onClick=${() => end(null)} aria-label="Sign out" title="Sign out"><${Icon} name="out" /></button></div>
+        <button class="button plain" onClick=${signOut} aria-label="Sign out" title="Sign out"><${Icon} name="out" /></button></div>
     </div></header>`;
 }
 

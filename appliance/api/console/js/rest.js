@@ -7,16 +7,17 @@ import { passive } from "./passive.js";
 
 /**
  * @typedef {{query?: Record<string, any>, json?: any, text?: string, match?: string, token?: string,
- *   headers?: Record<string, string>, signal?: AbortSignal}} Options
+ *   anonymous?: boolean, headers?: Record<string, string>, signal?: AbortSignal}} Options
+ * `anonymous`: the request needs no session.
  */
 
 /**
  * Return the response once its headers arrive. A request with `match` is a change and is signed. Throws `Problem`.
  * @param {string} method @param {string} path @param {Options} [options]
  */
-export async function send(method, path, { query, json, text, match, token, headers = {}, signal } = {}) {
-  if (!token) await unlocked();
-  const holder = token ?? session.get().current?.token;
+export async function send(method, path, { query, json, text, match, token, anonymous, headers = {}, signal } = {}) {
+  if (!token && !anonymous) await unlocked();
+  const holder = anonymous ? undefined : token ?? session.get().current?.token;
   const at = new URL(path + queryText(query), location.origin);
   const body = json !== undefined ? JSON.stringify(json) : text;
   const type = json !== undefined ? "application/json" : text !== undefined ? "text/plain; charset=utf-8" : "";

@@ -12,6 +12,8 @@ import { Problem } from "./problem.js";
 import { createStore } from "./store.js";
 
 const KEY = "rosrv.token";
+/** Names of people who signed in at the provider start with this. */
+export const PERSON = "sso:";
 const LAST_USE = "rosrv.used"; // time of the last use: a browser may unload a tab and reload it hours later
 const RANK = { viewer: 1, investigator: 1, operator: 2, admin: 3 };
 const USES = ["pointerdown", "pointermove", "keydown", "wheel", "touchstart"];
@@ -21,13 +23,14 @@ export const UNUSED = Number(stated("lock-seconds")) * 1000;
 
 /**
  * @typedef {{token: string, name: string, role: "viewer" | "investigator" | "operator" | "admin", expires: number}} Session
- * `current` is null while signed out; `ended` is the reason why the last session ended. `checking`: the token of an
+ * `current` is null while signed out; `ended` is the reason why the last session ended, under `heading`. `checking`: the token of an
  * earlier page is being checked; `waiting` is the problem that delays the check. While the page is locked, `locked` is
  * the locked session. `number` counts sessions; unlocking does not start a new session.
  */
 export const session = createStore({
   current: /** @type {Session | null} */ (null),
   ended: /** @type {string | null} */ (null),
+  heading: "Signed out",
   checking: false,
   waiting: /** @type {Problem | null} */ (null),
   locked: /** @type {{name: string, role: string} | null} */ (null),
@@ -63,20 +66,20 @@ export function open(opened, keep) {
   if (locked && !same) end(null);
   if (keep) store(opened.token);
   const { number } = session.get();
-  session.set({ current: opened, ended: null, checking: false, waiting: null, locked: null, number: same ? number : number + 1 });
+  session.set({ current: opened, ended: null, heading: "Signed out", checking: false, waiting: null, locked: null, number: same ? number : number + 1 });
   clearTimeout(ending);
   const left = opened.expires * 1000 - Date.now();
-  if (left < LONGEST) ending = setTimeout(() => end("The token has expired. Create another: rosrv token add."), left);
+  if (left < LONGEST) ending = setTimeout(() => end(opened.name.startsWith(PERSON) ? "The session has expired. Sign in again." : "The token has expired. Create another: rosrv token add."), left);
   use();
   watch();
 }
 
-/** @param {string | null} why */
-export function end(why) {
+/** @param {string | null} why @param {string} [heading] */
+export function end(why, heading = "Signed out") {
   clearTimeout(ending);
   clearTimeout(locking);
   forget();
-  session.update({ current: null, ended: why, checking: false, waiting: null, locked: null });
+  session.update({ current: null, ended: why, heading, checking: false, waiting: null, locked: null });
 }
 
 /** Lock the unused page: forget the token, but keep unsaved work. */

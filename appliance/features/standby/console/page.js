@@ -6,7 +6,8 @@ import { Mark } from "#console/parts/icon.js";
 import { Failure, Loading } from "#console/parts/notice.js";
 import { useResource } from "#console/parts/resource.js";
 import { get } from "#console/rest.js";
-import { end, entitle } from "#console/session.js";
+import { entitle } from "#console/session.js";
+import { signOut } from "#console/sign-on.js";
 import { useStore } from "#console/store.js";
 import { Pair } from "./pair.js";
 import { passive } from "#console/passive.js";
@@ -29,6 +30,6 @@ export function StandbyPage() {
     <div class="brand"><${Mark} size=${40} /><div><h1 class="brand-name">Standby</h1><div class="brand-sub">${value && !value.other.connected ? "The other appliance is away." : "The robot's nodes use the other appliance."}</div></div></div>
     <a class="button primary" href=${there} rel="noreferrer"><span>Open the console of ${value ? html`<${Given} value=${value.other.name} most=${40} />` : "the active appliance"}</span></a>
     ${value ? html`<${Pair} state=${value} />` : error ? html`<${Failure} error=${error} />` : html`<section class="panel"><${Loading} rows=${3} /></section>`}
-    <div class="row row-apart"><span class="muted small"><${Given} value=${there} mono /></span><button class="button small" onClick=${() => end(null)}>Sign out</button></div>
+    <div class="row row-apart"><span class="muted small"><${Given} value=${there} mono /></span><button class="button small" onClick=${signOut}>Sign out</button></div>
   </div></main>`;
 }

@@ -1,0 +1,1 @@
+"""Single sign-on beside tokens: people sign in at the site's OpenID Connect provider."""

@@ -1,0 +1,75 @@
+"""The link control <-> sso: sign-ons that begin, and the identities of those that the provider confirmed."""
+
+import msgspec
+
+from appliance.channel.answers.token_answers import TokenRole
+from appliance.channel.messages.message import Message
+
+
+class SessionKeys(msgspec.Struct, frozen=True):
+    """The id of a session that a browser chose, and the verifiers of its keys, as of a token (`TokenKeys`)."""
+
+    id: str
+    reading: bytes
+    verifying: bytes
+
+
+class Identity(msgspec.Struct, frozen=True):
+    """A person whom the provider identified, and their rights; `ends` is seconds since the epoch.
+
+    `subject` is the provider's `sub`. `name` is unique among the people of the provider. `mail` is empty unless it is
+    verified. `doors` are groups of doors.
+    """
+
+    subject: str
+    name: str
+    mail: str
+    role: TokenRole
+    doors: tuple[str, ...]
+    ends: float
+
+
+class SignOnWanted(Message, frozen=True):
+    """Control passes on that a browser at this address begins; `again`: the person must prove who they are again."""
+
+    number: int
+    keys: SessionKeys
+    address: str
+    again: bool
+
+
+class SignOnBegun(Message, frozen=True):
+    """The browser is sent to this URL, and returns with `state`."""
+
+    number: int
+    url: str
+    state: str
+
+
+class SignOnReturned(Message, frozen=True):
+    """Control passes on that a browser returned from the provider with a code."""
+
+    number: int
+    state: str
+    code: str
+    issuer: str
+
+
+class SignOnConfirmed(Message, frozen=True):
+    """The provider identified the person who began with these keys at this address."""
+
+    number: int
+    identity: Identity
+    keys: SessionKeys
+    address: str
+
+
+class SignOnFailed(Message, frozen=True):
+    """Request `number` failed. `refused`: the person or the browser is not accepted; otherwise, the provider fails."""
+
+    number: int
+    reason: str
+    refused: bool
+
+
+SsoLink = SignOnWanted | SignOnBegun | SignOnReturned | SignOnConfirmed | SignOnFailed

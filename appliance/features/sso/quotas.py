@@ -1,0 +1,24 @@
+"""The quotas of single sign-on."""
+
+from appliance.quotas.pool import Bounds
+from appliance.quotas.table import QuotaRow
+
+SIGN_ONS = QuotaRow(
+    thing="sign-ons at the provider that are not finished",
+    bounds=Bounds(whole=256, host=8, unknown=8, kept=0),
+    at_limit="the oldest one of the address ends; an address begins at most `api_limits.failures_per_minute` a minute",
+    between="if all are taken, the oldest one of the address with most ends",
+    counting="an IPv6 network (/64) is one address",
+    alarm="none: the person signs in again",
+    shown_by=("unit/features/sso/test_sign_on.py::test_a_flood_of_sign_ons_ends_only_its_own",),
+)
+SESSIONS = QuotaRow(
+    thing="sessions of people who signed in at the provider",
+    bounds=Bounds(whole=500, host=8, unknown=0, kept=0),
+    at_limit="the oldest session of the person ends; beyond the whole, a sign-on is refused",
+    counting="a person is a `sub` of the provider",
+    alarm="`sign-on refused`",
+    shown_by=("unit/features/sso/test_sessions.py::test_a_person_and_all_people_have_a_quota_of_sessions",),
+)
+
+ROWS = (SIGN_ONS, SESSIONS)

@@ -1,0 +1,114 @@
+"""Keep the sessions of people in memory.
+
+Invariants:
+
+1. Sessions are never stored. They end with control's process, so a restart with changed roles, and a takeover, end all
+   of them.
+2. A session ends at its time by the system time or by the time since the boot, whichever is earlier, so a step back of
+   the clock postpones no end.
+3. A name in the audit log means one person at a time: while a person is signed in, another `sub` with this name is
+   refused. If a person's rights have changed, their next sign-on ends their earlier sessions.
+"""
+
+from typing import NamedTuple
+
+from appliance.base import clock
+from appliance.control.errors import UnknownThingError
+from appliance.control.operators.sessions import Session
+from appliance.control.operators.token_orders import TokenRefusedError
+from appliance.features.sso.link import Identity, SessionKeys
+from appliance.features.sso.quotas import SESSIONS
+from appliance.signing.request_signing import TokenKeys
+from appliance.store.access_tokens import TokenRow
+
+_PREFIX = "sso:"  # no token has such a name
+_MOST, _MOST_OF_PERSON = SESSIONS.bounds.whole, SESSIONS.bounds.host
+
+
+class _Kept(NamedTuple):
+    session: Session
+    row: TokenRow
+    until: float  # seconds since the boot
+
+
+class SessionTable:
+    """All sessions, the oldest first."""
+
+    def __init__(self) -> None:
+        self._kept: dict[str, _Kept] = {}
+
+    def rows(self) -> list[TokenRow]:
+        """Return the sessions that may be used now, in the form of tokens."""
+        return [kept.row for kept in self._usable()]
+
+    def sessions(self) -> list[Session]:
+        """Return the sessions that may be used now."""
+        return [kept.session for kept in self._usable()]
+
+    def of(self, session_id: str) -> Session | None:
+        """Return the person of a session, or None if it has ended."""
+        return next((one for one in self.sessions() if one.id == session_id), None)
+
+    def open(self, identity: Identity, keys: SessionKeys) -> tuple[Session, list[Session]]:
+        """Open a session; return it, and the person's sessions that this ends. Raises `TokenRefusedError`."""
+        name, now = f"{_PREFIX}{identity.name}", clock.wall()
+        present = self.sessions()
+        if any(one.id == keys.id for one in present):
+            raise TokenRefusedError("the browser chose the id of another session: sign in again")
+        if any(one.name == name and one.subject != identity.subject for one in present):
+            raise TokenRefusedError(
+                f"another person is signed in as {name}: choose a claim for sso.name_claim that identifies people"
+            )
+        rights = identity.role, identity.doors
+        own = [one for one in present if one.subject == identity.subject]
+        ended = [one for one in own if (one.role, one.groups) != rights]
+        staying = [one for one in own if one not in ended]
+        ended += staying[: max(0, len(staying) + 1 - _MOST_OF_PERSON)]
+        if len(present) - len(ended) >= _MOST:
+            raise TokenRefusedError(f"{_MOST} people's sessions are open: end some (rosrv sso end NAME)")
+        for one in ended:
+            del self._kept[one.id]
+        session = Session(
+            keys.id, name, identity.subject, identity.mail, identity.role, identity.doors, identity.ends
+        )
+        # No hash: a session has only keys, and its token is never sent.
+        row = TokenRow(
+            keys.id,
+            name,
+            identity.role,
+            b"",
+            b"",
+            now,
+            identity.ends,
+            None,
+            TokenKeys(keys.reading, keys.verifying),
+        )
+        self._kept[keys.id] = _Kept(session, row, clock.since_boot() + identity.ends - now)
+        return session, ended
+
+    def end(self, session_id: str, who: str) -> Session:
+        """End a session of `who`. Raises `UnknownThingError`."""
+        found = self.of(session_id)
+        if found is None or found.name != who:
+            raise UnknownThingError("this is not a session of yours")
+        del self._kept[session_id]
+        return found
+
+    def end_all(self, name: str) -> list[Session]:
+        """End all sessions of a person. Raises `UnknownThingError`."""
+        ended = [one for one in self.sessions() if one.name in (name, f"{_PREFIX}{name}")]
+        if not ended:
+            names = ", ".join(sorted({one.name for one in self.sessions()})[:20]) or "none"
+            raise UnknownThingError(f"nobody is signed in as {name[:140]!r}; there are: {names}")
+        for one in ended:
+            del self._kept[one.id]
+        return ended
+
+    def _usable(self) -> list[_Kept]:
+        wall, boot = clock.wall(), clock.since_boot()
+        self._kept = {
+            name: kept
+            for name, kept in self._kept.items()
+            if wall < kept.session.expires and boot < kept.until
+        }
+        return list(self._kept.values())

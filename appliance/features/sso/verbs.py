@@ -1,0 +1,44 @@
+"""`rosrv sso list|end`: the sessions of people who signed in at the provider."""
+
+from typing import Annotated
+
+import typer
+
+from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.output import moment, say_json, say_row
+from appliance.features.sso.requests import SessionsEnd, SessionsWanted
+from rosmop.tool.terminal import say
+
+
+@speaks
+def list_sessions(appliance: Appliance) -> None:
+    """List the sessions of people who signed in at the provider.
+
+    Example: rosrv sso list
+    """
+    body = appliance.ask_or_exit(SessionsWanted())
+    if appliance.as_json:
+        say_json(body)
+        return
+    if not body.sessions:
+        say("Nobody is signed in at the provider.")
+    for one in body.sessions:
+        groups = [f"doors {', '.join(one.groups)}"] if one.groups else []
+        row = f"{one.name:<32} {one.role:<12} {one.id}"
+        say_row([row, f"until {moment(one.expires)}", f"sub {one.subject}", *groups])
+
+
+@speaks
+def end(
+    appliance: Appliance,
+    name: Annotated[str, typer.Argument(help="Name of the person, as in the list", show_default=False)],
+) -> None:
+    """End all sessions of a person now. To keep them out, also remove their access at the provider.
+
+    Example: rosrv sso end sso:alice@example.org
+    """
+    body = appliance.ask_or_exit(SessionsEnd(name))
+    if appliance.as_json:
+        say_json(body)
+        return
+    say(f"{body.sessions[0].name}: {len(body.sessions)} sessions ended.")
