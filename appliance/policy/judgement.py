@@ -20,7 +20,8 @@ class PolicyContext:
 
     `cases` is None if the policy has no test cases. `cases_error` is the reason if they could not be read; it rejects
     the policy. If `site_keys` is not empty, one of these keys must have signed the policy. `blocks` has the hosts that
-    an operator blocks (`Policy.blocks`); they do not affect checks and test cases.
+    an operator blocks (`Policy.blocks`), and `holders` the hosts that hold groups (`Policy.holders`); neither affects
+    checks and test cases.
     """
 
     hosts: Mapping[str, Address] = field(default_factory=dict)
@@ -30,6 +31,7 @@ class PolicyContext:
     cases_error: str | None = None
     site_keys: Sequence[str] = ()
     blocks: Mapping[Address, str] = field(default_factory=dict)
+    holders: Mapping[str, Address] | None = None
 
     @classmethod
     def of(cls, fields: Mapping[str, Any]) -> Self:
@@ -39,6 +41,7 @@ class PolicyContext:
             [ipaddress.ip_network(place) for place in fields["robot"]],
             **{name: fields[name] for name in ("cases_file", "cases", "cases_error", "site_keys")},
             blocks={ipaddress.ip_address(address): block for address, block in fields["blocks"].items()},
+            holders={group: ipaddress.ip_address(host) for group, host in (fields["holders"] or {}).items()},
         )
 
     def fields(self) -> dict[str, Any]:
@@ -51,6 +54,7 @@ class PolicyContext:
             "cases_error": self.cases_error,
             "site_keys": list(self.site_keys),
             "blocks": {str(address): block for address, block in self.blocks.items()},
+            "holders": {group: str(host) for group, host in (self.holders or {}).items()},
         }
 
 

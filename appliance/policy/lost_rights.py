@@ -17,7 +17,7 @@ class LostRights:
     def __init__(self, old: Policy, new: Policy) -> None:
         self.old, self.new = old, new
         self._names = {category: tuple(dict.fromkeys(_names(old, new, category))) for category in Category}
-        self._before, self._after = replace(old, blocks={}), replace(new, blocks={})
+        self._before, self._after = (replace(one, blocks={}, holders=None) for one in (old, new))
         self._lost: dict[tuple[str, str], bool] = {}  # by the networks that both policies name
 
     def took_from(self, host: Address) -> bool:
@@ -36,6 +36,7 @@ def _names(old: Policy, new: Policy, category: Category) -> Iterator[str]:
         yield from COMMANDS
         return
     yield from (f"/{_ANY}", f"/{_ANY}/{_ANY}", f"/{_ANY}/{_ANY}/{_ANY}")  # mostly decided by the default
+    yield from (name for policy in (old, new) for group in policy.authority.values() for name in group.names)
     for rule in (*old.rules(category), *new.rules(category)):
         if rule.key is not None:
             yield from _matching(rule.key)

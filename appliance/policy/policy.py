@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from appliance.policy import commands
+from appliance.policy.authority import AuthorityGroup
 from appliance.policy.host_sets import Atom, HostSets, Network, canonical_address
 from appliance.policy.keys import Key, is_parameter_key
 from appliance.policy.model import Address, Category, Decision, Request, Rule
@@ -26,6 +27,7 @@ from roswire.names import is_global_name
 DEFAULT_PORTS = range(19001, 26001)
 
 _LIMITED = {Category.PUBLISH: LimitScope.PUBLISHER, Category.SUBSCRIBE: LimitScope.SUBSCRIBER}
+_COMMANDING = frozenset({Category.PUBLISH, Category.CALL})
 _KEPT_DECISIONS = 8192
 _KEPT_NAME = 256
 _LONGEST_REASON = 299
@@ -74,7 +76,9 @@ class Policy:
     rule names. `present` lists the categories that have a section. `ports` are the ports for proxy endpoints and relay.
     `monitored_topics` and `monitored_services` are the names in `[Monitor]`. `takeover` is `same-host` or `granted`.
     `enrolled` and `robot` are the given addresses of `host:NAME` and `robot`. `blocks` has the hosts that an operator
-    blocks, by canonical address: the end of a sentence, such as `blocked by ann`.
+    blocks, by canonical address: the end of a sentence, such as `blocked by ann`. `authority` has the groups of
+    `[Authority]`, and `holders` the host that holds each of them; a group without an entry is free. Without `holders` (for
+    checks of a text), each host with a claim counts as the holder.
     """
 
     text: str
@@ -88,11 +92,13 @@ class Policy:
     monitored_topics: frozenset[str]
     monitored_services: frozenset[str]
     limits: LimitTable
+    authority: Mapping[str, AuthorityGroup]
     takeover: str
     tell: str
     enrolled: Mapping[str, Address]
     robot: tuple[Network, ...]
     blocks: Mapping[Address, str] = field(default_factory=dict)
+    holders: Mapping[str, Address] | None = None
     kept: dict[tuple[int, int, Category, str], Decision] = field(default_factory=dict, init=False)
     _kept_below: dict[tuple[int, int, Category, str, bool], Decision] = field(
         default_factory=dict, init=False
@@ -100,6 +106,7 @@ class Policy:
 
     def __post_init__(self) -> None:
         self._any_audit_only = any(table.audit_only for table in self.tables.values())
+        self._commanded = {name: group for group in self.authority.values() for name in group.names}
 
     def decide(self, request: Request) -> Decision:
         """Decide by the rules of the request's own category whether the host may access the resource.
@@ -190,6 +197,26 @@ class Policy:
             return None
         return Decision(False, None, f"{host} is {block}", told=f"{host} is blocked by an operator")
 
+    def commanded(self, name: str) -> AuthorityGroup | None:
+        """Return the group of `[Authority]` with this topic or service, or None."""
+        return self._commanded.get(name)
+
+    def may_command(self, name: str, host: Address) -> bool:
+        """Whether messages and calls of this host reach a topic or service: it holds the group, or there is none."""
+        group = self._commanded.get(name)
+        if group is None:
+            return True
+        if self.holders is None:
+            return group.claim(self.atoms_of(host)) is not None
+        return self.holder(group) == canonical_address(host)
+
+    def holder(self, group: AuthorityGroup) -> Address | None:
+        """Return the host that holds a group and still has a claim to it; None: the group is free."""
+        host = (self.holders or {}).get(group.name)
+        if host is None or self.blocked(host) is not None or group.claim(self.atoms_of(host)) is None:
+            return None
+        return host
+
     def named_as(self, address: Address) -> Network:
         """Return the smallest network of the policy that contains the address, or the address itself as a network."""
         return self.hosts.narrowest(address)
@@ -238,9 +265,31 @@ class Policy:
         found = table.tree.find(name)
         if category is Category.COMMAND and name in commands.NAMED_ONLY:
             return self._decide_named_only(request, table, found)
-        if category not in self.present:
-            return self._without_section(request, table)
-        return self._apply(request, table, found or table.default)
+        if category in self.present:
+            decision = self._apply(request, table, found or table.default)
+        else:
+            decision = self._without_section(request, table)
+        group = self._commanded.get(name) if category in _COMMANDING else None
+        return decision if group is None else self._commanding(request, decision, group)
+
+    def _commanding(self, request: Request, decision: Decision, group: AuthorityGroup) -> Decision:
+        """Deny what the rules grant to a host without a claim to the group, and calls of a host that does not hold it.
+
+        The publication of a host with a claim stays registered, because a ROS 1 node never registers again. The relay
+        carries its messages only while the host holds the group.
+        """
+        if not decision.allowed:
+            return decision
+        if group.claim(self.atoms_of(request.host)) is None:
+            reason = f"{_what(request, 'may not')}: no line of {place_of(group.rule)} lets it take, override or ask"
+            return Decision(False, group.rule, reason)
+        holder = self.holder(group)
+        now = "" if self.holders is None else f"; now {holder or 'nobody'} holds it"
+        if request.category is Category.CALL and not self.may_command(request.resource, request.host):
+            told = f"{_what(request, 'may not')} while it does not hold {group.name}: rosrv drive take {group.name}"
+            return Decision(False, group.rule, told + now, told=told)
+        reason = f"{decision.reason}, while it holds {group.name}{now}"
+        return replace(decision, reason=reason if len(reason) <= _LONGEST_REASON else decision.reason)
 
     def _decide_named_only(self, request: Request, table: RuleTable, found: CompiledRule | None) -> Decision:
         if found is None:

@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping
 
 from appliance.base.validation_messages import meant, nearest
 from appliance.policy import sections
+from appliance.policy.authority import read_authority
 from appliance.policy.groups import HostGroups
 from appliance.policy.host_sets import HostSets, Network
 from appliance.policy.ini_reader import SectionText, read
@@ -41,6 +42,7 @@ def compile_policy(
     ports = read_ports(written.get(sections.PORTS), findings)
     monitor = read_monitor(written.get(sections.MONITOR), findings)
     limits = read_limits(written.get(sections.LIMITS), file, groups, findings)
+    authority = read_authority(written.get(sections.AUTHORITY), file, groups, findings)
     compiler = RuleCompiler(file, groups, findings)
     present: set[Category] = set()
     for decider in sections.DECIDERS:
@@ -65,6 +67,7 @@ def compile_policy(
         monitored_topics=monitor.topics,
         monitored_services=monitor.services,
         limits=limits,
+        authority=authority,
         takeover=options.takeover,
         tell=options.tell,
         enrolled=dict(hosts or {}),

@@ -47,5 +47,6 @@ DEFAULT = "default"
 """The key that applies to names without another matching key in the section."""
 
 GROUPS, PORTS, MONITOR, LIMITS, OPTIONS = "Groups", "Ports", "Monitor", "Limits", "Options"
+AUTHORITY = "Authority"
 
-NAMES = (GROUPS, PORTS, MONITOR, *(decider.name for decider in DECIDERS), LIMITS, OPTIONS)
+NAMES = (GROUPS, PORTS, MONITOR, *(decider.name for decider in DECIDERS), LIMITS, AUTHORITY, OPTIONS)

@@ -129,7 +129,9 @@ def explanation(
 ) -> DecisionExplanation:
     """Return the reasons for the decision of a request. Raises `ProblemError` if the request is invalid."""
     fields = msgspec.structs.asdict(current)
-    policy = replace(judge_text(text, current, cases=False).policy, blocks=PolicyContext.of(fields).blocks)
+    known = PolicyContext.of(fields)
+    policy = judge_text(text, current, cases=False).policy
+    policy = replace(policy, blocks=known.blocks, holders=known.holders)
     try:
         request = Request(find_host(host, policy), node, category, check_resource(category, resource))
     except BadWordError as error:

@@ -45,6 +45,7 @@ class PolicyInForce(RevisionText, frozen=True, kw_only=True):
         dict[str, str],
         doc("hosts that an operator blocks, by address: the end of the reason of their denials"),
     ] = {}
+    holders: Annotated[dict[str, str], doc("address of the host that holds each group of [Authority]")] = {}
 
 
 class PolicyKnown(PolicyInForce, frozen=True):

@@ -93,6 +93,7 @@ def policy_in_force(
         {name: canonical_address(ipaddress.ip_address(address)) for name, address in body.hosts.items()},
         [ipaddress.ip_network(place) for place in body.robot],
         blocks={ipaddress.ip_address(address): block for address, block in body.blocks.items()},
+        holders={group: ipaddress.ip_address(host) for group, host in body.holders.items()},
     )
     return body.text, body.file, known_of(robot, enrolled, known)
 

@@ -136,7 +136,7 @@ def compiled(
         policy = compile_policy(text, file=name, hosts=known.hosts, robot=known.robot)
     except PolicyError as error:  # the appliance has another version
         raise refused(error.findings) from error
-    return replace(policy, blocks=known.blocks)
+    return replace(policy, blocks=known.blocks, holders=known.holders)
 
 
 @speaks
