@@ -6,7 +6,7 @@ The decision, the grant and its revocation are about the host that the relay see
 
 import ipaddress
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from appliance.base import clock
 from appliance.channel.messages import MonitorCallAnswered, MonitorCallWanted
@@ -61,7 +61,9 @@ class MonitorCallGate:
     async def _refused(self, service: str) -> str:
         """Return why the call is denied; empty if it is allowed."""
         request = request_of(_CALL, ipaddress.ip_address(self.host), self.name, service)
-        decision = decide(self.policy(), rights_of_call(request, _CALL))
+        # A guard stops the robot whoever holds its group (`[Authority]`).
+        policy = replace(self.policy(), authority={}) if self.policy().authority else self.policy()
+        decision = decide(policy, rights_of_call(request, _CALL))
         asker = Asker(self.host, self.name, clock.now_ns(), None)
         record = self.trail.decided(asker, _CALL, request.category.value, service, decision)
         if not decision.allowed:

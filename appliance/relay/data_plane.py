@@ -156,6 +156,7 @@ class DataPlane:
         elif isinstance(message, messages.PublicationPlaced):
             self._place_topic(message.key, message.topic)
             self._limit_topic(message)
+            self.topics[message.key, message.topic][1].silence(silent=message.silent)
         elif isinstance(message, messages.GrantInstalled):
             self._limit_subscriber(message)
         if self.waiting and message.key in self.waiting:

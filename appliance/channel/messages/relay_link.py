@@ -67,7 +67,8 @@ class PublicationPlaced(Message):
 
     `limit` applies to all publications of the topic on this host. `together` applies to all publications of the topic;
     hosts, by `counted_as`, share it equally. Sending this message again changes the limits. `named`: the policy names
-    the node's host, not only all hosts (`*`).
+    the node's host, not only all hosts (`*`). `silent`: the relay takes no message from the node, because its host does
+    not hold the topic's group (`[Authority]`).
     """
 
     key: str
@@ -77,6 +78,7 @@ class PublicationPlaced(Message):
     together: FlowLimit = UNLIMITED
     counted_as: str = ""
     named: bool = True
+    silent: bool = False
 
 
 class PublicationWithdrawn(Message):

@@ -168,6 +168,7 @@ async def make_foundation(
         robot=robot_addresses(settings, role.robot),
         hosts=lambda: {**tunnels().addresses, **features().addresses()},
         blocks=lambda: blocks.reasons,
+        holders=lambda: features().holders(),
         live=lambda: enforcement().revocation.live(),  # noqa: PLW0108  it is assembled later
         changed=lambda before, policy: enforcement().policy_changed(before, policy),
         carried_out=lambda: enforcement().carried_out(),

@@ -82,6 +82,7 @@ class Policies(Revisions[RevisionRow]):
         robot: Collection[Address | Network],
         hosts: Callable[[], Mapping[str, Address]],
         blocks: Callable[[], Mapping[Address, str]],
+        holders: Callable[[], Mapping[str, Address]],
         live: Callable[[], Iterable[LiveRight]],
         changed: Callable[[Policy, Policy], int],
         carried_out: Callable[[], Awaitable[None]],
@@ -90,8 +91,8 @@ class Policies(Revisions[RevisionRow]):
         """Prepare; `start` brings a policy into force.
 
         `hosts()` returns the addresses for `host:NAME`; the owner calls `hosts_changed` when they change. `blocks()`
-        returns the blocked hosts (`Policy.blocks`); the owner calls `blocks_changed` when they change. `live()` returns
-        the live rights of all hosts.
+        returns the blocked hosts (`Policy.blocks`), and `holders()` the hosts that hold groups (`Policy.holders`); the
+        owner calls `decide_again` when they change. `live()` returns the live rights of all hosts.
         `changed(before, policy)` decides all live rights again, and returns the number of revocations. `carried_out()`
         waits until the relays have carried out all orders. With `site_keys`, one of these keys must sign every policy.
         """
@@ -102,6 +103,7 @@ class Policies(Revisions[RevisionRow]):
         self._robot = robot
         self._hosts = hosts
         self._blocks = blocks
+        self._holders = holders
         self._live = live
         self._changed = changed
         self._carried_out = carried_out
@@ -208,8 +210,8 @@ class Policies(Revisions[RevisionRow]):
             return 0
         return self._enforce(policy)
 
-    def blocks_changed(self) -> int:
-        """Decide by the present blocks of hosts. Return the number of revocations."""
+    def decide_again(self) -> int:
+        """Decide by the present blocks of hosts and holders of groups. Return the number of revocations."""
         return self._enforce(self.current)
 
     async def roll_back(self, request: admin.PolicyRollback, who: str) -> Loaded:
@@ -277,7 +279,11 @@ class Policies(Revisions[RevisionRow]):
     def known(self) -> PolicyContext:
         """Return the present context of policies: hosts, robot and site keys."""
         return PolicyContext(
-            dict(self._hosts()), self._robot, site_keys=self._site_keys, blocks=self._blocks()
+            dict(self._hosts()),
+            self._robot,
+            site_keys=self._site_keys,
+            blocks=self._blocks(),
+            holders=self._holders(),
         )
 
     # --- inside ---
@@ -371,7 +377,10 @@ class Policies(Revisions[RevisionRow]):
         return self._loaded(before, revoked, lost)
 
     def _enforce(self, policy: Policy) -> int:
-        before, self._current = self._current, replace(policy, blocks=dict(self._blocks()))
+        before, self._current = (
+            self._current,
+            replace(policy, blocks=dict(self._blocks()), holders=dict(self._holders())),
+        )
         self._trail.revision = self.revision
         return 0 if before is None else self._changed(before, self._current)
 

@@ -188,7 +188,7 @@ class BlockOrders:
         return self._registrations() - before
 
     def _apply(self) -> None:
-        self._policies.blocks_changed()
+        self._policies.decide_again()
         self._changed.set()
 
     async def _read_clock(self) -> None:

@@ -286,6 +286,7 @@ class RelayControl:
             _flow(together),
             policy.counted_as(incarnation.host) if together else "",
             _names(policy, incarnation.host),
+            not (incarnation.own or policy.may_command(topic, incarnation.host)),
         )
 
     # --- what the relays say ---

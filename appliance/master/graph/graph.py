@@ -238,13 +238,15 @@ class RosGraph:
         ]
 
     def limits_changed(self, before: Policy, now: Policy) -> Effects:
-        """Send the relays all changed limits, and whether the policy names a host if that has changed."""
+        """Send the relays all changed limits, and whether a host is named or may command, if that has changed."""
         effects: Effects = []
         for node in self.registry.live():
             for registration in node.registrations.values():
                 parts = ((LimitScope.PUBLISHER, node.host), (LimitScope.TOPIC, None))
                 if registration.kind is Kind.PUBLICATION and (
                     before.names(node.host) != now.names(node.host)
+                    or before.may_command(registration.resource, node.host)
+                    != now.may_command(registration.resource, node.host)
                     or _differ(before, now, registration.resource, parts)
                     or (
                         now.limit(LimitScope.TOPIC, registration.resource)

@@ -2,8 +2,8 @@
 
 The default, `relaying: all` and `mediation: full`, is a security boundary.
 
-With `relaying: monitored` (the thesis's mode), the relay carries only topics and services in the policy's `[Monitor]`,
-or with events of a specification. For all others, nodes connect directly. With `mediation: monitored`, nodes also get
+With `relaying: monitored` (the thesis's mode), the relay carries only topics and services in the policy's `[Monitor]`
+and `[Authority]`, or with events of a specification. For all others, nodes connect directly. With `mediation: monitored`, nodes also get
 each other's real URIs; this mode requires `relaying: monitored`. Both modes are faster, but not a security boundary: a
 node that knows a port can send any request to it.
 """
@@ -29,6 +29,7 @@ class Mediation:
             self.relay_all
             or topic in self.policy().monitored_topics
             or self.policy().limit_rule(topic) is not None
+            or self.policy().commanded(topic) is not None
             or self.specifications().of_topic(topic)
         )
 
@@ -36,6 +37,7 @@ class Mediation:
         return (
             self.relay_all
             or service in self.policy().monitored_services
+            or self.policy().commanded(service) is not None
             or self.specifications().of_service(service)
         )
 

@@ -1,10 +1,10 @@
-"""The service that the appliance itself offers (`std_srvs/Trigger`); control answers it through the relay.
+"""The services that the appliance itself offers (`std_srvs/Trigger`); control answers them through the relay.
 
 `OwnServer` replaces the connection to a node, so grants, headers, monitors and limits apply as for any other service.
 
 Invariants:
-- Control gets at most one call of a host at a time, and at most one a second. Further calls of that host get the same
-  answer, so a single host cannot keep control busy.
+- Control gets at most one call of a service from a host at a time, and at most one a second. Further calls of that host
+  get the same answer, so a single host cannot keep control busy.
 - Every call is answered. If control ends first, the answer reports that control is not running.
 """
 
@@ -28,7 +28,7 @@ _SECOND = 1.0
 
 @dataclass(slots=True)
 class _Call:
-    """The last call of a host: the clients that wait for the answer, or the answer and the time when it expires."""
+    """The last call of a service by a host: the clients that wait for the answer, or the answer and the time when it expires."""
 
     number: int
     waiting: list["OwnServer"] = field(default_factory=list)
@@ -42,24 +42,24 @@ class OwnService:
     def __init__(self, loop: EventLoop, send: Callable[[Message], None]) -> None:
         self._loop = loop
         self._send = send
-        self._calls: dict[str, _Call] = {}
+        self._calls: dict[tuple[str, str], _Call] = {}  # by service and host
         self._number = 0
 
     def call(self, service: str, host: str, caller_id: str, server: "OwnServer") -> None:
         """Ask control, or repeat the answer to this host's last call if that answer is less than a second old."""
-        last = self._calls.get(host)
+        last = self._calls.get((service, host))
         if last is not None and not last.until:
             last.waiting.append(server)
         elif last is not None and self._loop.clock() < last.until:
             server.answered(last.reply)
         else:
             self._number += 1
-            self._calls[host] = _Call(self._number, [server])
+            self._calls[service, host] = _Call(self._number, [server])
             self._send(OwnServiceCalled(self._number, service, host, caller_id))
 
-    def forget(self, host: str, server: "OwnServer") -> None:
+    def forget(self, service: str, host: str, server: "OwnServer") -> None:
         """Drop a client that has disconnected."""
-        last = self._calls.get(host)
+        last = self._calls.get((service, host))
         if last is not None and server in last.waiting:
             last.waiting.remove(server)
 
@@ -77,7 +77,7 @@ class OwnService:
     def tidy(self) -> None:
         """Forget answers that are older than a second."""
         now = self._loop.clock()
-        self._calls = {host: call for host, call in self._calls.items() if not call.until or now < call.until}
+        self._calls = {key: call for key, call in self._calls.items() if not call.until or now < call.until}
 
     def _settle(self, call: _Call, success: bool, text: str) -> None:
         data = text.encode()
@@ -135,4 +135,4 @@ class OwnServer:
     def close(self) -> None:
         """Forget the client."""
         self._timer.cancel()
-        self._own.forget(self._called[1], self)
+        self._own.forget(self._called[0], self._called[1], self)

@@ -75,6 +75,9 @@ class Upstream:
     def recheck(self) -> None:
         """Apply the specifications that are in force now."""
 
+    def silence(self, *, silent: bool) -> None:
+        """Take no message from the publisher, and close its connection at once; or connect again if it is wanted."""
+
     def check_stall(self) -> None:
         """Cut a publisher that holds memory for a message and sends nothing of it; called once a second."""
 

@@ -4,6 +4,8 @@
       ^               |                          |                        |                  |
       +---linger------+------ refused, failed, lost: wait (doubling), then ask again --------+
 
+A silent publisher (`silence`) stays idle, even if the topic is wanted.
+
 A publisher that turns the relay's header away is asked again at once with another header, while there is one
 (`introductions`).
 
@@ -81,6 +83,7 @@ class PublisherConnection(Upstream):
         self.state = UpstreamState.IDLE
         self.failures = 0
         self._wanted = False
+        self._silent = False
         self._objected = ""
         self._timer: LoopTimer | None = None  # of the state
         self._linger: LoopTimer | None = None
@@ -94,7 +97,17 @@ class PublisherConnection(Upstream):
         if self._linger is not None:
             self._linger.cancel()
             self._linger = None
-        if self.state is UpstreamState.IDLE:
+        if self.state is UpstreamState.IDLE and not self._silent:
+            self.ask()
+
+    def silence(self, *, silent: bool) -> None:
+        """Take no message from the publisher, and close its connection at once; or connect again if it is wanted."""
+        before, self._silent = self._silent, silent
+        if silent and not before:
+            self._drop_connection()
+            self._enter(UpstreamState.IDLE)
+        elif before and not silent and self._wanted:
+            self.failures = 0
             self.ask()
 
     def release(self) -> None:
