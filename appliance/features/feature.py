@@ -100,8 +100,8 @@ class FeaturePart:
     ends; its names go into error messages. `limits` returns how much of its resources is used.
     `connected(door, ticket, peer, descriptor)` passes a WebSocket of the api on; it returns an HTTP status and why it
     is refused, or an empty text. `details` returns what it adds to the details of a record (`RecordDetails`). `called`
-    answers nodes' calls of its service. `sessions` are those of people whom the feature signs in; they count beside
-    tokens.
+    answers nodes' calls of its services, by name without the appliance's own name. `sessions` are those of people whom
+    the feature signs in; they count beside tokens. `holders` returns the host that holds each group (`Policy.holders`).
 
     These return a state, or None if there is none: `forwarding` that of the forwarding of the audit log, `collector`
     that of its segments, `bundles` that of the fleet's bundles, `recorder` that of the flight recorder, and `pair` that
@@ -114,7 +114,10 @@ class FeaturePart:
     longest: Mapping[str, int] = field(default_factory=dict)
     limits: "Callable[[], tuple[LimitUse, ...]]" = lambda: ()
     details: "RecordDetails" = lambda *_event: {}
-    called: "Callable[[OwnServiceCalled], Awaitable[OwnServiceAnswered]] | None" = None
+    called: "Mapping[str, Callable[[OwnServiceCalled], Awaitable[OwnServiceAnswered]]]" = field(
+        default_factory=dict
+    )
+    holders: "Callable[[], Mapping[str, Address]]" = dict
     recorder: "Callable[[], RecorderState | None]" = lambda: None
     pair: "Callable[[], StandbyState | None]" = lambda: None
     work: Mapping[str, Callable[[], Awaitable[None]]] = field(default_factory=dict)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appliance.configuration.sections import Sections
+from appliance.features.authority.feature import AUTHORITY
 from appliance.features.backup.feature import BACKUP
 from appliance.features.demo.feature import DEMO
 from appliance.features.doors.feature import DOORS
@@ -56,6 +57,7 @@ FEATURES: tuple[Feature, ...] = (
     TUNNELS,
     POLICY_TOOLS,
     SSO,
+    AUTHORITY,
 )
 
 
@@ -143,9 +145,18 @@ class FeatureParts:
         return details
 
     async def called(self, call: "OwnServiceCalled") -> "OwnServiceAnswered":
-        """Answer a node's call of the appliance's own service."""
-        (called,) = filter(None, (part.called for part in self._parts))
+        """Answer a node's call of one of the appliance's own services."""
+        (called,) = (
+            answer
+            for part in self._parts
+            for name, answer in part.called.items()
+            if call.service.endswith(f"/{name}")
+        )
         return await called(call)
+
+    def holders(self) -> "dict[str, Address]":
+        """Return the host that holds each group of `[Authority]`."""
+        return {group: host for part in self._parts for group, host in part.holders().items()}
 
     def collector(self) -> "ForwardingState | None":
         """Return the state of the push of segments, or None if none is configured."""

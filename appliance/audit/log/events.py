@@ -31,6 +31,10 @@ EVENTS: dict[str, str] = {
     " what ended.",
     "host unblocked": "An operator lifted the block of a host; `detail` has who.",
     "host block ended": "The time of a host's block was over; the host is decided by the policy again.",
+    "authority handed over": "A group of [Authority] has another holder, or none; `resource` is the group, `detail` has"
+    " the earlier holder, the holder, and who ordered it.",
+    "authority asked": "A host waits for a group of [Authority]; `resource` is the group.",
+    "authority refused": "A host may not take a group of [Authority], or not now; `resource` is the group.",
     "alarm acknowledged": "An operator takes care of an alarm; `resource` is its kind, `detail` has who and the note.",
     "alarm silenced": "An operator made an alarm a notice for a time; `detail` has who, `until` and the note.",
     "alarm sounds again": "An operator ended the silence or the acknowledgement of an alarm.",
@@ -179,7 +183,7 @@ SEVERITIES: dict[str, Severity] = {
     name: severity
     for severity, names in {
         Severity.NOTICE: (
-            "host block ended", "host unblocked",
+            "authority asked", "authority handed over", "host block ended", "host unblocked",
             "appliance started", "appliance stopped", "bundle in force", "clock not synchronised", "clock synchronised",
             "evidence exported", "forwarding resumed", "handed over", "host awaited", "host awaited no longer",
             "host enrolled", "host renewed", "hosts reloaded", "monitor resumed", "monitor set", "policy loaded",
@@ -189,7 +193,7 @@ SEVERITIES: dict[str, Severity] = {
             "tunnel down", "tunnel moved", "tunnel up", "probe passed",
         ),
         Severity.WARNING: (
-            "bundle metadata rejected", "bundle refused",
+            "authority refused", "bundle metadata rejected", "bundle refused",
             "certificate ended", "certificate ends soon", "clock set back", "clock set forward", "enrolment refused",
             "door entry refused", "door failed", "forwarding failed", "host authority replaced",
             "host blocked", "host revoked", "limit exceeded", "malformed", "packets refused",

@@ -22,7 +22,7 @@ def make(core: FeatureContext) -> FeaturePart:
         methods=request_methods(orders),
         limits=orders.limits,
         details=plan.detail,
-        called=orders.called,
+        called={"record_now": orders.called},
         recorder=orders.state,
     )
 

@@ -1,0 +1,269 @@
+"""Hand groups of `[Authority]` over between hosts, by orders of operators, calls of nodes, and the end of a lease.
+
+A hand-over takes the path of a change of the policy: all rights are decided again, so the relays get new orders. The
+earlier holder is cut off on every relay before the next host holds the group. Nothing is stored: after a restart of
+control, and after a takeover, each group is free.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+
+from appliance.base import clock
+from appliance.base.withdrawal import take_effect
+from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
+from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
+from appliance.features.authority import drive_requests as requests
+from appliance.features.authority.group_holders import GroupHolders, Holding
+from appliance.policy.actions import BadWordError, find_host
+from appliance.policy.authority import AuthorityGroup, Claim
+from appliance.policy.model import Address, address_of
+from appliance.policy.policy import Policy
+from appliance.telemetry.audit_trail import AuditTrail
+
+CHECK_SECONDS = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class HostSigns:
+    """The signs of life of hosts: `live(host)` whether it has a live node, `moved(host, names)` its last message."""
+
+    live: Callable[[Address], bool]
+    moved: Callable[[Address, frozenset[str]], float]
+
+
+class DriveOrders:
+    """The orders about groups. Their methods raise `SenselessError`, `UnavailableError` and `UnknownThingError`.
+
+    `decide_again()` brings the present `holders` into force, and `carried_out()` waits until the relays have carried
+    out their orders. `relays_ready()` returns whether all relays are connected.
+    """
+
+    def __init__(
+        self,
+        policy: Callable[[], Policy],
+        trail: AuditTrail,
+        signs: HostSigns,
+        *,
+        decide_again: Callable[[], int],
+        carried_out: Callable[[], Awaitable[None]],
+        relays_ready: Callable[[], bool],
+    ) -> None:
+        self._policy = policy
+        self._trail = trail
+        self._signs = signs
+        self._decide_again = decide_again
+        self._carried_out = carried_out
+        self._relays_ready = relays_ready
+        self._groups = GroupHolders(self._claim)
+        self._turn = asyncio.Lock()
+
+    def holders(self) -> dict[str, Address]:
+        """Return the host that holds each group."""
+        return {name: holding.host for name, holding in self._groups.holdings().items()}
+
+    # --- operators ---
+
+    async def status(self, _request: requests.DriveStatus) -> requests.GroupStates:
+        groups = self._policy().authority
+        return requests.GroupStates([self._state(groups[name]) for name in sorted(groups)])
+
+    async def take(self, request: requests.DriveTake, who: str) -> requests.GroupState:
+        """Give a group to a host that may take it now."""
+        group, host = self._group(request.group), self._host(request.host)
+        async with self._turn:
+            await self._taken(group, host, who)
+        return self._state(group)
+
+    async def give(self, request: requests.DriveGive, who: str) -> requests.GroupState:
+        """Free a group, or give it to a host with any claim: so an operator lets an agent drive."""
+        group = self._group(request.group)
+        to = self._host(request.to) if request.to else None
+        if to is not None and self._claim(group, to) is None:
+            raise SenselessError(
+                f"{to} has no claim to {group.name}: add it to ask {group.name} in [Authority]"
+            )
+        async with self._turn:
+            if self._groups.holder(group.name) is None and to is None:
+                raise SenselessError(f"nobody holds {group.name}: `rosrv drive status` lists all groups")
+            await self._hand_over(group, to or self._next(group), f"given by {who}", who)
+        return self._state(group)
+
+    async def ask(self, request: requests.DriveAsk, who: str) -> requests.GroupState:
+        """Let a host wait for a group; if the group is free and the host may take it, it gets it at once."""
+        group, host = self._group(request.group), self._host(request.host)
+        async with self._turn:
+            await self._asked(group, host, who)
+        return self._state(group)
+
+    # --- nodes ---
+
+    async def take_called(self, call: OwnServiceCalled) -> OwnServiceAnswered:
+        """Give the caller's host all groups that it may take; answer with the reason if it gets none of them."""
+        host, done, refused = address_of(call.host), [], []
+        for group in self._policy().authority.values():
+            claim = self._claim(group, host)
+            if claim is None:
+                continue
+            try:
+                async with self._turn:
+                    if claim is Claim.ASK:
+                        await self._asked(group, host, call.caller_id)
+                        refused.append(f"{group.name}: asked for it")
+                    else:
+                        await self._taken(group, host, call.caller_id)
+                        done.append(group.name)
+            except (SenselessError, UnavailableError) as error:
+                refused.append(str(error))
+        if not done and not refused:
+            refused.append(f"{host} has no claim to a group of [Authority]")
+        text = "; ".join([*([f"{host} holds {', '.join(done)}"] if done else []), *refused])
+        return OwnServiceAnswered(call.number, bool(done) and not refused, text)
+
+    async def give_called(self, call: OwnServiceCalled) -> OwnServiceAnswered:
+        """End the authority of the caller's host over all groups."""
+        host, done = address_of(call.host), []
+        for group in self._policy().authority.values():
+            async with self._turn:
+                holding = self._groups.holder(group.name)
+                if holding is not None and holding.host == host:
+                    await self._hand_over(
+                        group, self._next(group), f"given by {call.caller_id}", call.caller_id
+                    )
+                    done.append(group.name)
+        text = f"{host} gave {', '.join(done)}" if done else f"{host} holds no group"
+        return OwnServiceAnswered(call.number, bool(done), text)
+
+    # --- the end of a lease ---
+
+    async def watch(self) -> None:
+        """End the authority of silent and absent holders; runs until cancelled."""
+        while True:
+            await self.check()
+            await asyncio.sleep(CHECK_SECONDS)
+
+    async def check(self) -> None:
+        """End the authority that is over now, and give each group to the host that waits for it."""
+        groups = self._policy().authority
+        for name, holding in self._groups.forget_others(frozenset(groups)).items():
+            self._decide_again()
+            self._record(name, holding, None, "the policy no longer has the group", "")
+        for group in groups.values():
+            async with self._turn:
+                holding = self._groups.holder(group.name)
+                if holding is None:
+                    continue
+                live, moved = self._signs.live(holding.host), self._signs.moved(holding.host, group.names)
+                loss = self._groups.loss(group, clock.now(), moved=moved, live=live)
+                if loss:
+                    await self._hand_over(group, self._next(group), loss, "")
+
+    # --- inside; the caller has the turn ---
+
+    async def _taken(self, group: AuthorityGroup, host: Address, who: str) -> None:
+        holding = self._groups.holder(group.name)
+        if not self._groups.may_take(group, host):
+            raise SenselessError(self._refusal(group, host, holding, who))
+        if holding is not None and holding.host == host:
+            self._groups.hold(group.name, host, clock.now())
+            return
+        reason = "taken" if holding is None else f"{host} may override its holder"
+        await self._hand_over(group, host, reason, who)
+
+    async def _asked(self, group: AuthorityGroup, host: Address, who: str) -> None:
+        if self._claim(group, host) is None:
+            raise SenselessError(self._refusal(group, host, None, who))
+        if self._groups.holder(group.name) is None and self._groups.may_take(group, host):
+            await self._hand_over(group, host, "asked while nobody held it", who)
+            return
+        if not self._groups.wait(group, host, clock.now()):
+            raise UnavailableError(f"too many hosts wait for {group.name}: ask again later")
+        self._trail.happened(
+            "authority asked", f"{host} waits for {group.name}", host=str(host), resource=group.name, who=who
+        )
+
+    async def _hand_over(self, group: AuthorityGroup, to: Address | None, reason: str, who: str) -> None:
+        """Cut the holder off on all relays, then let the next host hold the group. This is one audit record."""
+        if to is not None and not self._relays_ready():
+            if who:
+                raise UnavailableError(f"a relay starts, so {group.name} cannot be handed over: try again")
+            to = None
+        take_effect()
+        before = self._groups.free(group.name)
+        try:
+            if before is not None:
+                self._decide_again()
+                await self._carried_out()
+            if to is not None and self._claim(group, to) is not None:
+                self._groups.hold(group.name, to, clock.now())
+                self._decide_again()
+                await self._carried_out()
+        finally:
+            self._record(group.name, before, self._groups.holder(group.name), reason, who)
+
+    def _record(self, group: str, before: Holding | None, now: Holding | None, reason: str, who: str) -> None:
+        earlier, later = (("nobody" if one is None else str(one.host)) for one in (before, now))
+        self._trail.happened(
+            "authority handed over",
+            f"{group}: from {earlier} to {later}: {reason}",
+            host=later if now is not None else earlier if before is not None else None,
+            resource=group,
+            whole=True,
+            earlier=earlier,
+            holder=later,
+            who=who,
+        )
+
+    def _refusal(self, group: AuthorityGroup, host: Address, holding: Holding | None, who: str) -> str:
+        claim = self._claim(group, host)
+        if holding is not None and claim is Claim.TAKE:
+            reason = (
+                f"{holding.host} holds {group.name}: `rosrv drive ask {group.name}`, or wait until it is free"
+            )
+        elif claim is Claim.ASK:
+            reason = (
+                f"{host} may only ask for {group.name}: `rosrv drive ask {group.name}`; an operator gives it"
+            )
+        else:
+            reason = f"{host} has no claim to {group.name}: no line of [Authority] names it ({group.rule})"
+        self._trail.happened(
+            "authority refused", reason, host=str(host), resource=group.name, decision="deny", who=who
+        )
+        return reason
+
+    def _next(self, group: AuthorityGroup) -> Address | None:
+        return self._groups.successor(group, clock.now())
+
+    def _claim(self, group: AuthorityGroup, host: Address) -> Claim | None:
+        policy = self._policy()
+        current = policy.authority.get(group.name)
+        if current is None or policy.blocked(host) is not None:
+            return None
+        return current.claim(policy.atoms_of(host))
+
+    def _group(self, name: str) -> AuthorityGroup:
+        group = self._policy().authority.get(name)
+        if group is None:
+            known = ", ".join(sorted(self._policy().authority)) or "none"
+            raise UnknownThingError(f"[Authority] has no group {name[:64]!r}; its groups: {known}")
+        return group
+
+    def _host(self, text: str) -> Address:
+        try:
+            return find_host(text, self._policy())
+        except BadWordError as error:
+            raise SenselessError(str(error)) from None
+
+    def _state(self, group: AuthorityGroup) -> requests.GroupState:
+        now, holding = clock.now(), self._groups.holder(group.name)
+        moved = 0.0 if holding is None else self._signs.moved(holding.host, group.names)
+        left = self._groups.seconds_left(group, now, moved)
+        return requests.GroupState(
+            group.name,
+            sorted(group.names),
+            "" if holding is None else str(holding.host),
+            None if holding is None else round(now - holding.since, 1),
+            group.lease,
+            None if left is None else round(max(0.0, left), 1),
+            [str(host) for host in self._groups.waiting(group, now)],
+        )

@@ -1,0 +1,82 @@
+"""Define the requests of operators' tools about command authority, and their answers."""
+
+from typing import Annotated
+
+import msgspec
+
+from appliance.channel.admin import AdminRequest, WaitingRequest
+from appliance.channel.answers.field_docs import doc
+from appliance.channel.rest_operation import parameter, rest
+
+_NO_GROUP = {404: "The policy has no such group in [Authority].", 422: "The host may not."}
+GroupName = Annotated[str, parameter("name of the group", min_length=1, max_length=64, examples=["base"])]
+
+
+class GroupHost(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The host that is meant."""
+
+    host: Annotated[
+        Annotated[str, msgspec.Meta(min_length=1, max_length=300)], doc("address or name of a host")
+    ]
+
+
+class GroupGift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The host that gets the group next; empty: the first one that waits."""
+
+    to: Annotated[Annotated[str, msgspec.Meta(max_length=300)], doc("address or name of a host")] = ""
+
+
+class GroupState(msgspec.Struct, frozen=True):
+    """One group of `[Authority]`."""
+
+    group: str
+    names: Annotated[list[str], doc("its topics and services")]
+    holder: Annotated[str, doc("address of the host that holds it; empty: nobody")]
+    held_seconds: float | None
+    lease: Annotated[float, doc("seconds of silence after which a holder loses the group")]
+    left_seconds: Annotated[float | None, doc("until silence ends the authority")]
+    waiting: Annotated[list[str], doc("addresses of the hosts that asked for it, the first one first")]
+
+
+class GroupStates(msgspec.Struct, frozen=True):
+    """All groups of `[Authority]`, by name."""
+
+    groups: list[GroupState]
+
+
+@rest("viewer", "GET", "/v1/authority", name="authority")
+class DriveStatus(AdminRequest[GroupStates], frozen=True, tag="drive status"):
+    """Who holds each group of topics and services, and who waits for it."""
+
+
+@rest(
+    "operator", "POST", "/v1/authority/{group}/take", name="take_authority", body=GroupHost, problems=_NO_GROUP
+)  # fmt: skip
+class DriveTake(WaitingRequest[GroupState], frozen=True, tag="drive take"):
+    """Give a group to a host that may take it, or that may override its holder."""
+
+    group: GroupName
+    host: str
+
+
+@rest(
+    "operator", "POST", "/v1/authority/{group}/give", name="give_authority", body=GroupGift, problems=_NO_GROUP
+)  # fmt: skip
+class DriveGive(WaitingRequest[GroupState], frozen=True, tag="drive give"):
+    """End the authority of a group's holder: the group is given to a host, or to the first one that waits."""
+
+    group: GroupName
+    to: str = ""
+
+
+@rest(
+    "operator", "POST", "/v1/authority/{group}/ask", name="ask_for_authority", body=GroupHost, problems=_NO_GROUP
+)  # fmt: skip
+class DriveAsk(WaitingRequest[GroupState], frozen=True, tag="drive ask"):
+    """Let a host wait for a group. One that may take it gets it as soon as it is free."""
+
+    group: GroupName
+    host: str
+
+
+REQUESTS = (DriveStatus, DriveTake, DriveGive, DriveAsk)

@@ -1,0 +1,81 @@
+"""`rosrv drive status|take|give|ask`: which host commands each group of `[Authority]`."""
+
+from typing import Annotated
+
+import typer
+
+from appliance.cli.connection.target import Appliance, speaks
+from appliance.features.authority.drive_requests import (
+    DriveAsk,
+    DriveGive,
+    DriveStatus,
+    DriveTake,
+    GroupState,
+)
+from rosmop.tool.terminal import say
+
+_GroupName = Annotated[
+    str, typer.Argument(metavar="GROUP", help="A group of [Authority]", show_default=False)
+]
+_Host = Annotated[
+    str,
+    typer.Option("--host", metavar="HOST", help="An address, or the name of one host (robot, host:NAME)"),
+]
+
+
+@speaks
+def status(
+    appliance: Appliance,
+    group: Annotated[str | None, typer.Argument(metavar="[GROUP]", help="Only this group")] = None,
+) -> None:
+    """Show the holder of each group, and the hosts that wait for it.
+
+    Example: rosrv drive status
+    """
+    body = appliance.answer_or_exit(DriveStatus())
+    rows = [one for one in body.groups if group in (None, one.group)]
+    if not rows:
+        say("the policy has no such group in [Authority]")
+        raise typer.Exit(1)
+    for one in rows:
+        _show(one)
+
+
+@speaks
+def take(appliance: Appliance, group: _GroupName, *, host: _Host) -> None:
+    """Give a group to a host that may take it, or that may override its holder.
+
+    Example: rosrv drive take base --host host:ocu-1
+    """
+    _show(appliance.answer_or_exit(DriveTake(group, host)))
+
+
+@speaks
+def give(
+    appliance: Appliance,
+    group: _GroupName,
+    *,
+    to: Annotated[
+        str, typer.Option("--to", metavar="HOST", help="Give it to this host, even if it may only ask")
+    ] = "",
+) -> None:
+    """End the authority of a group's holder. The first host that waits and may take the group gets it.
+
+    Example: rosrv drive give base
+    """
+    _show(appliance.answer_or_exit(DriveGive(group, to)))
+
+
+@speaks
+def ask(appliance: Appliance, group: _GroupName, *, host: _Host) -> None:
+    """Let a host wait for a group. One that may take it gets it as soon as it is free.
+
+    Example: rosrv drive ask base --host host:agent-1
+    """
+    _show(appliance.answer_or_exit(DriveAsk(group, host)))
+
+
+def _show(one: GroupState) -> None:
+    held = f"held by {one.holder}, {one.left_seconds:g} s left of its lease" if one.holder else "free"
+    waiting = f"; waiting: {', '.join(one.waiting)}" if one.waiting else ""
+    say(f"{one.group}: {held}{waiting}")

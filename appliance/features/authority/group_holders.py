@@ -1,0 +1,119 @@
+"""Keep the holder of each group, and the hosts that wait for it. No I/O; times are monotonic seconds.
+
+Invariants:
+
+1. A group has at most one holder. `free` and `hold` are separate steps, so that the caller can cut the earlier holder
+   off before the next one holds the group.
+2. A holder loses the group once it was silent for the group's lease, or once its nodes have ended.
+3. The first waiting host that may take the group follows. One that may only ask is never chosen by itself.
+4. A group has at most `MOST_WAITING` waiting hosts, each for `WAITING_SECONDS`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from appliance.policy.authority import AuthorityGroup, Claim
+from appliance.policy.model import Address
+
+WAITING_SECONDS = 60.0
+MOST_WAITING = 16
+ClaimOf = Callable[[AuthorityGroup, Address], Claim | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Holding:
+    """A host that holds a group: since when, when it last took it again, and whether it had a node since then."""
+
+    host: Address
+    since: float
+    renewed: float
+    had_node: bool = False
+
+
+class GroupHolders:
+    """The holders and the waiting hosts; `claim_of(group, host)` returns the present claim of a host."""
+
+    def __init__(self, claim_of: ClaimOf) -> None:
+        self._claim_of = claim_of
+        self._held: dict[str, Holding] = {}
+        self._waiting: dict[str, dict[Address, float]] = {}
+
+    def holdings(self) -> dict[str, Holding]:
+        """Return the holder of each group that is not free."""
+        return dict(self._held)
+
+    def holder(self, group: str) -> Holding | None:
+        return self._held.get(group)
+
+    def waiting(self, group: AuthorityGroup, now: float) -> list[Address]:
+        """Return the hosts that wait for a group, the first one first, without those that lost their claim."""
+        queue = self._waiting.get(group.name, {})
+        left = {
+            host: since
+            for host, since in queue.items()
+            if now - since < WAITING_SECONDS and self._claim_of(group, host) is not None
+        }
+        self._waiting[group.name] = left
+        return list(left)
+
+    def may_take(self, group: AuthorityGroup, host: Address) -> bool:
+        """Whether a host may take the group now: it is free or its own, or the host may override its holder."""
+        claim, holding = self._claim_of(group, host), self._held.get(group.name)
+        if holding is None or holding.host == host:
+            return claim in (Claim.TAKE, Claim.OVERRIDE)
+        return claim is Claim.OVERRIDE
+
+    def wait(self, group: AuthorityGroup, host: Address, now: float) -> bool:
+        """Let a host wait for a group, from now on. Return False if too many hosts wait."""
+        waiting = self.waiting(group, now)
+        if host not in waiting and len(waiting) >= MOST_WAITING:
+            return False
+        self._waiting[group.name][host] = now
+        return True
+
+    def free(self, group: str) -> Holding | None:
+        """End the authority over a group, and return who had it."""
+        return self._held.pop(group, None)
+
+    def hold(self, group: str, host: Address, now: float) -> None:
+        """Give a free group to a host, or let its holder take it again."""
+        before = self._held.get(group)
+        if before is not None and before.host != host:
+            raise ValueError(f"{group} is held by {before.host}: free it first")
+        self._held[group] = Holding(host, now, now) if before is None else replace(before, renewed=now)
+        self._waiting.get(group, {}).pop(host, None)
+
+    def seconds_left(self, group: AuthorityGroup, now: float, moved: float) -> float | None:
+        """Return the seconds until silence ends the authority; None: the group is free.
+
+        `moved` is the time of the last message from the holder on a topic of the group.
+        """
+        holding = self._held.get(group.name)
+        return None if holding is None else max(holding.renewed, moved) + group.lease - now
+
+    def loss(self, group: AuthorityGroup, now: float, *, moved: float, live: bool) -> str:
+        """Return why the holder loses the group now; empty: it keeps it. `live`: the holder has a live node."""
+        holding = self._held.get(group.name)
+        if holding is None:
+            return ""
+        if self._claim_of(group, holding.host) is None:
+            return "the policy no longer lets it hold the group"
+        if live and not holding.had_node:
+            self._held[group.name] = replace(holding, had_node=True)
+        if holding.had_node and not live:
+            return "its nodes ended"
+        left = self.seconds_left(group, now, moved)
+        return f"it was silent for {group.lease:g} s" if left is not None and left <= 0 else ""
+
+    def successor(self, group: AuthorityGroup, now: float) -> Address | None:
+        """Return the waiting host that gets the group once it is free."""
+        able = (Claim.TAKE, Claim.OVERRIDE)
+        return next((host for host in self.waiting(group, now) if self._claim_of(group, host) in able), None)
+
+    def forget_others(self, names: frozenset[str]) -> dict[str, Holding]:
+        """Forget groups that the policy no longer has, and return those that had a holder."""
+        self._waiting = {name: queue for name, queue in self._waiting.items() if name in names}
+        gone = {name: holding for name, holding in self._held.items() if name not in names}
+        for name in gone:
+            del self._held[name]
+        return gone

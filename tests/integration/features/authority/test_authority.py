@@ -1,0 +1,102 @@
+"""Two real publishers on two hosts share a topic of [Authority]: one at a time is heard."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from appliance.features.authority.drive_requests import DriveStatus, GroupState
+from examples.landshark.lab import Host, Lab
+from tests.support.appliance import Appliance
+from tests.support.nodes import RosSession
+from tests.support.processes import Process
+from tests.support.waiting import eventually
+
+PILOT, BOSS = "10.77.0.66", "10.77.0.67"
+SOME = 15
+SETTINGS = "authority: {nodes_may_call: true}\n"
+POLICY = f"""
+[Nodes]
+default = *
+[Publishers]
+default = *
+[Subscribers]
+default = *
+[Commands]
+default = *
+[Authority]
+base = /chatter
+take base = {PILOT}
+override base = {BOSS}
+lease base = 3s
+"""
+
+
+class Site(NamedTuple):
+    """A listener on the robot, and a talker on each of two hosts."""
+
+    appliance: Appliance
+    listener: Process
+    pilot: Process
+    boss: Process
+    tablet: RosSession
+
+    def heard(self, name: str) -> set[str]:
+        """Return the talkers of the next messages, from the first message of this talker on."""
+        self.listener.wait_for(event="received", publisher=name, since=self.listener.mark())
+        first = self.listener.mark()
+        self.listener.wait_for_count(SOME, event="received", publisher=name, since=first)
+        return {event["publisher"] for event in self.listener.events[first:] if "publisher" in event}
+
+    def state(self) -> GroupState:
+        return self.appliance.ask(DriveStatus()).groups[0]
+
+    def drive(self, *words: str, check: bool = True) -> str:
+        done = self.appliance.rosrv("drive", *words, check=check)
+        return done.stdout + done.stderr
+
+
+@pytest.fixture
+def site(lab: Lab, robot: Host, tmp_path: Path) -> Iterator[Site]:
+    """A site whose policy gives the pilot and the boss claims to the topic."""
+    with (
+        Appliance(lab.host("appliance", "10.77.0.2/24"), policy=POLICY, settings=SETTINGS) as appliance,
+        RosSession(appliance.master_uri, tmp_path, robot) as ros,
+    ):
+        pilot, boss = ros.on(lab.host("pilot", f"{PILOT}/24")), ros.on(lab.host("boss", f"{BOSS}/24"))
+        yield Site(
+            appliance,
+            ros.listener("rospy", "/chatter"),
+            pilot.talker("rospy", "/chatter", name="pilot"),
+            boss.talker("rospy", "/chatter", name="boss"),
+            pilot,
+        )
+
+
+def test_one_host_at_a_time_is_heard(site: Site) -> None:
+    """Nobody, the pilot, the boss who overrides, the pilot who asked; a killed holder loses the group."""
+    time.sleep(2)
+    assert not [one for one in site.listener.events if one.get("event") == "received"]
+    assert site.drive("take", "base", "--host", PILOT).startswith(f"base: held by {PILOT}")
+    assert site.heard("/pilot") == {"/pilot"}
+    site.drive("take", "base", "--host", BOSS)
+    assert site.heard("/boss") == {"/boss"}
+    assert f"{BOSS} holds base" in site.drive("take", "base", "--host", PILOT, check=False)
+    answer = site.tablet.run("rosservice", "call", "/rosrv/drive/take").stdout
+    assert "success: False" in answer
+    site.drive("ask", "base", "--host", PILOT)
+    site.boss.kill()
+    eventually(lambda: site.state().holder == PILOT, "the pilot holds the group")
+    assert site.heard("/pilot") == {"/pilot"}
+    answer = site.tablet.run("rosservice", "call", "/rosrv/drive/give").stdout
+    assert "success: True" in answer
+    site.appliance.kill("control")
+    eventually(lambda: site.state().holder == "", "nobody holds the group")
+    first = site.listener.mark()
+    time.sleep(2)
+    assert len(site.listener.events[first:]) == 0
+    assert "success: True" in site.tablet.run("rosservice", "call", "/rosrv/drive/take").stdout
+    assert site.heard("/pilot") == {"/pilot"}
+    assert len(site.appliance.recorded("--event", "authority handed over", count=5)) >= 5
