@@ -66,14 +66,14 @@ class Guarded:
         for one in self.monitors.advance(BEGIN + at * MS):
             self._sent(one, (one.time - BEGIN) // MS)
 
-    def tell(self, given: str, data: bytes, at: int, node: str = "/a") -> Outcome:
-        """Send a message on a topic that is given to the guard."""
+    def tell(self, given: str, data: bytes, at: int, node: str = "/a", *, faults: bool = False) -> Outcome:
+        """Send a message on a topic that is given to the guard; `faults`: it is too much for the guard."""
         self.advance(at)
         topic = self.topics[given]
         outcome = self.monitors.judge(
             topic, bytearray(data), BEGIN + at * MS, MessageSender(NODES.index(node))
         )
-        assert not outcome.faults
+        assert bool(outcome.faults) == faults
         self._sent(outcome, at)
         if given == "command" and outcome.result != "dropped":
             self.got.append((at, bytes(outcome.buffer)))

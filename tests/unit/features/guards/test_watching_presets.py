@@ -107,6 +107,29 @@ def test_a_sensor_is_silent_frozen_or_blind() -> None:
             guard.tell("by", scan(ranges), at)
 
 
+@pytest.mark.parametrize("preset", ["sensor", "separation"])
+def test_a_scan_that_is_too_large_to_judge_stops_the_base(preset: str) -> None:
+    """It uses up the budget; the guard begins again, and waits for a scan that it can judge."""
+    guard = Guarded(preset)
+    near = message("sensor_msgs/LaserScan", ranges=[4.0], range_max=30.0)
+    guard.tell("by", near, 1)
+    assert runs(guard, 2)
+    huge = message("sensor_msgs/LaserScan", ranges=np.full(400_000, 4.0, dtype=np.float32), range_max=30.0)
+    guard.tell("by", huge, 3, faults=True)
+    stops(guard)
+    assert not runs(guard, 4)
+    guard.tell("by", near, 5)
+    assert runs(guard, 6)
+
+
+def test_many_values_are_compared_by_their_sum() -> None:
+    """A repeated scan is always found, and on the module."""
+    guard = Guarded("sensor", frozen=2)
+    for at, (first, moves) in enumerate(((1.0, True), (1.0, True), (1.0, False), (2.0, True)), 1):
+        guard.tell("by", scan([first] + [3.0] * 5000), at)
+        assert runs(guard, at) == moves
+
+
 def test_a_moving_base_is_stopped_when_its_sensor_falls_silent() -> None:
     """Within the limit and a tick, once."""
     guard = Guarded("sensor")

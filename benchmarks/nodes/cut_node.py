@@ -1,0 +1,84 @@
+"""Cut an operator's commands at full speed, with two rospy nodes (run by Debian's Python): `cut_node.py COUNT SILENT`.
+
+One node commands full speed on `/cmd_vel`, 50 times a second, and then falls silent without a closed connection, as
+behind a cut link. The other node is the base. Print `{"event": "measured", "late": [...]}`: milliseconds from the call
+of `publish` of the last command until the base's callback for the stop, less SILENT (seconds).
+"""
+
+import json
+import os
+import select
+import struct
+import sys
+import threading
+import time
+
+import rospy
+from geometry_msgs.msg import Twist
+
+PERIOD, COMMANDS, PATIENCE = 0.02, 5, 5.0
+ARRIVED = struct.Struct("dd")
+NAMES = [word for word in sys.argv if word.startswith("__")]
+
+
+def base(arrivals):
+    """Be the base: write the time and the number of each command, and end with the other node."""
+
+    def arrived(command):
+        os.write(arrivals, ARRIVED.pack(time.monotonic(), command.linear.x))
+
+    rospy.init_node("base", argv=NAMES, anonymous=True, disable_signals=True)
+    subscriber = rospy.Subscriber("/cmd_vel", Twist, arrived, tcp_nodelay=True)
+    sys.stdin.read()
+    del subscriber
+
+
+def next_of(arrivals, speed):
+    """Return the time of the next command with this speed, or None."""
+    while select.select([arrivals], [], [], PATIENCE)[0]:
+        at, found = ARRIVED.unpack(os.read(arrivals, ARRIVED.size))
+        if found == speed:
+            return at
+    return None
+
+
+def cut(publisher, arrivals, number, silent, pause):
+    """Drive, and fall silent; return the milliseconds by which the stop is late, or None without a stop."""
+    command = Twist()
+    command.linear.x = 1.0 + number
+    for place in range(COMMANDS):
+        if place:
+            pause.wait(PERIOD)
+        last = time.monotonic()
+        publisher.publish(command)
+    for _command in range(COMMANDS):
+        if next_of(arrivals, command.linear.x) is None:
+            return None
+    stopped = next_of(arrivals, 0.0)
+    return None if stopped is None else (stopped - last - silent) * 1e3
+
+
+def main():
+    """Cut this number of times."""
+    arrivals, writer = os.pipe()
+    end, alive = os.pipe()
+    if not os.fork():
+        os.close(alive)
+        os.dup2(end, 0)
+        base(writer)
+        os._exit(0)
+    rospy.init_node("operator", argv=NAMES, anonymous=True)
+    publisher = rospy.Publisher("/cmd_vel", Twist, queue_size=10, tcp_nodelay=True)
+    pause = threading.Event()
+    for _ in range(100):
+        if publisher.get_num_connections():
+            break
+        pause.wait(0.1)
+    pause.wait(1.0)
+    silent = float(sys.argv[2])
+    late = [cut(publisher, arrivals, number, silent, pause) for number in range(int(sys.argv[1]))]
+    print(json.dumps({"event": "measured", "late": late}), flush=True)
+
+
+if __name__ == "__main__":
+    main()
