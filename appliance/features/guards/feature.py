@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from appliance.cli.verb_table import Group, Verb
-from appliance.features.feature import Feature, FeaturePart, OperatorContext
+from appliance.features.feature import ConsolePart, Feature, FeaturePart, OperatorContext
 
 if TYPE_CHECKING:
     from appliance.channel.admin import AdminRequest
@@ -28,6 +28,7 @@ GUARDS = Feature(
     "guards",
     operations=_operations,
     operate=_operate,
+    console=(ConsolePart("robot", "panel.js", "Guards"),),
     verbs={
         "guard": Group(
             "Stop a robot that runs away: monitors from presets, without editing a file.",

@@ -1,56 +1,32 @@
 /** A topic's last message as subscribers receive it, and one of its numbers over time. The audit log has the query. */
 
-import { html, useEffect, useState } from "../html.js";
+import { html, useState } from "../html.js";
 import { Moment } from "../moments.js";
 import { Button } from "../parts/button.js";
 import { Given } from "../parts/given.js";
+import { SECONDS, useLook } from "../parts/look.js";
 import { Failure } from "../parts/notice.js";
 import { Plot } from "../parts/plot.js";
-import { get } from "../rest.js";
-
-const SECONDS = 60; // shown period; the query ends automatically after it
-const EACH = { messages: 20, seconds: 2 };
 
 /** @param {{topic: string}} given */
 export function Messages({ topic }) {
-  const [until, setUntil] = useState(0);
-  const [seen, setSeen] = useState(/** @type {any[]} */ ([]));
-  const [error, setError] = useState(/** @type {unknown} */ (null));
+  const { looking, turn, seen: all, error } = useLook([topic]);
   const [number, setNumber] = useState("");
-  useEffect(() => {
-    if (!until) return undefined;
-    const controller = new AbortController();
-    const look = async () => {
-      for (let latched = true; Date.now() < until && !controller.signal.aborted; latched = false) {
-        const [body] = /** @type {any[]} */ (await Promise.all([get("/v1/messages", { topic, latched, ...EACH }, controller.signal), pause(500)]));
-        setSeen((seen) => [...seen, ...body.messages].filter((one) => one.time / 1e9 > Date.now() / 1000 - 2 * SECONDS).slice(-1200));
-      }
-      setUntil(0);
-    };
-    setError(null);
-    look().catch((problem) => {
-      if (controller.signal.aborted) return;
-      setError(problem);
-      setUntil(0);
-    });
-    return () => controller.abort();
-  }, [topic, until]);
+  const seen = all[topic] ?? [];
   const last = seen.at(-1);
   const names = last ? numbers(last.fields, "") : [];
   const chosen = names.includes(number) ? number : "";
   const points = chosen ? seen.map((one) => ({ time: one.time / 1e9, value: at(one.fields, chosen) })) : [];
-  return html`<div><h3>Messages</h3><div class="row"><${Button} small role="operator" onClick=${() => setUntil(until ? 0 : Date.now() + SECONDS * 1000)}>${until ? "Stop" : "Look"}</${Button}>
-      <span class="muted small">${until ? "As subscribers receive them, after the monitors." : "For a minute. The audit log records it."}</span></div>
+  return html`<div><h3>Messages</h3><div class="row"><${Button} small role="operator" onClick=${turn}>${looking ? "Stop" : "Look"}</${Button}>
+      <span class="muted small">${looking ? "As subscribers receive them, after the monitors." : "For a minute. The audit log records it."}</span></div>
     ${error ? html`<${Failure} error=${error} />` : null}
-    ${!last && until ? html`<p class="muted small" role="status">No message yet.</p>` : null}
+    ${!last && looking ? html`<p class="muted small" role="status">No message yet.</p>` : null}
     ${last && html`<p class="small"><${Moment} at=${new Date(last.time / 1e6).toISOString()} /> <${Given} value=${last.node} mono /> <span class="muted">${last.size} bytes</span></p>
       ${last.why && html`<p class="small"><${Given} value=${last.why} most=${400} /></p>`}
       <pre class="bytes" aria-label="The last message"><${Given} value=${JSON.stringify(last.fields, null, 1)} most=${6000} /></pre>
       ${names.length > 0 && html`<label class="row small">Draw <select value=${chosen} onChange=${(/** @type {any} */ event) => setNumber(event.target.value)}><option value="">nothing</option>${names.map((name) => html`<option key=${name} value=${name}>${name}</option>`)}</select></label>`}
       ${chosen && html`<${Plot} label=${chosen} unit="" say=${(/** @type {number | null} */ value) => (value === null ? "–" : String(Number(value.toPrecision(4))))} span=${SECONDS} height=${120} series=${[{ name: chosen, colour: "c1", points }]} />`}`}</div>`;
 }
-
-const pause = (/** @type {number} */ milliseconds) => new Promise((done) => setTimeout(done, milliseconds));
 
 /** The paths of the first numbers in a message. @returns {string[]} */
 function numbers(/** @type {any} */ value, /** @type {string} */ path) {

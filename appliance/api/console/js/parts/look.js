@@ -1,0 +1,50 @@
+/** Messages of topics as subscribers receive them, for a minute. The audit log has each query. */
+
+import { useEffect, useState } from "../html.js";
+import { get } from "../rest.js";
+
+export const SECONDS = 60; // the query ends automatically after it
+const EACH = { messages: 20, seconds: 2 };
+const PAUSE = 500; // milliseconds between queries of a topic
+const MOST = 1200; // messages that are kept of a topic
+
+/**
+ * `seen`: the messages of each topic, the oldest first; messages are missed before one that is the `first` of a query. `turn` begins and ends the query.
+ * @param {string[]} topics
+ * @returns {{looking: boolean, turn: () => void, seen: Record<string, any[]>, error: unknown}}
+ */
+export function useLook(topics) {
+  const [until, setUntil] = useState(0);
+  const [seen, setSeen] = useState(/** @type {Record<string, any[]>} */ ({}));
+  const [error, setError] = useState(/** @type {unknown} */ (null));
+  const about = topics.join();
+  useEffect(() => {
+    if (!until) return undefined;
+    const controller = new AbortController();
+    setError(null);
+    Promise.all(topics.map((topic) => follow(topic, until, controller.signal, (more) => setSeen((seen) => ({ ...seen, [topic]: recent([...(seen[topic] ?? []), ...more]) }))))).then(
+      () => setUntil(0),
+      (problem) => {
+        if (controller.signal.aborted) return;
+        setError(problem);
+        setUntil(0);
+      },
+    );
+    return () => controller.abort();
+  }, [about, until]);
+  return { looking: until > 0, turn: () => setUntil(until ? 0 : Date.now() + SECONDS * 1000), seen, error };
+}
+
+/** @param {string} topic @param {number} until @param {AbortSignal} signal @param {(more: any[]) => void} heard */
+async function follow(topic, until, signal, heard) {
+  for (let latched = true; Date.now() < until && !signal.aborted; latched = false) {
+    const [body] = /** @type {any[]} */ (await Promise.all([get("/v1/messages", { topic, latched, ...EACH }, signal), pause(PAUSE)]));
+    heard(body.messages.map((/** @type {any} */ one, /** @type {number} */ at) => ({ ...one, first: at === 0 })));
+  }
+}
+
+function recent(/** @type {any[]} */ messages) {
+  return messages.filter((one) => one.time / 1e9 > Date.now() / 1000 - 2 * SECONDS).slice(-MOST);
+}
+
+const pause = (/** @type {number} */ milliseconds) => new Promise((done) => setTimeout(done, milliseconds));

@@ -1,0 +1,86 @@
+/** Guards on the robot's page: states, margins, the map of each fence, and a button for each verb of `rosrv guard`. */
+
+import { html, useState } from "#console/html.js";
+import { Moment } from "#console/moments.js";
+import { counted } from "#console/numbers.js";
+import { Badge } from "#console/parts/badge.js";
+import { Button } from "#console/parts/button.js";
+import { Dialog } from "#console/parts/dialog.js";
+import { Given } from "#console/parts/given.js";
+import { Icon } from "#console/parts/icon.js";
+import { useLook } from "#console/parts/look.js";
+import { Empty, Failure, Loading } from "#console/parts/notice.js";
+import { Link } from "#console/router.js";
+import { corners } from "./geometry.js";
+import { FenceMap } from "./map.js";
+import { constant, margins, trailOf } from "./margins.js";
+import { Margins } from "./meter.js";
+import { useGuards } from "./state.js";
+import { Suggest } from "./suggest.js";
+import { SetValues } from "./values.js";
+
+const TONES = { free: "allow", stopping: "warn", holding: "deny", shadow: "note", off: "" };
+const WATCHED = 6; // topics that are watched at once: control answers eight queries at a time
+
+export function Guards() {
+  const guards = useGuards();
+  const { body, error, again } = guards;
+  const rows = body?.guards ?? [];
+  const topics = /** @type {string[]} */ ([...new Set(rows.flatMap((/** @type {any} */ one) => [one.topics.by, one.topics.command].filter(Boolean)))].slice(0, WATCHED));
+  const { looking, turn, seen, error: unseen } = useLook(topics);
+  const [suggesting, setSuggesting] = useState(false);
+  return html`<section class="panel" aria-labelledby="guards"><div class="panel-head"><h2 id="guards">Guards</h2>${body && html`<span class="muted small">${counted(rows.length, "guard")}</span>`}
+      <span class="end">${rows.length > 0 && html`<${Button} small role="operator" aria-pressed=${String(looking)} title="Reads positions and commands for a minute; the audit log records it" onClick=${turn}><${Icon} name=${looking ? "pause" : "play"} size=${14} />${looking ? "Stop watching" : "Watch"}</${Button}>`}
+        <${Button} small tone=${rows.length ? "" : "primary"} onClick=${() => setSuggesting(true)}><${Icon} name="plus" size=${14} />Suggest guards</${Button}></span></div>
+    ${unseen ? html`<div class="panel-body"><${Failure} error=${unseen} /></div>` : null}
+    ${error && !body ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : !body ? html`<${Loading} rows=${3} />`
+      : !rows.length ? html`<${Empty} icon="robot" title="No guard">A guard stops the robot when its commands end, when it leaves a fence or drives too fast. Suggest guards reads the graph and proposes them.</${Empty}>`
+      : html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>Guard</th><th>State</th><th>Guards</th><th>How close it came</th><th class="number">Stopped</th><th><span class="sr-only">Actions</span></th></tr></thead>
+        <tbody>${rows.map((/** @type {any} */ one) => html`<${Guard} key=${one.name} guard=${one} guards=${guards} seen=${seen} />`)}</tbody></table></div>`}
+    ${rows.map((/** @type {any} */ one) => html`<${Fence} key=${one.name} guard=${one} seen=${seen} />`)}
+    ${suggesting && html`<${Suggest} guards=${guards} close=${() => setSuggesting(false)} />`}</section>`;
+}
+
+function Guard(/** @type {{guard: any, guards: ReturnType<typeof useGuards>, seen: Record<string, any[]>}} */ { guard, guards, seen }) {
+  const [open, setOpen] = useState("");
+  const close = () => setOpen("");
+  const preset = guards.body.presets.find((/** @type {any} */ one) => one.preset === guard.preset);
+  const path = `/v1/monitors/${encodeURIComponent(guard.name)}`;
+  const turn = (/** @type {string} */ said, /** @type {string} */ more, /** @type {any} */ json) => guards.order(`${guard.name} ${said}`, more, "PATCH", path, { json });
+  const found = margins(guard, seen);
+  return html`<tr data-guard=${guard.name}>
+    <td class="first"><${Link} to=${`/console/monitors/${encodeURIComponent(guard.name)}`}><strong><${Given} value=${guard.name} most=${60} /></strong></${Link}><div class="muted small">${guard.preset === guard.name ? "" : `${guard.preset}: `}${preset?.what}</div></td>
+    <td data-label="State"><span><${Badge} word=${guard.state} tone=${TONES[/** @type {keyof typeof TONES} */ (guard.state)]} />${guard.why_held && html`<div class="small muted"><${Given} value=${guard.why_held} most=${200} /></div>`}
+      ${guard.off_until && html`<div class="small muted">until <${Moment} at=${guard.off_until} /></div>`}${guard.confirm_by && html`<div class="small muted">returns to shadow mode at <${Moment} at=${guard.confirm_by} />, unless confirmed</div>`}</span></td>
+    <td data-label="Guards"><span><${Given} value=${guard.topics.command} mono most=${60} />${guard.topics.by && html`<div class="small muted">by <${Given} value=${guard.topics.by} mono most=${60} /></div>`}</span></td>
+    <td data-label="Margins">${found.length ? html`<${Margins} margins=${found} />` : html`<span class="muted small">${"–"}</span>`}</td>
+    <td class="number" data-label=${guard.state === "shadow" ? "Would stop" : "Stopped"}>${guard.state === "shadow" ? html`<span class="muted" title="would have stopped">(${guard.stops})</span>` : guard.stops}</td>
+    <td><div class="row row-end guard-verbs">
+      ${guard.state === "holding" && html`<${Button} small role="operator" tone="primary" onClick=${() => turn("is resumed", "Its topics are released.", { held: false })}>Resume</${Button}>`}
+      ${guard.state === "shadow" && html`<${Button} small role="operator" tone="primary" onClick=${() => setOpen("enforce")}>Enforce</${Button}>`}
+      ${guard.state === "off" && html`<${Button} small role="operator" tone="primary" onClick=${() => turn("is in force", "It acts from now on.", { enabled: true })}>Turn on</${Button}>`}
+      <${Button} small role="operator" onClick=${() => setOpen("set")}>Set…</${Button}>
+      ${guard.state !== "shadow" && guard.state !== "holding" && html`<${Button} small role="operator" onClick=${() => setOpen("shadow")}>Shadow</${Button}>`}
+      <${Button} small role="admin" tone="danger" onClick=${() => setOpen("remove")}>Remove</${Button}></div>
+      ${open === "set" && html`<${SetValues} guard=${guard} preset=${preset} seen=${seen} guards=${guards} close=${close} />`}
+      ${open === "enforce" && html`<${Confirm} title=${`Bring ${guard.name} into force?`} verb="Enforce" role="operator" close=${close} act=${() => turn("is in force", "It acts from now on.", { shadow: false })}>
+        <p>It stops the robot from now on. In shadow mode it would have stopped it ${counted(guard.stops, "time")}.</p></${Confirm}>`}
+      ${open === "shadow" && html`<${Confirm} title=${`Put ${guard.name} into shadow mode?`} verb="Shadow mode" role="operator" tone="danger" close=${close} act=${() => turn("is in shadow mode", "It only records what it would have done.", { shadow: true })}>
+        <p>It stops the robot no longer: it only records what it would have done.</p></${Confirm}>`}
+      ${open === "remove" && html`<${Confirm} title=${`Remove ${guard.name}?`} verb="Remove" role="admin" tone="danger" close=${close} act=${() => guards.order(`${guard.name} is removed`, "", "DELETE", path)}>
+        <p>It stops the robot no longer. The file <code><${Given} value=${guard.file} /></code> on disk is kept: remove it there also, or the next reload loads it again.</p></${Confirm}>`}</td></tr>`;
+}
+
+function Confirm(/** @type {{title: string, verb: string, role: "operator" | "admin", tone?: string, close: () => void, act: () => Promise<boolean>, children?: any}} */ { title, verb, role, tone = "primary", close, act, children }) {
+  const go = async () => {
+    close();
+    await act();
+  };
+  return html`<${Dialog} title=${title} close=${close} foot=${html`<button class="button" onClick=${close}>Not now</button><${Button} role=${role} tone=${tone} onClick=${go}>${verb}</${Button}>`}>${children}</${Dialog}>`;
+}
+
+function Fence(/** @type {{guard: any, seen: Record<string, any[]>}} */ { guard, seen }) {
+  const polygon = corners(guard.loads.polygon ?? "");
+  if (!polygon) return null;
+  return html`<div class="panel-body"><h3><${Given} value=${guard.name} most=${60} /></h3><${FenceMap} name=${guard.name} polygon=${polygon} margin=${constant(guard, "margin") ?? 0} trail=${trailOf(guard, seen)} /></div>`;
+}

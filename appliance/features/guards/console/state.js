@@ -1,0 +1,40 @@
+/** The guards from `/v1/guards`, fetched again after each change, and while one of them acts or only records. */
+
+import { useEffect, useState } from "#console/html.js";
+import { live } from "#console/live.js";
+import { ask, get } from "#console/rest.js";
+import { useStore } from "#console/store.js";
+import { done, failed } from "#console/parts/toast.js";
+
+const PASSING = ["stopping", "shadow"]; // states whose counts change without a change of the specifications
+
+/** @returns {{body: any, error: unknown, again: () => Promise<void>, order: (said: string, more: string, method: string, path: string, options?: any) => Promise<boolean>}} */
+export function useGuards() {
+  const [state, setState] = useState({ body: /** @type {any} */ (null), error: /** @type {unknown} */ (null) });
+  const passing = state.body?.guards.some((/** @type {any} */ row) => PASSING.includes(row.state));
+  const mark = useStore(live, (one) => JSON.stringify([one.status?.monitors ?? null, one.samples.at(-1)?.monitors ?? null, passing && one.samples.at(-1)?.time]));
+  const again = async () => {
+    try {
+      setState({ body: await get("/v1/guards"), error: null });
+    } catch (error) {
+      setState((state) => ({ ...state, error }));
+    }
+  };
+  useEffect(() => {
+    again();
+  }, [mark]);
+  /** Send a change, say that it is done, and fetch the guards again. Returns whether it was done. */
+  const order = async (/** @type {string} */ said, /** @type {string} */ more, /** @type {string} */ method, /** @type {string} */ path, /** @type {any} */ options = {}) => {
+    let made = false;
+    try {
+      await ask(method, path, { ...options, match: `"${state.body.tag}"` });
+      done(said, more);
+      made = true;
+    } catch (failure) {
+      failed(failure);
+    }
+    await again();
+    return made;
+  };
+  return { ...state, again, order };
+}
