@@ -19,6 +19,7 @@ VIEWS = [
     "monitors/safeTrigger",
     "hosts",
     "recordings",
+    "robot",
 ]
 
 

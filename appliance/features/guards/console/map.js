@@ -42,7 +42,7 @@ export function FenceMap({ name, polygon, margin, trail, draft = null, move }) {
       onPointerMove=${(/** @type {PointerEvent} */ event) => held !== null && move?.(held, at(event))} onPointerUp=${() => setHeld(null)} onPointerCancel=${() => setHeld(null)}>
       <clipPath id=${id}><polygon points=${points(bounds)} /></clipPath>
       ${lines(frame.x - WIDE * frame.width, (1 + 2 * WIDE) * frame.width, frame.step).map((x) => html`<line key=${`x${x}`} class="fence-grid" x1=${x} x2=${x} y1=${-frame.y} y2=${-frame.y - frame.height} /><text class="fence-tick" x=${x + 2 * pixel} y=${-frame.y - 3 * pixel} font-size=${9 * pixel}>${short(x)}</text>`)}
-      ${lines(frame.y, frame.height, frame.step).map((y) => html`<line key=${`y${y}`} class="fence-grid" x1=${frame.x - WIDE * frame.width} x2=${frame.x + (1 + WIDE) * frame.width} y1=${-y} y2=${-y} /><text class="fence-tick" x=${frame.x + 2 * pixel} y=${-y - 2 * pixel} font-size=${9 * pixel}>${short(y)}</text>`)}
+      ${lines(frame.y, frame.height, frame.step).map((y) => html`<line key=${`y${y}`} class="fence-grid" x1=${frame.x - WIDE * frame.width} x2=${frame.x + (1 + WIDE) * frame.width} y1=${-y} y2=${-y} />${y > frame.y + 14 * pixel && html`<text class="fence-tick" x=${frame.x + 2 * pixel} y=${-y - 2 * pixel} font-size=${9 * pixel}>${short(y)}</text>`}`)}
       ${draft && html`<polygon class="fence-before" points=${points(polygon)} />`}
       <polygon class="fence-area" points=${points(bounds)} />
       ${margin > 0 && html`<polygon class="fence-margin" clip-path=${`url(#${id})`} points=${points(bounds)} stroke-width=${2 * margin} />`}

@@ -2,7 +2,7 @@
 
 import { corners, depth, positionIn } from "./geometry.js";
 
-/** @typedef {{name: string, value: number, bound: number, unit: string, used: number}} Margin `used`: 1 at the bound, and above it beyond */
+/** @typedef {{name: string, value: number, bound: number, unit: string, used: number, least?: boolean}} Margin `used`: 1 at the bound, more beyond; `least`: the bound is the least value */
 
 /** @param {any} guard as `/v1/guards` has it @param {Record<string, any[]>} seen messages by topic @returns {Margin[]} */
 export function margins(guard, seen) {
@@ -27,7 +27,7 @@ function edge(/** @type {any} */ guard, /** @type {Record<string, any[]>} */ see
   const bound = constant(guard, "margin");
   if (!polygon || !trail.length || bound === null) return [];
   const value = Math.min(...trail.map((one) => depth(one, polygon)));
-  return [{ name: "distance to the edge", value, bound, unit: "m", used: value > 0 ? bound / value : 1 + Math.abs(value) }];
+  return [{ name: "distance to the edge", value, bound, unit: "m", least: true, used: value > 0 ? bound / value : 1 + Math.abs(value) }];
 }
 
 function silences(/** @type {any} */ guard, /** @type {Record<string, any[]>} */ seen) {

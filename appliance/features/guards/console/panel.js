@@ -6,6 +6,7 @@ import { counted } from "#console/numbers.js";
 import { Badge } from "#console/parts/badge.js";
 import { Button } from "#console/parts/button.js";
 import { Dialog } from "#console/parts/dialog.js";
+import { Field } from "#console/parts/field.js";
 import { Given } from "#console/parts/given.js";
 import { Icon } from "#console/parts/icon.js";
 import { useLook } from "#console/parts/look.js";
@@ -20,6 +21,7 @@ import { Suggest } from "./suggest.js";
 import { SetValues } from "./values.js";
 
 const TONES = { free: "allow", stopping: "warn", holding: "deny", shadow: "note", off: "" };
+const WITHIN = /** @type {[string, string][]} */ ([["60", "unless confirmed within 1 minute"], ["300", "unless confirmed within 5 minutes"], ["3600", "unless confirmed within an hour"], ["", "never"]]);
 const WATCHED = 6; // topics that are watched at once: control answers eight queries at a time
 
 export function Guards() {
@@ -58,17 +60,26 @@ function Guard(/** @type {{guard: any, guards: ReturnType<typeof useGuards>, see
     <td><div class="row row-end guard-verbs">
       ${guard.state === "holding" && html`<${Button} small role="operator" tone="primary" onClick=${() => turn("is resumed", "Its topics are released.", { held: false })}>Resume</${Button}>`}
       ${guard.state === "shadow" && html`<${Button} small role="operator" tone="primary" onClick=${() => setOpen("enforce")}>Enforce</${Button}>`}
+      ${guard.confirm_by && html`<${Button} small role="operator" tone="primary" onClick=${() => guards.order(`${guard.name} stays in force`, "It is confirmed.", "POST", "/v1/monitors/confirm")}>Confirm</${Button}>`}
       ${guard.state === "off" && html`<${Button} small role="operator" tone="primary" onClick=${() => turn("is in force", "It acts from now on.", { enabled: true })}>Turn on</${Button}>`}
       <${Button} small role="operator" onClick=${() => setOpen("set")}>Set…</${Button}>
       ${guard.state !== "shadow" && guard.state !== "holding" && html`<${Button} small role="operator" onClick=${() => setOpen("shadow")}>Shadow</${Button}>`}
       <${Button} small role="admin" tone="danger" onClick=${() => setOpen("remove")}>Remove</${Button}></div>
       ${open === "set" && html`<${SetValues} guard=${guard} preset=${preset} seen=${seen} guards=${guards} close=${close} />`}
-      ${open === "enforce" && html`<${Confirm} title=${`Bring ${guard.name} into force?`} verb="Enforce" role="operator" close=${close} act=${() => turn("is in force", "It acts from now on.", { shadow: false })}>
-        <p>It stops the robot from now on. In shadow mode it would have stopped it ${counted(guard.stops, "time")}.</p></${Confirm}>`}
+      ${open === "enforce" && html`<${Enforce} guard=${guard} guards=${guards} path=${path} close=${close} />`}
       ${open === "shadow" && html`<${Confirm} title=${`Put ${guard.name} into shadow mode?`} verb="Shadow mode" role="operator" tone="danger" close=${close} act=${() => turn("is in shadow mode", "It only records what it would have done.", { shadow: true })}>
         <p>It stops the robot no longer: it only records what it would have done.</p></${Confirm}>`}
       ${open === "remove" && html`<${Confirm} title=${`Remove ${guard.name}?`} verb="Remove" role="admin" tone="danger" close=${close} act=${() => guards.order(`${guard.name} is removed`, "", "DELETE", path)}>
         <p>It stops the robot no longer. The file <code><${Given} value=${guard.file} /></code> on disk is kept: remove it there also, or the next reload loads it again.</p></${Confirm}>`}</td></tr>`;
+}
+
+function Enforce(/** @type {{guard: any, guards: ReturnType<typeof useGuards>, path: string, close: () => void}} */ { guard, guards, path, close }) {
+  const [within, setWithin] = useState("300");
+  const said = within ? "It acts from now on, and returns to shadow mode unless you confirm it." : "It acts from now on.";
+  const act = () => guards.order(`${guard.name} is in force`, said, "PATCH", path, { json: { shadow: false }, query: { confirm_within: within } });
+  return html`<${Confirm} title=${`Bring ${guard.name} into force?`} verb="Enforce" role="operator" close=${close} act=${act}>
+    <p>It stops the robot from now on. In shadow mode it would have stopped, changed or sent ${counted(guard.stops, "message")}.</p>
+    <${Field} label="Back to shadow mode" value=${within} set=${setWithin} options=${WITHIN} /></${Confirm}>`;
 }
 
 function Confirm(/** @type {{title: string, verb: string, role: "operator" | "admin", tone?: string, close: () => void, act: () => Promise<boolean>, children?: any}} */ { title, verb, role, tone = "primary", close, act, children }) {

@@ -1,6 +1,7 @@
 /** Messages of topics as subscribers receive them, for a minute. The audit log has each query. */
 
 import { useEffect, useState } from "../html.js";
+import { Problem } from "../problem.js";
 import { get } from "../rest.js";
 
 export const SECONDS = 60; // the query ends automatically after it
@@ -21,15 +22,17 @@ export function useLook(topics) {
   useEffect(() => {
     if (!until) return undefined;
     const controller = new AbortController();
+    const { signal } = controller;
     setError(null);
-    Promise.all(topics.map((topic) => follow(topic, until, controller.signal, (more) => setSeen((seen) => ({ ...seen, [topic]: recent([...(seen[topic] ?? []), ...more]) }))))).then(
-      () => setUntil(0),
-      (problem) => {
-        if (controller.signal.aborted) return;
-        setError(problem);
-        setUntil(0);
-      },
-    );
+    let unheard = 0;
+    Promise.all(topics.map(async (topic) => {
+      try {
+        await follow(topic, until, signal, (more) => setSeen((seen) => ({ ...seen, [topic]: recent([...(seen[topic] ?? []), ...more]) })));
+      } catch (problem) {
+        unheard += 1; // a topic that nobody publishes does not end the query of the others
+        if (!signal.aborted && (!(problem instanceof Problem && problem.status === 404) || unheard === topics.length)) setError(problem);
+      }
+    })).then(() => signal.aborted || setUntil(0));
     return () => controller.abort();
   }, [about, until]);
   return { looking: until > 0, turn: () => setUntil(until ? 0 : Date.now() + SECONDS * 1000), seen, error };

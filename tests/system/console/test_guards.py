@@ -1,0 +1,60 @@
+"""Test guards in the console: margins, the map of a fence, and a button for each verb, by role."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import expect
+
+from tests.support.appliance import Appliance
+from tests.support.nodes import RosSession
+from tests.system.console.conftest import CONFIG
+from tests.system.console.reader import Reader
+
+_ODOMETRY = "{pose: {pose: {position: {x: 1.5}, orientation: {w: 1}}}}"
+
+
+@pytest.fixture(scope="module")
+def appliance() -> Iterator[Appliance]:
+    """Run an appliance with a folder of specifications of its own."""
+    with Appliance(settings=CONFIG, monitors={}) as running:
+        yield running
+
+
+def test_a_fence_is_drawn_changed_and_enforced(
+    appliance: Appliance, opened: Callable[..., Reader], token: Callable[..., str], tmp_path: Path
+) -> None:
+    """The map and the margins show a robot half a metre from the edge; values are tried on what it did, then set."""
+    types = ("--type", "command=geometry_msgs/Twist", "--type", "by=nav_msgs/Odometry")
+    made = appliance.rosrv("guard", "new", "fence", "/cmd_vel", "--by", "/odom", "--shadow", *types)
+    assert made.returncode == 0, made.stderr
+    reader = opened()
+    page = reader.go("robot")
+    row = page.locator("tr[data-guard=fence]")
+    with RosSession(appliance.master_uri, tmp_path) as ros:
+        ros.start(["rostopic", "pub", "-r", "20", "/odom", "nav_msgs/Odometry", _ODOMETRY])
+        expect(page.get_by_role("img", name="Map of fence")).to_be_visible()
+        page.get_by_role("button", name="Watch").click()
+        expect(page.get_by_text("The robot is at 1.5, 0, 0.5 m from the edge.")).to_be_visible()
+        expect(row).to_contain_text("distance to the edge 0.5 at least 0.2 m")
+        assert reader.axe() == []
+    row.get_by_role("button", name="Set…").click()
+    polygon = page.get_by_label("polygon")
+    polygon.fill("-1,-1 1,-1 1,1 -1,1")
+    expect(page.get_by_text("These values would have stopped the robot")).to_be_visible()
+    page.get_by_role("button", name="Corner 2").press("Shift+ArrowRight")
+    expect(polygon).to_have_value("-1,-1 2,-1 1,1 -1,1")
+    assert reader.axe() == []
+    page.get_by_role("dialog").get_by_role("button", name="Set", exact=True).click()
+    expect(reader.toast("fence is set")).to_be_visible()
+    row.get_by_role("button", name="Enforce").click()
+    page.get_by_role("dialog").get_by_role("button", name="Enforce").click()
+    expect(row).to_contain_text("unless confirmed")
+    row.get_by_role("button", name="Confirm").click()
+    expect(row).not_to_contain_text("unless confirmed")
+    assert "POLYGON[] = {-1, -1, 2, -1, 1, 1, -1, 1}" in appliance.rosrv("monitor", "show").stdout
+    viewed = opened(token("viewer")).go("robot").locator("tr[data-guard=fence]")
+    expect(viewed.get_by_role("button", name="Remove")).to_have_attribute("aria-disabled", "true")
+    row.get_by_role("button", name="Remove").click()
+    page.get_by_role("dialog").get_by_role("button", name="Remove").click()
+    expect(page.get_by_text("No guard", exact=True)).to_be_visible()
