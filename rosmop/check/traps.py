@@ -1,6 +1,7 @@
 """Warn of valid code that lets an unsafe message pass, or stops a safe one, against its author's likely intention."""
 
 from collections.abc import Iterator, Sequence
+from ipaddress import ip_address
 from itertools import combinations
 
 from rosmop.check.phases import Phases
@@ -17,6 +18,7 @@ _UNORDERED = frozenset({"<", "<=", ">", ">="})
 
 def traps(specification: tree.Specification) -> Iterator[Diagnostic]:
     """Yield warnings about the events of a specification."""
+    yield from _unlike_a_sender(specification)
     tests = {node.parts[-1] for node in tree.walk(specification) if isinstance(node, tree.Name)}
     for event in specification.events:
         if isinstance(event.trigger, tree.TimerTrigger) and not event.trigger.has_unit:
@@ -39,6 +41,39 @@ def _called_again(event: tree.EventDefinition) -> Iterator[Diagnostic]:
                     text = f"{shown(event.name)} calls {service}, and happens with each call of it"
                     text += ": it calls without end; call it from another event"
                     yield Diagnostic(node.position, "warning", text)
+
+
+def _unlike_a_sender(specification: tree.Specification) -> Iterator[Diagnostic]:
+    """Warn of a sender that is compared with a text that no sender has."""
+    own = {function.name for function in specification.functions}
+    for node in tree.walk(specification):
+        match node:
+            case (
+                tree.BinaryExpression(operator="==" | "!=", left=call, right=tree.StringLiteral() as text)
+                | tree.BinaryExpression(operator="==" | "!=", left=tree.StringLiteral() as text, right=call)
+            ) if isinstance(call, tree.CallExpression) and isinstance(call.callee, tree.Name):
+                if call.callee.parts[-1] not in own and (
+                    wrong := _wrong_sender(call.callee.parts[-1], text.value.decode("utf-8", "replace"))
+                ):
+                    yield Diagnostic(text.position, "warning", wrong)
+
+
+def _wrong_sender(function: str, text: str) -> str:
+    """Return why a text is not the host or the name of any sender; empty if it may be."""
+    if function == "caller" and text and not text.startswith("/"):
+        return f"the name of a node begins with `/`, so this is never equal; write {shown('/' + text)}"
+    if function != "host" or not text:
+        return ""
+    try:
+        plain = str(ip_address(text))
+    except ValueError:
+        why = "`host` is an address such as 10.0.0.7, and never a name or a group"
+        return f"{why}, so this is never equal; write the address of {shown(text)}"
+    return (
+        ""
+        if plain == text
+        else f"`host` has this address as {shown(plain)}, so this is never equal; write that"
+    )
 
 
 def _always_dropped(event: tree.EventDefinition) -> Iterator[Diagnostic]:
