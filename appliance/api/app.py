@@ -21,7 +21,6 @@ from appliance.api.routes import (
     enrol,
     host_routes,
     live,
-    metrics_route,
     monitor_routes,
     operation_routes,
     policy_routes,
@@ -72,8 +71,7 @@ def build_app(services: Services) -> FastAPI:
     for feature in FEATURES:
         if feature.routes is not None:
             app.include_router(pkgutil.resolve_name(feature.routes)(services))
-    for part in (metrics_route, live):
-        app.include_router(part.routes(services))
+    app.include_router(live.routes(services))
     app.include_router(console.routes(services.settings))
     app.openapi = lambda: contract_of(app)  # type: ignore[method-assign]  # FastAPI's own way to change the contract
 

@@ -1,4 +1,4 @@
-"""Tests of `appliance.telemetry.metrics` and `appliance.api.routes.metrics_route`."""
+"""Tests of `appliance.telemetry.metrics` and `appliance.features.metrics.metrics_route`."""
 
 import os
 from collections.abc import Sequence
@@ -8,11 +8,11 @@ from typing import Any
 import msgspec
 from prometheus_client.parser import text_string_to_metric_families
 
-from appliance.api.routes.metrics_route import rendered, rendered_standby
 from appliance.base import clock
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.answers.status import RecorderState
+from appliance.features.metrics.metrics_route import rendered, rendered_standby
 from appliance.telemetry.metrics import BOUNDS, METRICS, Meter, markdown
 from tests.support.answers import example
 

@@ -1,0 +1,1 @@
+"""Metrics: the route for Prometheus."""

@@ -1,0 +1,5 @@
+"""The feature metrics: `GET /v1/metrics` for Prometheus. Control measures; `telemetry/metrics.py` has the names."""
+
+from appliance.features.feature import Feature
+
+METRICS = Feature("metrics", routes="appliance.features.metrics.metrics_route:routes")
