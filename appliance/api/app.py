@@ -20,7 +20,6 @@ from appliance.api.routes import (
     audit_summary,
     enrol,
     host_routes,
-    live,
     monitor_routes,
     operation_routes,
     policy_routes,
@@ -71,7 +70,6 @@ def build_app(services: Services) -> FastAPI:
     for feature in FEATURES:
         if feature.routes is not None:
             app.include_router(pkgutil.resolve_name(feature.routes)(services))
-    app.include_router(live.routes(services))
     app.include_router(console.routes(services.settings))
     app.openapi = lambda: contract_of(app)  # type: ignore[method-assign]  # FastAPI's own way to change the contract
 

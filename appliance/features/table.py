@@ -17,6 +17,7 @@ from appliance.features.evidence.feature import EVIDENCE
 from appliance.features.feature import Feature, FeatureContext, FeaturePart, KeptHosts, OperatorContext
 from appliance.features.fleet.feature import FLEET
 from appliance.features.guards.feature import GUARDS
+from appliance.features.live.feature import LIVE
 from appliance.features.metrics.feature import METRICS
 from appliance.features.policy_tools.feature import POLICY_TOOLS
 from appliance.features.recorder.feature import RECORDER
@@ -60,6 +61,7 @@ FEATURES: tuple[Feature, ...] = (
     SSO,
     AUTHORITY,
     METRICS,
+    LIVE,
 )
 
 

@@ -1,0 +1,1 @@
+"""Live: the state of the appliance, its last hour and the token's holder, for the console."""
