@@ -35,7 +35,6 @@ from appliance.channel.answers import (
     measures,
     monitor_answers,
     policy_answers,
-    standby_answers,
     status,
     token_answers,
 )
@@ -139,24 +138,6 @@ class AlarmSilence(AdminRequest[alarms.AlarmList], frozen=True, tag="alarm silen
     kind: str
     seconds: float | None = None
     note: str = ""
-
-
-@rest(
-    "viewer", "GET", "/v1/standby", name="standby", tag="status",
-    problems={404: "This appliance is not one of two."},
-)  # fmt: skip
-class StandbyWanted(AdminRequest[standby_answers.StandbyState], frozen=True, tag="standby"):
-    """This appliance, the other one, and the witness on the robot. The standby also answers it."""
-
-
-@rest(
-    "admin", "POST", "/v1/standby/promote", name="promote_standby", tag="status",
-    problems={404: "This appliance is not one of two."},
-)  # fmt: skip
-class StandbyPromote(WaitingRequest[standby_answers.StandbyState], frozen=True, tag="standby promote"):
-    """Make the standby the active appliance: a planned switchover. The answer may be lost, because this appliance
-    becomes the standby; `GET /v1/standby` shows the result.
-    """
 
 
 @rest("operator", "POST", "/v1/policy/reload", _WITHIN, name="reload_policy", of=POLICY)

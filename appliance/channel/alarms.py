@@ -8,9 +8,9 @@ import msgspec
 from msgspec import structs
 
 from appliance.channel.answers.field_docs import doc
-from appliance.channel.answers.status import BlocksState, BundlesState, ProcessInfo, Status
+from appliance.channel.answers.status import BlocksState, ProcessInfo, Status
 from appliance.channel.status_summary import no_relay, probe_failed
-from appliance.features.views import pair_view
+from appliance.features.views import states_of
 
 Severity = Literal["alarm", "warning", "notice"]
 About = Literal["system", "policy", "monitors", "hosts", "audit"]
@@ -40,10 +40,8 @@ def open_alarms(status: Status) -> list[Alarm]:
     found = [*_system(status), *_policy(status), *_monitors(status)]
     found += [("warning", "ipsec", "hosts", line) for line in status.ipsec.troubles]
     found += _blocks(status.blocks)
-    if status.standby is not None:
-        troubles = pair_view().alarms(status.standby)
-        found += [(one.severity, one.kind, "system", one.text) for one in troubles]
-    found += _bundles(status.bundles)
+    for view, state in states_of(status):
+        found += [(one.severity, one.kind, one.about, one.text) for one in view.alarms(state)]
     alarms = (
         Alarm(kind=kind, severity=severity, text=text, about=about) for severity, kind, about, text in found
     )
@@ -84,7 +82,7 @@ def _handled(status: Status, alarms: Iterable[Alarm]) -> Iterator[Alarm]:
 
 
 def _system(status: Status) -> Iterator[_Condition]:
-    audit, forwarding = status.audit, status.audit.forwarding
+    audit = status.audit
     if audit.failed is not None:
         yield "alarm", "audit-failed", "audit", f"the audit log cannot be written: {audit.failed}"
     if probe_failed(status):
@@ -98,17 +96,8 @@ def _system(status: Status) -> Iterator[_Condition]:
             yield "alarm", "process-failing", "system", _failing(process)
     if status.rosmaster != "reachable":
         yield "warning", "rosmaster", "system", "the ROS master is being rebuilt: calls wait"
-    if status.recorder is not None and not status.recorder.running:
-        yield "warning", "recorder", "system", "the flight recorder is not running: nothing is recorded"
     if audit.degraded is not None:
         yield "warning", "audit-degraded", "audit", f"the audit log is behind: {audit.degraded}"
-    if forwarding is not None and forwarding.trouble:
-        where = f"the audit log is not forwarded to {forwarding.to}, {forwarding.behind} records wait"
-        yield "warning", "audit-not-forwarded", "audit", f"{where}: {forwarding.trouble}"
-    collector = audit.collector
-    if collector is not None and collector.trouble:
-        where = f"the audit log is not collected by {collector.to}, {collector.behind} sealed records wait"
-        yield "warning", "audit-not-collected", "audit", f"{where}: {collector.trouble}"
 
 
 def _policy(status: Status) -> Iterator[_Condition]:
@@ -170,23 +159,6 @@ def _blocks(blocks: BlocksState) -> Iterator[_Condition]:
         which = "the first block ends" if blocks.hosts > 1 else "the block ends"
         end = "without an end" if blocks.first_end is None else f"{which} at {_moment(blocks.first_end)}"
         yield "warning", "hosts-blocked", "hosts", f"{count}, {end}: rosrv host blocks"
-
-
-def _bundles(bundles: BundlesState | None) -> Iterator[_Condition]:
-    if bundles is None:
-        return
-    if bundles.refused:
-        stays = f"{bundles.in_force} stays" if bundles.in_force else "no bundle is"
-        text = f"{bundles.refused} is refused, {stays} in force: {bundles.reason.splitlines()[0]}"
-        yield "warning", "bundle-refused", "system", text
-    if bundles.rejected:
-        text = f"the collector {bundles.collector} serves bundles that are not accepted: {bundles.trouble}"
-        yield "alarm", "bundles-rejected", "system", text
-    elif bundles.trouble:
-        yield "warning", "bundles-not-polled", "system", f"no new bundles: {bundles.trouble}"
-    if bundles.changed:
-        text = f"{bundles.in_force} is in force, but was changed on this robot since"
-        yield "notice", "bundle-changed", "system", text
 
 
 def _failing(process: ProcessInfo) -> str:

@@ -12,13 +12,12 @@ from rich.table import Table
 from rich.text import Text
 
 from appliance.api.front.moments import in_full
-from appliance.base import clock
 from appliance.base.actors import DISK
-from appliance.channel.admin import A, AdminAnswer, StandbyWanted, StatusWanted
+from appliance.base.ages import age
+from appliance.channel.admin import A, AdminAnswer, StatusWanted
 from appliance.channel.alarms import Alarm, activity, open_alarms
 from appliance.channel.answers.host_answers import PortsSeen
 from appliance.channel.answers.status import (
-    BundlesState,
     ClockState,
     FirewallState,
     IpsecState,
@@ -31,7 +30,7 @@ from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
 from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusView, Watch, watched
-from appliance.features.views import pair_view
+from appliance.features.views import pair_view, states_of
 from rosmop.tool.tables import table_of
 from rosmop.tool.terminal import counted
 
@@ -95,7 +94,8 @@ def _answer(appliance: Appliance) -> AdminAnswer[StatusView]:
     """Return the status; on a standby, which has none, the state of both appliances. Raises `NotRunningError`."""
     answer = appliance.ask(StatusWanted())
     if answer.trouble == "standby":
-        return _shown(appliance.ask(StandbyWanted()), pair_view().status)
+        pair = pair_view()
+        return _shown(appliance.ask(pair.request()), pair.status)
     return _shown(answer, _view)
 
 
@@ -158,8 +158,6 @@ def _grid(body: Status) -> Table:
     doubted = doubted_clock(body.clock)
     if doubted is not None:
         grid.add_row("clock", Text(doubted, style=_YELLOW))
-    if body.standby is not None:
-        grid.add_row("standby", pair_view().line(body.standby))
     for name, text in _others_rules(body.firewall):
         grid.add_row(name, text)
     grid.add_row("policy", _policy(body.policy))
@@ -187,33 +185,13 @@ def _grid(body: Status) -> Table:
     grid.add_row("relay", relay)
     grid.add_row("tunnels", _tunnels(body.ipsec))
     grid.add_row("hosts' ports", _ports(body.ipsec.ports))
-    forwarding = audit.forwarding
-    forwarded = "" if forwarding is None else f", {forwarding.behind} to be forwarded to {forwarding.to}"
-    if audit.collector is not None:
-        forwarded += f", {audit.collector.behind} to be collected by {audit.collector.to}"
+    lines = [view.line(state) for view, state in states_of(body) if view.line is not None]
+    forwarded = "".join(f", {text}" for name, text in lines if not name)
     grid.add_row("audit log", f"{counted(audit.lag_records, 'record')} waiting to be written{forwarded}")
-    if body.bundles is not None:
-        grid.add_row("bundle", _bundle(body.bundles))
-    if body.recorder is not None:
-        kept = body.recorder
-        making = f", {kept.in_progress} being made" if kept.in_progress else ""
-        grid.add_row(
-            "recorder", f"{counted(kept.recordings, 'recording')}, {kept.bytes / 1e6:.1f} MB{making}"
-        )
+    for name, text in lines:
+        if name:
+            grid.add_row(name, text)
     return grid
-
-
-def _bundle(bundles: BundlesState) -> Text:
-    line = Text(f"{bundles.in_force or 'none'}{' in force' if bundles.in_force else ''}")
-    if bundles.changed:
-        line.append("; changed on this robot since", style=_YELLOW)
-    if bundles.trying:
-        line.append(f"; {bundles.trying} waits for its confirmation")
-    if bundles.refused:
-        line.append(f"; {bundles.refused} REFUSED", style=_YELLOW)
-    checked = "not verified yet" if bundles.checked is None else f"verified {age(bundles.checked)} ago"
-    line.append(f"; the collector's metadata {'were ' if bundles.checked else ''}{checked}")
-    return line
 
 
 def _policy(policy: PolicyState) -> Text:
@@ -315,19 +293,6 @@ def doubted_clock(clock: ClockState) -> str | None:
     if clock.synchronised is None:
         return "synchronisation unknown: the kernel does not report it"
     return None if clock.synchronised else "not synchronised: run chrony or systemd-timesyncd"
-
-
-def age(since: float, now: float | None = None) -> str:
-    """Return the age of a time (seconds since the epoch) in at most two units."""
-    seconds = max(0, int((clock.wall() if now is None else now) - since))
-    days, rest = divmod(seconds, 86_400)
-    hours, rest = divmod(rest, 3_600)
-    minutes, left = divmod(rest, 60)
-    if days:
-        return f"{days} d {hours} h"
-    if hours:
-        return f"{hours} h {minutes} min"
-    return f"{minutes} min {left} s" if minutes else f"{left} s"
 
 
 def shortened(lines: Sequence[str], most: int) -> list[str]:

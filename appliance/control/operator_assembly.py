@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 from appliance.channel.answers.status import AuditState
 from appliance.control.assembly.assembly import Parts
@@ -103,15 +104,13 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         base.policies,
         hosts,
         base.lifeline.surroundings,
+        features=base.features.state,
         audit=partial(_audit_state, base),
         clock=clock.state,
-        recorder=base.features.recorder,
         queued_deliveries=lambda: ends.enactor.delivery.waiting,
         live=core.revocation.live,
         switched_off=switched_off.rows,
         blocks=blocks.status,
-        standby=base.features.pair,
-        bundles=base.features.bundles,
         handled=handled.marked,
         name=base.settings.name,
     )
@@ -163,12 +162,11 @@ async def _durable(base: Foundation) -> None:
         await base.role.before_answer()
 
 
-def _audit_state(base: Foundation) -> AuditState:
+def _audit_state(base: Foundation, states: dict[str, Any]) -> AuditState:
     return AuditState(
         *base.audit.lag,
         failed=base.audit.failed,
         on_failure=base.settings.audit.on_audit_failure,
         degraded=base.audit.degraded,
-        forwarding=base.features.forwarding(),
-        collector=base.features.collector(),
+        **states,
     )

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from appliance.channel.admin import AdminRequest
     from appliance.channel.answers.graph_answers import Graph
     from appliance.channel.answers.limit_answers import LimitUse
-    from appliance.channel.answers.standby_answers import StandbyState
-    from appliance.channel.answers.status import BundlesState, ForwardingState, ProcessInfo, RecorderState
+    from appliance.channel.answers.status import ProcessInfo
     from appliance.channel.link import Link
     from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
     from appliance.control.assembly.policies import Policies
@@ -103,27 +102,22 @@ class FeaturePart:
     answers nodes' calls of its services, by name without the appliance's own name. `sessions` are those of people whom
     the feature signs in; they count beside tokens. `holders` returns the host that holds each group (`Policy.holders`).
 
-    These return a state, or None if there is none: `forwarding` that of the forwarding of the audit log, `collector`
-    that of its segments, `bundles` that of the fleet's bundles, `recorder` that of the flight recorder, and `pair` that
-    of this appliance and of the one that can take over.
+    `status_fields()` returns the present states of the feature by their fields in `rosrv status --json`. The feature's
+    view defines the fields (`StateView`). A state that is None or missing is null there.
     """
 
     links: "Mapping[str, tuple[Link, Any]]" = field(default_factory=dict)
-    forwarding: "Callable[[], ForwardingState | None]" = lambda: None
     methods: "tuple[RequestMethod[Any], ...]" = ()
     longest: Mapping[str, int] = field(default_factory=dict)
+    status_fields: Callable[[], Mapping[str, Any]] = dict
     limits: "Callable[[], tuple[LimitUse, ...]]" = lambda: ()
     details: "RecordDetails" = lambda *_event: {}
     called: "Mapping[str, Callable[[OwnServiceCalled], Awaitable[OwnServiceAnswered]]]" = field(
         default_factory=dict
     )
     holders: "Callable[[], Mapping[str, Address]]" = dict
-    recorder: "Callable[[], RecorderState | None]" = lambda: None
-    pair: "Callable[[], StandbyState | None]" = lambda: None
     work: Mapping[str, Callable[[], Awaitable[None]]] = field(default_factory=dict)
     connected: "Callable[[str, str, str, int], tuple[int, str]] | None" = None
-    collector: "Callable[[], ForwardingState | None]" = lambda: None
-    bundles: "Callable[[], BundlesState | None]" = lambda: None
     sessions: "Sessions | None" = None
 
 

@@ -31,8 +31,6 @@ from appliance.supervisor.role import SharedMemory
 if TYPE_CHECKING:
     from appliance.audit.log.record import Severity
     from appliance.channel.answers.limit_answers import LimitUse
-    from appliance.channel.answers.standby_answers import StandbyState
-    from appliance.channel.answers.status import BundlesState, ForwardingState, RecorderState
     from appliance.channel.link import Link
     from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
     from appliance.control.operators.request_method import RequestMethod
@@ -127,13 +125,9 @@ class FeatureParts:
         """Return the methods that answer the features' requests."""
         return tuple(method for part in self._parts for method in part.methods)
 
-    def forwarding(self) -> "ForwardingState | None":
-        """Return the state of the forwarding of the audit log, or None if none is configured."""
-        return next(filter(None, (part.forwarding() for part in self._parts)), None)
-
-    def recorder(self) -> "RecorderState | None":
-        """Return the state of the flight recorder, or None if none is configured."""
-        return next(filter(None, (part.recorder() for part in self._parts)), None)
+    def state(self) -> dict[str, Any]:
+        """Return the present states of all features by their fields in the status; `with_states` defines the fields."""
+        return {field: state for part in self._parts for field, state in part.status_fields().items()}
 
     def limits(self) -> "tuple[LimitUse, ...]":
         """Return how much of the features' resources is used."""
@@ -161,18 +155,6 @@ class FeatureParts:
     def holders(self) -> "dict[str, Address]":
         """Return the host that holds each group of `[Authority]`."""
         return {group: host for part in self._parts for group, host in part.holders().items()}
-
-    def collector(self) -> "ForwardingState | None":
-        """Return the state of the push of segments, or None if none is configured."""
-        return next(filter(None, (part.collector() for part in self._parts)), None)
-
-    def bundles(self) -> "BundlesState | None":
-        """Return the state of the fleet's bundles, or None if none are configured or in force."""
-        return next(filter(None, (part.bundles() for part in self._parts)), None)
-
-    def pair(self) -> "StandbyState | None":
-        """Return the state of both appliances, or None for a single appliance."""
-        return next(filter(None, (part.pair() for part in self._parts)), None)
 
     def sessions(self) -> "Sessions | None":
         """Return the sessions of people, or None if nobody can sign in without a token."""

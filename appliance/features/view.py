@@ -3,58 +3,80 @@
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
+from appliance.base.metric import Metric
 from appliance.base.user_errors import UserError
 
-if TYPE_CHECKING:
-    from appliance.audit.proof.chain_findings import Verification
-    from appliance.channel.answers.standby_answers import StandbyState
+S = TypeVar("S")
 
 Samples = Iterable[tuple[tuple[str, ...], Any]]
 """The samples of a metric: values of its labels, and the value."""
 
 
 class Trouble(NamedTuple):
-    """A condition that needs attention; `text` has the reason and what to do."""
+    """A condition that needs attention; `text` has the reason and what to do, `about` is as in `Alarm`."""
 
-    severity: Literal["alarm", "warning"]
+    severity: Literal["alarm", "warning", "notice"]
     kind: str
     text: str
+    about: Literal["system", "audit"] = "system"
+
+
+@dataclass(frozen=True)
+class StateView(Generic[S]):
+    """A state of a feature: a field of `rosrv status --json`, with its alarms, metrics and line.
+
+    `kind` defines the state, and `doc` describes the field. The field belongs to the status, or to its `audit`, before
+    the field `before`, or at the end. It is null without a state; a client may rely on a field that is `required`.
+    `metrics` have no samples without a state. `line(state)` returns what `rosrv status` prints: a name, and a text for
+    rich; an empty name adds the text to the line of the audit log.
+    """
+
+    field: str
+    kind: type[S]
+    doc: str
+    part: Literal["status", "audit"] = "status"
+    before: str = ""
+    required: bool = False
+    alarms: Callable[[S], Iterable[Trouble]] = lambda _state: ()
+    metrics: tuple[Metric, ...] = ()
+    samples: Callable[[S], Mapping[str, Samples]] = lambda _state: {}
+    line: Callable[[S], tuple[str, Any]] | None = None
+
+
+_NO_PAIRS = UserError("this appliance is one of two, which this rosrv cannot show: use one with `standby`")
 
 
 class PairView:
     """The views of two appliances; this class is for a product without pairs."""
 
-    def alarms(self, state: "StandbyState") -> Iterable[Trouble]:
-        """Return what is wrong and lasts."""
-        del state
-        return ()
+    def request(self) -> Any:
+        """Return the request for the state of both appliances."""
+        raise _NO_PAIRS
 
-    def samples(self, state: "StandbyState") -> Mapping[str, Samples]:
+    def samples(self, state: Any) -> Mapping[str, Samples]:
+        """Return the samples of each metric of a pair."""
         del state
         return {}
 
-    def line(self, state: "StandbyState") -> Any:
-        return state.role
-
-    def status(self, state: "StandbyState") -> Any:
+    def status(self, state: Any) -> Any:
         """Return the `StatusView` of an appliance that waits for the other one to end."""
-        raise UserError(
-            f"{state.name} is one of two appliances, which this rosrv cannot show: use one with `standby`"
-        )
+        del state
+        raise _NO_PAIRS
 
     def verify(
         self,
         own: Path,
-        verified: "Verification",
+        verified: Any,
         other: Path,
         state: Path,
-        verify: "Callable[[], Verification]",
+        verify: Callable[[], Any],
     ) -> tuple[Any, Callable[[Any], None]]:
-        """Verify the log `own`, which is `verified`, and the log `other` in a state directory, with `verify()`.
+        """Verify the log `own` and the log `other` in a state directory.
 
-        Return the result, and the function that prints it.
+        `verified` is the `Verification` of `own`, and `verify()` returns that of `other`. Return the result, and the
+        function that prints it.
         """
         del verified, state, verify
         raise UserError(f"{own} and {other}: this rosrv cannot verify takeovers: use one with `standby`")
@@ -62,7 +84,8 @@ class PairView:
 
 @dataclass(frozen=True)
 class FeatureView:
-    """A class of `PairView` (`module:name`), for the feature that makes pairs."""
+    """The states of a feature. `pair` is a class of `PairView` (`module:name`), for the feature that makes pairs."""
 
     name: str
-    pair: str
+    states: tuple[StateView[Any], ...] = ()
+    pair: str | None = None

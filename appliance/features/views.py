@@ -2,15 +2,53 @@
 
 import functools
 import pkgutil
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any
 
+import msgspec
+
+from appliance.channel.answers.field_docs import doc
+from appliance.features.fleet.view import FLEET_VIEW
+from appliance.features.recorder.view import RECORDER_VIEW
 from appliance.features.standby.view import STANDBY_VIEW
-from appliance.features.view import FeatureView, PairView
+from appliance.features.syslog.view import SYSLOG_VIEW
+from appliance.features.view import FeatureView, PairView, StateView
 
-VIEWS: tuple[FeatureView, ...] = (STANDBY_VIEW,)
+VIEWS: tuple[FeatureView, ...] = (SYSLOG_VIEW, STANDBY_VIEW, FLEET_VIEW, RECORDER_VIEW)
+STATES: tuple[StateView[Any], ...] = tuple(state for view in VIEWS for state in view.states)
+
+
+def with_states(kind: type[msgspec.Struct], part: str) -> Any:
+    """Return the struct with a field for each state of a feature that belongs to this part of the status."""
+    fields: list[Any] = []
+    for field in msgspec.structs.fields(kind):
+        defaults = {"default": field.default, "default_factory": field.default_factory}
+        fields.append((field.name, field.type, msgspec.field(**defaults)))
+    for state in STATES:
+        if state.part == part:
+            names = [name for name, *_ in fields]
+            given = {} if state.required else {"default": None}
+            added = (state.field, Annotated[state.kind | None, doc(state.doc)], msgspec.field(**given))
+            fields.insert(names.index(state.before) if state.before else len(names), added)
+    return msgspec.defstruct(
+        kind.__name__, fields, namespace={"__doc__": kind.__doc__}, module=kind.__module__, frozen=True
+    )
+
+
+def states_in(states: Mapping[str, Any], part: str) -> dict[str, Any]:
+    """Return the fields of a part of the status that features add."""
+    return {view.field: states.get(view.field) for view in STATES if view.part == part}
+
+
+def states_of(status: Any) -> Iterator[tuple[StateView[Any], Any]]:
+    """Yield each view with its state in a status; features that are not configured have no state."""
+    for view in STATES:
+        state = getattr(status.audit if view.part == "audit" else status, view.field)
+        if state is not None:
+            yield view, state
 
 
 @functools.cache
 def pair_view() -> PairView:
     """Return the views of two appliances."""
-    found: PairView = next((pkgutil.resolve_name(view.pair)() for view in VIEWS), PairView())
-    return found
+    return next((pkgutil.resolve_name(view.pair)() for view in VIEWS if view.pair), PairView())

@@ -41,6 +41,7 @@ from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
+from appliance.features.table import FEATURES
 from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import PortChecks
 from appliance.hosts.enrolment import HostEnrolment
@@ -154,12 +155,12 @@ class RestWorld:
             limits=idle(LimitQueries),
             alarms=idle(AlarmOrders),
         )
+        later = [one for feature in FEATURES if feature.may_start for one in feature.operations()]
         administration = Administration(
             queries,
             [
                 *(replace(method, answer=self.carried.out) for method in methods),
-                RequestMethod(admin.StandbyWanted, self.carried.out, order=False),
-                RequestMethod(admin.StandbyPromote, self.carried.out, who=True, order=False),
+                *(RequestMethod(one, self.carried.out, who=True, order=False) for one in later),
             ],
             durable=self.trail.durable,
             require_room=lambda: None,

@@ -176,6 +176,8 @@ LOOKUPS = {
     "appliance/features/table.py inherit": _IMPORTED,
     "appliance/features/table.py start_gates": _IMPORTED,
     "appliance/features/views.py pair_view": _IMPORTED,
+    "appliance/features/views.py states_of": "states are fields of the status, which the core does not name",
+    "appliance/features/views.py with_states": "the extended struct has the name of the struct in the contract",
     "appliance/features/fleet/segment_pusher.py _failed": _TEXT,
     "appliance/master/calls/call.py _type_name": _TEXT,
     "appliance/features/table.py recorded_messages": _IMPORTED,
@@ -297,7 +299,7 @@ WALL_CLOCK = {
         "supervisor/supervisor.py",
     ],
     "an end that is a date: of a certificate, a token, a revocation": [
-        "features/metrics/metrics_route.py", "api/process.py", "features/selftest/file_checks.py",
+        "features/metrics/metrics_route.py", "features/fleet/view.py", "api/process.py", "features/selftest/file_checks.py",
         "base/deadlines.py", "features/fleet/verified_bundles.py",
         "control/operators/token_orders.py", "features/standby/appliance_table.py",
         "hosts/certification.py", "hosts/enrolment_tokens.py",
@@ -315,7 +317,7 @@ WALL_CLOCK = {
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
         "api/front/moments.py", "audit/search/filter_options.py",
         "features/evidence/evidence_verbs.py",
-        "cli/monitor/offline.py", "features/policy_tools/learn_verb.py", "cli/protect_verb.py", "cli/status_verb.py",
+        "cli/monitor/offline.py", "features/policy_tools/learn_verb.py", "cli/protect_verb.py", "base/ages.py",
         "cli/topic_verbs.py", "features/recorder/recorder_input.py", "features/recorder/record_verbs.py",
     ],
 }  # fmt: skip

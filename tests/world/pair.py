@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from appliance.channel import admin
-from appliance.features.standby import witness
+from appliance.features.standby import standby_requests, witness
 from appliance.features.standby.membership import PORT, Membership
 from tests.world import robot
 from tests.world.appliance import MASTER_PORT, Appliance
@@ -133,7 +133,7 @@ class PairWorld(World):
         while (found := await self._check_policy(active[0])) is None:
             await asyncio.sleep(_AGAIN_SECONDS)
         self.possible = {found}
-        state: Any = await self.order(admin.StandbyWanted())
+        state: Any = await self.order(standby_requests.StandbyWanted())
         if state is None or not state.other.in_sync:
             raise BrokenPromiseError(f"the standby is not in sync after all faults have ended: {state}")
 
@@ -170,7 +170,7 @@ class PairWorld(World):
     def switches_over(self) -> None:
         """Order a switchover."""
         self.say("a switchover is ordered")
-        self.loop.outside.start(self.order(admin.StandbyPromote()))
+        self.loop.outside.start(self.order(standby_requests.StandbyPromote()))
 
     def lease_stalls(self) -> None:
         """Pause the process `lease` of the appliance that became active last."""

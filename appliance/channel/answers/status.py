@@ -1,12 +1,15 @@
-"""The state of the running appliance: its processes, isolation, policy, graph, tunnels, audit log."""
+"""The state of the running appliance: its processes, isolation, policy, graph, tunnels, audit log.
 
-from typing import Annotated, Literal
+Features add fields (`features.view.StateView`).
+"""
+
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 
 from appliance.channel.answers.field_docs import Moment, doc
 from appliance.channel.answers.host_answers import PortsSeen
-from appliance.channel.answers.standby_answers import StandbyState
+from appliance.features.views import with_states
 
 
 class ProcessInfo(msgspec.Struct, frozen=True):
@@ -119,23 +122,6 @@ class MonitorsState(msgspec.Struct, frozen=True):
     ] = {}
 
 
-class ForwardingState(msgspec.Struct, frozen=True):
-    """How far the audit log is forwarded: `behind` records wait, the oldest for `seconds`; `missed` were removed.
-
-    `sent` messages since the forwarder started, up to the record `sequence` and the checkpoint `checkpoint`.
-    """
-
-    sent: int
-    sequence: int
-    checkpoint: int
-    behind: int
-    seconds: float
-    missed: int
-    trouble: Annotated[str, doc("why forwarding is stopped; empty: it is not")]
-    to: str
-    send: str
-
-
 class ClockState(msgspec.Struct, frozen=True):
     """Whether the times of records can be believed."""
 
@@ -160,19 +146,10 @@ class AuditState(msgspec.Struct, frozen=True):
     failed: str | None
     on_failure: Literal["deny", "allow"]
     degraded: str | None
-    forwarding: Annotated[ForwardingState | None, doc("null: forwarding is not configured")]
-    collector: Annotated[
-        ForwardingState | None, doc("segments pushed to the collector; null: none is configured")
-    ] = None
 
 
-class RecorderState(msgspec.Struct, frozen=True):
-    """The flight recorder: how many recordings are kept, their bytes, and how many are being made."""
-
-    running: bool
-    recordings: int
-    bytes: int
-    in_progress: int = 0
+if not TYPE_CHECKING:
+    AuditState = with_states(AuditState, "audit")
 
 
 class SwitchedOff(msgspec.Struct, frozen=True):
@@ -192,24 +169,6 @@ class BlocksState(msgspec.Struct, frozen=True):
 
     hosts: int
     first_end: Annotated[Moment | None, doc("when the first block ends; null: none ends without an order")]
-
-
-class BundlesState(msgspec.Struct, frozen=True):
-    """The bundle of the fleet in force (SITE/GROUP/VERSION.tar; empty: none), and what became of later ones."""
-
-    collector: Annotated[str, doc("URL of the collector")]
-    in_force: Annotated[str, doc("the bundle in force; empty: none")]
-    sha256: Annotated[str, doc("SHA-256 of its archive")]
-    since: Annotated[Moment | None, doc("when its trial ended; null: none is in force")]
-    trying: Annotated[str, doc("the bundle in its commit-confirm period; empty: none")]
-    refused: Annotated[
-        str, doc("the last bundle that this robot refused; empty: none since the one in force")
-    ]
-    reason: Annotated[str, doc("why it was refused")]
-    changed: Annotated[bool, doc("an operator has changed a part of the bundle on this robot")]
-    checked: Annotated[Moment | None, doc("when the collector's metadata were last verified; null: not yet")]
-    trouble: Annotated[str, doc("why no bundles are taken now; empty: they are")]
-    rejected: Annotated[bool, doc("the collector serves metadata that are not accepted")]
 
 
 class MinuteState(msgspec.Struct, frozen=True):
@@ -256,13 +215,14 @@ class Status(msgspec.Struct, frozen=True):
     dropped: int
     audit: AuditState
     clock: ClockState
-    recorder: Annotated[RecorderState | None, doc("null: nothing is recorded")] = None
     switched_off: Annotated[list[SwitchedOff], doc("what an operator switched off")] = []
     blocks: BlocksState = BlocksState(0, None)
     last_minute: MinuteState = MinuteState(0, {})
     name: Annotated[str, doc("the robot's name (`name` in appliance.yaml); empty: none")] = ""
-    standby: Annotated[StandbyState | None, doc("null: this appliance is not one of two")] = None
-    bundles: Annotated[BundlesState | None, doc("null: no bundles of a fleet are configured")] = None
     handled_alarms: Annotated[
         list[HandledAlarm], doc("alarms that an operator acknowledged or silenced")
     ] = []
+
+
+if not TYPE_CHECKING:
+    Status = with_states(Status, "status")

@@ -6,8 +6,8 @@ from collections.abc import Callable
 import msgspec
 
 from appliance.channel import messages
-from appliance.channel.answers.status import ForwardingState
 from appliance.channel.link import Link
+from appliance.forwarding.forwarding_state import ForwardingState
 from appliance.telemetry.audit_trail import AuditTrail
 
 _PATIENCE_SECONDS = 10.0  # a shorter failure, such as the restart of a receiver, is not recorded

@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import msgspec
 
@@ -19,15 +20,12 @@ from appliance.channel.answers.graph_answers import (
 from appliance.channel.answers.inventory_answers import InUse, Inventory
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.monitor_answers import Monitors
-from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.answers.status import (
     AuditState,
     BlocksState,
-    BundlesState,
     ClockState,
     MinuteState,
     PolicyState,
-    RecorderState,
     Status,
     SwitchedOff,
 )
@@ -38,6 +36,7 @@ from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.links.supervisor_link import Surroundings
 from appliance.control.operators.measurements import measures_of
 from appliance.control.operators.overview import graph_of
+from appliance.features.views import states_in
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.master.graph.registry import Kind, Life
 from appliance.policy.live_rights import LiveRight
@@ -58,11 +57,10 @@ _TOPIC = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 class Queries:
     """The answers to queries.
 
-    `audit()`, `clock()` and `recorder()` return the states of the audit log, the machine's clock and the flight
-    recorder. `live()` returns the rights that a change of the policy may end. `switched_off()` returns the protection
-    that is switched off. `blocks()` and `bundles()` return the states of the blocks and the bundles. `standby()`
-    returns the state of the two appliances, or None if this one is not one of two. `handled(status)` adds the alarms
-    that operators have acknowledged or silenced.
+    `features()` returns the states of the features, by their fields in the status. `audit(states)` returns the state of
+    the audit log, and `clock()` that of the machine's clock. `live()` returns the rights that a change of the policy
+    may end. `switched_off()` returns the protection that is switched off. `blocks()` returns the state of the blocks.
+    `handled(status)` adds the alarms that operators have acknowledged or silenced.
     """
 
     parts: Parts
@@ -70,15 +68,13 @@ class Queries:
     policies: Policies
     hosts: HostEnrolment
     surroundings: Surroundings
-    audit: Callable[[], AuditState]
+    features: Callable[[], dict[str, Any]]
+    audit: Callable[[dict[str, Any]], AuditState]
     clock: Callable[[], ClockState]
-    recorder: Callable[[], RecorderState | None]
     queued_deliveries: Callable[[], int]
     live: Callable[[], list[LiveRight]]
     switched_off: Callable[[], list[SwitchedOff]]
     blocks: Callable[[], BlocksState]
-    standby: Callable[[], StandbyState | None]
-    bundles: Callable[[], BundlesState | None]
     handled: Callable[[Status], Status]
     name: str = ""
     started: float = field(default_factory=wall)
@@ -173,7 +169,7 @@ class Queries:
 
     def _status(self) -> Status:
         parts, registry, relay = self.parts, self.parts.core.registry, self.parts.endpoints.relay
-        meter = self.trail.meter
+        meter, states = self.trail.meter, self.features()
         # The appliance's own nodes are not counted; the graph leaves them out also.
         lives = [incarnation.life for incarnation in registry.all() if not incarnation.own]
         named = {
@@ -204,14 +200,12 @@ class Queries:
             connections=len(relay.carried.connections),
             messages=relay.carried.total.messages,
             dropped=relay.carried.total.dropped,
-            audit=self.audit(),
+            audit=self.audit(states_in(states, "audit")),
             clock=self.clock(),
-            recorder=self.recorder(),
             switched_off=self.switched_off(),
             blocks=self.blocks(),
             last_minute=MinuteState(sum(meter.denied.counts().values()), meter.dropped.counts()),
-            standby=self.standby(),
-            bundles=self.bundles(),
+            **states_in(states, "status"),
         )
 
     def _policy(self) -> PolicyState:

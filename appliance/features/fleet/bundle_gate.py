@@ -23,7 +23,6 @@ import structlog
 from appliance.base import clock
 from appliance.base.actors import UNCONFIRMED
 from appliance.channel import admin
-from appliance.channel.answers.status import BundlesState
 from appliance.channel.link import Link
 from appliance.control.assembly.policies import Policies, PolicyCases, RevisionChangedError
 from appliance.control.assembly.policy_gate import PolicyRefusedError
@@ -37,6 +36,7 @@ from appliance.features.fleet.bundle_link import (
     RefusedBundle,
 )
 from appliance.features.fleet.settings import Fleet
+from appliance.features.fleet.view import BundlesState
 from appliance.formats.bundle_archive import BundleContents
 from appliance.hosts.host_table import HostRefusedError
 from appliance.hosts.hosts_file import IN_BUNDLE, DeclaredHostsError, parse_declared

@@ -38,6 +38,5 @@ def make_part(context: OperatorContext) -> FeaturePart:
         {PUSHER: (pushed.link, messages.ForwardingLink), POLLER: (gate.link, BundleLink)},
         longest={POLLER: _LONGEST_BUNDLE},
         work={"the bundles": gate.run},
-        collector=pushed.status,
-        bundles=gate.status,
+        status_fields=lambda: {"collector": pushed.status(), "bundles": gate.status()},
     )

@@ -18,14 +18,14 @@ from appliance.api.front.route_roles import Viewer, ask
 from appliance.api.front.routing import Routes, file
 from appliance.api.front.services import Services
 from appliance.base import clock
-from appliance.channel.admin import MetricsWanted, StandbyWanted
+from appliance.base.metric import Metric
+from appliance.channel.admin import MetricsWanted
 from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.measures import Measures
-from appliance.channel.answers.standby_answers import StandbyState
-from appliance.channel.answers.status import BundlesState, ForwardingState, ProcessInfo
+from appliance.channel.answers.status import ProcessInfo
 from appliance.channel.status_summary import no_relay, probe_failed, process_names
-from appliance.features.views import pair_view
-from appliance.telemetry.metrics import METRICS, Metric
+from appliance.features.views import STATES, pair_view, states_of
+from appliance.telemetry.metric_table import METRICS
 
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 _Samples = Iterable[tuple[tuple[str, ...], Any]]
@@ -44,7 +44,7 @@ def routes(services: Services) -> Routes:
         except ProblemError as problem:
             if problem.kind != "standby":
                 raise
-            page = rendered_standby(await ask(services.control, StandbyWanted(), bearer), calls)
+            page = rendered_standby(await ask(services.control, pair_view().request(), bearer), calls)
         return Response(page, media_type=CONTENT_TYPE_LATEST)
 
     for prefix, name in (("", ""), ("/v1", "_v1")):
@@ -63,7 +63,7 @@ def rendered(body: Measures, calls: Mapping[tuple[str, str], int]) -> bytes:
     return _page({**_samples(body), "rosrv_rest_calls_total": calls.items()}, METRICS)
 
 
-def rendered_standby(state: StandbyState, calls: Mapping[tuple[str, str], int]) -> bytes:
+def rendered_standby(state: Any, calls: Mapping[tuple[str, str], int]) -> bytes:
     """Return the metrics of a standby, which has only its own state and the numbers of REST calls."""
     samples = {**pair_view().samples(state), "rosrv_rest_calls_total": calls.items()}
     return _page(samples, [metric for metric in METRICS if metric.name in samples])
@@ -110,7 +110,7 @@ def _buckets(bounds: Sequence[float], counts: Sequence[float]) -> list[tuple[str
 def _samples(body: Measures) -> dict[str, _Samples]:
     status = body.status
     policy, audit, monitors, clock = status.policy, status.audit, status.monitors, status.clock
-    relayed, recorder = body.relayed, status.recorder
+    relayed = body.relayed
     return {
         "rosrv_info": [((status.version, status.name), 1)],
         "rosrv_start_time_seconds": [((), status.since)],
@@ -159,50 +159,16 @@ def _samples(body: Measures) -> dict[str, _Samples]:
         "rosrv_audit_lag_seconds": [((), audit.lag_seconds)],
         "rosrv_audit_failed": [((), audit.failed is not None)],
         "rosrv_audit_degraded": [((), audit.degraded is not None)],
-        **_forwarding("syslog", audit.forwarding),
-        **_forwarding("collector", audit.collector),
-        **_bundles(status.bundles),
         "rosrv_clock_synchronised": [((), -1 if clock.synchronised is None else clock.synchronised)],
         "rosrv_clock_behind_seconds": [((), clock.behind_seconds)],
-        "rosrv_recorder_up": [((), recorder.running)] if recorder else [],
-        "rosrv_recordings": [((), recorder.recordings)] if recorder else [],
-        "rosrv_recordings_bytes": [((), recorder.bytes)] if recorder else [],
-        **{metric.name: [] for metric in METRICS if metric.name.startswith("rosrv_standby_")},
-        **(pair_view().samples(status.standby) if status.standby is not None else {}),
+        **{metric.name: [] for view in STATES for metric in view.metrics},
+        **{name: rows for view, state in states_of(status) for name, rows in view.samples(state).items()},
         "rosrv_policy_revision": [((), policy.revision)],
         "rosrv_policy_differs_from_file": [((), policy.differs_from_file)],
         "rosrv_process_restarts_total": [
             ((name,), process.restarts) for name, process in _named(status.processes)
         ],
         "rosrv_process_resident_bytes": list(_memory(status.processes)),
-    }
-
-
-def _forwarding(to: str, forwarding: ForwardingState | None) -> dict[str, _Samples]:
-    if forwarding is None:
-        names = ("up", "sent_total", "lag_records", "lag_seconds", "missed_total")
-        return {f"rosrv_{to}_{name}": [] for name in names}
-    return {
-        f"rosrv_{to}_up": [((), not forwarding.trouble)],
-        f"rosrv_{to}_sent_total": [((), forwarding.sent)],
-        f"rosrv_{to}_lag_records": [((), forwarding.behind)],
-        f"rosrv_{to}_lag_seconds": [((), forwarding.seconds)],
-        f"rosrv_{to}_missed_total": [((), forwarding.missed)],
-    }
-
-
-def _bundles(bundles: BundlesState | None) -> dict[str, _Samples]:
-    if bundles is None:
-        names = ("version", "refused", "changed", "checked_seconds", "rejected")
-        return {f"rosrv_bundle_{name}": [] for name in names}
-    number = bundles.in_force.rpartition("/")[2].removesuffix(".tar")
-    checked = -1.0 if bundles.checked is None else clock.wall() - bundles.checked
-    return {
-        "rosrv_bundle_version": [((), int(number or 0))],
-        "rosrv_bundle_refused": [((), bool(bundles.refused))],
-        "rosrv_bundle_changed": [((), bundles.changed)],
-        "rosrv_bundle_checked_seconds": [((), checked)],
-        "rosrv_bundle_rejected": [((), bundles.rejected)],
     }
 
 

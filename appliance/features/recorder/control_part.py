@@ -23,7 +23,7 @@ def make(core: FeatureContext) -> FeaturePart:
         limits=orders.limits,
         details=plan.detail,
         called={"record_now": orders.called},
-        recorder=orders.state,
+        status_fields=lambda: {"recorder": orders.state()},
     )
 
 

@@ -11,7 +11,6 @@ from appliance.audit.log.record_format import rfc3339
 from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.answers.limit_answers import LimitUse
-from appliance.channel.answers.status import RecorderState
 from appliance.channel.channel import ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
 from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
@@ -28,6 +27,7 @@ from appliance.features.recorder.recording_answers import (
 from appliance.features.recorder.recording_plan import RecordingPlan
 from appliance.features.recorder.recording_store import MOST_TEMPORARY
 from appliance.features.recorder.settings import RecorderRules
+from appliance.features.recorder.view import RecorderState
 from appliance.telemetry.audit_trail import AuditTrail
 
 _PATIENCE_SECONDS = 10.0

@@ -1,7 +1,7 @@
 """The feature standby: two appliances, of which one stands by to take over (docs/standby.md)."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from appliance.cli.verb_table import Group, Verb
 from appliance.features.feature import ConsolePart, Feature
@@ -11,6 +11,7 @@ from appliance.supervisor.role import Role
 from appliance.supervisor.sandbox.sandbox_plan import NETWORK, SandboxPlan
 
 if TYPE_CHECKING:
+    from appliance.channel.admin import AdminRequest
     from appliance.supervisor.service_gate import Pairing
 
 _PLACE = "appliance.features.standby."
@@ -20,6 +21,12 @@ def _pairing(state: Path) -> "Pairing | None":
     from appliance.features.standby.pairing import pairing_in  # noqa: PLC0415  only the supervisor needs it
 
     return pairing_in(state)
+
+
+def _operations() -> "tuple[type[AdminRequest[Any]], ...]":
+    from appliance.features.standby.standby_requests import REQUESTS  # noqa: PLC0415  few processes need it
+
+    return REQUESTS
 
 
 STANDBY = Feature(
@@ -32,6 +39,7 @@ STANDBY = Feature(
             paired=True, sandbox=lambda _facts: SandboxPlan(allowlist=True, families=NETWORK, binds=None),
         ),
     ),
+    operations=_operations,
     verbs={
         "standby": Group(
             "Run two appliances, of which one stands by to take over.",

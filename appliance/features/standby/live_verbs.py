@@ -8,12 +8,12 @@ import typer
 from rich.console import Console
 
 from appliance.base import clock
-from appliance.channel.admin import StandbyPromote, StandbyWanted
-from appliance.channel.answers.standby_answers import StandbyState
 from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
 from appliance.cli.connection.target import Appliance, speaks, speaks_with
 from appliance.cli.output import say_json, usage_error
 from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusView, Watch, watched
+from appliance.features.standby.standby_answers import StandbyState
+from appliance.features.standby.standby_requests import StandbyPromote, StandbyWanted
 from appliance.features.standby.standby_view import standby_view
 from rosmop.tool.terminal import printable, say
 

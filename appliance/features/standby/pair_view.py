@@ -1,33 +1,30 @@
 """The views of two appliances. Methods import what only one of the processes and commands needs."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from appliance.channel.answers.standby_answers import StandbyState
-from appliance.features.standby.standby_summary import PATIENCE_SECONDS, standby_troubles
-from appliance.features.view import PairView, Samples, Trouble
+from appliance.features.standby.standby_answers import StandbyState
+from appliance.features.view import PairView, Samples
 
 if TYPE_CHECKING:
     from appliance.audit.proof.chain_findings import Verification
+    from appliance.features.standby.standby_requests import StandbyWanted
 
 
 class StandbyPairView(PairView):
     """The views of an appliance that can be one of two."""
 
-    def alarms(self, state: StandbyState) -> Iterable[Trouble]:
-        """Return what is wrong; the other appliance may be away for some time first."""
-        return standby_troubles(state, PATIENCE_SECONDS)
+    def request(self) -> "StandbyWanted":
+        """Return the request for the state of both appliances."""
+        from appliance.features.standby.standby_requests import StandbyWanted  # noqa: PLC0415  it imports the views
+
+        return StandbyWanted()
 
     def samples(self, state: StandbyState) -> Mapping[str, Samples]:
         from appliance.features.standby.samples import samples_of  # noqa: PLC0415  only the api needs it
 
         return samples_of(state)
-
-    def line(self, state: StandbyState) -> Any:
-        from appliance.features.standby.standby_view import standby_line  # noqa: PLC0415  only the command needs it
-
-        return standby_line(state)
 
     def status(self, state: StandbyState) -> Any:
         from appliance.features.standby.standby_view import standby_view  # noqa: PLC0415  only the command needs it

@@ -16,7 +16,6 @@ import structlog
 from appliance.base import clock
 from appliance.base.background import run_always
 from appliance.channel import messages
-from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState
 from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings
 from appliance.control.links.supervisor_link import ControlLifeline
@@ -32,6 +31,7 @@ from appliance.features.standby.replication import Pair, host_endpoint, state_of
 from appliance.features.standby.replication_frames import ReplicationError
 from appliance.features.standby.replication_receiver import ReplicationReceiver
 from appliance.features.standby.replication_transport import follow_at
+from appliance.features.standby.standby_answers import OtherAppliance, StandbyState
 from appliance.features.standby.standby_orders import StandbyAdministration
 from appliance.features.standby.standby_tunnels import StandbyTunnels
 from appliance.features.standby.takeover_check import TakeoverCheck

@@ -19,7 +19,6 @@ import structlog
 
 from appliance.base import clock
 from appliance.base.background import run_always
-from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState, WitnessSeen
 from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings
 from appliance.features.standby import lease_link
@@ -30,6 +29,7 @@ from appliance.features.standby.replication_frames import Introduction, Replicat
 from appliance.features.standby.replication_sender import ReplicationSender
 from appliance.features.standby.replication_transport import ReplicationListener
 from appliance.features.standby.settings import Availability
+from appliance.features.standby.standby_answers import OtherAppliance, StandbyState, WitnessSeen
 from appliance.features.standby.standby_tunnels import StandbyTunnels
 from appliance.store.writer_thread import Database, StoreError
 

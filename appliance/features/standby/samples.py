@@ -2,7 +2,7 @@
 
 import math
 
-from appliance.channel.answers.standby_answers import StandbyState
+from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_summary import both_active
 from appliance.features.view import Samples
 

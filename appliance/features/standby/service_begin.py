@@ -8,13 +8,12 @@ from functools import partial
 import structlog
 
 from appliance.base import clock
-from appliance.channel import admin
 from appliance.channel.status_summary import no_relay
 from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.foundation import Foundation
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.feature import FeaturePart
-from appliance.features.standby import lease_link
+from appliance.features.standby import lease_link, standby_requests
 from appliance.features.standby.inheritance import StateCopies, inherited_state, keep_state, leave_state
 from appliance.features.standby.replication import Pair
 from appliance.features.standby.standby_orders import ActiveAppliance, SingleAppliance, StandbyOrders
@@ -93,14 +92,16 @@ async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
         "the replication of checkpoints": recorder.follow,
         "the reports to the lease": report_service,
     }
-    return replace(_part(orders), pair=active.state, work=work)
+    return replace(_part(orders), status_fields=lambda: {"standby": active.state()}, work=work)
 
 
 def _part(orders: StandbyOrders) -> FeaturePart:
     return FeaturePart(
         methods=(
-            RequestMethod(admin.StandbyWanted, orders.state, order=False),
-            RequestMethod(admin.StandbyPromote, orders.promote, who=True, order=False, full_disk=True),
+            RequestMethod(standby_requests.StandbyWanted, orders.state, order=False),
+            RequestMethod(
+                standby_requests.StandbyPromote, orders.promote, who=True, order=False, full_disk=True
+            ),
         )
     )
 

@@ -8,10 +8,11 @@ import structlog
 
 from appliance.channel import admin
 from appliance.channel.admin import A
-from appliance.channel.answers.standby_answers import StandbyState
 from appliance.control.errors import UnknownThingError
+from appliance.features.standby import standby_requests
 from appliance.features.standby.lease_client import HandOverError
 from appliance.features.standby.replication import Replication
+from appliance.features.standby.standby_answers import StandbyState
 from appliance.telemetry.audit_trail import AuditTrail
 
 _log = structlog.get_logger()
@@ -80,11 +81,11 @@ class StandbyOrders:
         self._source = source
         self._trail = trail
 
-    async def state(self, _request: admin.StandbyWanted) -> StandbyState:
+    async def state(self, _request: standby_requests.StandbyWanted) -> StandbyState:
         """Return the state of both appliances."""
         return _state_of(self._source)
 
-    async def promote(self, _request: admin.StandbyPromote, who: str) -> StandbyState:
+    async def promote(self, _request: standby_requests.StandbyPromote, who: str) -> StandbyState:
         """Make the standby the active appliance. Raises `HandOverError`.
 
         The order is on disk before the hand-over begins, because the hand-over ends this process.
@@ -108,7 +109,7 @@ class StandbyOrders:
             await wanted.wait()
             wanted.clear()
             try:
-                await self.promote(admin.StandbyPromote(), _STANDBY)
+                await self.promote(standby_requests.StandbyPromote(), _STANDBY)
             except HandOverError as error:
                 await refuse(str(error))
 
@@ -121,9 +122,11 @@ class StandbyAdministration:
 
     def __init__(self, source: StandbySource, *, orders: bool) -> None:
         self._source = source
-        self._answers: dict[type, Callable[[], Awaitable[StandbyState]]] = {admin.StandbyWanted: self._state}
+        self._answers: dict[type, Callable[[], Awaitable[StandbyState]]] = {
+            standby_requests.StandbyWanted: self._state
+        }
         if orders:
-            self._answers[admin.StandbyPromote] = self._promoted
+            self._answers[standby_requests.StandbyPromote] = self._promoted
 
     async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:
         """Answer a request, whose sender does not matter."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState, WitnessSeen
+from appliance.features.standby.standby_answers import OtherAppliance, StandbyState, WitnessSeen
 from appliance.features.view import Trouble
 
 PATIENCE_SECONDS = 60.0

@@ -1,5 +1,67 @@
-"""The views of the standby."""
+"""The state of two appliances, with its alarms, metrics and line of `rosrv status`."""
 
-from appliance.features.view import FeatureView
+from typing import Any
 
-STANDBY_VIEW = FeatureView("standby", pair="appliance.features.standby.pair_view:StandbyPairView")
+from appliance.base.metric import counter, gauge
+from appliance.features.standby.samples import samples_of
+from appliance.features.standby.standby_answers import StandbyState
+from appliance.features.standby.standby_summary import PATIENCE_SECONDS, standby_troubles
+from appliance.features.view import FeatureView, StateView
+
+_METRICS = (
+    gauge(
+        "rosrv_standby_role",
+        "1 for the role of this appliance, 0 for the other: active, standby;"
+        " absent, like all `rosrv_standby` metrics, if it is not one of two",
+        "role",
+    ),
+    gauge("rosrv_standby_connected", "1 while the replication between the two appliances is open"),
+    gauge("rosrv_standby_in_sync", "1 while the standby has all changes; only on the active appliance"),
+    gauge("rosrv_standby_obstacle", "1 while the standby follows, but could not start if it took over"),
+    gauge("rosrv_standby_behind_changes", "changes that the standby lacks; only on the active appliance"),
+    gauge("rosrv_standby_behind_bytes", "bytes of these changes in memory; only on the active appliance"),
+    gauge(
+        "rosrv_standby_witness_age_seconds",
+        "time since the last answer of the witness; +Inf if it never answered",
+    ),
+    gauge(
+        "rosrv_standby_other_witness_age_seconds",
+        "time since the witness last answered the standby; only on the active appliance, once the standby has reported",
+    ),
+    gauge(
+        "rosrv_standby_witness_trouble",
+        "1 while the witness could not save a takeover, such as on a disk that cannot be written",
+    ),
+    gauge(
+        "rosrv_standby_both_active",
+        "1 while this appliance is active, but the witness names the other; only on the active appliance",
+    ),
+    counter(
+        "rosrv_standby_takeovers_total",
+        "takeovers since the two appliances were joined: the epoch that this appliance knows last",
+    ),
+)
+
+
+def _line(state: StandbyState) -> tuple[str, Any]:
+    from appliance.features.standby.standby_line import standby_line  # noqa: PLC0415  only the command needs it
+
+    return "standby", standby_line(state)
+
+
+STANDBY_VIEW = FeatureView(
+    "standby",
+    (
+        StateView(
+            "standby",
+            StandbyState,
+            "null: this appliance is not one of two",
+            before="handled_alarms",
+            alarms=lambda state: standby_troubles(state, PATIENCE_SECONDS),
+            metrics=_METRICS,
+            samples=samples_of,
+            line=_line,
+        ),
+    ),
+    pair="appliance.features.standby.pair_view:StandbyPairView",
+)

@@ -31,7 +31,10 @@ def _make(core: FeatureContext) -> FeaturePart:
 
     wanted = core.sections.of(Syslog)
     forwarded = ForwarderLink(wanted.to, wanted.send, core.trail)
-    return FeaturePart({ROLE: (forwarded.link, messages.ForwardingLink)}, forwarded.status)
+    return FeaturePart(
+        {ROLE: (forwarded.link, messages.ForwardingLink)},
+        status_fields=lambda: {"forwarding": forwarded.status()},
+    )
 
 
 SYSLOG = Feature(

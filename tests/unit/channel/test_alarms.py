@@ -8,7 +8,6 @@ from appliance.channel.alarms import activity, open_alarms
 from appliance.channel.answers.status import Status
 from tests.support.answers import example
 
-FORWARDING = {"to": "tls://10.0.0.9:6514", "behind": 7}
 GOOD: dict[str, Any] = {
     "probe": "passed",
     "relay": "connected",
@@ -36,7 +35,6 @@ def test_a_healthy_appliance_has_none() -> None:
         ("rosmaster", "being rebuilt", "rosmaster", "warning", "system"),
         ("audit.failed", "disk full", "audit-failed", "alarm", "audit"),
         ("relay", "1 of 2 are away", "relay", "alarm", "system"),
-        ("audit.forwarding", FORWARDING | {"trouble": "refused"}, "audit-not-forwarded", "warning", "audit"),
         ("audit.degraded", "fsync is slow", "audit-degraded", "warning", "audit"),
         ("policy.confirm_by", 1.0, "policy-unconfirmed", "warning", "policy"),
         ("policy.audit_only", ["Publishers"], "policy-audit-only", "warning", "policy"),
@@ -49,7 +47,6 @@ def test_a_healthy_appliance_has_none() -> None:
         ("monitors.differs_from_folder", True, "monitors-differ", "notice", "monitors"),
         ("ipsec.troubles", ["a certificate ends"], "ipsec", "warning", "hosts"),
         ("blocks.hosts", 1, "hosts-blocked", "warning", "hosts"),
-        ("recorder", {"running": False}, "recorder", "warning", "system"),
         (
             "processes",
             [{"role": "charon", "failing": "no /dev/net/tun"}],
@@ -68,7 +65,6 @@ def test_each_condition_is_an_alarm(path: str, value: object, kind: str, severit
 def test_one_missing_relay_is_not_reported_as_all() -> None:
     (alarm,) = open_alarms(changed("relay", "1 of 2 are away"))
     assert "1 of 2 are away: their topics" in alarm.text
-    assert open_alarms(changed("audit.forwarding", FORWARDING)) == []
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from appliance.telemetry.metrics import METRICS
+from appliance.telemetry.metric_table import METRICS
 
 ROOT = Path(__file__).parents[3]
 DASHBOARD: dict[str, Any] = json.loads((ROOT / "examples/grafana/rosrv.json").read_text())

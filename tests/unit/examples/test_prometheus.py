@@ -7,7 +7,7 @@ from typing import Any
 import yaml
 
 from appliance.audit.log.events import EVENTS
-from appliance.telemetry.metrics import METRICS
+from appliance.telemetry.metric_table import METRICS
 
 FOLDER = Path(__file__).parents[3] / "examples" / "prometheus"
 # tests/system/fleet/test_bundles.py compares the page with what the collector serves.

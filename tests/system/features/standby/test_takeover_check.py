@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from appliance.channel import admin
+from appliance.features.standby import standby_requests
 from examples.landshark.lab import Lab
 from tests.support.appliance import OPEN_POLICY
 from tests.support.features.standby.standby_site import StandbySite
@@ -97,7 +98,7 @@ def until_obstacle_without_active(site: StandbySite) -> None:
     """Wait until the standby has seen the lease expire for several seconds."""
 
     def waits() -> bool:
-        state = site.appliances["b"].ask(admin.StandbyWanted())
+        state = site.appliances["b"].ask(standby_requests.StandbyWanted())
         return state.role == "standby" and (state.other.trouble_seconds or 0) > 5 and bool(state.obstacle)
 
     eventually(waits, site.story)

@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 
 from appliance.channel import admin
+from appliance.features.standby import standby_requests
 from appliance.features.standby.lease_watch import PAUSED
 from appliance.features.standby.membership import PORT
 from appliance.features.standby.witness import EXPIRY
@@ -99,7 +100,7 @@ def test_a_paused_appliance_answers_nothing_when_it_wakes_up(site: StandbySite, 
     assert [answer_to(one) for one in requests] == [b"", b""]
     site.until_both_in_sync()
     assert site.holder() == passive
-    assert site.appliances[active].ask(admin.StandbyWanted()).role == "standby"
+    assert site.appliances[active].ask(standby_requests.StandbyWanted()).role == "standby"
 
 
 def request(site: StandbySite, name: str, method: str) -> socket.socket:
@@ -217,7 +218,7 @@ def test_a_port_of_the_replication_that_is_in_use(site: StandbySite, robot: Stan
         site.until_taken_over(passive)
         site.restore(active)
         robot.lost_nothing()
-        found = site.appliances[passive].ask(admin.StandbyWanted())
+        found = site.appliances[passive].ask(standby_requests.StandbyWanted())
         assert found.other.reason == f"the standby cannot connect to port {PORT}: Address already in use"
         assert site.in_sync() == {passive}
 
@@ -263,7 +264,7 @@ def test_a_power_cut_of_all_three(site: StandbySite, robot: StandbyRobot, order:
         site.restore(name)
     if order == "appliances first":
         wait(2 * EXPIRY)
-        roles = [one.ask(admin.StandbyWanted()).role for one in site.appliances.values()]
+        roles = [one.ask(standby_requests.StandbyWanted()).role for one in site.appliances.values()]
         assert roles == ["standby", "standby"]
     else:
         site.stop_witness()

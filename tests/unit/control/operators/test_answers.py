@@ -20,6 +20,7 @@ from appliance.control.operators.limit_use import LimitQueries
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.token_orders import TokenOrders
+from appliance.features.table import FEATURES
 from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import PortChecks
 from appliance.hosts.enrolment import HostEnrolment
@@ -47,7 +48,9 @@ CLASSES: dict[str, Any] = {
     "alarms": AlarmOrders,
 }
 METHODS = idle_parts().methods() + request_methods(**CLASSES)
-OF_FEATURES = [admin.StandbyWanted, admin.StandbyPromote]  # a part that control inherits brings the methods
+OF_FEATURES = [
+    one for feature in FEATURES if feature.may_start for one in feature.operations()
+]  # methods come later
 REQUESTS: tuple[type[Any], ...] = tuple(dict.fromkeys([*get_args(AnyRequest), *get_args(RestRequest)]))
 # Exceptions: a record's fields depend on its event, a child's readiness on its role, a memory's terms on its feature.
 OPEN = {
@@ -96,7 +99,7 @@ def test_one_method_answers_each_request() -> None:
 @pytest.mark.anyio
 async def test_a_request_without_its_feature_is_unknown() -> None:
     administration = Administration(cast(Any, None), (), durable=cast(Any, None), require_room=lambda: None)
-    answer = await administration.carry_out(admin.StandbyWanted(), who="operator")
+    answer = await administration.carry_out(admin.StatusWanted(), who="operator")
     assert (answer.ok, answer.trouble) == (False, "unknown")
 
 

@@ -1,31 +1,28 @@
-"""Tests of `appliance.telemetry.metrics` and `appliance.features.metrics.metrics_route`."""
+"""Tests of `appliance.telemetry.metric_table` and `appliance.features.metrics.metrics_route`."""
 
 import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
 from prometheus_client.parser import text_string_to_metric_families
 
 from appliance.base import clock
+from appliance.base.metric import BOUNDS
 from appliance.channel.answers.measures import Measures
-from appliance.channel.answers.standby_answers import StandbyState
-from appliance.channel.answers.status import RecorderState
-from appliance.features.metrics.metrics_route import rendered, rendered_standby
-from appliance.telemetry.metrics import BOUNDS, METRICS, Meter, markdown
+from appliance.features.metrics.metrics_route import rendered
+from appliance.telemetry.metric_table import METRICS, markdown
+from appliance.telemetry.metrics import Meter
 from tests.support.answers import example
 
 PAGE = Path(__file__).parents[4] / "docs" / "reference" / "metrics.md"
 
 
 CALLS = {("GET", "200"): 8}
-FORWARDING: dict[str, Any] = {"sent": 9, "behind": 4, "seconds": 1.5, "trouble": "nobody there"}
 
 
 def body(
     processes: Sequence[dict[str, Any]] = ({"role": "control", "pid": 1, "restarts": 4},),
-    forwarding: dict[str, Any] | None = FORWARDING,
 ) -> Measures:
     meter = Meter()
     meter.decided("publish", "deny", 0.0003, "10.0.0.1")
@@ -41,7 +38,7 @@ def body(
             "ipsec": {"troubles": ["a", "b"]},
             "policy": {"revision": 3, "differs_from_file": True},
             "monitors": {"loaded": 3, "enabled": 2, "held": ["b"], "failing": []},
-            "audit": {"lag_records": 2, "lag_seconds": 0.5, "degraded": "fsync", "forwarding": forwarding},
+            "audit": {"lag_records": 2, "lag_seconds": 0.5, "degraded": "fsync"},
             "processes": list(processes),
         },
         queued_deliveries=6,
@@ -108,8 +105,6 @@ def test_values_are_exported() -> None:
     assert samples["rosrv_relay_connected", ()] == 0
     assert samples["rosrv_monitor_dropped_total", (("resource", "/b"),)] == 5
     assert samples["rosrv_monitor_changed_total", (("resource", "(others)"),)] == 1
-    assert samples["rosrv_syslog_up", ()] == 0
-    assert samples["rosrv_syslog_lag_records", ()] == 4
     assert samples["rosrv_process_resident_bytes", (("role", "control"),)] > 0
 
 
@@ -130,38 +125,9 @@ def test_tunnels_are_measured() -> None:
     assert ("rosrv_tunnel_up", (("host", "b"),)) not in samples
 
 
-def test_recordings_are_measured_only_with_a_recorder() -> None:
-    def samples(recorder: RecorderState | None) -> dict[str, float]:
-        given = body()
-        given = msgspec.structs.replace(
-            given, status=msgspec.structs.replace(given.status, recorder=recorder)
-        )
-        families = text_string_to_metric_families(rendered(given, CALLS).decode())
-        return {
-            one.name: one.value
-            for family in families
-            for one in family.samples
-            if "recordings" in one.name or "recorder" in one.name
-        }
-
-    assert samples(None) == {}
-    assert samples(RecorderState(running=True, recordings=2, bytes=300)) == {
-        "rosrv_recorder_up": 1,
-        "rosrv_recordings": 2,
-        "rosrv_recordings_bytes": 300,
-    }
-
-
-def test_forwarding_has_no_samples_unless_configured() -> None:
-    """Without a syslog receiver there are no samples, so that no alert fires."""
-    answer = body(forwarding=None)
-    families = {one.name: one for one in text_string_to_metric_families(rendered(answer, CALLS).decode())}
-    assert not any(family.samples for name, family in families.items() if name.startswith("rosrv_syslog_"))
-
-
 def test_the_page_matches_the_code() -> None:
-    """docs/reference/metrics.md lists all metrics (python -m appliance.telemetry.metrics)."""
-    generated = PAGE.read_text().split("<!-- generated: python -m appliance.telemetry.metrics -->\n")[1]
+    """docs/reference/metrics.md lists all metrics (python -m appliance.telemetry.metric_table)."""
+    generated = PAGE.read_text().split("<!-- generated: python -m appliance.telemetry.metric_table -->\n")[1]
     assert generated.startswith(markdown())
 
 
@@ -175,57 +141,3 @@ def test_processes_of_one_role_have_separate_series() -> None:
     lines = [one for one in rendered(answer, CALLS).decode().splitlines() if one.startswith("rosrv_process")]
     assert len({line.rsplit(" ", 1)[0] for line in lines}) == len(lines) == 4
     assert 'rosrv_process_restarts_total{role="relay 1"} 2.0' in lines
-
-
-def standby_samples(page: bytes) -> dict[str, float]:
-    return {
-        line.rsplit(" ", 1)[0].removeprefix("rosrv_standby_"): float(line.rsplit(" ", 1)[1])
-        for line in page.decode().splitlines()
-        if line.startswith("rosrv_standby")
-    }
-
-
-def test_two_appliances_are_measured() -> None:
-    """The active appliance has the lag of the standby; a single appliance has no sample, so that no alert fires."""
-    assert standby_samples(rendered(body(), CALLS)) == {}
-    other = {
-        "name": "b", "connected": True, "behind_changes": 12, "behind_bytes": 3400, "witness_seconds": 7.5,
-    }  # fmt: skip
-    state = example(
-        StandbyState, name="a", role="active", epoch=4, other=other, obstacle="other keys",
-        witness={"answered_seconds": 0.25, "holder": "b", "trouble": "full"},
-    )  # fmt: skip
-    answer = body()
-    status = msgspec.structs.replace(answer.status, standby=state)
-    assert standby_samples(rendered(msgspec.structs.replace(answer, status=status), CALLS)) == {
-        'role{role="active"}': 1,
-        'role{role="standby"}': 0,
-        "connected": 1,
-        "in_sync": 0,
-        "obstacle": 1,
-        "behind_changes": 12,
-        "behind_bytes": 3400,
-        "witness_age_seconds": 0.25,
-        "other_witness_age_seconds": 7.5,
-        "witness_trouble": 1,
-        "both_active": 1,
-        "takeovers_total": 4,
-    }  # fmt: skip
-
-
-def test_a_standby_has_its_own_metrics() -> None:
-    state = example(StandbyState, name="b", role="standby", epoch=4, other={"name": "a"})
-    page = rendered_standby(state, CALLS)
-    assert standby_samples(page) == {
-        'role{role="active"}': 0,
-        'role{role="standby"}': 1,
-        "connected": 0,
-        "obstacle": 0,
-        "witness_age_seconds": float("inf"),
-        "witness_trouble": 0,
-        "takeovers_total": 4,
-    }
-    unknown = msgspec.structs.replace(state, epoch=0)
-    assert "takeovers_total" not in standby_samples(rendered_standby(unknown, CALLS))
-    names = {one.name for one in text_string_to_metric_families(page.decode())}
-    assert {name for name in names if not name.startswith("rosrv_standby_")} == {"rosrv_rest_calls"}

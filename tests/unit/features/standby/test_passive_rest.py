@@ -11,12 +11,12 @@ import pytest
 
 from appliance.base.clock import wall
 from appliance.channel import admin
-from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.channel import Channel
 from appliance.channel.messages.api import ApiLink, RequestAnswered, RequestMade, TokensStated
 from appliance.features.standby import passive_rest
 from appliance.features.standby.lease_client import HandOverError
 from appliance.features.standby.passive_rest import PassiveRest, ReplicatedTokens
+from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_orders import StandbyAdministration
 from appliance.signing.request_signing import TokenKeys
 from appliance.store.access_tokens import TokenRow, make_token

@@ -16,11 +16,11 @@ from appliance.api.front.history import SampleHistory, measures_of
 from appliance.api.front.journal import Journal
 from appliance.api.front.request_gate import RequestGate
 from appliance.api.front.services import Services
-from appliance.channel import admin
 from appliance.channel.admin import A, AdminAnswer, AdminRequest
-from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.messages.api import TokenKept
 from appliance.configuration.settings import ApiLimits, Settings
+from appliance.features.standby import standby_requests
+from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_orders import on_standby
 from appliance.store.access_tokens import make_token
 from tests.support.answers import example
@@ -42,7 +42,7 @@ class Standby(ControlLink):
     async def ask(
         self, request: AdminRequest[A], bearer: Bearer | None, seconds: float | None = None
     ) -> AdminAnswer[A]:  # fmt: skip
-        if isinstance(request, admin.StandbyWanted):
+        if isinstance(request, standby_requests.StandbyWanted):
             return AdminAnswer(True, STATE)  # type: ignore[arg-type]  # the answer to this request
         return on_standby(STATE)
 

@@ -5,9 +5,10 @@ from typing import Any, cast
 import pytest
 
 from appliance.channel import admin
-from appliance.channel.answers.standby_answers import StandbyState
 from appliance.control.errors import UnknownThingError
+from appliance.features.standby import standby_requests
 from appliance.features.standby.lease_client import HandOverError
+from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_orders import SingleAppliance, StandbyAdministration, StandbyOrders
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.answers import example
@@ -50,7 +51,7 @@ class Pair:
 async def test_the_order_is_on_disk_before_the_switchover() -> None:
     """The record names the operator; it is written first, because the switchover ends the process."""
     pair = Pair("active")
-    after = await pair.orders().promote(admin.StandbyPromote(), "alice")
+    after = await pair.orders().promote(standby_requests.StandbyPromote(), "alice")
     assert after.role == "standby"
     assert pair.did == [
         "switchover ordered by alice: b (10.0.0.2) is to become the active appliance",
@@ -63,19 +64,19 @@ async def test_a_failed_switchover_is_recorded_with_its_reason() -> None:
     pair = Pair("active")
     pair.refusal = "b does not have all changes"
     with pytest.raises(HandOverError, match="b does not have all changes"):
-        await pair.orders().promote(admin.StandbyPromote(), "alice")
+        await pair.orders().promote(standby_requests.StandbyPromote(), "alice")
     assert pair.did[1:] == ["on disk", "switchover failed by alice: b does not have all changes", "on disk"]
-    assert (await pair.orders().state(admin.StandbyWanted())).role == "active"
+    assert (await pair.orders().state(standby_requests.StandbyWanted())).role == "active"
 
 
-@pytest.mark.parametrize("request_", [admin.StandbyWanted(), admin.StandbyPromote()])
+@pytest.mark.parametrize("request_", [standby_requests.StandbyWanted(), standby_requests.StandbyPromote()])
 async def test_a_single_appliance_says_how_it_gets_a_standby(request_: Any) -> None:
     pair = Pair("active")
     orders = StandbyOrders(SingleAppliance(), cast(AuditTrail, pair))
     with pytest.raises(UnknownThingError, match="rosrv standby join"):
         await (
             orders.state(request_)
-            if isinstance(request_, admin.StandbyWanted)
+            if isinstance(request_, standby_requests.StandbyWanted)
             else orders.promote(request_, "alice")
         )
     assert pair.did == []
@@ -91,18 +92,20 @@ async def test_a_standby_answers_nothing_else() -> None:
         answer = await handler.carry_out(request, who="operator")
         assert (answer.ok, answer.trouble, answer.active) == (False, "standby", "10.0.0.2"), request
         assert answer.error == "this appliance is the standby of b (10.0.0.2); give the command there"
-    assert (await handler.carry_out(admin.StandbyWanted(), who="operator")).given() == pair.state()
+    assert (await handler.carry_out(standby_requests.StandbyWanted(), who="operator")).given() == pair.state()
     assert pair.did == []
 
 
 async def test_only_the_admin_socket_of_a_standby_orders_a_switchover() -> None:
     pair = Pair("standby")
     over_rest = StandbyAdministration(pair, orders=False)
-    assert (await over_rest.carry_out(admin.StandbyPromote(), who="alice")).trouble == "standby"
+    assert (await over_rest.carry_out(standby_requests.StandbyPromote(), who="alice")).trouble == "standby"
     assert pair.did == []
     handler = StandbyAdministration(pair, orders=True)
     pair.refusal = "give the order on the active appliance"
-    answer = await handler.carry_out(admin.StandbyPromote(), who="operator")
+    answer = await handler.carry_out(standby_requests.StandbyPromote(), who="operator")
     assert (answer.trouble, answer.error) == ("failed", pair.refusal)
     pair.refusal = ""
-    assert (await handler.carry_out(admin.StandbyPromote(), who="operator")).given().role == "active"
+    assert (
+        await handler.carry_out(standby_requests.StandbyPromote(), who="operator")
+    ).given().role == "active"

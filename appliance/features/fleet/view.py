@@ -1,0 +1,122 @@
+"""The states of the push of the audit log and of the bundles, with their alarms, metrics and lines."""
+
+from collections.abc import Iterator
+from typing import Annotated, Any
+
+import msgspec
+
+from appliance.base import clock
+from appliance.base.ages import age
+from appliance.base.metric import counter, gauge
+from appliance.channel.answers.field_docs import Moment, doc
+from appliance.features.view import FeatureView, Samples, StateView, Trouble
+from appliance.forwarding.forwarding_state import ForwardingState, samples_of
+
+
+class BundlesState(msgspec.Struct, frozen=True):
+    """The bundle of the fleet in force (SITE/GROUP/VERSION.tar; empty: none), and what became of later ones."""
+
+    collector: Annotated[str, doc("URL of the collector")]
+    in_force: Annotated[str, doc("the bundle in force; empty: none")]
+    sha256: Annotated[str, doc("SHA-256 of its archive")]
+    since: Annotated[Moment | None, doc("when its trial ended; null: none is in force")]
+    trying: Annotated[str, doc("the bundle in its commit-confirm period; empty: none")]
+    refused: Annotated[
+        str, doc("the last bundle that this robot refused; empty: none since the one in force")
+    ]
+    reason: Annotated[str, doc("why it was refused")]
+    changed: Annotated[bool, doc("an operator has changed a part of the bundle on this robot")]
+    checked: Annotated[Moment | None, doc("when the collector's metadata were last verified; null: not yet")]
+    trouble: Annotated[str, doc("why no bundles are taken now; empty: they are")]
+    rejected: Annotated[bool, doc("the collector serves metadata that are not accepted")]
+
+
+_COLLECTOR_METRICS = (
+    gauge("rosrv_collector_up", "1 while segments are pushed to the collector; absent if none is configured"),
+    counter("rosrv_collector_sent_total", "segments with a receipt since the pusher started"),
+    gauge("rosrv_collector_lag_records", "sealed audit records that the collector does not have"),
+    gauge("rosrv_collector_lag_seconds", "how long the oldest such record has waited"),
+    counter("rosrv_collector_missed_total", "records that retention removed before the collector had them"),
+)
+_BUNDLE_METRICS = (
+    gauge("rosrv_bundle_version", "version of the fleet's bundle in force; 0: none; absent without a fleet"),
+    gauge("rosrv_bundle_refused", "1 while the last bundle that was offered is refused"),
+    gauge("rosrv_bundle_changed", "1 while a part of the bundle in force is changed on this robot"),
+    gauge("rosrv_bundle_checked_seconds", "since the collector's metadata were last verified; -1: not yet"),
+    gauge("rosrv_bundle_rejected", "1 while the collector serves bundles or metadata that are not accepted"),
+)
+
+
+def _collector_alarms(state: ForwardingState) -> Iterator[Trouble]:
+    if state.trouble:
+        where = f"the audit log is not collected by {state.to}, {state.behind} sealed records wait"
+        yield Trouble("warning", "audit-not-collected", f"{where}: {state.trouble}", "audit")
+
+
+def _bundle_alarms(bundles: BundlesState) -> Iterator[Trouble]:
+    if bundles.refused:
+        stays = f"{bundles.in_force} stays" if bundles.in_force else "no bundle is"
+        text = f"{bundles.refused} is refused, {stays} in force: {bundles.reason.splitlines()[0]}"
+        yield Trouble("warning", "bundle-refused", text)
+    if bundles.rejected:
+        text = f"the collector {bundles.collector} serves bundles that are not accepted: {bundles.trouble}"
+        yield Trouble("alarm", "bundles-rejected", text)
+    elif bundles.trouble:
+        yield Trouble("warning", "bundles-not-polled", f"no new bundles: {bundles.trouble}")
+    if bundles.changed:
+        text = f"{bundles.in_force} is in force, but was changed on this robot since"
+        yield Trouble("notice", "bundle-changed", text)
+
+
+def _bundle_samples(bundles: BundlesState) -> dict[str, Samples]:
+    number = bundles.in_force.rpartition("/")[2].removesuffix(".tar")
+    checked = -1.0 if bundles.checked is None else clock.wall() - bundles.checked
+    return {
+        "rosrv_bundle_version": [((), int(number or 0))],
+        "rosrv_bundle_refused": [((), bool(bundles.refused))],
+        "rosrv_bundle_changed": [((), bundles.changed)],
+        "rosrv_bundle_checked_seconds": [((), checked)],
+        "rosrv_bundle_rejected": [((), bundles.rejected)],
+    }
+
+
+def _bundle_line(bundles: BundlesState) -> tuple[str, Any]:
+    from rich.text import Text  # noqa: PLC0415  only the command needs it
+
+    line = Text(f"{bundles.in_force or 'none'}{' in force' if bundles.in_force else ''}")
+    if bundles.changed:
+        line.append("; changed on this robot since", style="yellow")
+    if bundles.trying:
+        line.append(f"; {bundles.trying} waits for its confirmation")
+    if bundles.refused:
+        line.append(f"; {bundles.refused} REFUSED", style="yellow")
+    checked = "not verified yet" if bundles.checked is None else f"verified {age(bundles.checked)} ago"
+    line.append(f"; the collector's metadata {'were ' if bundles.checked else ''}{checked}")
+    return "bundle", line
+
+
+FLEET_VIEW = FeatureView(
+    "fleet",
+    (
+        StateView(
+            "collector",
+            ForwardingState,
+            "segments pushed to the collector; null: none is configured",
+            part="audit",
+            alarms=_collector_alarms,
+            metrics=_COLLECTOR_METRICS,
+            samples=lambda state: samples_of("collector", state),
+            line=lambda state: ("", f"{state.behind} to be collected by {state.to}"),
+        ),
+        StateView(
+            "bundles",
+            BundlesState,
+            "null: no bundles of a fleet are configured",
+            before="handled_alarms",
+            alarms=_bundle_alarms,
+            metrics=_BUNDLE_METRICS,
+            samples=_bundle_samples,
+            line=_bundle_line,
+        ),
+    ),
+)

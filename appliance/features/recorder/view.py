@@ -1,0 +1,56 @@
+"""The state of the flight recorder, with its alarm, metrics and line of `rosrv status`."""
+
+from collections.abc import Iterator
+
+import msgspec
+
+from appliance.base.metric import gauge
+from appliance.features.view import FeatureView, StateView, Trouble
+
+
+class RecorderState(msgspec.Struct, frozen=True):
+    """The flight recorder: how many recordings are kept, their bytes, and how many are being made."""
+
+    running: bool
+    recordings: int
+    bytes: int
+    in_progress: int = 0
+
+
+_METRICS = (
+    gauge("rosrv_recorder_up", "1 while the flight recorder runs; absent if recording is off"),
+    gauge("rosrv_recordings", "stored recordings"),
+    gauge("rosrv_recordings_bytes", "bytes of the stored recordings"),
+)
+
+
+def _alarms(state: RecorderState) -> Iterator[Trouble]:
+    if not state.running:
+        yield Trouble("warning", "recorder", "the flight recorder is not running: nothing is recorded")
+
+
+def _line(state: RecorderState) -> tuple[str, str]:
+    making = f", {state.in_progress} being made" if state.in_progress else ""
+    noun = "recording" if state.recordings == 1 else "recordings"
+    return "recorder", f"{state.recordings} {noun}, {state.bytes / 1e6:.1f} MB{making}"
+
+
+RECORDER_VIEW = FeatureView(
+    "recorder",
+    (
+        StateView(
+            "recorder",
+            RecorderState,
+            "null: nothing is recorded",
+            before="switched_off",
+            alarms=_alarms,
+            metrics=_METRICS,
+            samples=lambda state: {
+                "rosrv_recorder_up": [((), state.running)],
+                "rosrv_recordings": [((), state.recordings)],
+                "rosrv_recordings_bytes": [((), state.bytes)],
+            },
+            line=_line,
+        ),
+    ),
+)

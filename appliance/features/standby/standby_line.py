@@ -1,0 +1,34 @@
+"""Write the state of two appliances in one line."""
+
+from rich.text import Text
+
+from appliance.features.standby.standby_answers import OtherAppliance, StandbyState, WitnessSeen
+from appliance.features.standby.standby_summary import is_silent, lag_of, lasting, standby_troubles
+
+
+def standby_line(state: StandbyState) -> Text:
+    """Return the state in a line of `rosrv status`."""
+    other, witness = lag_in_words(state.other), answer_in_words(state.witness)
+    line = f"{state.name} is {state.role}; {state.other.name}: {other}; witness: {witness}"
+    return Text(line, style="yellow" if any(standby_troubles(state)) else "")
+
+
+def lag_in_words(other: OtherAppliance) -> str:
+    """Return how well the standby follows this active appliance."""
+    if other.connected:
+        return "in sync" if other.in_sync else lag_of(other)
+    return connection(other)
+
+
+def answer_in_words(witness: WitnessSeen) -> str:
+    seconds = witness.answered_seconds
+    if seconds is None:
+        return "has never answered"
+    return f"silent for {lasting(seconds)}" if is_silent(witness) else "answers"
+
+
+def connection(other: OtherAppliance) -> str:
+    if other.connected:
+        return "connected"
+    away = "" if other.trouble_seconds is None else f" for {lasting(other.trouble_seconds)}"
+    return f"away{away}" + (f": {other.reason}" if other.reason else "")

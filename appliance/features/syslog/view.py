@@ -1,0 +1,39 @@
+"""The state of the forwarding to a syslog receiver, with its alarm and metrics."""
+
+from collections.abc import Iterator
+
+from appliance.base.metric import counter, gauge
+from appliance.features.view import FeatureView, StateView, Trouble
+from appliance.forwarding.forwarding_state import ForwardingState, samples_of
+
+_METRICS = (
+    gauge("rosrv_syslog_up", "1 while the audit log is forwarded; absent if forwarding is not configured"),
+    counter("rosrv_syslog_sent_total", "messages that the receiver got since the forwarder started"),
+    gauge("rosrv_syslog_lag_records", "audit records that wait to be forwarded"),
+    gauge("rosrv_syslog_lag_seconds", "how long the oldest such record has waited"),
+    counter("rosrv_syslog_missed_total", "records that retention removed before they were forwarded"),
+)
+
+
+def _alarms(state: ForwardingState) -> Iterator[Trouble]:
+    if state.trouble:
+        where = f"the audit log is not forwarded to {state.to}, {state.behind} records wait"
+        yield Trouble("warning", "audit-not-forwarded", f"{where}: {state.trouble}", "audit")
+
+
+SYSLOG_VIEW = FeatureView(
+    "syslog",
+    (
+        StateView(
+            "forwarding",
+            ForwardingState,
+            "null: forwarding is not configured",
+            part="audit",
+            required=True,
+            alarms=_alarms,
+            metrics=_METRICS,
+            samples=lambda state: samples_of("syslog", state),
+            line=lambda state: ("", f"{state.behind} to be forwarded to {state.to}"),
+        ),
+    ),
+)

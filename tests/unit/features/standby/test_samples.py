@@ -1,0 +1,53 @@
+"""Tests of `appliance.features.standby.samples`."""
+
+import msgspec
+
+from appliance.features.metrics.metrics_route import rendered_standby
+from appliance.features.standby.samples import samples_of
+from appliance.features.standby.standby_answers import StandbyState
+from tests.support.answers import example
+
+
+def numbers(state: StandbyState) -> dict[str, float]:
+    page = rendered_standby(state, {("GET", "200"): 8}).decode()
+    rows = [line.rsplit(" ", 1) for line in page.splitlines() if not line.startswith("#")]
+    return {name: float(value) for name, value in rows if not name.startswith("rosrv_rest_calls_total")}
+
+
+def test_the_active_appliance_has_the_lag_of_the_standby() -> None:
+    other = {
+        "name": "b", "connected": True, "behind_changes": 12, "behind_bytes": 3400, "witness_seconds": 7.5,
+    }  # fmt: skip
+    state = example(
+        StandbyState, name="a", role="active", epoch=4, other=other, obstacle="other keys",
+        witness={"answered_seconds": 0.25, "holder": "b", "trouble": "full"},
+    )  # fmt: skip
+    assert {name.removeprefix("rosrv_standby_"): value for name, value in numbers(state).items()} == {
+        'role{role="active"}': 1,
+        'role{role="standby"}': 0,
+        "connected": 1,
+        "in_sync": 0,
+        "obstacle": 1,
+        "behind_changes": 12,
+        "behind_bytes": 3400,
+        "witness_age_seconds": 0.25,
+        "other_witness_age_seconds": 7.5,
+        "witness_trouble": 1,
+        "both_active": 1,
+        "takeovers_total": 4,
+    }
+
+
+def test_a_standby_has_its_own_metrics() -> None:
+    """A standby has only what it can know: neither its lag, nor takeovers before it knows the epoch."""
+    state = example(StandbyState, name="b", role="standby", epoch=4, other={"name": "a"})
+    assert {name.removeprefix("rosrv_standby_"): value for name, value in numbers(state).items()} == {
+        'role{role="active"}': 0,
+        'role{role="standby"}': 1,
+        "connected": 0,
+        "obstacle": 0,
+        "witness_age_seconds": float("inf"),
+        "witness_trouble": 0,
+        "takeovers_total": 4,
+    }
+    assert samples_of(msgspec.structs.replace(state, epoch=0))["rosrv_standby_takeovers_total"] == []

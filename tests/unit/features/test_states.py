@@ -1,0 +1,66 @@
+"""The states of features: their fields in the documented status, their alarms and metrics."""
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from appliance.channel.answers.status import AuditState, Status
+from appliance.features.view import StateView
+from appliance.features.views import STATES, states_in, states_of
+from tests.support.answers import example
+
+AUDIT = "lag_records lag_seconds failed on_failure degraded forwarding collector"
+STATUS = (
+    "version since master processes isolation relaying mediation firewall probe policy ipsec monitors rosmaster relay"
+    " nodes shadows topics services connections messages dropped audit clock recorder switched_off blocks last_minute"
+    " name standby bundles handled_alarms"
+)
+TO: dict[str, Any] = {"to": "tls://log:6514", "behind": 7}
+BAD: dict[str, tuple[dict[str, Any], list[tuple[str, str]]]] = {
+    "forwarding": (TO | {"trouble": "refused"}, [("audit-not-forwarded", "warning")]),
+    "collector": (TO | {"trouble": "refused"}, [("audit-not-collected", "warning")]),
+    "recorder": ({"running": False}, [("recorder", "warning")]),
+    "standby": (
+        {"role": "active", "obstacle": "other keys"},
+        [("standby-unready", "alarm"), ("witness-silent", "warning")],
+    ),
+    "bundles": (
+        {"refused": "a/b/2.tar", "reason": "no", "trouble": "bad", "rejected": True, "changed": True},
+        [("bundle-refused", "warning"), ("bundles-rejected", "alarm"), ("bundle-changed", "notice")],
+    ),
+}  # fmt: skip
+
+
+def test_the_status_has_the_documented_fields() -> None:
+    """The fields of features are at their documented places, although the core does not name them."""
+    assert " ".join(AuditState.__struct_fields__) == AUDIT
+    assert " ".join(Status.__struct_fields__) == STATUS
+    required = {
+        field.name
+        for kind in (AuditState, Status)
+        for field in msgspec.structs.fields(kind)
+        if field.required
+    }
+    assert {view.field for view in STATES} & required == {"forwarding"}
+
+
+def test_a_feature_without_a_state_is_null() -> None:
+    assert states_in({}, "audit") == {"forwarding": None, "collector": None}
+    status = example(Status)
+    assert list(states_of(status)) == []
+    assert msgspec.to_builtins(status)["recorder"] is None
+
+
+@pytest.mark.parametrize("view", STATES, ids=lambda view: view.field)
+def test_each_state_has_its_alarms_metrics_and_line(view: StateView[Any]) -> None:
+    """Each metric of a state has samples, also when clients send the state as JSON."""
+    given, alarms = BAD[view.field]
+    place = {"audit": {view.field: given}} if view.part == "audit" else {view.field: given}
+    status = msgspec.json.decode(msgspec.json.encode(example(Status, **place)), type=Status)
+    [(found, state)] = states_of(status)
+    assert found is view
+    assert [(one.kind, one.severity) for one in view.alarms(state)] == alarms
+    assert set(view.samples(state)) == {metric.name for metric in view.metrics}
+    assert view.line is not None
+    assert str(view.line(state)[1])
