@@ -1,6 +1,5 @@
 """Write docs/reference/quotas.md: `python -m distribution.quotas_page > docs/reference/quotas.md`."""
 
-import pkgutil
 import sys
 from collections.abc import Callable, Iterator
 
@@ -19,11 +18,7 @@ one quota. The *kept* part is for hosts with a registration only, so the robot's
 
 def all_rows() -> tuple[QuotaRow, ...]:
     """Return the rows of the core, then those of features."""
-    named = (feature.quotas for feature in FEATURES)
-    return (
-        *QUOTA_ROWS,
-        *(row for place in named if place is not None for row in pkgutil.resolve_name(place)),
-    )
+    return (*QUOTA_ROWS, *(row for feature in FEATURES for row in feature.quotas))
 
 
 def page() -> str:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 from appliance.cli.verb_table import Verbs
 from appliance.configuration.sections import FeatureSection, Sections
+from appliance.quotas.table import QuotaRow
 from appliance.supervisor.role import Role, SharedMemory
 
 if TYPE_CHECKING:
@@ -143,7 +144,7 @@ class Feature:
     rows. `routes` is the function (`module:function`) that returns further routes of the api for its `Services`.
     `without_token` lists the paths of routes that need no token. `page` returns settings for the console's page.
     `verbs` are commands of `rosrv`.
-    `quotas` names the tuple of rows (`module:name`) that the table of quotas lists.
+    `quotas` are rows that the table of quotas lists.
     `recorded` is the function (`module:function`) that gives `rosrv monitor replay` the recorded messages of a period.
     `console` are components of the console; all style sheets of the folder are part of its style.
     `memory` makes the memory that the supervisor shares with this number of relays; None if none is configured.
@@ -164,7 +165,7 @@ class Feature:
     without_token: tuple[str, ...] = ()
     page: Callable[[Sections], Mapping[str, str]] = lambda _sections: {}
     verbs: Verbs = field(default_factory=dict)
-    quotas: str | None = None
+    quotas: tuple[QuotaRow, ...] = ()
     recorded: str | None = None
     console: tuple[ConsolePart, ...] = ()
     memory: Callable[[Sections, int], SharedMemory | None] = lambda _sections, _relays: None

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 from appliance.cli.verb_table import Group, Verb
 from appliance.configuration.sections import Sections
 from appliance.features.feature import ConsolePart, Feature, FeatureContext, FeaturePart
+from appliance.features.recorder.quotas import ROWS
 from appliance.features.recorder.settings import RecorderRules
 from appliance.supervisor.role import Role, SharedMemory
 from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
@@ -50,7 +51,7 @@ RECORDER = Feature(
     operations=_operations,
     routes="appliance.features.recorder.recording_routes:routes",
     memory=_memory,
-    quotas="appliance.features.recorder.quotas:ROWS",
+    quotas=ROWS,
     recorded="appliance.features.recorder.recorder_input:recorded_messages",
     make=_make,
     console=(
