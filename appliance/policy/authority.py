@@ -87,7 +87,7 @@ def read_authority(
             )
     for group in found.values():
         if not any(claim is not Claim.ASK for claim, _hosts in group.hosts):
-            text = f"only an operator can give {group.name} to a host: add take {group.name} = HOSTS, if one may take it"
+            text = f"only an operator can give {group.name} to a host: if a host may take it, add take {group.name} ="
             findings.warn(group.rule.line, 1, text)
     return found
 

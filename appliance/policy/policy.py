@@ -77,8 +77,8 @@ class Policy:
     `monitored_topics` and `monitored_services` are the names in `[Monitor]`. `takeover` is `same-host` or `granted`.
     `enrolled` and `robot` are the given addresses of `host:NAME` and `robot`. `blocks` has the hosts that an operator
     blocks, by canonical address: the end of a sentence, such as `blocked by ann`. `authority` has the groups of
-    `[Authority]`, and `holders` the host that holds each of them; a group without an entry is free. Without `holders` (for
-    checks of a text), each host with a claim counts as the holder.
+    `[Authority]`, and `holders` the host that holds each of them; a group without an entry is free. Without `holders`
+    (for checks of a text), each host with a claim counts as the holder.
     """
 
     text: str

@@ -41,7 +41,8 @@ class HostAnswer:
 def who_may(policy: Policy, category: Category, resource: str, node: str = "") -> Iterator[HostAnswer]:
     """Yield the answer for each network in order of addresses, then for all other hosts.
 
-    Without the name of a `node`, the right to a node's name is not decided. Blocks of hosts are ignored, and which host holds a group.
+    Without the name of a `node`, the right to a node's name is not decided. Blocks of hosts are ignored, and which host
+    holds a group.
     """
     policy = replace(policy, blocks={}, holders=None)
     networks = sorted(policy.hosts.networks(), key=lambda one: (one.version, one))

@@ -3,9 +3,9 @@
 The default, `relaying: all` and `mediation: full`, is a security boundary.
 
 With `relaying: monitored` (the thesis's mode), the relay carries only topics and services in the policy's `[Monitor]`
-and `[Authority]`, or with events of a specification. For all others, nodes connect directly. With `mediation: monitored`, nodes also get
-each other's real URIs; this mode requires `relaying: monitored`. Both modes are faster, but not a security boundary: a
-node that knows a port can send any request to it.
+and `[Authority]`, or with events of a specification. For all others, nodes connect directly. With `mediation:
+monitored`, nodes also get each other's real URIs; this mode requires `relaying: monitored`. Both modes are faster, but
+not a security boundary: a node that knows a port can send any request to it.
 """
 
 from collections.abc import Callable

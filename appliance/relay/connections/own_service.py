@@ -28,7 +28,7 @@ _SECOND = 1.0
 
 @dataclass(slots=True)
 class _Call:
-    """The last call of a service by a host: the clients that wait for the answer, or the answer and the time when it expires."""
+    """A host's last call of a service: the clients that wait for the answer, or the answer and when it expires."""
 
     number: int
     waiting: list["OwnServer"] = field(default_factory=list)

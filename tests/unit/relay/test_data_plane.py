@@ -376,6 +376,35 @@ def test_a_connection_ends_with_its_grant_publication_or_node(world: World, mess
     assert world.hears(ConnectionClosed).reason
 
 
+def test_no_message_of_a_silent_publisher_passes(world: World) -> None:
+    """Its connection is closed at once, is not opened for subscribers or monitors, and returns with the authority."""
+    publisher, subscriber = world.subscribed()
+    publisher.send(encode_frame(b"before"))
+    world.gets(subscriber, encode_frame(b"before"))
+    publisher.send(encode_frame(b"late"))
+    world.state(PublicationPlaced("k", "/chatter", "*", silent=True))
+    world.ends(publisher)
+    world.state(GrantInstalled("k", "/chatter", LOOPBACK, "/other"))
+    other = world.connect(encode_header(ASK | {"callerid": "/other"}))
+    world.state(StateBegan(2))
+    world.state(NodePlaced("k", "/talker", LOOPBACK), world.port)
+    world.state(PublicationPlaced("k", "/chatter", "*", silent=True))
+    for name in ("/listener", "/other"):
+        world.state(GrantInstalled("k", "/chatter", LOOPBACK, name))
+    world.state(StateEnded(2))
+    world.engine.topics["k", "/chatter"][0].upstream.request_latched()  # type: ignore[union-attr]  # it has one
+    world.loop.turn(0.05)
+    world.told += [message for message, _fds in world.control.receive()]
+    assert not any(isinstance(message, UpstreamWanted) for message in world.told)
+    assert subscriber.data == other.data == b""
+    world.state(PublicationPlaced("k", "/chatter", "*"))
+    again = world.upstream()
+    assert world.gets_header(other) == HEADER
+    again.send(encode_frame(b"after"))
+    for one in (subscriber, other):
+        world.gets(one, encode_frame(b"after"))
+
+
 def test_a_withdrawn_nodes_port_is_closed(world: World) -> None:
     """The kernel refuses new connections once no process has the socket."""
     world.state(NodeWithdrawn("k"))

@@ -1,0 +1,220 @@
+"""Hand-overs of a group: random histories of hosts, operators and relays, and the answers of each order."""
+
+import asyncio
+import random
+from collections.abc import Iterable, Iterator
+from typing import Any, cast
+
+import pytest
+
+from appliance.base import clock
+from appliance.channel.messages import OwnServiceCalled
+from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
+from appliance.features.authority.drive_orders import CHECK_SECONDS, DriveOrders, HostSigns
+from appliance.features.authority.drive_requests import (
+    DriveAsk,
+    DriveGive,
+    DriveStatus,
+    DriveTake,
+    GroupState,
+)
+from appliance.policy.model import Address, address_of
+from appliance.policy.policy import Policy
+from appliance.policy.policy_compiler import compile_policy
+from tests.support.virtual_clock import VirtualClock
+
+pytestmark = pytest.mark.anyio
+PILOT, SECOND, BOSS, AGENT, STRANGER = (f"10.0.0.{number}" for number in range(1, 6))
+LEASE = 5.0
+TEXT = f"""
+[Authority]
+base = /cmd_vel
+take base = {PILOT} {SECOND}
+override base = {BOSS}
+ask base = {AGENT}
+lease base = {LEASE:g}s
+"""
+
+
+class Site:
+    """Two relays, five hosts and a group. A relay applies an order some turns of the loop after control sent it."""
+
+    def __init__(self, chance: random.Random, time: VirtualClock) -> None:
+        self.time = time
+        self.chance = chance
+        self.policy: Policy = compile_policy(TEXT, file="site.ini")
+        self.live = {address_of(host) for host in (PILOT, SECOND, BOSS, AGENT, STRANGER)}
+        self.moved: dict[Address, float] = {}
+        self.records: list[dict[str, Any]] = []
+        self.applied: list[Address | None] = [None, None]
+        self.ordered: list[list[Address | None]] = [[], []]
+        self.ready = True
+        self.orders = DriveOrders(
+            lambda: self.policy,
+            cast(Any, self),
+            HostSigns(self.live.__contains__, lambda host, _names: self.moved.get(host, 0.0)),
+            decide_again=self.decide_again,
+            carried_out=self.carried_out,
+            relays_ready=lambda: self.ready,
+        )
+
+    def happened(self, event: str, reason: str, **detail: Any) -> None:
+        self.records.append({"event": event, "reason": reason, **detail})
+
+    def decide_again(self) -> int:
+        for queue in self.ordered:
+            queue.append(self.orders.holders().get("base"))
+        return 0
+
+    async def carried_out(self) -> None:
+        """Let the relays apply their orders in any order, and check after each that at most one host is let through."""
+        while any(self.ordered):
+            await asyncio.sleep(0)
+            relay = self.chance.choice([number for number in (0, 1) if self.ordered[number]])
+            self.applied[relay] = self.ordered[relay].pop(0)
+            assert len({host for host in self.applied if host is not None}) <= 1, self.applied
+
+    def handed_over(self) -> list[str]:
+        """Return `from -> to` of each hand-over."""
+        return [
+            f"{one['earlier']} -> {one['holder']}"
+            for one in self.records
+            if one["event"] == "authority handed over"
+        ]
+
+    async def state(self) -> GroupState:
+        return (await self.orders.status(DriveStatus())).groups[0]
+
+    async def pass_time(self, seconds: float, moving: Iterable[str] = ()) -> None:
+        """Let time pass, in which these hosts publish."""
+        for _ in range(round(seconds / CHECK_SECONDS)):
+            self.time.advance(CHECK_SECONDS)
+            self.moved |= {address_of(host): clock.now() for host in moving}
+            await self.orders.check()
+
+
+@pytest.fixture
+def site() -> Iterator[Site]:
+    """A site in virtual time, also at night."""
+    with clock.using(time := VirtualClock()):
+        yield Site(random.Random(1), time)  # noqa: S311  a repeatable history
+
+
+@pytest.mark.parametrize("number", [2_000, pytest.param(100_000, marks=pytest.mark.nightly)])
+async def test_never_two_holders_and_never_none_for_longer_than_the_lease(site: Site, number: int) -> None:
+    """Hosts take, ask, give, move, fall silent and end at random, at the same time, while the relays lag."""
+    chance, hosts, hand_overs = site.chance, (PILOT, SECOND, BOSS, AGENT, STRANGER), 0
+    orders, moves = site.orders, set[str]()
+    kinds = (
+        lambda host: orders.take(DriveTake("base", host), "op"),
+        lambda host: orders.ask(DriveAsk("base", host), "op"),
+        lambda host: orders.give(DriveGive("base", host), "op"),
+        lambda _host: orders.give(DriveGive("base"), "op"),
+        lambda host: orders.take_called(OwnServiceCalled(1, "/rosrv/drive/take", host, "/pad")),
+        lambda host: orders.give_called(OwnServiceCalled(1, "/rosrv/drive/give", host, "/pad")),
+    )
+    while hand_overs < number:
+        acts = [chance.choice(kinds)(chance.choice(hosts)) for _ in range(3)]
+        for error in await asyncio.gather(*acts, orders.check(), return_exceptions=True):
+            assert isinstance(error, SenselessError) or not isinstance(error, BaseException), error
+        host = chance.choice(hosts)
+        (moves.add if chance.random() < 0.5 else moves.discard)(host)
+        (site.live.add if chance.random() < 0.8 else site.live.discard)(address_of(host))
+        if chance.random() < 0.3:
+            await site.pass_time(chance.choice((0.25, 1.0, LEASE + 0.5)), moves)
+        hand_overs += len(site.handed_over())
+        site.records.clear()
+        state = await site.state()
+        assert site.applied == [address_of(state.holder) if state.holder else None] * 2
+        if not state.holder:
+            assert not {PILOT, SECOND, BOSS} & set(state.waiting), (
+                "the group is free while a host waits for it"
+            )
+        else:
+            assert state.left_seconds is not None
+            assert state.left_seconds <= LEASE
+
+
+async def test_who_gets_a_group(site: Site) -> None:
+    """A free group is taken, a held one only by a host that may override; one that asked follows the holder."""
+    orders = site.orders
+    await orders.take(DriveTake("base", PILOT), "op")
+    for host in (SECOND, AGENT, STRANGER):
+        with pytest.raises(SenselessError):
+            await orders.take(DriveTake("base", host), "op")
+    await orders.ask(DriveAsk("base", AGENT), "op")
+    await orders.ask(DriveAsk("base", SECOND), "op")
+    with pytest.raises(SenselessError):
+        await orders.ask(DriveAsk("base", STRANGER), "op")
+    assert (await site.state()).waiting == [AGENT, SECOND]
+    await orders.take(DriveTake("base", BOSS), "op")
+    await orders.give(DriveGive("base"), "op")
+    await orders.give(DriveGive("base", AGENT), "op")
+    with pytest.raises(SenselessError):
+        await orders.give(DriveGive("base", STRANGER), "op")
+    await orders.give(DriveGive("base"), "op")
+    assert site.handed_over() == [
+        f"nobody -> {PILOT}", f"{PILOT} -> {BOSS}", f"{BOSS} -> {SECOND}", f"{SECOND} -> {AGENT}", f"{AGENT} -> nobody",
+    ]  # fmt: skip
+    assert [one["host"] for one in site.records if one["event"] == "authority refused"] == [
+        SECOND, AGENT, STRANGER, STRANGER,
+    ]  # fmt: skip
+    with pytest.raises(SenselessError):
+        await orders.give(DriveGive("base"), "op")
+    with pytest.raises(UnknownThingError, match="its groups: base"):
+        await orders.take(DriveTake("arm", PILOT), "op")
+
+
+async def test_a_holder_loses_a_group(site: Site) -> None:
+    """It is silent for the lease, its nodes end, the policy takes its claim, or the policy no longer has the group."""
+    take = DriveTake("base", PILOT)
+    await site.orders.take(take, "op")
+    await site.pass_time(3 * LEASE, [PILOT])
+    await site.pass_time(LEASE - 1)
+    await site.orders.take(take, "op")  # takes it again
+    await site.pass_time(LEASE - 1)
+    assert (await site.state()).holder == PILOT
+    await site.pass_time(1)
+    await site.orders.take(take, "op")
+    await site.pass_time(1, [PILOT])
+    site.live.discard(address_of(PILOT))
+    await site.pass_time(1)
+    site.live.add(address_of(PILOT))
+    for text in (TEXT.replace(PILOT, "10.0.0.9"), TEXT.replace("base", "arm")):
+        site.policy = compile_policy(TEXT, file="site.ini")
+        await site.orders.take(take, "op")
+        site.policy = compile_policy(text, file="site.ini")
+        await site.pass_time(CHECK_SECONDS)
+    reasons = [one["reason"].rpartition(": ")[2] for one in site.records if one["holder"] == "nobody"]
+    assert reasons == [
+        "it was silent for 5 s", "its nodes ended", "the policy no longer lets it hold the group",
+        "the policy no longer has the group",
+    ]  # fmt: skip
+
+
+async def test_nothing_is_handed_over_while_a_relay_starts(site: Site) -> None:
+    """The relay may still let the earlier holder through, so a host gets the group later; a group is always freed."""
+    await site.orders.take(DriveTake("base", PILOT), "op")
+    site.ready = False
+    with pytest.raises(UnavailableError):
+        await site.orders.take(DriveTake("base", BOSS), "op")
+    await site.orders.give(DriveGive("base"), "op")
+    assert site.handed_over() == [f"nobody -> {PILOT}", f"{PILOT} -> nobody"]
+
+
+async def test_a_node_takes_and_gives_for_its_host(site: Site) -> None:
+    """The services answer with what the host holds, or with the reason."""
+
+    def called(host: str) -> OwnServiceCalled:
+        return OwnServiceCalled(7, "/rosrv/drive/take", host, "/pad")
+
+    answers = [await site.orders.take_called(called(host)) for host in (PILOT, SECOND, AGENT, STRANGER)]
+    assert [(one.success, one.text.split(":")[0]) for one in answers] == [
+        (True, f"{PILOT} holds base"),
+        (False, f"{PILOT} holds base"),
+        (False, "base"),
+        (False, f"{STRANGER} has no claim to a group of [Authority]"),
+    ]
+    assert (await site.orders.give_called(called(SECOND))).text == f"{SECOND} holds no group"
+    assert (await site.orders.give_called(called(PILOT))).success
+    assert (await site.state()).holder == ""
