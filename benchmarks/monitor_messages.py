@@ -57,6 +57,8 @@ WINDOW = """window() { std::vector<double> window; double mean = 0;
         mean = std::accumulate(window.begin(), window.end(), 0.0) / window.size(); } }"""
 PUBLISHED = """published() { std_msgs::Float64 m; event e(double x) /cmd geometry_msgs/TwistStamped
     '{twist:{linear:{x:x}}}' { m.data = x; PUBLISH(/out, std_msgs/Float64, m); } }"""
+STOPPED = """stopped() { safe geometry_msgs/TwistStamped { header.frame_id: "base_link" } on /cmd every 1s;
+    event e(double x) /cmd geometry_msgs/TwistStamped '{twist:{linear:{x:x}}}' { if (!(x <= 1)) { STOP; } } }"""
 WHOLE = "whole() { geometry_msgs::TwistStamped v; event e() /cmd geometry_msgs/TwistStamped '{}' { v = MESSAGE; } }"
 OTHERS = "".join(
     f"other{number}() {{ event e(int x) /other{number} std_msgs/Int32 '{{data:x}}' {{ x++; }} }}\n"
@@ -110,7 +112,12 @@ def batched(messages: int, body: bytes, text: str = REFERENCE, topic: str = "/cm
     view[:] = frame * messages
     prepared = lane.prepare(loud=False, told=(), counted=[True] * len(lane.verdicts))
     times = MESSAGES // messages
-    return microseconds(lambda: lane.process_batch(view, 0, 0, [], 1, prepared), times) / messages
+
+    def process() -> None:
+        view[:] = frame * messages  # a monitor may have changed it
+        lane.process_batch(view, 0, 0, [], 1, prepared)
+
+    return microseconds(process, times) / messages
 
 
 DEFINITIONS = standard_definitions()
@@ -130,6 +137,7 @@ def main() -> None:
         ("a window of ten, engine", WINDOW),
         ("a message is published", PUBLISHED),
         ("a copy of all", WHOLE),
+        ("a stop, engine", STOPPED),
     ):
         loaded = monitors(text)
         rows.append((name, partial(loaded.process, "/cmd", COMMAND, 1)))
@@ -147,6 +155,8 @@ def main() -> None:
     print(f"{'a tfsm, engine':32} {row:8.2f} µs")
     print(f"{'a tfsm, 64 together':32} {batched(64, COMMAND, WATCHED):8.3f} µs")
     print(f"{'a string is kept, 64 together':32} {batched(64, COMMAND, KEPT):8.3f} µs")
+    print(f"{'a stop each, 64 together':32} {batched(64, COMMAND, STOPPED):8.3f} µs")
+    print(f"{'a stop that comes alone':32} {batched(1, COMMAND, STOPPED):8.3f} µs")
     print(f"{'a handler each, 64 together':32} {batched(64, COMMAND, HANDLED):8.3f} µs")
     print(f"{'a line each, 64 together':32} {batched(64, COMMAND, SAID):8.3f} µs")
     scans = monitors(SCAN)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 from appliance.cli.verb_table import Group, Verb
 from appliance.configuration.sections import Sections
 from appliance.features.feature import Feature, FeaturePart, OperatorContext
+from appliance.features.sso.quotas import ROWS
 from appliance.features.sso.settings import Sso
 from appliance.supervisor.role import Facts, RemoteReceiver, Role
 from appliance.supervisor.sandbox.folders import folders_of
@@ -98,6 +99,6 @@ SSO = Feature(
             after="token",
         )
     },
-    quotas="appliance.features.sso.quotas:ROWS",
+    quotas=ROWS,
     operate=_operate,
 )  # fmt: skip
