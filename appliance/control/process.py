@@ -34,7 +34,7 @@ from appliance.control.operator_assembly import Operators, make_operators
 from appliance.control.operators.admin_socket import AdminServer
 from appliance.control.spare_memory import return_spare_memory
 from appliance.control.supervisor_messages import SupervisorMessages
-from appliance.features.table import start_gates
+from appliance.features.table import start_gate
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.registry import Life
@@ -63,7 +63,7 @@ def main(lifeline_fd: int, config_path: Path) -> None:
 
 async def _run(settings: Settings, lifeline_fd: int, config: Path) -> None:
     stopping, tunnels = asyncio.Event(), Current[Tunnels]()
-    gate: StartGate = next(iter(start_gates()), StartGate())
+    gate: StartGate = start_gate() or StartGate()
     compiler = SpecificationCompiler(lambda: lifeline.say(messages.CompilerWanted()))
     lifeline = ControlLifeline(
         lifeline_fd,
@@ -77,7 +77,7 @@ async def _run(settings: Settings, lifeline_fd: int, config: Path) -> None:
         role = await gate.role(config, settings, lifeline, compiler, stopping)
         if role is None or stopping.is_set():
             return
-        control = await _start(settings, lifeline, compiler, tunnels, role)
+        control = await _start(settings, lifeline, compiler, tunnels, role, gate=gate)
     except (*STATE_ERRORS, NoPortError) as error:
         lifeline.say(messages.Failed(str(error)))
         await stopping.wait()
@@ -92,6 +92,8 @@ async def _start(
     compiler: SpecificationCompiler,
     tunnels: Current[Tunnels],
     role: ActiveRole,
+    *,
+    gate: StartGate,
 ) -> "_Control":
     if settings.monitors is not None:
         compiler.call()  # the compiler starts while the policy is read
@@ -99,7 +101,7 @@ async def _start(
     base = await make_foundation(settings, lifeline, compiler, tunnels, role, restarted=restarted)
     parts = assemble(base)
     await parts.monitors.start(restarted=restarted, taken_over=role.paired)
-    await base.features.inherit(base, parts)
+    base.features.add(await gate.begin(base, parts))
     control = _Control(base, parts, make_operators(base, parts))
     await _restore(base, parts)
     await control.serve()

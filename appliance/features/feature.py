@@ -155,6 +155,7 @@ class Feature:
     a class of `control.assembly.active_role.StartGate`. `keep(sections, store, lifeline)` returns `KeptHosts`, before
     the policy comes into force. `inherit(foundation, parts)` returns a `FeaturePart` once
     control may serve and has its parts, before it serves.
+    a class of `control.assembly.active_role.StartGate`.
     """
 
     name: str
@@ -175,4 +176,3 @@ class Feature:
     state_files: tuple[str, ...] = ()
     may_start: str | None = None
     keep: str | None = None
-    inherit: str | None = None

@@ -102,12 +102,10 @@ class FeatureParts:
         context = OperatorContext(self._core, **later)
         self._parts += [feature.operate(context) for feature in FEATURES if feature.operate is not None]
 
-    async def inherit(self, foundation: Any, parts: Any) -> None:
-        """Add the parts that need the other parts of control."""
-        for feature in FEATURES:
-            if feature.inherit is not None:
-                part: FeaturePart = await pkgutil.resolve_name(feature.inherit)(foundation, parts)
-                self._parts.append(part)
+    def add(self, part: FeaturePart | None) -> None:
+        """Add the part of the feature that let control serve, if there is one."""
+        if part is not None:
+            self._parts.append(part)
 
     def link(self, role: str, index: int = 0) -> "tuple[Link, Any] | None":
         """Return control's end of the link to a process, with the accepted messages; None for an unknown one.
@@ -171,8 +169,7 @@ def pairing_in(state: Path) -> "Pairing | None":
     return next(filter(None, found), None)
 
 
-def start_gates() -> list[Any]:
-    """Return the gates of the features that decide when control may serve."""
-    return [
-        pkgutil.resolve_name(feature.may_start)() for feature in FEATURES if feature.may_start is not None
-    ]
+def start_gate() -> Any:
+    """Return the gate of the feature that decides when control may serve, or None if no feature does."""
+    named = (feature.may_start for feature in FEATURES if feature.may_start is not None)
+    return next((pkgutil.resolve_name(name)() for name in named), None)

@@ -15,6 +15,7 @@ from appliance.control.assembly.host_authority import HostAuthority, make_host_a
 from appliance.control.assembly.policy_gate import PolicyRefusedError
 from appliance.control.errors import StateError
 from appliance.control.links.supervisor_link import ControlLifeline
+from appliance.features.feature import FeaturePart
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.rpc.server import Handler, HttpRequest
@@ -101,3 +102,8 @@ class StartGate:
         """Wait until control may serve; return None if it is stopped first. Raises `STATE_ERRORS`."""
         del config, settings, lifeline, compiler, stopping
         return ActiveRole()
+
+    async def begin(self, base: Any, parts: Any) -> FeaturePart | None:
+        """Return a part of control, once control has its other parts (`Foundation`, `Parts`) and before it serves."""
+        del base, parts
+        return None

@@ -61,5 +61,4 @@ STANDBY = Feature(
     pairing=_pairing,
     state_files=(f"{FOLDER}/{FILE}", f"{FOLDER}/{LEFT_FILE}"),
     may_start=f"{_PLACE}start_gate:StandbyGate",
-    inherit=f"{_PLACE}service_begin:inherit",
 )  # fmt: skip

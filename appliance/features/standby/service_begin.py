@@ -15,9 +15,9 @@ from appliance.control.operators.request_method import RequestMethod
 from appliance.features.feature import FeaturePart
 from appliance.features.standby import lease_link, standby_requests
 from appliance.features.standby.inheritance import StateCopies, inherited_state, keep_state, leave_state
+from appliance.features.standby.paired_role import PairedRole
 from appliance.features.standby.replication import Pair
 from appliance.features.standby.standby_orders import ActiveAppliance, SingleAppliance, StandbyOrders
-from appliance.features.standby.start_gate import PairedRole
 from appliance.features.standby.stored_times import note_times
 from appliance.features.standby.takeover_record import TakeoverRecorder
 
@@ -59,7 +59,7 @@ _SEAL_SECONDS = 0.5  # the robot waits
 _log = structlog.get_logger()
 
 
-async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
+async def begin(base: Foundation, parts: Parts) -> FeaturePart:
     """Return the part of the standby in control. One of two appliances first begins its epoch (`_begin_epoch`)."""
     role = base.role
     if not isinstance(role, PairedRole):
