@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from appliance.channel import admin
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
+from appliance.features.standby import standby_requests
 from tests.support.features.standby.standby_site import ADDRESSES, ROBOT, StandbySite
 from tests.support.processes import Process
 from tests.support.small_disk import filled
@@ -157,7 +157,7 @@ def _promoted(
 
 def _promote(site: StandbySite, name: str, said: Said) -> None:
     try:
-        answer = AdminSocket(site.appliances[name].state, _PROMOTE_SECONDS).ask(admin.StandbyPromote())
+        answer = AdminSocket(site.appliances[name].state, _PROMOTE_SECONDS).ask(standby_requests.StandbyPromote())
         text = "done" if answer.ok else answer.error
     except NotRunningError as error:
         text = str(error).partition(": ")[2]

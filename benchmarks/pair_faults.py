@@ -29,10 +29,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from appliance.channel import admin
-from appliance.channel.answers.standby_answers import StandbyState
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
+from appliance.features.standby import standby_requests
 from appliance.features.standby.membership import load_membership, path_of, save_membership
+from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_summary import standby_troubles
 from benchmarks.pair_fault_kinds import Fault, drawn
 from benchmarks.standby import Successes, Watch, busy
@@ -89,7 +89,7 @@ class Statuses:
     def _ask(self, name: str, state: Path) -> None:
         began = time.monotonic()
         try:
-            answer = AdminSocket(state).ask(admin.StandbyWanted())
+            answer = AdminSocket(state).ask(standby_requests.StandbyWanted())
             text = _judgement(answer.given()) if answer.ok else answer.error
         except NotRunningError as error:
             text = str(error).partition(": ")[2]
@@ -198,7 +198,7 @@ def until_whole(site: StandbySite, robot: StandbyRobot) -> None:
     robot.lost_nothing()
     eventually(lambda: robot.admitted() == {ADDRESSES[site.holder()]}, site.story)
     for one in site.appliances.values():
-        eventually(lambda one=one: not [*standby_troubles(one.ask(admin.StandbyWanted()))], site.story)  # type: ignore[misc]  # mypy infers no type for a lambda's default
+        eventually(lambda one=one: not [*standby_troubles(one.ask(standby_requests.StandbyWanted()))], site.story)  # type: ignore[misc]  # mypy infers no type for a lambda's default
 
 
 def one(

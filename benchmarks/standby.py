@@ -30,8 +30,8 @@ from typing import Self
 from rich.console import Console
 from rich.table import Table
 
-from appliance.channel import admin
 from appliance.cli.connection.admin_client import NotRunningError
+from appliance.features.standby import standby_requests
 from examples.landshark.lab import Lab
 from tests.support.appliance import Appliance
 from tests.support.features.standby.standby_robot import StandbyRobot
@@ -195,7 +195,7 @@ def one_takeover(site: StandbySite, robot: StandbyRobot, *, planned: bool) -> di
             with contextlib.suppress(
                 NotRunningError
             ):  # the answer may be lost: its appliance is the standby then
-                site.appliances[active].ask(admin.StandbyPromote())
+                site.appliances[active].ask(standby_requests.StandbyPromote())
         else:
             site.cut(active)
         site.until_taken_over(passive)

@@ -102,6 +102,7 @@ async def _start(
     parts = assemble(base)
     await parts.monitors.start(restarted=restarted, taken_over=role.paired)
     base.features.add(await gate.begin(base, parts))
+    await base.features.inherit(base, parts)
     control = _Control(base, parts, make_operators(base, parts))
     await _restore(base, parts)
     await control.serve()

@@ -176,3 +176,4 @@ class Feature:
     state_files: tuple[str, ...] = ()
     may_start: str | None = None
     keep: str | None = None
+    inherit: str | None = None

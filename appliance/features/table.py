@@ -102,6 +102,13 @@ class FeatureParts:
         context = OperatorContext(self._core, **later)
         self._parts += [feature.operate(context) for feature in FEATURES if feature.operate is not None]
 
+    async def inherit(self, foundation: Any, parts: Any) -> None:
+        """Add the parts that need the other parts of control."""
+        for feature in FEATURES:
+            if feature.inherit is not None:
+                part: FeaturePart = await pkgutil.resolve_name(feature.inherit)(foundation, parts)
+                self._parts.append(part)
+
     def add(self, part: FeaturePart | None) -> None:
         """Add the part of the feature that let control serve, if there is one."""
         if part is not None:

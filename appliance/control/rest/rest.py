@@ -69,7 +69,7 @@ class RestLink:
         *,
         served: Callable[[str], None],
         certified: Callable[[str], None],
-        connected: Callable[[str, str, str, int], tuple[int, str]],
+        connected: Callable[[str, str, str, int], tuple[int, str]] = lambda *_entry: (404, "there is no door"),
         require_proof: bool,
     ) -> None:
         self._administration = administration

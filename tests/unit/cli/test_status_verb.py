@@ -1,6 +1,7 @@
 """How `rosrv status` shows ages and long lists; `status.txt` has the rest."""
 
-from appliance.cli.status_verb import age, shortened
+from appliance.base.ages import age
+from appliance.cli.status_verb import shortened
 
 
 def test_ages_are_two_units() -> None:
