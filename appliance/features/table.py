@@ -94,12 +94,16 @@ class FeatureParts:
 
     def connected(self, door: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
         """Pass a WebSocket of the api on; return an HTTP status and why it is refused, or an empty text."""
-        (connected,) = filter(None, (part.connected for part in self._parts))
-        return connected(door, ticket, peer, descriptor)
+        connected = next(filter(None, (part.connected for part in self._parts)), None)
+        return (
+            connected(door, ticket, peer, descriptor)
+            if connected is not None
+            else (404, "there are no doors")
+        )
 
     def operate(self, **later: Any) -> None:
         """Add the parts that need objects of control that exist now: the fields of `OperatorContext`."""
-        context = OperatorContext(self._core, **later)
+        context = OperatorContext(self._core, **later, kept=self.kept)
         self._parts += [feature.operate(context) for feature in FEATURES if feature.operate is not None]
 
     async def inherit(self, foundation: Any, parts: Any) -> None:

@@ -50,6 +50,7 @@ _TEXT = 300
 _DENIED = (401, 403, 421, 429)
 _METHODS = ("POST", "PUT", "PATCH", "DELETE")  # a rejected request with one of these methods changed nothing
 _MOST_SLOW = 16
+NO_DOORS = (503, "this appliance opens no doors now")
 
 
 class RestLink:
@@ -57,7 +58,7 @@ class RestLink:
 
     `served(pin)` is called with the pin by which hosts recognise the api, and `certified(sha256)`
     with the fingerprint of its certificate. `connected(door, ticket, peer, descriptor)` passes a WebSocket on, and
-    returns why it is refused. `require_proof`: every change needs a signed
+    returns a status and why it is refused. `require_proof`: every change needs a signed
     request, because a bare token is not enough.
     """
 
@@ -69,8 +70,8 @@ class RestLink:
         *,
         served: Callable[[str], None],
         certified: Callable[[str], None],
-        connected: Callable[[str, str, str, int], tuple[int, str]] = lambda *_entry: (404, "there is no door"),
         require_proof: bool,
+        connected: Callable[[str, str, str, int], tuple[int, str]] = lambda *_connection: NO_DOORS,
     ) -> None:
         self._administration = administration
         self._tokens = tokens

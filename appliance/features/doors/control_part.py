@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+from collections.abc import Mapping
 from typing import Any
 
 import structlog
@@ -19,8 +20,8 @@ from appliance.features.doors.door_processes import DoorProcesses
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.door_tickets import DoorTickets
 from appliance.features.doors.settings import MOST_DOORS, Doors
-from appliance.features.feature import FeaturePart
-from appliance.policy.model import address_of
+from appliance.features.feature import FeaturePart, OperatorContext
+from appliance.policy.model import Address, address_of
 from appliance.store.door_tables import DoorRow, TicketRow
 from appliance.store.state_file import StateStore
 from appliance.store.stored_deadlines import StoredDeadlines
@@ -30,7 +31,19 @@ _RETRY_SECONDS = 10
 _log = structlog.get_logger()
 
 
-async def keep(sections: Sections, store: StateStore, lifeline: ControlLifeline) -> DoorTable:
+class KeptDoors:
+    """The doors in the state, and the orders about them once control has its other parts."""
+
+    def __init__(self, table: DoorTable) -> None:
+        self.table = table
+        self.orders: DoorOrders
+
+    def addresses(self) -> Mapping[str, Address]:
+        """Return the addresses of `door:NAME` in the policy."""
+        return self.table.addresses()
+
+
+async def keep(sections: Sections, store: StateStore, lifeline: ControlLifeline) -> KeptDoors:
     """Return the table of doors, with addresses that no other program can use, before the policy names them."""
     settings = sections.of(Doors)
     table = DoorTable(store, settings)
@@ -38,27 +51,47 @@ async def keep(sections: Sections, store: StateStore, lifeline: ControlLifeline)
         table.problem = await lifeline.open_own_network(settings.network, table.ports())
     if table.problem:
         _log.error("doors cannot be used", reason=table.problem)
-    return table
+    return KeptDoors(table)
 
 
 async def inherit(base: Foundation, parts: Any) -> FeaturePart:
-    """Return the part."""
-    table = base.features.kept["doors"]
-    assert isinstance(table, DoorTable)  # noqa: S101  `keep` made it
+    """Return the part with the processes of doors."""
+    kept = base.features.kept["doors"]
+    assert isinstance(kept, KeptDoors)  # noqa: S101  `keep` made it
+    table = kept.table
     ends = StoredDeadlines(base.store)
     processes = DoorProcesses(base, table)
-    orders = DoorOrders(base, parts, table, DoorTickets(base.store, ends), processes)
+    orders = kept.orders = DoorOrders(base, parts, table, DoorTickets(base.store, ends), processes)
     return FeaturePart(
         links=processes.links(),
-        methods=(
-            RequestMethod(door_requests.DoorsWanted, orders.listed),
-            RequestMethod(door_requests.DoorAdd, orders.add, who=True),
-            RequestMethod(door_requests.DoorRemove, orders.remove, who=True, full_disk=True),
-            RequestMethod(door_requests.DoorTicket, orders.ticket, who=True),
-        ),
         limits=orders.limits,
         connected=orders.enter,
         work={"the doors": orders.watch, "the ends of tickets of doors": ends.watch},
+    )
+
+
+def operate(context: OperatorContext) -> FeaturePart:
+    """Return the part that answers operators' requests."""
+
+    def orders() -> DoorOrders:
+        kept = context.kept["doors"]
+        assert isinstance(kept, KeptDoors)  # noqa: S101  `keep` made it
+        return kept.orders
+
+    return FeaturePart(
+        methods=(
+            RequestMethod(door_requests.DoorsWanted, lambda request: orders().listed(request)),
+            RequestMethod(door_requests.DoorAdd, lambda request, who: orders().add(request, who), who=True),
+            RequestMethod(
+                door_requests.DoorRemove,
+                lambda request, who: orders().remove(request, who),
+                who=True,
+                full_disk=True,
+            ),
+            RequestMethod(
+                door_requests.DoorTicket, lambda request, who: orders().ticket(request, who), who=True
+            ),
+        )
     )
 
 

@@ -27,7 +27,7 @@ class Ticket(msgspec.Struct, frozen=True):
 class Door(msgspec.Struct, frozen=True, kw_only=True):
     """The door of one identity. The policy names it `door:NAME`."""
 
-    name: str
+    name: Annotated[str, doc("`door:NAME` in the policy")]
     address: Annotated[str, doc("its source address inside the appliance, as in records")]
     node: Annotated[str, doc("the name of its ROS node")]
     added: Moment
@@ -39,19 +39,19 @@ class Door(msgspec.Struct, frozen=True, kw_only=True):
     sent: Annotated[int, doc("frames to clients since the start of its process")]
     dropped: Annotated[int, doc("messages for clients that read too slowly")]
     refused: Annotated[int, doc("connections in excess of the limits")]
-    tickets: list[Ticket]
+    tickets: Annotated[list[Ticket], doc("that can be used now")]
 
 
 class DoorList(msgspec.Struct, frozen=True):
-    """All doors, the oldest first."""
+    """All doors."""
 
-    doors: list[Door]
+    doors: Annotated[list[Door], doc("the oldest first")]
 
 
 class NewTicket(Ticket, frozen=True, kw_only=True):
     """A new ticket with its text, which is shown only here."""
 
-    door: str
+    door: Annotated[str, doc("that it opens")]
     ticket: Annotated[str, doc("the secret; whoever has it uses the door")]
     path: Annotated[str, doc("of the WebSocket at the REST port, with the ticket")]
 
@@ -60,7 +60,10 @@ class NewDoor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A door; an agent's door has a port, and may have the agent's address or network."""
 
     name: Annotated[str, msgspec.Meta(max_length=31)]
-    port: Annotated[int, msgspec.Meta(ge=1024, le=65_535)] | None = None
+    port: Annotated[
+        Annotated[int, msgspec.Meta(ge=1024, le=65_535)] | None,
+        doc("port of an agent; null: only tickets open the door"),
+    ] = None
     source: Annotated[
         str, doc("address or network of the agent; empty: any"), msgspec.Meta(max_length=64)
     ] = ""

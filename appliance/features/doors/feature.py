@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from appliance.cli.verb_table import Group, Verb
 from appliance.features.doors.settings import MOST_DOORS, Doors
-from appliance.features.feature import Feature
+from appliance.features.feature import Feature, FeaturePart, OperatorContext
 from appliance.supervisor.role import Role
 from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
 
@@ -19,6 +19,12 @@ def _operations() -> "tuple[type[AdminRequest[Any]], ...]":
     from appliance.features.doors.door_requests import REQUESTS  # noqa: PLC0415  few processes need it
 
     return REQUESTS
+
+
+def _operate(context: OperatorContext) -> FeaturePart:
+    from appliance.features.doors.control_part import operate  # noqa: PLC0415  only control needs it
+
+    return operate(context)
 
 
 DOORS = Feature(
@@ -45,6 +51,7 @@ DOORS = Feature(
             after="host",
         )
     },
+    operate=_operate,
     keep=f"{_PART}:keep",
     inherit=f"{_PART}:inherit",
 )  # fmt: skip

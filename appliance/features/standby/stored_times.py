@@ -1,9 +1,9 @@
 """Move the times in the state to this appliance's clocks when it takes over from the other one.
 
-The state has ends of durations: of blocks, commit-confirm, timed disables, tokens and their grace time, and one-time
-tokens of hosts. They are in the clocks of the appliance that wrote them. The active appliance replicates a reading of
-its clocks every `READ_SECONDS`. At a takeover, all ends move by the difference between both appliances' clocks, in one
-write, so that each duration has the time left that it had.
+The state has ends of durations: of blocks, commit-confirm, timed disables, tokens and their grace time, tickets of
+doors, and one-time tokens of hosts. They are in the clocks of the appliance that wrote them. The active appliance
+replicates a reading of its clocks every `READ_SECONDS`. At a takeover, all ends move by the difference between both
+appliances' clocks, in one write, so that each duration has the time left that it had.
 
 If this appliance did not follow the other one before the takeover, the difference is not known: it may be time off.
 Durations then go on from the last reading: a block never ends early. The ends of tokens stay as they are, because they
@@ -57,6 +57,8 @@ def adopt_times(store: StateStore, pair: Pair, age: Callable[[], int]) -> None:
             store.hosts.save_awaited(awaited._replace(expires=awaited.expires + shift))
         if pair.away_seconds is not None:
             store.save_tokens(*(row._replace(expires=row.expires + shift) for row in store.tokens()))
+            tickets = store.doors.tickets()
+            store.doors.save_tickets(*(row._replace(expires=row.expires + shift) for row in tickets))
         _save(store, now)
 
 

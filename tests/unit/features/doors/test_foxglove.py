@@ -14,7 +14,7 @@ from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.definitions import Definitions
 from roswire.node import MessageType, RosNode, ServiceFailedError, ServiceType
 from roswire.standard import standard_definitions
-from tests.support.door_world import DoorWorld, WebSocketClient, door_world
+from tests.support.features.doors.door_world import DoorWorld, WebSocketClient, door_world
 
 pytestmark = pytest.mark.anyio
 OWN = Definitions.from_files({"own/Load.msg": "geometry_msgs/Point32 at\nfloat32 weight"})

@@ -17,7 +17,7 @@ from roswire.errors import PeerError
 from roswire.node import MasterDenialError
 from roswire.standard import standard_definitions
 from roswire.xmlrpc import Value
-from tests.support.door_world import door_world
+from tests.support.features.doors.door_world import door_world
 
 pytestmark = pytest.mark.anyio
 ACTION = {f"/move_base/{part}": ["/move_base"] for part in ("cancel", "feedback", "goal", "result", "status")}

@@ -10,7 +10,7 @@ from websockets.datastructures import Headers
 from appliance.features.doors.origins import rejection
 from roswire.node import MessageType, RosNode, ServiceFailedError, ServiceType
 from roswire.standard import standard_definitions
-from tests.support.door_world import DOOR, WebSocketClient, door_world
+from tests.support.features.doors.door_world import DOOR, WebSocketClient, door_world
 
 pytestmark = pytest.mark.anyio
 

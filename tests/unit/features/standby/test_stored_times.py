@@ -151,7 +151,7 @@ async def test_without_a_view_of_the_other_appliance_durations_go_on_from_the_la
         assert left == {name: pytest.approx(HOUR - 600.0) for name in left}
 
 
-MOVED = {"token.expires", "enrolment_token.expires", "host_block.ends"}
+MOVED = {"token.expires", "door_ticket.expires", "enrolment_token.expires", "host_block.ends"}
 DATES = {
     "incarnation.changed": "monotonic seconds, used only for the order",
     "policy_revision.loaded": "shown to people",
@@ -169,6 +169,7 @@ DATES = {
     "enrolment_token.days": "a length", "revoked_certificate.moment": "a date of the list of revoked certificates",
     "revocation.moment": "a date of the list of revoked certificates",
     "revocation.expires": "the end of a certificate, which is a date", "host_block.since": "shown to people",
+    "door.added": "shown to people", "door.removed": "shown to people", "door_ticket.created": "shown to people",
     "authority.signed": "a date of the list of revoked certificates",
     "appliance.expires": "the end of a certificate, which is a date",
 }  # fmt: skip

@@ -12,7 +12,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from tests.support.nodes import RosSession
-from tests.support.real_door import real_door
+from tests.support.features.doors.real_door import real_door
 from tests.support.site import Site
 
 SECONDS = 20.0

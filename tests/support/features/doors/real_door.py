@@ -1,4 +1,4 @@
-"""A door on real sockets: `python -m tests.support.real_door MASTER_URI ADDRESS PORT [FILE.srv …]` serves until killed.
+"""A door on real sockets: `python -m tests.support.features.doors.real_door MASTER_URI ADDRESS PORT [FILE.srv …]` serves until killed.
 
 It is assembled as the door process will be: each connection comes as a descriptor from another part, which listens.
 """
