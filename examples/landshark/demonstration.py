@@ -2,8 +2,9 @@
 
 A lab on this machine has four hosts: the appliance, a simulated LandShark of real ROS nodes, its operator, and an
 attacker. The operator drives and fires. The attacker tries everything that ROS 1 allows any host. For each attempt, the
-demo reads the deciding rule from the audit log. Finally the operator makes mistakes that no policy can forbid, and
-monitors prevent them. Scripts can rely on the exit status: 0 if the robot obeyed only its operator.
+demo reads the deciding rule from the audit log. Then the operator makes mistakes that no policy can forbid, and
+monitors prevent them. Finally the operator's link is cut at full speed, and guards stop the robot. Scripts can rely on
+the exit status: 0 if the robot obeyed only its operator.
 """
 
 import shutil
@@ -28,6 +29,7 @@ from examples.landshark.doorway import Doorway
 from examples.landshark.lab import Lab
 from examples.landshark.mistakes import Mistakes, Ways
 from examples.landshark.results import Result
+from examples.landshark.runaways import Runaways
 from examples.landshark.stage import (
     ATTACKER,
     MASTER_URI,
@@ -97,7 +99,7 @@ class Show:
         self.expect_blocked(self.stage.attack(BYPASS))
         self.aftermath(operator, before)
         operator.stop()
-        self.ways = Mistakes(self.stage, self).run()
+        self.ways = {**Mistakes(self.stage, self).run(), **Runaways(self.stage, self).run()}
         self.summary()
         return all(result.good for result in self.results)
 

@@ -12,6 +12,7 @@ from examples.landshark.nodes import physics
 if TYPE_CHECKING:
     from examples.landshark.drive import Drive
 
+FENCE = 8.0  # metres, as in runaways.py
 ZONE = 20.0  # metres, as in safe_zone.rv
 LOWEST = -0.45  # radians, as in safe_triggering.rv
 SCALE = 16.0  # pixels a metre
@@ -50,8 +51,13 @@ def draw(without: "Drive", guarded: "Drive") -> str:
     return "\n".join(parts) + "\n"
 
 
-def draw_ways(without: list[physics.Pose], guarded: list[physics.Pose]) -> str:
-    """Return the picture of two drives with only their positions."""
+def draw_ways(
+    without: list[physics.Pose],
+    guarded: list[physics.Pose],
+    cut: list[physics.Pose] | None = None,
+    stopped: list[physics.Pose] | None = None,
+) -> str:
+    """Return the picture of two drives with only their positions, and of two drives whose link is `cut`."""
     parts = [
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1000 640" role="img">',
         "<title>The LandShark's ways from above, without and with monitors</title>",
@@ -62,10 +68,32 @@ def draw_ways(without: list[physics.Pose], guarded: list[physics.Pose]) -> str:
         _track(without, "without"),
         _track(guarded, "guarded"),
         *(_end(way[-1], colour) for way, colour in ((without, WITHOUT), (guarded, GUARDED))),
+        *(_cut(cut, stopped) if cut and stopped else ()),
         *_legend_of_ways(),
         "</svg>",
     ]
     return "\n".join(parts) + "\n"
+
+
+def _cut(cut: list[physics.Pose], stopped: list[physics.Pose]) -> list[str]:
+    """Draw the drives to the west whose link is cut, and the fence."""
+    left, top = _at(-FENCE, FENCE)
+    size = 2 * FENCE * SCALE
+    x, y = _at(stopped[1].x, stopped[1].y)
+    return [
+        f'<rect x="{left}" y="{top}" width="{size}" height="{size}" fill="none" stroke="#7c3aed" '
+        'stroke-dasharray="3 5"/>',
+        _text(left + 6, top + 16, "fence", "small"),
+        *(_track(way, kind) for way, kind in ((cut, "without"), (stopped, "guarded"))),
+        *(_end(way[-1], colour) for way, colour in ((cut, WITHOUT), (stopped, GUARDED))),
+        f'<path d="M{x:.1f} {y - 12:.1f}v24" stroke="#b91c1c" stroke-width="3"/>',
+        _text(x, y + 28, "link cut", "small", "middle"),
+        _text(
+            *_at(-FENCE, -1.9),
+            "without a guard it drives on; with guards it stops, and stays inside",
+            "small",
+        ),
+    ]
 
 
 def _at(x: float, y: float) -> tuple[float, float]:

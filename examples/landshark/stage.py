@@ -151,12 +151,14 @@ class Stage:
         self.appliances = [APPLIANCE]
         self.shipped = shipped
         self.nodes = shipped / "examples" / "landshark" / "nodes"
-        self.monitors = shipped / "monitors"
         self.policy = shipped / "examples" / "landshark" / "landshark-demo.ini"
         self.directory = Path(tempfile.mkdtemp(prefix="rosrv-demo-"))
         self.directory.chmod(0o755)  # the appliance's processes run as other users
+        # A copy, because `rosrv guard new` writes into the folder of specifications.
+        self.monitors = shutil.copytree(shipped / "monitors", self.directory / "monitors")
         self.state = self.directory / "state"
         self._radar: Path | None = None
+        self._lab = lab
         self.appliance_host = lab.host("appliance", f"{APPLIANCE}/24")
         self.robot_host = lab.host("robot", f"{ROBOT}/24")
         self.operator_host = lab.host("ocu", f"{OPERATOR}/24")
@@ -266,13 +268,35 @@ class Stage:
         """Forward a port of this machine to the console, which listens on loopback of the appliance's host."""
         return Doorway(self.appliance_host, CONSOLE)
 
-    def enable_monitor(self, name: str) -> None:
-        """Run `rosrv monitor enable NAME`, while the robot runs."""
-        command = [sys.executable, "-m", "appliance.cli.main", "monitor", "enable", name]
-        command += ["--state", str(self.state)]
+    def rosrv(self, *arguments: str) -> None:
+        """Run `rosrv` with these arguments, while the robot runs."""
+        command = [sys.executable, "-m", "appliance.cli.main", *arguments, "--state", str(self.state)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=START_SECONDS, check=False)
         if done.returncode:
-            raise DemoError(f"the monitor {name} cannot be enabled: {done.stderr.strip()}")
+            raise DemoError(f"rosrv {' '.join(arguments)} failed: {done.stderr.strip()}")
+
+    def start_runaway(self) -> Actor:
+        """Replace the robot's base by one that does not stop when commands cease."""
+        for base in [actor for actor in self.actors if actor.name == "landshark_base"]:
+            base.stop()
+            self.actors.remove(base)
+        command = [NODE_PYTHON, str(self.nodes / "base.py"), "runaway"]
+        return self._start(self.robot_host, "landshark_base", command)
+
+    def cut_while_driving(self, forward: float) -> Callable[[], None]:
+        """Have the operator drive, and cut the link at full speed; return the function that plugs it in again."""
+        command = [NODE_PYTHON, str(self.nodes / "command.py"), "dash", str(forward)]
+        actor = self._start(self.operator_host, "ocu command", command)
+        actor.expect("dashing", COMMAND_SECONDS)
+        self._lab.unplug(self.operator_host)
+
+        def plug() -> None:
+            actor.process.kill()  # before its old commands can arrive
+            actor.stop()
+            self.actors.remove(actor)
+            self._lab.plug(self.operator_host)
+
+        return plug
 
     def attack(self, name: str) -> Attack:
         """Have the attacker try one attack."""

@@ -1,6 +1,7 @@
 """Two ways of the robot from above, as `rosrv demo --picture` saw them: `python -m examples.landshark.ways WAYS SVG`.
 
-WAYS is a JSON file, `{"without": [[x, y], ...], "guarded": [[x, y], ...]}` in metres.
+WAYS is a JSON file, `{"without": [[x, y], ...], "guarded": [[x, y], ...]}` in metres. With `cut` and `stopped`, it also
+has the paths of a robot whose link is cut.
 """
 
 import argparse
@@ -18,8 +19,8 @@ def main() -> None:
     parser.add_argument("svg", type=Path)
     options = parser.parse_args()
     ways = json.loads(options.ways.read_text(encoding="utf-8"))
-    without, guarded = ([physics.Pose(x, y) for x, y in ways[name]] for name in ("without", "guarded"))
-    options.svg.write_text(draw_ways(without, guarded), encoding="utf-8")
+    paths = {name: [physics.Pose(x, y) for x, y in way] for name, way in ways.items()}
+    options.svg.write_text(draw_ways(**paths), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,7 @@
-"""Run /landshark_base, the motors: velocity commands in, odometry out. The robot stops when commands cease."""
+"""Run /landshark_base, the motors: velocity commands in, odometry out. The robot stops when commands cease.
+
+With the argument `runaway` it lacks this timeout, as many real drivers do. It then faces west, and reports its motion.
+"""
 
 import math
 import threading
@@ -7,6 +10,7 @@ import physics
 import rospy
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
+from report import report
 
 HERTZ = 20.0
 
@@ -14,9 +18,10 @@ HERTZ = 20.0
 class Base:
     """The moving robot."""
 
-    def __init__(self):
+    def __init__(self, runaway):
         self.lock = threading.Lock()
-        self.pose = physics.Pose()
+        self.runaway = runaway
+        self.pose = physics.Pose(heading=math.pi if runaway else 0.0)
         self.velocity = physics.Velocity()
         self.told = rospy.Time(0)
         self.odometry = rospy.Publisher("/landshark/odom", Odometry, queue_size=10)
@@ -34,7 +39,7 @@ class Base:
         """Move for this number of seconds, and publish the robot's position."""
         now = rospy.Time.now()
         with self.lock:
-            if (now - self.told).to_sec() > physics.COMMAND_LIFETIME:
+            if not self.runaway and (now - self.told).to_sec() > physics.COMMAND_LIFETIME:
                 self.velocity = physics.Velocity()
             self.pose = physics.drive(self.pose, self.velocity, seconds)
             pose, velocity = self.pose, self.velocity
@@ -46,12 +51,14 @@ class Base:
         message.pose.pose.orientation.w = math.cos(pose.heading / 2)
         message.twist.twist.linear.x, message.twist.twist.angular.z = velocity.forward, velocity.turn
         self.odometry.publish(message)
+        if self.runaway:
+            report("moved", x=round(pose.x, 2), y=round(pose.y, 2), speed=round(velocity.forward, 2))
 
 
 def main():
     """Run until a signal ends the program."""
     rospy.init_node("landshark_base")
-    base = Base()
+    base = Base(runaway="runaway" in rospy.myargv())
     rate = rospy.Rate(HERTZ)
     while not rospy.is_shutdown():
         base.step(1 / HERTZ)

@@ -1,10 +1,13 @@
-"""Give one command of an operator: `command.py drive FORWARD TURN SECONDS`, `reach X Y`, `aim PAN TILT`, `fire`.
+"""Give one command of an operator.
+
+    command.py drive FORWARD TURN SECONDS | dash FORWARD | reach X Y | aim PAN TILT | fire
 
 Positions are in metres, speeds in metres and radians a second, angles in radians. The program waits for the driver and
-prints one JSON object. `drove` has the position at the end. `reached` has the way, whether the robot arrived, its
-smallest distance from the obstacle's edge (negative inside), and its largest distance from the origin. `aimed` has the
-angle reached, and `fired` the number of shots so far. A message that is published once is latched for a while, as with
-`rostopic pub -1`, so that a driver or recorder that connects a little later also receives it.
+prints one JSON object. `drove` has the position at the end. `dashing` says that the robot is under way, and the program
+drives on. `reached` has the way, whether the robot arrived, its smallest distance from the obstacle's edge (negative
+inside), and its largest distance from the origin. `aimed` has the angle reached, and `fired` the number of shots so
+far. A message that is published once is latched for a while, as with `rostopic pub -1`, so that a driver or recorder
+that connects a little later also receives it.
 """
 
 import math
@@ -77,6 +80,24 @@ def drive(forward, turn, seconds):
     report("drove", x=round(position.x, 2), y=round(position.y, 2))
 
 
+def dash(forward):
+    """Drive until the program is killed."""
+    display = Display("/landshark/odom", Odometry)
+    publisher = connected(rospy.Publisher("/landshark_control/base_velocity", TwistStamped, queue_size=10))
+    display.wait(lambda _odometry: True)
+    begin, rate, dashing = physics.pose_of(display.message), rospy.Rate(HERTZ), False
+    for _ in range(int(UNDER_WAY * HERTZ)):
+        message = TwistStamped()
+        message.header.stamp = rospy.Time.now()
+        message.twist.linear.x = forward
+        publisher.publish(message)
+        pose = physics.pose_of(display.message)
+        if not dashing and math.hypot(pose.x - begin.x, pose.y - begin.y) > 1.0:
+            dashing = True
+            report("dashing", x=round(pose.x, 2))
+        rate.sleep()
+
+
 def reach(x, y):
     """Drive straight to a place at top speed; give up when the robot gets no nearer."""
     display = Display("/landshark/odom", Odometry)
@@ -136,9 +157,17 @@ def fire():
 def main():
     """Carry out one command."""
     what, *values = rospy.myargv()[1:] or ["nothing"]
-    actions = {"drive": (drive, 3), "reach": (reach, 2), "aim": (aim, 2), "fire": (fire, 0)}
+    actions = {
+        "drive": (drive, 3),
+        "dash": (dash, 1),
+        "reach": (reach, 2),
+        "aim": (aim, 2),
+        "fire": (fire, 0),
+    }
     if what not in actions or len(values) != actions[what][1]:
-        sys.exit("usage: command.py drive FORWARD TURN SECONDS | reach X Y | aim PAN TILT | fire")
+        sys.exit(
+            "usage: command.py drive FORWARD TURN SECONDS | dash FORWARD | reach X Y | aim PAN TILT | fire"
+        )
     rospy.init_node("ocu")
     actions[what][0](*map(float, values))
     rospy.sleep(LATCHED)
