@@ -54,8 +54,6 @@ FEATURES: tuple[Feature, ...] = (
     BACKUP,
     SELFTEST,
     DEMO,
-    TUNNELS,
-    POLICY_TOOLS,
     SSO,
     AUTHORITY,
     METRICS,

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from appliance.cli.verb_table import Group, Verb
 from appliance.features.authority.settings import AuthoritySettings
-from appliance.features.feature import Feature
+from appliance.features.feature import ConsolePart, Feature
 
 if TYPE_CHECKING:
     from appliance.channel.admin import AdminRequest
@@ -22,6 +22,7 @@ AUTHORITY = Feature(
     "authority",
     settings=AuthoritySettings,
     operations=_operations,
+    console=(ConsolePart("robot", "panel.js", "Drive"),),
     verbs={
         "drive": Group(
             "Say which host may drive: one at a time holds each group of [Authority].",

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from appliance.cli.verb_table import Group, Verb
 from appliance.features.doors.settings import MOST_DOORS, Doors
-from appliance.features.feature import Feature, FeaturePart, OperatorContext
+from appliance.features.feature import ConsolePart, Feature, FeaturePart, OperatorContext
 from appliance.supervisor.role import Role
 from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
 
@@ -39,6 +39,7 @@ DOORS = Feature(
         ),
     ),
     operations=_operations,
+    console=(ConsolePart("robot", "panel.js", "Doors"),),
     verbs={
         "door": Group(
             "Let browsers, viewers and agents in, each with its own rights.",

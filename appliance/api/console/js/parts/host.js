@@ -40,6 +40,12 @@ export function useShown() {
   return useMemo(() => (/** @type {string} */ address) => [nameOf(address, known), address].filter(Boolean).join(" "), [known]);
 }
 
+/** The names of all hosts that have one. @returns {string[]} */
+export function useHosts() {
+  const known = useStore(labels);
+  return useMemo(() => [...new Set(known.map(({ name }) => name))].sort(), [known]);
+}
+
 /** @param {{value: string | null | undefined, none?: string}} given */
 export function Host({ value, none = "–" }) {
   const name = useStore(labels, (known) => nameOf(value, known));

@@ -1,0 +1,71 @@
+/** Command authority on the robot's page: who holds each group of topics and services, who waits, and the hand-over. */
+
+import { html, useEffect, useId, useState } from "#console/html.js";
+import { lasting } from "#console/moments.js";
+import { Badge } from "#console/parts/badge.js";
+import { Button } from "#console/parts/button.js";
+import { Dialog } from "#console/parts/dialog.js";
+import { Field } from "#console/parts/field.js";
+import { Given } from "#console/parts/given.js";
+import { Host, useHosts } from "#console/parts/host.js";
+import { Empty, Failure, Loading } from "#console/parts/notice.js";
+import { useResource } from "#console/parts/resource.js";
+import { done, failed } from "#console/parts/toast.js";
+import { ask, get } from "#console/rest.js";
+
+const EVERY = 2000; // milliseconds
+const SAID = { take: "Take", give: "Give", ask: "Ask" };
+
+export function Drive() {
+  const { value, error, again } = useResource((signal) => get("/v1/drive", {}, signal), []);
+  useEffect(() => {
+    const timer = setInterval(again, EVERY);
+    return () => clearInterval(timer);
+  }, []);
+  const rows = value?.groups ?? [];
+  return html`<section class="panel" aria-labelledby="drive"><div class="panel-head"><h2 id="drive">Who drives</h2></div>
+    ${error && !value ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : !value ? html`<${Loading} rows=${2} />`
+      : !rows.length ? html`<${Empty} icon="hosts" title="No command authority">Every host with the right to publish commands the robot. <code>[Authority]</code> in the policy names topics that one host at a time commands.</${Empty}>`
+      : html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>Group</th><th>Holder</th><th>Waits</th><th><span class="sr-only">Actions</span></th></tr></thead>
+        <tbody>${rows.map((/** @type {any} */ one) => html`<${Group} key=${one.group} group=${one} again=${again} />`)}</tbody></table></div>`}</section>`;
+}
+
+function Group(/** @type {{group: any, again: () => void}} */ { group, again }) {
+  const [open, setOpen] = useState(/** @type {keyof typeof SAID | ""} */ (""));
+  const button = (/** @type {keyof typeof SAID} */ verb, /** @type {any} */ more = {}) => html`<${Button} small role="operator" ...${more} onClick=${() => setOpen(verb)}>${SAID[verb]}…</${Button}>`;
+  return html`<tr data-group=${group.group}>
+    <td class="first"><strong><${Given} value=${group.group} most=${64} /></strong><div class="muted small">${group.names.map((/** @type {string} */ name) => html`<div key=${name}><${Given} value=${name} mono most=${80} /></div>`)}</div></td>
+    <td data-label="Holder"><div>${group.holder ? html`<${Host} value=${group.holder} /><div class="muted small">for ${lasting(group.held_seconds)}; ends after ${lasting(group.lease)} of silence${group.left_seconds !== null && group.left_seconds < group.lease / 2 && html` <${Badge} word=${`silent: ${group.left_seconds.toFixed(1)} s left`} tone="warn" />`}</div>` : html`<${Badge} word="nobody" />`}</div></td>
+    <td data-label="Waits"><div>${group.waiting.length ? group.waiting.map((/** @type {string} */ host) => html`<div key=${host}><${Host} value=${host} /></div>`) : html`<span class="muted">–</span>`}</div></td>
+    <td><div class="row row-end">${button("take", { tone: group.holder ? "" : "primary" })}${button("give", { disabled: !group.holder, why: "Nobody holds it" })}${button("ask")}</div>
+      ${open && html`<${HandOver} verb=${open} group=${group} again=${again} close=${() => setOpen("")} />`}</td></tr>`;
+}
+
+function HandOver(/** @type {{verb: keyof typeof SAID, group: any, again: () => void, close: () => void}} */ { verb, group, again, close }) {
+  const [host, setHost] = useState(verb === "give" ? (group.waiting[0] ?? "") : "");
+  const hosts = useHosts();
+  const id = useId();
+  const give = verb === "give";
+  const go = async () => {
+    try {
+      const { body } = await ask("POST", `/v1/drive/${encodeURIComponent(group.group)}/${verb}`, { json: give ? { to: host } : { host }, match: "*" });
+      done(body.holder ? `${body.holder} holds ${body.group}` : `Nobody holds ${body.group}`, body.waiting.length ? `${body.waiting.length} waiting` : "");
+      close();
+    } catch (failure) {
+      failed(failure);
+    }
+    again();
+  };
+  const text = {
+    take: "The host drives from now on, if the policy lets it take the group or override its holder. Messages of all other hosts on these topics are dropped.",
+    give: "The holder's authority ends. The group goes to this host, or without one to the first that waits.",
+    ask: "The host waits for the group. It gets the group once that is free, if the policy lets it take the group.",
+  }[verb];
+  const submit = (/** @type {Event} */ event) => {
+    event.preventDefault();
+    if (host || give) go();
+  };
+  return html`<${Dialog} title=${`${SAID[verb]} ${group.group}`} close=${close} foot=${html`<button class="button" onClick=${close}>Not now</button><${Button} role="operator" tone="primary" disabled=${!host && !give} why="Name a host" onClick=${go}>${SAID[verb]}</${Button}>`}>
+    <p>${text}</p><form onSubmit=${submit}><${Field} label="Host" mono value=${host} set=${setHost} list=${id} hint="an address, or the name of a host" /></form>
+    <datalist id=${id}>${hosts.map((one) => html`<option key=${one} value=${one}></option>`)}</datalist></${Dialog}>`;
+}
