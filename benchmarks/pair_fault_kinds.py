@@ -157,7 +157,9 @@ def _promoted(
 
 def _promote(site: StandbySite, name: str, said: Said) -> None:
     try:
-        answer = AdminSocket(site.appliances[name].state, _PROMOTE_SECONDS).ask(standby_requests.StandbyPromote())
+        answer = AdminSocket(site.appliances[name].state, _PROMOTE_SECONDS).ask(
+            standby_requests.StandbyPromote()
+        )
         text = "done" if answer.ok else answer.error
     except NotRunningError as error:
         text = str(error).partition(": ")[2]

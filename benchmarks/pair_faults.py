@@ -198,7 +198,9 @@ def until_whole(site: StandbySite, robot: StandbyRobot) -> None:
     robot.lost_nothing()
     eventually(lambda: robot.admitted() == {ADDRESSES[site.holder()]}, site.story)
     for one in site.appliances.values():
-        eventually(lambda one=one: not [*standby_troubles(one.ask(standby_requests.StandbyWanted()))], site.story)  # type: ignore[misc]  # mypy infers no type for a lambda's default
+        eventually(
+            lambda one=one: not [*standby_troubles(one.ask(standby_requests.StandbyWanted()))], site.story
+        )  # type: ignore[misc]  # mypy infers no type for a lambda's default
 
 
 def one(

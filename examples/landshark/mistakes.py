@@ -85,7 +85,7 @@ class Mistakes:
         return self._stage.command("reach", *place)
 
     def _enable(self, name: str, file: str) -> None:
-        self._stage.rosrv("monitor", "enable", name)
+        self._stage.order("monitor", "enable", name)
         self._narrator.say(f"rosrv monitor enable {name}  ({self._stage.monitors / file})")
 
     def _fires(self, what: str, *, hit: bool) -> None:

@@ -29,7 +29,7 @@ class Runaways:
             "The operator's link is cut at full speed, and the base has no timeout of its own"
         )
         for monitor in ("obstacleAvoidance", "safeZone"):
-            self._stage.rosrv("monitor", "disable", monitor)
+            self._stage.order("monitor", "disable", monitor)
         metres, without = self._cut(self._stage.start_runaway())
         self._result("without a guard it drives on", metres > RAN_AWAY, f"{metres:.1f} m in {WATCHED:g} s")
         self._guard("deadman", "silent=0.5")
@@ -76,8 +76,8 @@ class Runaways:
     def _guard(self, preset: str, value: str, *further: str) -> None:
         """Make a guard in shadow mode, and bring it into force."""
         new = ("guard", "new", preset, COMMANDS, *further, "--shadow", value)
-        self._stage.rosrv(*new)
-        self._stage.rosrv("guard", "enforce", preset)
+        self._stage.order(*new)
+        self._stage.order("guard", "enforce", preset)
         shown = [f"'{word}'" if " " in word else word for word in new]
         self._narrator.say(f"rosrv {' '.join(shown)}; rosrv guard enforce {preset}")
 

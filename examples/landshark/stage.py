@@ -268,8 +268,8 @@ class Stage:
         """Forward a port of this machine to the console, which listens on loopback of the appliance's host."""
         return Doorway(self.appliance_host, CONSOLE)
 
-    def rosrv(self, *arguments: str) -> None:
-        """Run `rosrv` with these arguments, while the robot runs."""
+    def order(self, *arguments: str) -> None:
+        """Carry out a command of `rosrv` at the appliance, while the robot runs."""
         command = [sys.executable, "-m", "appliance.cli.main", *arguments, "--state", str(self.state)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=START_SECONDS, check=False)
         if done.returncode:

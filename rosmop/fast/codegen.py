@@ -171,7 +171,9 @@ class ModuleCodegen(MemoryLayout):
 
     def stops(self, event: nodes.Event) -> bool:
         """Whether the action of an event may send the safe message."""
-        return any(isinstance(one, nodes.StopMessage) for one in nodes.walk(self.functions[event.function].body))
+        return any(
+            isinstance(one, nodes.StopMessage) for one in nodes.walk(self.functions[event.function].body)
+        )
 
     def function(
         self,

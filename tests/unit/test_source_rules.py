@@ -298,7 +298,8 @@ WALL_CLOCK = {
         "supervisor/supervisor.py",
     ],
     "an end that is a date: of a certificate, a token, a revocation": [
-        "features/metrics/metrics_route.py", "features/fleet/view.py", "api/process.py", "features/selftest/file_checks.py",
+        "features/metrics/metrics_route.py", "features/fleet/view.py", "api/process.py",
+        "features/selftest/file_checks.py",
         "base/deadlines.py", "features/fleet/verified_bundles.py",
         "control/operators/token_orders.py", "features/standby/appliance_table.py",
         "hosts/certification.py", "hosts/enrolment_tokens.py",

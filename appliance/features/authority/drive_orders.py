@@ -150,10 +150,10 @@ class DriveOrders:
             self._record(name, holding, None, "the policy no longer has the group", "")
         for group in groups.values():
             async with self._turn:
-                holding = self._groups.holder(group.name)
-                if holding is None:
+                held = self._groups.holder(group.name)
+                if held is None:
                     continue
-                live, moved = self._signs.live(holding.host), self._signs.moved(holding.host, group.names)
+                live, moved = self._signs.live(held.host), self._signs.moved(held.host, group.names)
                 loss = self._groups.loss(group, clock.now(), moved=moved, live=live)
                 if loss:
                     await self._hand_over(group, self._next(group), loss, "")

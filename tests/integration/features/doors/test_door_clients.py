@@ -11,8 +11,8 @@ import pytest
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from tests.support.nodes import RosSession
 from tests.support.features.doors.real_door import real_door
+from tests.support.nodes import RosSession
 from tests.support.site import Site
 
 SECONDS = 20.0

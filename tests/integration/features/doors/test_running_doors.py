@@ -156,7 +156,7 @@ def test_doors_survive_a_restart_and_a_removed_one_ends(appliance: Appliance, co
             with pytest.raises(ConnectionClosed):
                 client.recv(SECONDS)
         with pytest.raises(OSError, match="refused"):
-            eventually(lambda: not connect(AGENT).close(), "the port closes", 1)
+            eventually(lambda: connect(AGENT).close_code, "the port closes", 1)
 
     on_robot(common_robot, work)
     added = appliance.row("door", "list")

@@ -1,4 +1,4 @@
-"""A door on real sockets: `python -m tests.support.features.doors.real_door MASTER_URI ADDRESS PORT [FILE.srv …]` serves until killed.
+"""Serve a door on real sockets until killed: `real_door.py MASTER_URI ADDRESS PORT [FILE.srv …]`, run with `python -m`.
 
 It is assembled as the door process will be: each connection comes as a descriptor from another part, which listens.
 """

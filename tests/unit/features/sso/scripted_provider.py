@@ -49,7 +49,7 @@ def rsa(name: str) -> RSAKey:
 
 @functools.cache
 def ec(name: str, curve: str = "P-256") -> ECKey:
-    return ECKey.generate_key(curve, {"kid": name, "use": "sig"})  # type: ignore[arg-type]  # a curve's name
+    return ECKey.generate_key(curve, {"kid": name, "use": "sig"})
 
 
 def public(*keys: Key) -> list[dict[str, Any]]:

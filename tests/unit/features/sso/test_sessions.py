@@ -60,7 +60,7 @@ class World:
         )
         self.checks = RequestAuthenticator(self.tokens, require_proof=False)
         self.answer: Any = None
-        self.sso.link.ask = self._ask  # type: ignore[method-assign]  # the process
+        self.sso.link.ask = self._ask  # type: ignore[method-assign, assignment]  # the process
 
     def _changed(self) -> None:
         self.changes += 1

@@ -5,7 +5,8 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from appliance.features.sso.provider_connection import ProviderConnection, ProviderError
+from appliance.features.sso.errors import ProviderError
+from appliance.features.sso.provider_connection import ProviderConnection
 from appliance.features.sso.settings import Sso
 from tests.unit.features.sso.scripted_provider import sso
 
