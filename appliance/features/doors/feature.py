@@ -53,6 +53,7 @@ DOORS = Feature(
         )
     },
     operate=_operate,
+    quotas="appliance.features.doors.quotas:ROWS",
     keep=f"{_PART}:keep",
     inherit=f"{_PART}:inherit",
 )  # fmt: skip

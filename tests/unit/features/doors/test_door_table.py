@@ -1,0 +1,107 @@
+"""Doors and tickets in the state: names, addresses, secrets and ends."""
+
+from pathlib import Path
+
+import pytest
+
+from appliance.base import clock
+from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.features.doors.door_table import DoorTable
+from appliance.features.doors.door_tickets import DoorTickets
+from appliance.features.doors.settings import MOST_DOORS, Doors
+from appliance.store.state_file import StateStore
+from appliance.store.stored_deadlines import StoredDeadlines
+from tests.support.engines import InlineDatabase
+from tests.support.virtual_clock import VirtualClock
+
+WALL = 1_790_000_000.0
+
+
+def opened(home: Path) -> StateStore:
+    """Return the state in a folder."""
+    return StateStore(home, failed=pytest.fail, kind=InlineDatabase)
+
+
+def test_a_name_keeps_its_address_and_no_other_name_gets_it(tmp_path: Path) -> None:
+    """Also over restarts, and after its removal; the address of another network is never given to the policy."""
+    store = opened(tmp_path)
+    table = DoorTable(store, Doors())
+    for name in ("alice", "bob"):
+        table.save(table.planned(name, None, ""))
+    alice = table.of("alice")
+    table.remove("alice")
+    assert [*table.addresses()] == ["door:bob"]
+    again = DoorTable(store, Doors())
+    new = again.planned("carol", 9091, "10.0.0.7")
+    assert new.address not in {alice.address, again.of("bob").address, Doors().gateway}
+    assert new.slot == alice.slot
+    assert again.planned("alice", None, "").address == alice.address
+    moved = DoorTable(store, Doors(network="10.9.0.0/24"))
+    assert "door bob has the address" in moved.problem
+    assert not moved.addresses()
+
+
+@pytest.mark.parametrize(
+    ("name", "port", "source", "words"),
+    [
+        ("Alice", None, "", "not a name"),
+        ("a" * 32, None, "", "not a name"),
+        ("agent-1", None, "", "already"),
+        ("agent_1", None, "", "only in - and _"),
+        ("bob", 80, "", "use 1024"),
+        ("bob", 9091, "", "port of the door agent-1"),
+        ("bob", None, "10.0.0.7", "needs --port"),
+        ("bob", 9092, "10.0.0.0/33", "not an address or network"),
+    ],
+)
+def test_a_door_that_would_confuse_is_refused(
+    tmp_path: Path, name: str, port: int | None, source: str, words: str
+) -> None:
+    table = DoorTable(opened(tmp_path), Doors())
+    table.save(table.planned("agent-1", 9091, ""))
+    with pytest.raises(SenselessError, match=words):
+        table.planned(name, port, source)
+    with pytest.raises(UnknownThingError, match="agent-1"):
+        table.of(name if name != "agent-1" else "nobody")
+
+
+def test_doors_are_bounded(tmp_path: Path) -> None:
+    table = DoorTable(opened(tmp_path), Doors())
+    for number in range(MOST_DOORS):
+        table.save(table.planned(f"d{number}", None, ""))
+    assert sorted(row.slot or 0 for row in table.live()) == [*range(MOST_DOORS)]
+    with pytest.raises(SenselessError, match="limit"):
+        table.planned("more", None, "")
+
+
+def test_a_ticket_opens_one_door_until_its_end(tmp_path: Path) -> None:
+    """Its secret is not stored. Neither a step of the clock nor a restart gives it more time."""
+    machine = VirtualClock(wall=WALL)
+    with clock.using(machine):
+        store = opened(tmp_path)
+        ends = StoredDeadlines(store)
+        tickets = DoorTickets(store, ends)
+        row, text = tickets.make("alice", 3600.0, "first")
+        assert tickets.find("alice", text) == row
+        wrong = (
+            text[:-1] + ("A" if text[-1] != "A" else "B"),
+            row.id,
+            "",
+            text + "A",
+            text.replace(".", "_"),
+        )
+        assert [tickets.find("alice", one) for one in wrong] == [None] * len(wrong)
+        assert tickets.find("bob", text) is None
+        assert text.partition(".")[2].encode() not in (tmp_path / "state.db").read_bytes()
+        machine.advance(3000.0)
+        ends.save()
+        store.close()
+    machine = VirtualClock(wall=WALL - 86_400.0, now=5.0)
+    with clock.using(machine):
+        store = opened(tmp_path)
+        tickets = DoorTickets(store, StoredDeadlines(store))
+        assert tickets.find("alice", text) == row
+        machine.advance(601.0)
+        assert tickets.find("alice", text) is None
+        assert tickets.valid() == []
+        assert store.doors.tickets() == []
