@@ -39,6 +39,22 @@ FULL = FirewallSettings(
 )
 
 
+def test_no_other_machine_uses_or_reaches_the_own_network() -> None:
+    """Both come before every rule that lets a packet from outside on; the ports of doors have a limit per host."""
+    settings = replace(FULL, own_network="198.19.240.0/20", own_ports=(PortRange.one(9091),))
+    rules = appliance_rules(settings)
+    added = [rule for rule in rules if rule not in appliance_rules(FULL)]
+    first, second, *_limits = added
+    assert (first.source, second.destination) == ("198.19.240.0/20", "198.19.240.0/20")
+    for rule in (first, second):
+        assert (rule.verdict, rule.chain) == (PacketVerdict.DROP, Chain.IN)
+        assert rule.arrives_on == Interface("lo", other=True)
+        assert not rule.is_tcp
+    passed = next(rule for rule in rules if rule.verdict is PacketVerdict.RETURN and rule.chain is Chain.IN)
+    assert rules.index(passed) > rules.index(second)
+    assert any(rule.above for rule in added if rule.tcp_ports == PortRange.one(9091))
+
+
 def test_the_rules_only_ever_refuse() -> None:
     """No rule in the appliance's namespace accepts a packet, so none overrides another firewall."""
     refusing = {PacketVerdict.RETURN, PacketVerdict.RESET, PacketVerdict.DROP}
