@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-from collections.abc import Mapping
 from typing import Any
 
 import structlog
@@ -13,15 +12,15 @@ from appliance.configuration.sections import Sections
 from appliance.control.assembly.foundation import Foundation
 from appliance.control.errors import SenselessError, UnavailableError
 from appliance.control.links.supervisor_link import ControlLifeline
-from appliance.control.operators.request_method import RequestMethod
 from appliance.features.doors import door_requests
 from appliance.features.doors.door_link import node_name
 from appliance.features.doors.door_processes import DoorProcesses
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.door_tickets import DoorTickets
+from appliance.features.doors.kept_doors import KeptDoors
 from appliance.features.doors.settings import MOST_DOORS, Doors
-from appliance.features.feature import FeaturePart, OperatorContext
-from appliance.policy.model import Address, address_of
+from appliance.features.feature import FeaturePart
+from appliance.policy.model import address_of
 from appliance.store.door_tables import DoorRow, TicketRow
 from appliance.store.state_file import StateStore
 from appliance.store.stored_deadlines import StoredDeadlines
@@ -29,18 +28,6 @@ from appliance.store.stored_deadlines import StoredDeadlines
 _LOOK_SECONDS = 1.0
 _RETRY_SECONDS = 10
 _log = structlog.get_logger()
-
-
-class KeptDoors:
-    """The doors in the state, and the orders about them once control has its other parts."""
-
-    def __init__(self, table: DoorTable) -> None:
-        self.table = table
-        self.orders: DoorOrders
-
-    def addresses(self) -> Mapping[str, Address]:
-        """Return the addresses of `door:NAME` in the policy."""
-        return self.table.addresses()
 
 
 async def keep(sections: Sections, store: StateStore, lifeline: ControlLifeline) -> KeptDoors:
@@ -67,31 +54,6 @@ async def inherit(base: Foundation, parts: Any) -> FeaturePart:
         limits=orders.limits,
         connected=orders.enter,
         work={"the doors": orders.watch, "the ends of tickets of doors": ends.watch},
-    )
-
-
-def operate(context: OperatorContext) -> FeaturePart:
-    """Return the part that answers operators' requests."""
-
-    def orders() -> DoorOrders:
-        kept = context.kept["doors"]
-        assert isinstance(kept, KeptDoors)  # noqa: S101  `keep` made it
-        return kept.orders
-
-    return FeaturePart(
-        methods=(
-            RequestMethod(door_requests.DoorsWanted, lambda request: orders().listed(request)),
-            RequestMethod(door_requests.DoorAdd, lambda request, who: orders().add(request, who), who=True),
-            RequestMethod(
-                door_requests.DoorRemove,
-                lambda request, who: orders().remove(request, who),
-                who=True,
-                full_disk=True,
-            ),
-            RequestMethod(
-                door_requests.DoorTicket, lambda request, who: orders().ticket(request, who), who=True
-            ),
-        )
     )
 
 

@@ -22,7 +22,7 @@ def _operations() -> "tuple[type[AdminRequest[Any]], ...]":
 
 
 def _operate(context: OperatorContext) -> FeaturePart:
-    from appliance.features.doors.control_part import operate  # noqa: PLC0415  only control needs it
+    from appliance.features.doors.kept_doors import operate  # noqa: PLC0415  only control needs it
 
     return operate(context)
 

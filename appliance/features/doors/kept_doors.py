@@ -1,0 +1,61 @@
+"""The doors in the state, which control reads before the policy comes into force, and the requests about them."""
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from appliance.control.operators.request_method import RequestMethod
+from appliance.features.doors import door_requests as requests
+from appliance.features.doors.door_table import DoorTable
+from appliance.features.feature import FeaturePart, OperatorContext
+from appliance.policy.model import Address
+
+
+class Orders(Protocol):
+    """The operators' requests about doors."""
+
+    async def listed(self, request: requests.DoorsWanted) -> requests.DoorList:
+        """Return all doors."""
+
+    async def add(self, request: requests.DoorAdd, who: str) -> requests.Door:
+        """Add a door."""
+
+    async def remove(self, request: requests.DoorRemove, who: str) -> requests.Door:
+        """Remove a door."""
+
+    async def ticket(self, request: requests.DoorTicket, who: str) -> requests.NewTicket:
+        """Make a ticket."""
+
+
+class KeptDoors:
+    """The doors in the state, and the orders about them once control has its other parts."""
+
+    def __init__(self, table: DoorTable) -> None:
+        self.table = table
+        self.orders: Orders
+
+    def addresses(self) -> Mapping[str, Address]:
+        """Return the addresses of `door:NAME` in the policy."""
+        return self.table.addresses()
+
+
+def operate(context: OperatorContext) -> FeaturePart:
+    """Return the part that answers operators' requests."""
+
+    def orders() -> Orders:
+        kept = context.kept["doors"]
+        assert isinstance(kept, KeptDoors)  # noqa: S101  `control_part.keep` made it
+        return kept.orders
+
+    return FeaturePart(
+        methods=(
+            RequestMethod(requests.DoorsWanted, lambda request: orders().listed(request)),
+            RequestMethod(requests.DoorAdd, lambda request, who: orders().add(request, who), who=True),
+            RequestMethod(
+                requests.DoorRemove,
+                lambda request, who: orders().remove(request, who),
+                who=True,
+                full_disk=True,
+            ),
+            RequestMethod(requests.DoorTicket, lambda request, who: orders().ticket(request, who), who=True),
+        )
+    )
