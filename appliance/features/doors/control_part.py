@@ -74,7 +74,7 @@ class DoorOrders:
     async def listed(self, _request: door_requests.DoorsWanted) -> door_requests.DoorList:
         return door_requests.DoorList([self._shown(row) for row in self._table.live()])
 
-    async def add(self, request: door_requests.DoorAdd, who: str) -> door_requests.Door:
+    async def add(self, request: door_requests.DoorAdd, who: str) -> door_requests.DoorState:
         """Add a door. Raises `SenselessError`, `UnavailableError` and `StoreError`."""
         async with self._one:
             row = self._table.planned(request.name, request.port, request.source)
@@ -103,7 +103,7 @@ class DoorOrders:
             await self._base.store.settled()
             return self._shown(row)
 
-    async def remove(self, request: door_requests.DoorRemove, who: str) -> door_requests.Door:
+    async def remove(self, request: door_requests.DoorRemove, who: str) -> door_requests.DoorState:
         """Remove a door. Raises `UnknownThingError` and `StoreError`."""
         async with self._one:
             shown = self._shown(self._table.of(request.name))
@@ -210,9 +210,9 @@ class DoorOrders:
             ),
         )
 
-    def _shown(self, row: DoorRow) -> door_requests.Door:
+    def _shown(self, row: DoorRow) -> door_requests.DoorState:
         counts, trouble = self._processes.state(row)
-        return door_requests.Door(
+        return door_requests.DoorState(
             name=row.name,
             address=row.address,
             node=node_name(row.name),

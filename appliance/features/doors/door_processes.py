@@ -4,7 +4,7 @@ Invariants:
 
 1. A process gets only sockets with the address of its door. It connects to RVMaster's port and to ports of proxy
    endpoints and relays, and to no other port.
-2. A process of a door that was removed, or that another door replaced, is told to end.
+2. A process of a door that was removed, or that another door replaced, gets `DoorEnded`.
 3. A process has at most `_MOST_PENDING` requests for sockets at once; further ones are refused.
 """
 

@@ -24,7 +24,7 @@ class Ticket(msgspec.Struct, frozen=True):
     who: Annotated[str, doc("who made it")]
 
 
-class Door(msgspec.Struct, frozen=True, kw_only=True):
+class DoorState(msgspec.Struct, frozen=True, kw_only=True):
     """The door of one identity. The policy names it `door:NAME`."""
 
     name: Annotated[str, doc("`door:NAME` in the policy")]
@@ -45,14 +45,14 @@ class Door(msgspec.Struct, frozen=True, kw_only=True):
 class DoorList(msgspec.Struct, frozen=True):
     """All doors."""
 
-    doors: Annotated[list[Door], doc("the oldest first")]
+    doors: Annotated[list[DoorState], doc("the oldest first")]
 
 
 class NewTicket(Ticket, frozen=True, kw_only=True):
     """A new ticket with its text, which is shown only here."""
 
     door: Annotated[str, doc("that it opens")]
-    ticket: Annotated[str, doc("the secret; whoever has it uses the door")]
+    ticket: Annotated[str, doc("the secret; anyone who has it uses the door")]
     path: Annotated[str, doc("of the WebSocket at the REST port, with the ticket")]
 
 
@@ -83,7 +83,7 @@ class DoorsWanted(AdminRequest[DoorList], frozen=True, tag="doors"):
 @rest(
     "admin", "POST", "/v1/doors", name="add_door", body=NewDoor, status=201, good="The door was added.",
 )  # fmt: skip
-class DoorAdd(WaitingRequest[Door], frozen=True, tag="door add"):
+class DoorAdd(WaitingRequest[DoorState], frozen=True, tag="door add"):
     """Add a door for one identity. Its rights are those of the host `door:NAME` in the policy."""
 
     name: str
@@ -92,7 +92,7 @@ class DoorAdd(WaitingRequest[Door], frozen=True, tag="door add"):
 
 
 @rest("admin", "DELETE", "/v1/doors/{door_name}", name="remove_door", problems=_NO_DOOR)
-class DoorRemove(WaitingRequest[Door], frozen=True, tag="door remove"):
+class DoorRemove(WaitingRequest[DoorState], frozen=True, tag="door remove"):
     """Remove a door: its connections and its tickets end. Its address stays reserved for its name."""
 
     name: DoorName

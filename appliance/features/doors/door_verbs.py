@@ -7,7 +7,7 @@ import typer
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import moment, say_json
-from appliance.features.doors.door_requests import Door, DoorAdd, DoorRemove, DoorsWanted, DoorTicket
+from appliance.features.doors.door_requests import DoorAdd, DoorRemove, DoorState, DoorsWanted, DoorTicket
 from rosmop.tool.terminal import counted, say
 
 _Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the door", show_default=False)]
@@ -34,8 +34,8 @@ def add(
 ) -> None:
     """Add a door for one person, viewer or agent. Its rights are those of the host `door:NAME` in the policy.
 
-    Without --port, only tickets open the door. With --port, whoever connects to the port from the given address has
-    the rights of the door.
+    Without --port, only tickets open the door. With --port, any program that connects to the port from the given
+    address has the rights of the door.
 
     Example: rosrv door add agent-1 --port 9091 --from 10.0.0.7
     """
@@ -82,7 +82,7 @@ def ticket(
 ) -> None:
     """Make a ticket: a URL with which a person's browser or viewer opens the door. It is shown only here.
 
-    Whoever has the URL has the rights of the door until the ticket is over.
+    Anyone who has the URL has the rights of the door until the ticket is over.
 
     Example: rosrv door ticket alice --for 8h
     """
@@ -106,7 +106,7 @@ def remove(appliance: Appliance, name: _Name) -> None:
     say(f"{body.name} ({body.address}) is removed")
 
 
-def _entry(row: Door) -> str:
+def _entry(row: DoorState) -> str:
     if row.port is None:
         return "by ticket"
     return f"port {row.port} from {row.source or 'anywhere'}"

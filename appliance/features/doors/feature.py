@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from appliance.cli.verb_table import Group, Verb
+from appliance.features.doors.quotas import ROWS
 from appliance.features.doors.settings import MOST_DOORS, Doors
 from appliance.features.feature import ConsolePart, Feature, FeaturePart, OperatorContext
 from appliance.supervisor.role import Role
@@ -53,7 +54,7 @@ DOORS = Feature(
         )
     },
     operate=_operate,
-    quotas="appliance.features.doors.quotas:ROWS",
+    quotas=ROWS,
     keep=f"{_PART}:keep",
     inherit=f"{_PART}:inherit",
 )  # fmt: skip

@@ -16,10 +16,10 @@ class Orders(Protocol):
     async def listed(self, request: requests.DoorsWanted) -> requests.DoorList:
         """Return all doors."""
 
-    async def add(self, request: requests.DoorAdd, who: str) -> requests.Door:
+    async def add(self, request: requests.DoorAdd, who: str) -> requests.DoorState:
         """Add a door."""
 
-    async def remove(self, request: requests.DoorRemove, who: str) -> requests.Door:
+    async def remove(self, request: requests.DoorRemove, who: str) -> requests.DoorState:
         """Remove a door."""
 
     async def ticket(self, request: requests.DoorTicket, who: str) -> requests.NewTicket:

@@ -288,4 +288,5 @@ def _protocol(node: str, queues: list[ViewerQueue[Any]], subprotocol: str | None
 
 def _plain(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
     address = ipaddress.ip_address(text.partition("%")[0])
-    return getattr(address, "ipv4_mapped", None) or address
+    mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
+    return mapped or address

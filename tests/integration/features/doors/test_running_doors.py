@@ -69,7 +69,7 @@ def frame(client: ClientConnection, **wanted: Any) -> Any:
 def test_an_agent_hears_publishes_and_calls_within_its_rights(
     appliance: Appliance, common_robot: Host, tmp_path: Path
 ) -> None:
-    """What its rights do not contain is refused in the words of the record, with the rule's line."""
+    """A refusal has the words of the record, with the line of the rule."""
     with RosSession(appliance.master_uri, tmp_path, common_robot) as ros:
         ros.talker("rospy", "/chatter")
         listener = ros.listener("rospy", "/answer")

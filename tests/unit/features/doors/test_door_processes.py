@@ -80,7 +80,7 @@ async def test_a_door_that_asks_for_many_sockets_at_once_waits(bench: Bench) -> 
 
 
 def test_the_process_of_a_removed_or_replaced_door_ends(bench: Bench) -> None:
-    """It is told so when it links up again, and a new one is started for the slot's new door."""
+    """It ends when it links up again, and another one starts for the new door of the slot."""
     bench.hears(door_link.DoorStarted("", None))
     assert [type(one) for one in bench.sent] == [door_link.DoorGiven]
     bench.hears(door_link.DoorStarted("bob", 9091))
