@@ -1,4 +1,4 @@
-"""Serve a door on real sockets until killed: `real_door.py MASTER_URI ADDRESS PORT [FILE.srv …]`, run with `python -m`.
+"""A door on real sockets; run the module with MASTER_URI ADDRESS PORT [FILE.srv …], and it serves until killed.
 
 It is assembled as the door process will be: each connection comes as a descriptor from another part, which listens.
 """
