@@ -145,9 +145,10 @@ class DriveOrders:
     async def check(self) -> None:
         """End the authority that is over now, and give each group to the host that waits for it."""
         groups = self._policy().authority
-        for name, holding in self._groups.forget_others(frozenset(groups)).items():
-            self._decide_again()
-            self._record(name, holding, None, "the policy no longer has the group", "")
+        async with self._turn:
+            for name, gone in self._groups.forget_others(frozenset(groups)).items():
+                self._decide_again()
+                self._record(name, gone, None, "the policy no longer has the group", "")
         for group in groups.values():
             async with self._turn:
                 held = self._groups.holder(group.name)

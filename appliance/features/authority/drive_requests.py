@@ -44,13 +44,13 @@ class GroupStates(msgspec.Struct, frozen=True):
     groups: list[GroupState]
 
 
-@rest("viewer", "GET", "/v1/drive", name="authority")
+@rest("viewer", "GET", "/v1/drive", name="drive")
 class DriveStatus(AdminRequest[GroupStates], frozen=True, tag="drive status"):
     """Who holds each group of topics and services, and who waits for it."""
 
 
 @rest(
-    "operator", "POST", "/v1/drive/{group}/take", name="take_authority", body=GroupHost, problems=_NO_GROUP
+    "operator", "POST", "/v1/drive/{group}/take", name="drive_take", body=GroupHost, problems=_NO_GROUP
 )  # fmt: skip
 class DriveTake(WaitingRequest[GroupState], frozen=True, tag="drive take"):
     """Give a group to a host that may take it, or that may override its holder."""
@@ -60,7 +60,7 @@ class DriveTake(WaitingRequest[GroupState], frozen=True, tag="drive take"):
 
 
 @rest(
-    "operator", "POST", "/v1/drive/{group}/give", name="give_authority", body=GroupGift, problems=_NO_GROUP
+    "operator", "POST", "/v1/drive/{group}/give", name="drive_give", body=GroupGift, problems=_NO_GROUP
 )  # fmt: skip
 class DriveGive(WaitingRequest[GroupState], frozen=True, tag="drive give"):
     """End the authority of a group's holder: the group is given to a host, or to the first one that waits."""
@@ -70,7 +70,7 @@ class DriveGive(WaitingRequest[GroupState], frozen=True, tag="drive give"):
 
 
 @rest(
-    "operator", "POST", "/v1/drive/{group}/ask", name="ask_for_authority", body=GroupHost, problems=_NO_GROUP
+    "operator", "POST", "/v1/drive/{group}/ask", name="drive_ask", body=GroupHost, problems=_NO_GROUP
 )  # fmt: skip
 class DriveAsk(WaitingRequest[GroupState], frozen=True, tag="drive ask"):
     """Let a host wait for a group. One that may take it gets it as soon as it is free."""
