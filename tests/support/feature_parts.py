@@ -4,7 +4,9 @@ from appliance.audit.log.log import AuditLog
 from appliance.channel.answers.graph_answers import Graph
 from appliance.configuration.sections import DEFAULTS
 from appliance.control.assembly.policies import Policies
-from appliance.features.feature import FeatureContext
+from appliance.features.authority.control_part import request_methods
+from appliance.features.authority.drive_orders import DriveOrders
+from appliance.features.feature import FeatureContext, FeaturePart
 from appliance.features.table import FeatureParts
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.specifications.specification_manager import SpecificationManager
@@ -25,4 +27,5 @@ def idle_parts() -> FeatureParts:
         appliance="", store=store, policies=idle(Policies), monitors=monitors, hosts=hosts, processes=tuple,
         received=lambda _sequence: None, graph=lambda: Graph([], [], []), tokens_changed=lambda: None,
     )  # fmt: skip
+    parts.add(FeaturePart(methods=request_methods(idle(DriveOrders))))
     return parts

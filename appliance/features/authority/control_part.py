@@ -1,6 +1,6 @@
 """Make the part of command authority in control."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.authority import drive_requests as requests
@@ -40,13 +40,18 @@ async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
         relays_ready=lambda: relay.presence == "connected",
     )
     return FeaturePart(
-        methods=(
-            RequestMethod(requests.DriveStatus, orders.status),
-            RequestMethod(requests.DriveTake, orders.take, who=True, full_disk=True),
-            RequestMethod(requests.DriveGive, orders.give, who=True, full_disk=True),
-            RequestMethod(requests.DriveAsk, orders.ask, who=True, full_disk=True),
-        ),
+        methods=request_methods(orders),
         called={TAKE: orders.take_called, GIVE: orders.give_called},
         holders=orders.holders,
         work={"the leases of command authority": orders.watch},
+    )
+
+
+def request_methods(orders: DriveOrders) -> tuple[RequestMethod[Any], ...]:
+    """Return the method that answers each request."""
+    return (
+        RequestMethod(requests.DriveStatus, orders.status),
+        RequestMethod(requests.DriveTake, orders.take, who=True, full_disk=True),
+        RequestMethod(requests.DriveGive, orders.give, who=True, full_disk=True),
+        RequestMethod(requests.DriveAsk, orders.ask, who=True, full_disk=True),
     )
