@@ -46,7 +46,7 @@ class GroupStates(msgspec.Struct, frozen=True):
 
 @rest("viewer", "GET", "/v1/drive", name="drive")
 class DriveStatus(AdminRequest[GroupStates], frozen=True, tag="drive status"):
-    """Who holds each group of topics and services, and who waits for it."""
+    """The holder of each group of topics and services, and the hosts that wait for it."""
 
 
 @rest(

@@ -5,7 +5,7 @@ Invariants:
 1. A group has at most one holder. `free` and `hold` are separate steps, so that the caller can cut the earlier holder
    off before the next one holds the group.
 2. A holder loses the group once it was silent for the group's lease, or once its nodes have ended.
-3. The first waiting host that may take the group follows. One that may only ask is never chosen by itself.
+3. The first waiting host that may take the group follows. A host that may only ask never follows.
 4. A group has at most `MOST_WAITING` waiting hosts, each for `WAITING_SECONDS`.
 """
 

@@ -135,7 +135,7 @@ async def test_never_two_holders_and_never_none_for_longer_than_the_lease(site: 
             assert state.left_seconds <= LEASE
 
 
-async def test_who_gets_a_group(site: Site) -> None:
+async def test_the_next_holder_of_a_group(site: Site) -> None:
     """A free group is taken, a held one only by a host that may override; one that asked follows the holder."""
     orders = site.orders
     await orders.take(DriveTake("base", PILOT), "op")
