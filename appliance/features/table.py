@@ -108,11 +108,8 @@ class FeatureParts:
         """Add the parts that need the other parts of control."""
         for feature in FEATURES:
             if feature.inherit is not None:
-                self.add(await pkgutil.resolve_name(feature.inherit)(foundation, parts))
-
-    def add(self, part: FeaturePart) -> None:
-        """Add a part that was made later."""
-        self._parts.append(part)
+                part: FeaturePart = await pkgutil.resolve_name(feature.inherit)(foundation, parts)
+                self._parts.append(part)
 
     def add(self, part: FeaturePart | None) -> None:
         """Add the part of the feature that let control serve, if there is one."""

@@ -1,13 +1,13 @@
 """Make the parts of features for tests that do not call them."""
 
+from typing import Any
+
 from appliance.audit.log.log import AuditLog
 from appliance.channel.answers.graph_answers import Graph
 from appliance.configuration.sections import DEFAULTS
 from appliance.control.assembly.policies import Policies
-from appliance.features.authority.control_part import request_methods
-from appliance.features.authority.drive_orders import DriveOrders
-from appliance.features.feature import FeatureContext, FeaturePart
-from appliance.features.table import FeatureParts
+from appliance.features.feature import FeatureContext
+from appliance.features.table import FEATURES, FeatureParts
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.state_file import StateStore
@@ -27,5 +27,14 @@ def idle_parts() -> FeatureParts:
         appliance="", store=store, policies=idle(Policies), monitors=monitors, hosts=hosts, processes=tuple,
         received=lambda _sequence: None, graph=lambda: Graph([], [], []), tokens_changed=lambda: None,
     )  # fmt: skip
-    parts.add(FeaturePart(methods=request_methods(idle(DriveOrders))))
     return parts
+
+
+def answered_later() -> list[tuple[Feature, type[Any]]]:
+    """Return the requests that parts answer which control makes at its start, with their features."""
+    return [
+        (feature, request)
+        for feature in FEATURES
+        if feature.inherit is not None or feature.may_start is not None
+        for request in feature.operations()
+    ]

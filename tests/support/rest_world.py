@@ -41,7 +41,6 @@ from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
-from appliance.features.table import FEATURES
 from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import PortChecks
 from appliance.hosts.enrolment import HostEnrolment
@@ -50,7 +49,7 @@ from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.access_tokens import TokenRow, make_token
 from tests.support.answers import example
 from tests.support.asgi import sent
-from tests.support.feature_parts import idle_parts
+from tests.support.feature_parts import answered_later, idle_parts
 from tests.support.idle import idle
 from tests.support.inline_loop import InlineLoop
 from tests.support.memory_channel import memory_link
@@ -155,12 +154,16 @@ class RestWorld:
             limits=idle(LimitQueries),
             alarms=idle(AlarmOrders),
         )
-        later = [one for feature in FEATURES if feature.may_start for one in feature.operations()]
         administration = Administration(
             queries,
             [
                 *(replace(method, answer=self.carried.out) for method in methods),
-                *(RequestMethod(one, self.carried.out, who=True, order=False) for one in later),
+                *(
+                    RequestMethod(
+                        request, self.carried.out, who=request in CHANGES, order=feature.may_start is None
+                    )
+                    for feature, request in answered_later()
+                ),
             ],
             durable=self.trail.durable,
             require_room=lambda: None,

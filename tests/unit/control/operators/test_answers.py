@@ -20,13 +20,12 @@ from appliance.control.operators.limit_use import LimitQueries
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.token_orders import TokenOrders
-from appliance.features.table import FEATURES
 from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import PortChecks
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.hosts.self_service import HostSelfService
 from appliance.specifications.specification_manager import SpecificationManager
-from tests.support.feature_parts import idle_parts
+from tests.support.feature_parts import answered_later, idle_parts
 
 
 class Hosts(HostEnrolment):
@@ -48,9 +47,7 @@ CLASSES: dict[str, Any] = {
     "alarms": AlarmOrders,
 }
 METHODS = idle_parts().methods() + request_methods(**CLASSES)
-OF_FEATURES = [
-    one for feature in FEATURES if feature.may_start for one in feature.operations()
-]  # methods come later
+OF_FEATURES = [request for _feature, request in answered_later()]
 REQUESTS: tuple[type[Any], ...] = tuple(dict.fromkeys([*get_args(AnyRequest), *get_args(RestRequest)]))
 # Exceptions: a record's fields depend on its event, a child's readiness on its role, a memory's terms on its feature.
 OPEN = {
