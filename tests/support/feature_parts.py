@@ -6,7 +6,7 @@ from appliance.audit.log.log import AuditLog
 from appliance.channel.answers.graph_answers import Graph
 from appliance.configuration.sections import DEFAULTS
 from appliance.control.assembly.policies import Policies
-from appliance.features.feature import FeatureContext
+from appliance.features.feature import Feature, FeatureContext
 from appliance.features.table import FEATURES, FeatureParts
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.specifications.specification_manager import SpecificationManager

@@ -56,9 +56,8 @@ def _operate(context: OperatorContext) -> FeaturePart:
     from appliance.features.sso.link import SsoLink  # noqa: PLC0415  as above
     from appliance.features.sso.orders import SsoOrders  # noqa: PLC0415  as above
 
-    if not _configured(context.core.sections):
-        return FeaturePart()
-    orders = SsoOrders(context.core.trail, context.tokens_changed)
+    configured = _configured(context.core.sections)
+    orders = SsoOrders(context.core.trail, context.tokens_changed, configured=configured)
     return FeaturePart(
         {ROLE: (orders.link, SsoLink)},
         methods=(
@@ -69,7 +68,7 @@ def _operate(context: OperatorContext) -> FeaturePart:
             RequestMethod(requests.SessionsEnd, orders.end, who=True, full_disk=True),
         ),
         longest={ROLE: 1 << 16},
-        sessions=orders.sessions,
+        sessions=orders.sessions if configured else None,
     )
 
 

@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 from appliance.channel import messages
 from appliance.channel.channel import ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
-from appliance.control.errors import UnavailableError
+from appliance.control.errors import UnavailableError, UnknownThingError
 from appliance.control.operators.sessions import Session
 from appliance.control.operators.token_orders import TokenRefusedError
 from appliance.features.sso import requests
@@ -27,11 +27,13 @@ _TEXT = 500
 class SsoOrders:
     """Sign people in and out; `changed()` is called when the usable sessions have changed."""
 
-    def __init__(self, trail: AuditTrail, changed: Callable[[], None]) -> None:
+    def __init__(self, trail: AuditTrail, changed: Callable[[], None], *, configured: bool) -> None:
+        """Make the parts. Unless `configured`, nobody can sign on."""
         self.link = Link(self._received)
         self.sessions = SessionTable()
         self._trail = trail
         self._changed = changed
+        self._configured = configured
 
     async def begin(self, request: requests.SignOnBegin) -> requests.SignOnPlace:
         """Begin a sign-on. Raises `UnavailableError`."""
@@ -105,7 +107,11 @@ class SsoOrders:
         )
 
     async def _ask(self, question: Callable[[int], messages.Message], wanted: type[M]) -> M:
-        """Return the answer of the process. Raises `TokenRefusedError` and `UnavailableError`."""
+        """Return the process's answer. Raises `TokenRefusedError`, `UnavailableError` and `UnknownThingError`."""
+        if not self._configured:
+            raise UnknownThingError(
+                "this appliance has no provider: name one in sso.issuer of appliance.yaml"
+            )
         try:
             answer = await self.link.ask(question, requests.EXCHANGE_SECONDS)
         except (TimeoutError, ChannelFullError, ChannelClosedError):

@@ -17,8 +17,8 @@ EXCHANGE_SECONDS = 40.0  # discovery, the code's exchange and the keys, one afte
 class SignOnPlace(msgspec.Struct, frozen=True):
     """The URL at the provider, to which the browser goes, and the `state` with which it returns."""
 
-    url: str
-    state: str
+    url: Annotated[str, doc("address at the provider, to which the browser goes")]
+    state: Annotated[str, doc("value with which the browser returns")]
 
 
 class SignedOn(msgspec.Struct, frozen=True):

@@ -23,6 +23,7 @@ from appliance.api.front.routing import Responses, Routes, body
 from appliance.api.front.services import Services
 from appliance.api.front.streams import peer_of
 from appliance.base import clock
+from appliance.channel.answers.field_docs import doc
 from appliance.channel.rest_bodies import WHOLE
 from appliance.features.sso.link import SessionKeys
 from appliance.features.sso.requests import SignedOn, SignOnBegin, SignOnComplete, SignOnPlace
@@ -36,24 +37,20 @@ _FAILS: Responses = {
 
 
 class BrowserKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The session that the browser made: a token's id, and the verifiers of its keys (base64url).
-
-    `reading` is the SHA-256 of the reading key, `verifying` the public signing key. `again`: the person must prove to
-    the provider again who they are.
-    """
+    """The session that the browser made: a token's id, and the verifiers of its keys."""
 
     id: Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{12}$" + WHOLE)]
-    reading: Annotated[str, msgspec.Meta(pattern=_KEY + WHOLE)]
-    verifying: Annotated[str, msgspec.Meta(pattern=_KEY + WHOLE)]
-    again: bool = False
+    reading: Annotated[str, msgspec.Meta(pattern=_KEY + WHOLE), doc("SHA-256 of the reading key, base64url")]
+    verifying: Annotated[str, msgspec.Meta(pattern=_KEY + WHOLE), doc("public signing key, base64url")]
+    again: Annotated[bool, doc("the person must prove to the provider again who they are")] = False
 
 
 class Returned(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The parameters with which the provider sent the browser back; `iss` may be empty."""
 
-    state: Annotated[str, msgspec.Meta(pattern=_KEY + WHOLE)]
-    code: Annotated[str, msgspec.Meta(min_length=1, max_length=4096)]
-    iss: Annotated[str, msgspec.Meta(max_length=2048)] = ""
+    state: Annotated[str, msgspec.Meta(pattern=_KEY + WHOLE), doc("as the browser got it when it began")]
+    code: Annotated[str, msgspec.Meta(min_length=1, max_length=4096), doc("the provider's code")]
+    iss: Annotated[str, msgspec.Meta(max_length=2048), doc("the provider's issuer, if it sends one")] = ""
 
 
 class _Limits:

@@ -53,7 +53,7 @@ class World:
         )
         self.trail = trail
         self.changes = 0
-        self.sso = SsoOrders(cast(AuditTrail, trail), self._changed)
+        self.sso = SsoOrders(cast(AuditTrail, trail), self._changed, configured=True)
         store = StateStore(home, failed=pytest.fail, kind=InlineDatabase)
         self.tokens = TokenOrders(
             store, cast(AuditTrail, trail), Deadlines(), lambda: None, sessions=lambda: self.sso.sessions
