@@ -1,0 +1,104 @@
+"""Single sign-on at a provider that is not ours (oidc-provider-mock), over REST as a browser does it."""
+
+import base64
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qsl, urlsplit
+
+import httpx
+import oidc_provider_mock  # type: ignore[import-untyped]  # it has no types
+import pytest
+
+from appliance.signing.request_signing import keys_of, reading_key
+from tests.support.appliance import Appliance
+
+# The provider, in a thread of the test, uses functions that its library will remove.
+pytestmark = pytest.mark.filterwarnings("ignore")
+USERS: dict[str, dict[str, Any]] = {
+    "alice": {"groups": ["crew"], "email": "alice@example.org", "email_verified": True},
+    "mallory": {"groups": ["strangers"]},
+}
+
+
+@pytest.fixture(scope="module")
+def provider() -> Iterator[str]:
+    users = [oidc_provider_mock.User(sub=name, claims=claims) for name, claims in USERS.items()]
+    with oidc_provider_mock.run_server_in_thread(user_claims=users) as server:
+        yield f"http://127.0.0.1:{server.server_port}"
+
+
+@pytest.fixture
+def running(provider: str, tmp_path: Path) -> Iterator[Appliance]:
+    (tmp_path / "secret").write_text("s3:cret/+\n")
+    settings = f"""
+sso:
+  issuer: {provider}
+  address: {urlsplit(provider).netloc}
+  client_id: rosrv
+  client_secret_file: {tmp_path / "secret"}
+  url: https://127.0.0.1:8443
+  roles: {{operator: [crew]}}
+  doors: {{floor: [crew]}}
+"""
+    with Appliance(settings=settings, options=("--api", "127.0.0.1:0")) as appliance:
+        yield appliance
+
+
+class Browser:
+    """A browser: it makes a token, goes to the provider and returns with a code."""
+
+    def __init__(self, appliance: Appliance) -> None:
+        self.token = f"rosrv_{secrets.token_hex(6)}_{secrets.token_urlsafe(32)}"
+        self.rest = httpx.Client(base_url=str(appliance.ready["api"]), verify=False)  # noqa: S501  of the test
+
+    def begin(self) -> str:
+        """Return the URL at the provider."""
+        keys = keys_of(self.token)
+        reading, verifying = (base64.urlsafe_b64encode(key).decode().rstrip("=") for key in keys)
+        body = {"id": self.token.split("_")[1], "reading": reading, "verifying": verifying}
+        return str(self.rest.post("/v1/sso/begin", json=body).raise_for_status().json()["url"])
+
+    def return_from(self, url: str, person: str) -> dict[str, str]:
+        """Sign in at the provider; return the parameters of the way back."""
+        answer = httpx.post(url, data={"sub": person})
+        place = answer.headers["location"]
+        assert place.startswith("https://127.0.0.1:8443/console?")
+        given = dict(parse_qsl(urlsplit(place).query))
+        return {name: given[name] for name in ("state", "code", "iss") if name in given}
+
+    def sign_on(self, person: str) -> httpx.Response:
+        return self.rest.post("/v1/sso/complete", json=self.return_from(self.begin(), person))
+
+    def who(self) -> Any:
+        return self.rest.get("/v1/whoami", headers={"Authorization": f"Bearer {reading_key(self.token)}"})
+
+
+def test_a_person_signs_in_and_a_restart_ends_the_session(running: Appliance) -> None:
+    """The session has the role of the claim, its own keys only, and ends with the appliance."""
+    browser = Browser(running)
+    signed = browser.sign_on("alice").raise_for_status().json()
+    assert (signed["name"], signed["role"], signed["groups"]) == ("sso:alice", "operator", ["floor"])
+    assert browser.who().json()["name"] == "sso:alice"
+    assert browser.rest.get("/v1/sso/sessions").status_code == 401
+    bare = browser.rest.get("/v1/whoami", headers={"Authorization": f"Bearer {browser.token}"})
+    assert bare.status_code == 401
+    running.stop()
+    running.start()
+    again = Browser(running)
+    again.token = browser.token
+    assert again.who().status_code == 401
+
+
+def test_a_stranger_and_a_used_code_get_no_session(running: Appliance) -> None:
+    stranger = Browser(running)
+    refused = stranger.sign_on("mallory")
+    assert refused.status_code == 422
+    assert "mallory has no role here" in refused.json()["detail"]
+    browser, thief = Browser(running), Browser(running)
+    back = browser.return_from(browser.begin(), "alice")
+    own = thief.return_from(thief.begin(), "mallory")
+    stolen = thief.rest.post("/v1/sso/complete", json={**own, "code": back["code"]})
+    assert stolen.status_code in (422, 503)  # the provider refuses the verifier, or the code's client
+    assert thief.who().status_code == 401
