@@ -79,21 +79,22 @@ def _cut(cut: list[physics.Pose], stopped: list[physics.Pose]) -> list[str]:
     """Draw the drives to the west whose link is cut, and the fence."""
     left, top = _at(-FENCE, FENCE)
     size = 2 * FENCE * SCALE
-    x, y = _at(stopped[1].x, stopped[1].y)
-    return [
+    parts = [
         f'<rect x="{left}" y="{top}" width="{size}" height="{size}" fill="none" stroke="#7c3aed" '
         'stroke-dasharray="3 5"/>',
         _text(left + 6, top + 16, "fence", "small"),
-        *(_track(way, kind) for way, kind in ((cut, "without"), (stopped, "guarded"))),
-        *(_end(way[-1], colour) for way, colour in ((cut, WITHOUT), (stopped, GUARDED))),
-        f'<path d="M{x:.1f} {y - 12:.1f}v24" stroke="#b91c1c" stroke-width="3"/>',
-        _text(x, y + 28, "link cut", "small", "middle"),
-        _text(
-            *_at(-FENCE, -1.9),
-            "without a guard it drives on; with guards it stops, and stays inside",
-            "small",
-        ),
     ]
+    for way, kind, colour, words in (
+        (cut, "without", WITHOUT, "link cut: drives on"), (stopped, "guarded", GUARDED, "link cut: guards stop it")
+    ):  # fmt: skip
+        (x, y), (end_x, end_y) = (_at(one.x, one.y) for one in (way[1], way[-1]))
+        parts += [
+            _track(way, kind),
+            _end(way[-1], colour),
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="#b91c1c"/>',
+            _text(end_x - 6, end_y - 12, words, "small"),
+        ]
+    return parts
 
 
 def _at(x: float, y: float) -> tuple[float, float]:

@@ -4,6 +4,7 @@ The base of this act lacks a timeout of its own, as many real drivers do. `rosrv
 `deadman` stops the base, `speed` limits it, and `fence` keeps it inside a square.
 """
 
+import math
 import time
 
 from examples.landshark.mistakes import Narrator, Ways
@@ -13,6 +14,7 @@ from examples.landshark.stage import Actor, Stage
 
 COMMANDS = "/landshark_control/base_velocity"
 TOP_SPEED, CAP = 2.0, 1.0  # metres a second
+NORTH_WEST = math.pi - 0.5  # so that the paths are apart on the picture
 WATCHED = 3.0  # seconds after the cut
 RAN_AWAY, STOPPED = 4.0, 2.0  # metres after the cut: at least without a guard, at most with one
 
@@ -30,10 +32,10 @@ class Runaways:
         )
         for monitor in ("obstacleAvoidance", "safeZone"):
             self._stage.order("monitor", "disable", monitor)
-        metres, without = self._cut(self._stage.start_runaway())
+        metres, without = self._cut(self._stage.start_runaway(NORTH_WEST))
         self._result("without a guard it drives on", metres > RAN_AWAY, f"{metres:.1f} m in {WATCHED:g} s")
         self._guard("deadman", "silent=0.5")
-        base = self._stage.start_runaway()
+        base = self._stage.start_runaway(math.pi)
         metres, guarded = self._cut(base)
         self._result(
             "the guard deadman stops it", metres < STOPPED and _speed(base) == 0, f"after {metres:.1f} m"
@@ -71,7 +73,8 @@ class Runaways:
                 end = base.newest("moved")
         finally:
             plug()
-        return begin["x"] - end["x"], [(0.0, 0.0), (begin["x"], begin["y"]), (end["x"], end["y"])]
+        metres = math.dist((begin["x"], begin["y"]), (end["x"], end["y"]))
+        return metres, [(0.0, 0.0), (begin["x"], begin["y"]), (end["x"], end["y"])]
 
     def _guard(self, preset: str, value: str, *further: str) -> None:
         """Make a guard in shadow mode, and bring it into force."""

@@ -275,12 +275,12 @@ class Stage:
         if done.returncode:
             raise DemoError(f"rosrv {' '.join(arguments)} failed: {done.stderr.strip()}")
 
-    def start_runaway(self) -> Actor:
+    def start_runaway(self, heading: float) -> Actor:
         """Replace the robot's base by one that does not stop when commands cease."""
         for base in [actor for actor in self.actors if actor.name == "landshark_base"]:
             base.stop()
             self.actors.remove(base)
-        command = [NODE_PYTHON, str(self.nodes / "base.py"), "runaway"]
+        command = [NODE_PYTHON, str(self.nodes / "base.py"), "runaway", str(heading)]
         return self._start(self.robot_host, "landshark_base", command)
 
     def cut_while_driving(self, forward: float) -> Callable[[], None]:

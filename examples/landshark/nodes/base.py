@@ -1,6 +1,6 @@
 """Run /landshark_base, the motors: velocity commands in, odometry out. The robot stops when commands cease.
 
-With the argument `runaway` it lacks this timeout, as many real drivers do. It then faces west, and reports its motion.
+With the arguments `runaway HEADING` it lacks this timeout, as many real drivers do, and reports its motion.
 """
 
 import math
@@ -18,10 +18,10 @@ HERTZ = 20.0
 class Base:
     """The moving robot."""
 
-    def __init__(self, runaway):
+    def __init__(self, heading=None):
         self.lock = threading.Lock()
-        self.runaway = runaway
-        self.pose = physics.Pose(heading=math.pi if runaway else 0.0)
+        self.runaway = heading is not None
+        self.pose = physics.Pose(heading=heading or 0.0)
         self.velocity = physics.Velocity()
         self.told = rospy.Time(0)
         self.odometry = rospy.Publisher("/landshark/odom", Odometry, queue_size=10)
@@ -58,7 +58,7 @@ class Base:
 def main():
     """Run until a signal ends the program."""
     rospy.init_node("landshark_base")
-    base = Base(runaway="runaway" in rospy.myargv())
+    base = Base(*map(float, rospy.myargv()[2:]))
     rate = rospy.Rate(HERTZ)
     while not rospy.is_shutdown():
         base.step(1 / HERTZ)

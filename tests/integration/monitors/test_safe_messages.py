@@ -10,6 +10,7 @@ from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession, has_ros
 from tests.support.processes import Process
 from tests.support.requirements import needs
+from tests.support.waiting import eventually
 
 GUARD = """
 guard() given { int least = 1 in 0..9; } {
@@ -56,6 +57,12 @@ def restart(appliance: Appliance, _: RosSession) -> None:
     appliance.start()
 
 
+def kill_control(appliance: Appliance, _: RosSession) -> None:
+    """Kill the control process, and wait until the next one answers."""
+    appliance.kill("control")
+    eventually(lambda: appliance.rosrv("monitor", "list", check=False).returncode == 0, appliance.story)
+
+
 def held(appliance: Appliance) -> list[str]:
     """Return the monitors that hold their topics."""
     return [str(row["name"]) for row in appliance.rows("monitor", "list") if row["held"]]
@@ -72,6 +79,8 @@ ROWS: dict[str, tuple[Callable[[Appliance, RosSession], object], bool]] = {
     "a new bound": (tighten, False),
     "a faulty sensor": (lambda appliance, ros: scan(appliance, ros, ""), True),
     "a changed text": (change, True),
+    "a killed control": (kill_control, False),
+    "a policy reload": (lambda appliance, _ros: appliance.rosrv("policy", "reload"), False),
 }
 
 

@@ -1,18 +1,20 @@
 """The tutorial's specifications work, and its quoted output is real."""
 
+import math
 import re
 import shutil
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from appliance.cli.main import app
-from examples.landshark.drive import TRIGGERED, Simulation, record
+from examples.landshark.drive import STEP, TRIGGERED, Simulation, record
 from examples.landshark.messages import MONITORS
 
 PAGE = (Path(__file__).parents[3] / "docs" / "monitors-tutorial.md").read_text(encoding="utf-8")
-FIRST, SECOND, *_OTHERS = re.findall(r"```cpp\n(.*?)```", PAGE, re.DOTALL)
+FIRST, SECOND, *_OTHERS, LAST = re.findall(r"```cpp\n(.*?)```", PAGE, re.DOTALL)
 RIGHT = FIRST.replace("positions:angles", "position:angles")
 
 
@@ -64,3 +66,12 @@ def test_the_second_one_locks_after_two_in_a_row(folder: Path) -> None:
         "passed",
     ]
     assert {one.result for one in guarded.messages if one.topic != TRIGGERED} == {"passed"}
+
+
+def test_the_last_one_keeps_the_robot_slow_while_its_gun_is_raised(folder: Path) -> None:
+    """The mission drives at up to two metres a second, and raises the gun before each drive."""
+    (folder / "calm.rv").write_text(LAST)
+    assert said("check", "my-monitors/calm.rv") == ["1 specification OK"]
+    drive = Simulation([folder / "calm.rv"]).run()
+    steps = [math.dist((one.x, one.y), (next_.x, next_.y)) for one, next_ in pairwise(drive.poses)]
+    assert 0 < max(steps) <= 0.5 * STEP / 10**9 + 1e-9

@@ -1,6 +1,8 @@
 """Presets are valid texts for each of their types, and their parameters are checked before a text is made."""
 
+import re
 from itertools import product
+from pathlib import Path
 
 import pytest
 
@@ -19,6 +21,7 @@ from rosmop.form.compiled import Compiled
 from rosmop.run.engine import MonitorSet
 from tests.unit.features.guards.guarding import DEFINITIONS
 
+ROOT = Path(__file__).parents[4]
 INTERPRETED = {"joints", "answer"}
 """Presets with arrays of messages or slices, which the module leaves to the engine."""
 
@@ -109,3 +112,19 @@ def test_a_guard_that_cannot_be_made_is_refused(  # noqa: PLR0917  a row
     with pytest.raises(GuardError) as error:
         text_of(Guard(name, PRESETS[preset], topics, types, values))
     assert why in str(error.value)
+
+
+def test_the_page_names_an_existing_test_for_each_fault() -> None:
+    """Only the death of the appliance's machine has none."""
+    page = (ROOT / "docs" / "guards.md").read_text(encoding="utf-8")
+    rows = page.partition("## When the base is stopped")[2].partition("###")[0].splitlines()
+    last = [row.split("|")[-2].strip() for row in rows if row.startswith("| ") and "what fails" not in row]
+    names = {re.sub(r"[`]|\[.*", "", cell) for cell in last}
+    folders = (ROOT / "tests", ROOT / "rosmop" / "tests")
+    there = {
+        name
+        for folder in folders
+        for file in folder.rglob("test_*.py")
+        for name in re.findall(r"^(?:async )?def (test_\w+)", file.read_text(encoding="utf-8"), re.MULTILINE)
+    }
+    assert names - there == {""} and last.count("") == 1
