@@ -84,15 +84,16 @@ def _cut(cut: list[physics.Pose], stopped: list[physics.Pose]) -> list[str]:
         'stroke-dasharray="3 5"/>',
         _text(left + 6, top + 16, "fence", "small"),
     ]
-    for way, kind, colour, words in (
-        (cut, "without", WITHOUT, "link cut: drives on"), (stopped, "guarded", GUARDED, "link cut: guards stop it")
-    ):  # fmt: skip
-        (x, y), (end_x, end_y) = (_at(one.x, one.y) for one in (way[1], way[-1]))
+    for way, kind, colour in ((cut, "without", WITHOUT), (stopped, "guarded", GUARDED)):
+        (x, y), (end_x, end_y) = (_at(one.x, one.y) for one in (way[1], way[2]))
+        up = -12 if kind == "without" else 20
+        words = "the link is cut: drives on" if kind == "without" else "is cut: deadman stops it here"
         parts += [
             _track(way, kind),
             _end(way[-1], colour),
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="#b91c1c"/>',
-            _text(end_x - 6, end_y - 12, words, "small"),
+            f'<path d="M{end_x:.1f} {end_y - 9:.1f}v18" stroke="{colour}" stroke-width="3"/>',
+            _text(end_x, end_y + up, words, "small", "start" if kind == "without" else "end"),
         ]
     return parts
 

@@ -268,12 +268,17 @@ class Stage:
         """Forward a port of this machine to the console, which listens on loopback of the appliance's host."""
         return Doorway(self.appliance_host, CONSOLE)
 
-    def order(self, *arguments: str) -> None:
-        """Carry out a command of `rosrv` at the appliance, while the robot runs."""
-        command = [sys.executable, "-m", "appliance.cli.main", *arguments, "--state", str(self.state)]
+    def rosrv(self, *arguments: str) -> str:
+        """Run a verb of `rosrv`; return what it prints."""
+        command = [sys.executable, "-m", "appliance.cli.main", *arguments]
         done = subprocess.run(command, capture_output=True, text=True, timeout=START_SECONDS, check=False)
         if done.returncode:
-            raise DemoError(f"rosrv {' '.join(arguments)} failed: {done.stderr.strip()}")
+            raise DemoError(f"rosrv {' '.join(arguments)}: {(done.stderr or done.stdout).strip()}")
+        return done.stdout
+
+    def order(self, *arguments: str) -> str:
+        """Run a verb of `rosrv` on the running appliance; return what it prints."""
+        return self.rosrv(*arguments, "--state", str(self.state))
 
     def start_runaway(self, heading: float) -> Actor:
         """Replace the robot's base by one that does not stop when commands cease."""

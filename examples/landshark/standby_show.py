@@ -66,14 +66,6 @@ class StandbyStage(Stage):
         path.write_text(json.dumps(settings))
         return path
 
-    def rosrv(self, *arguments: str) -> str:
-        """Run a verb of `rosrv`; return what it prints."""
-        command = [sys.executable, "-m", "appliance.cli.main", *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=START_SECONDS, check=False)
-        if done.returncode:
-            raise DemoError(f"rosrv {' '.join(arguments)}: {(done.stderr or done.stdout).strip()}")
-        return done.stdout
-
     def standby(self, state: Path) -> dict[str, Any]:
         """Return `rosrv standby status --json`."""
         command = [sys.executable, "-m", "appliance.cli.main", "standby", "status", "--json"]

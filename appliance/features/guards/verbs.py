@@ -14,8 +14,10 @@ from appliance.cli import completion
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor.in_force import say_replaced, say_shadow_deadline
-from appliance.cli.output import say_json
+from appliance.cli.output import moment, say_json
+from appliance.features.guards.guard_answers import GuardRow
 from appliance.features.guards.guard_facts import facts_of, preset_row
+from appliance.features.guards.guard_requests import GuardsWanted
 from appliance.features.guards.plans import planned
 from appliance.features.guards.presets import (
     PRESETS,
@@ -55,14 +57,14 @@ def list_guards(appliance: Appliance) -> None:
             _say_preset(preset)
     if not appliance.said and not _runs(appliance):
         return
-    loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True))
-    for row in loaded.monitors:
-        preset_of_row = preset_of((loaded.files or {}).get(row.file, ""))
-        if preset_of_row is not None and appliance.as_json:
-            say_json({"guard": row.name, "preset": preset_of_row.name, "shadow": row.shadow, "enabled": row.enabled,
-                      "held": row.held, "topics": row.topics})  # fmt: skip
-        elif preset_of_row is not None:
-            say(f"guard {row.name}: {preset_of_row.name} on {', '.join(row.topics)}, {_state(row)}")
+    for row in appliance.ask_or_exit(GuardsWanted()).guards:
+        if appliance.as_json:
+            held, shadow, on = (row.state == state for state in ("holding", "shadow", "off"))
+            say_json({"guard": row.name, "preset": row.preset, "state": row.state, "shadow": shadow,
+                      "enabled": not shadow and not on, "held": held, "topics": [*row.topics.values()],
+                      "stops": row.stops, "confirm_by": row.confirm_by})  # fmt: skip
+        else:
+            say(f"guard {row.name}: {row.preset} on {', '.join(row.topics.values())}, {_state(row)}")
 
 
 @speaks
@@ -305,7 +307,18 @@ def _say_preset(preset: Preset) -> None:
         say_table(table)
 
 
-def _state(row: MonitorState) -> str:
-    if row.held:
-        return f"holds its topics: rosrv monitor resume {row.name}"
-    return "in shadow mode" if row.shadow else "in force" if row.enabled else "disabled"
+def _state(row: GuardRow) -> str:
+    acts = f"{row.stops} stops"
+    match row.state:
+        case "holding":
+            return f"holds its topics: rosrv monitor resume {row.name}"
+        case "shadow":
+            return f"in shadow mode, {acts} not sent"
+        case "off":
+            return f"disabled: rosrv monitor enable {row.name}"
+    end = (
+        ""
+        if row.confirm_by is None
+        else f", until {moment(row.confirm_by)} unless you run: rosrv monitor confirm"
+    )
+    return f"in force, {'stopping' if row.state == 'stopping' else 'free'}, {acts}{end}"

@@ -8,6 +8,8 @@ import pytest
 
 from appliance.channel import admin
 from appliance.features.guards import verbs
+from appliance.features.guards.guard_answers import GuardRow
+from appliance.features.guards.guard_requests import GuardsWanted
 from appliance.features.guards.presets import PRESETS, Guard, GuardError, text_of
 from tests.unit.features.guards.test_suggestions import graph_of
 
@@ -37,6 +39,12 @@ class Robot:
                 topics = [SimpleNamespace(name=one.name, type=one.type, publishers=flows[one.name],
                                           subscribers=one.subscribers) for one in graph_of("turtlebot3")]  # fmt: skip
                 return SimpleNamespace(topics=topics)
+            case GuardsWanted():
+                rows = [
+                    GuardRow(one, one, "", "stopping", {"command": "/cmd_vel"}, {}, [], {}, 3)
+                    for one in ("fence",)
+                ]
+                return SimpleNamespace(guards=rows)
             case admin.MonitorsWanted():
                 return SimpleNamespace(monitors=self.rows, files=self.files, folder=self.folder)
         self.orders.append(request)
@@ -123,7 +131,7 @@ def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureF
     run(verbs.list_guards, Robot(tmp_path, FENCE))
     shown = capsys.readouterr().out
     assert all(f"{name}: {preset.what}" in shown for name, preset in PRESETS.items())
-    assert "guard fence: fence on /cmd_vel, in force" in shown
+    assert "guard fence: fence on /cmd_vel, in force, stopping, 3 stops" in shown
     run(verbs.suggest, Robot(None))
     shown = capsys.readouterr().out
     assert "rosrv guard new fence /cmd_vel --by /odom --shadow silent=0.2\n" in shown
