@@ -32,7 +32,7 @@ from appliance.features.guards.presets import (
 )
 from appliance.features.guards.suggestions import proposals
 from rosmop.tool.tables import say_table, table_of
-from rosmop.tool.terminal import say
+from rosmop.tool.terminal import counted, say
 
 _Name = Annotated[
     str, typer.Argument(metavar="GUARD", autocompletion=completion.monitors, show_default=False)
@@ -308,12 +308,12 @@ def _say_preset(preset: Preset) -> None:
 
 
 def _state(row: GuardRow) -> str:
-    acts = f"{row.stops} stops"
+    acts = counted(row.stops, "stop")
     match row.state:
         case "holding":
             return f"holds its topics: rosrv monitor resume {row.name}"
         case "shadow":
-            return f"in shadow mode, {acts} not sent"
+            return f"in shadow mode, {acts} only recorded"
         case "off":
             return f"disabled: rosrv monitor enable {row.name}"
     end = (
