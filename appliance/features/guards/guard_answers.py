@@ -57,7 +57,7 @@ class GuardRow(msgspec.Struct, frozen=True):
     off_until: Annotated[Moment | None, doc("when it is enabled again automatically; null: no end")] = None
 
 
-class Guards(msgspec.Struct, frozen=True):
+class GuardList(msgspec.Struct, frozen=True):
     """The presets, and the guards that are loaded, in the order in which they see messages."""
 
     revision: int

@@ -16,8 +16,8 @@ from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.guards import guard_requests
 from appliance.features.guards.guard_answers import (
+    GuardList,
     GuardRow,
-    Guards,
     Suggestion,
     Suggestions,
 )
@@ -87,10 +87,10 @@ class GuardOrders:
             self._acts[name] = acts
         self._acts = {name: acts for name, acts in self._acts.items() if name in guards}
 
-    async def guards(self, _request: guard_requests.GuardsWanted) -> Guards:
+    async def guards(self, _request: guard_requests.GuardsWanted) -> GuardList:
         """Return all presets and guards."""
         rows = [self._row(name, preset) for name, preset in self._guards().items()]
-        return Guards(
+        return GuardList(
             self._monitors.revision, self._monitors.tag, [preset_row(one) for one in PRESETS.values()], rows
         )
 
@@ -118,7 +118,7 @@ class GuardOrders:
         )  # fmt: skip
         return await self._monitors.load(order, who)
 
-    async def set(self, request: guard_requests.GuardSet, who: str) -> Guards:
+    async def set(self, request: guard_requests.GuardSet, who: str) -> GuardList:
         """Set values of a guard. Raises `UnknownThingError`, `SenselessError`, and the errors of monitors."""
         monitors, name = self._monitors, request.name
         preset, text = self._guard(name)

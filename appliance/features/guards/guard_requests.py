@@ -11,7 +11,7 @@ from appliance.channel.admin import MONITORS, AdminRequest, Confirm, Hold, OneMo
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.monitor_answers import Replacement
 from appliance.channel.rest_operation import rest
-from appliance.features.guards.guard_answers import Guards, Suggestions
+from appliance.features.guards.guard_answers import GuardList, Suggestions
 
 _NO_GUARD = {404: "There is no such guard."}
 _Text = Annotated[str, msgspec.Meta(max_length=4096)]
@@ -37,13 +37,13 @@ class GuardValues(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @rest("viewer", "GET", "/v1/guards", name="guards")
-class GuardsWanted(WaitingRequest[Guards], frozen=True, tag="guards"):
+class GuardsWanted(WaitingRequest[GuardList], frozen=True, tag="guards"):
     """The presets with their parameters, and the guards with their states."""
 
 
 @rest("viewer", "GET", "/v1/guards/suggestions", name="guard_suggestions")
 class GuardSuggestionsWanted(WaitingRequest[Suggestions], frozen=True, tag="guard suggestions"):
-    """Guards that fit the topics of the running robot; nothing changes."""
+    """GuardList that fit the topics of the running robot; nothing changes."""
 
 
 @rest(
@@ -67,7 +67,7 @@ class GuardNew(AdminRequest[Replacement], frozen=True, tag="guard new"):
     "admin", "PATCH", "/v1/guards/{name}", ("hold",), name="set_guard", body=GuardValues, of=MONITORS,
     problems=_NO_GUARD,
 )  # fmt: skip
-class GuardSet(AdminRequest[Guards], frozen=True, tag="guard set"):
+class GuardSet(AdminRequest[GuardList], frozen=True, tag="guard set"):
     """Set parameters of a guard. Its state stays, except for a polygon, limits of joints or a deadline.
 
     Operators set constants with `PATCH /v1/monitors/{name}/given`.
