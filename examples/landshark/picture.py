@@ -87,7 +87,7 @@ def _cut(cut: list[physics.Pose], stopped: list[physics.Pose]) -> list[str]:
     for way, kind, colour in ((cut, "without", WITHOUT), (stopped, "guarded", GUARDED)):
         (x, y), (end_x, end_y) = (_at(one.x, one.y) for one in (way[1], way[2]))
         up = -12 if kind == "without" else 20
-        words = "the link is cut: drives on" if kind == "without" else "is cut: deadman stops it here"
+        words = "link cut: it drives on" if kind == "without" else "link cut: deadman stops it here"
         parts += [
             _track(way, kind),
             _end(way[-1], colour),
