@@ -53,7 +53,7 @@ from rosmop.types.value_types import Type
 
 EQUAL = "equal"
 IN_PYTHON = "not compiled: Python evaluates the messages of this topic"
-PATIENCE = 5.0
+PATIENCE = 30.0
 """The default time limit for each event, in seconds."""
 
 _NOW, _REST = 16, 32  # addresses of the time and of the number of bytes that are not shown

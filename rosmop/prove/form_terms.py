@@ -42,6 +42,7 @@ from rosmop.prove.terms import (
     number_at,
     opposite,
     with_number,
+    with_sign,
 )
 from rosmop.runtime import times
 from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION, UNMEASURED
@@ -63,6 +64,17 @@ class _View:
     message: Term
     start: Term
     count: Term
+
+
+_LOOPS: Mapping[type[nodes.FormNode], str] = MappingProxyType(
+    {
+        nodes.Loop: "it has a loop",
+        nodes.ForEach: "it has a loop over an array",
+        nodes.Accumulate: "it adds up the elements of an array",
+        nodes.Skip: "a field comes after strings or arrays in an array",
+    }
+)
+"""Why a part of an event takes a number of steps that depends on the message."""
 
 
 class UnknownError(Exception):
@@ -193,8 +205,8 @@ class FormTerms:
         self._block(node.no, no)
         state.join(test, yes, no)
 
-    def _repeat(self, _node: nodes.Statement | nodes.Expression, _state: State) -> None:
-        raise NotProvedError("not loop-free")
+    def _repeat(self, node: nodes.Statement | nodes.Expression, _state: State) -> None:
+        raise NotProvedError(f"not loop-free: {_LOOPS[type(node)]}")
 
     def _select(self, node: nodes.Select, state: State) -> None:
         value = self._value(node.value, state)
@@ -694,7 +706,7 @@ class FormTerms:
         if name == "a_part":
             return self._with_part(node, state)
         if name == "l_nearest":
-            raise NotProvedError("not loop-free")
+            raise NotProvedError("not loop-free: `nearest` reads each element")
         values = [self._value(argument, state) for argument in arguments]
         kind = arguments[0].type if arguments else value_types.VOID
         if name in _OF_VIEWS and isinstance(values[0], _View):
@@ -712,6 +724,10 @@ class FormTerms:
             return _ROUNDED[rounded](values[0])
         if isinstance(kind, value_types.FloatingType) and name in _QUESTIONS:
             return _QUESTIONS[name](values[0])
+        if name in ("h_copysign", "h_copysignf"):
+            self._ignore(state.where(z3.fpIsNaN(values[1])), "the sign of a NaN")
+            state.require(opposite(z3.fpIsNaN(values[1])))
+            return with_sign(*values)
         if name in ("h_min", "h_max"):
             return self._chosen(
                 _compared("<" if name == "h_min" else ">", values[1], values[0], kind), values

@@ -42,6 +42,7 @@ from rosmop.prove.terms import (
     number_at,
     opposite,
     with_number,
+    with_sign,
 )
 
 POSITION, UNDO, SAID = 0, 8, 12
@@ -170,7 +171,7 @@ class ModuleExecution:
                 return
             family, _, rest = instruction.name.partition(".")
             if instruction.name in ("block", "loop", "br", "br_if"):
-                raise NotProvedError("not loop-free")
+                raise NotProvedError("not loop-free: it compares or copies strings, byte by byte")
             method = _CONTROL.get(instruction.name)
             if method is not None:
                 method(self, instruction, state, stack)
@@ -291,7 +292,7 @@ class ModuleExecution:
         known = z3.is_bv_value(number)
         place = int(number.as_long()) + offset if known else -1
         if any(place in string for string in self._strings) or (self._strings and not known):
-            raise NotProvedError("uses a constant string, or one that is kept")
+            raise NotProvedError("uses a constant string or array, or one that is kept")
         if not known:
             raise DiffersError("it reads an address outside the message")
         return place
@@ -516,5 +517,6 @@ _OF_FLOATS: Mapping[str, Callable[[Term, Term], Term]] = MappingProxyType(
         "sub": lambda left, right: z3.fpSub(NEAREST, left, right),
         "mul": lambda left, right: z3.fpMul(NEAREST, left, right),
         "div": lambda left, right: z3.fpDiv(NEAREST, left, right),
+        "copysign": with_sign,
     }
 )

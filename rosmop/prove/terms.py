@@ -117,6 +117,11 @@ def with_number(message: Term, position: Term, value: Term) -> Term:
     return message
 
 
+def with_sign(value: Term, sign: Term) -> Term:
+    """Return `copysign(value, sign)`. The sign of a NaN is not known."""
+    return z3.If(z3.fpIsNegative(sign), z3.fpNeg(z3.fpAbs(value)), z3.fpAbs(value))
+
+
 @dataclass
 class State:
     """The state at a point of a function: the condition under which it is reached (`alive`), and values (`slots`)."""
