@@ -257,6 +257,10 @@ STOPPING = [
         fsm: a [ e -> b ] b [ e -> a ] @b {{ n++; }} }}""",
     f"""s() {{ int n; {ON_PLAIN} event e(int c) /plain own/Plain '{{count:c}}' {{ n += c; if (c > 6) {{ STOP; }} }}
         ere: (e e e)* @fail {{ STOP; __RESET; }} @match {{ if (n % 3 == 0) {{ STOP; }} }} }}""",
+    f"""s() {{ int n; {ON_PLAIN} event e(int c) /plain own/Plain '{{count:c}}' when (c != 4) {{ }}
+        event f(int c) /plain own/Plain '{{count:c}}' when (c == 4) {{ }}
+        event g(int c) /plain own/Plain '{{count:c}}' when (c > 6) {{ STOP; }}
+        ptltl: f -> (*) f @violation {{ n++; }} }}""",
 ]  # fmt: skip
 
 
@@ -287,6 +291,11 @@ def test_the_module_sends_the_safe_message() -> None:
     assert both.came["together"] == 1
     both.check([*alike, command(9, "joystick")], "/cmd_vel")
     assert both.came["together"] == 2
+    lane = BothWays(f"s() {{ {SAFE} event e() /cmd_vel {TWIST} '{{}}' {{ STOP; }} }}").lane("/cmd_vel")
+    for data, result in ((command(9, "bose"), "changed"), (SAFE_BYTES, "passed")):
+        outcome = lane.process_message(data, 1, lane.prepare(loud=False, told=()))
+        assert outcome is not None
+        assert (outcome.result, bytes(outcome.buffer)) == (result, SAFE_BYTES)
 
 
 def test_a_string_of_the_message_is_kept_before_it_is_replaced() -> None:
