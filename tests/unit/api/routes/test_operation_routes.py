@@ -447,15 +447,21 @@ BY_HAND = {
 """The routes that have no row, or a row without a name, by their least role; evidence is for all but viewers."""
 
 
+def served() -> Iterator[tuple[str, Any]]:
+    for route in iter_route_contexts(idle_application().routes):
+        for method in route.methods or ():
+            if not is_console(str(route.path)):
+                yield f"{method} {re.sub(r':[a-z]+}', '}', str(route.path))}", route
+
+
+def test_each_path_is_served_once() -> None:
+    """An operation does not hide a route that is written by hand, such as the certificate authority's."""
+    paths = [path for path, _ in served()]
+    assert sorted(paths) == sorted(set(paths))
+
+
 def routes() -> dict[str, set[str]]:
-    return {
-        f"{method} {re.sub(r':[a-z]+}', '}', str(route.path))}": {
-            role for role in roles_of(route.dependant) if role
-        }
-        for route in iter_route_contexts(idle_application().routes)
-        for method in route.methods or ()
-        if not is_console(str(route.path))
-    }
+    return {path: {role for role in roles_of(route.dependant) if role} for path, route in served()}
 
 
 def test_routes_written_by_hand_are_for_these_roles() -> None:
