@@ -58,7 +58,7 @@ function DoorRow(/** @type {{door: any, again: () => void}} */ { door, again }) 
       ${!door.port && !door.tickets.length && html`<span class="muted small">no valid ticket</span>`}</div></td>
     <td class="number" data-label="Connected">${door.connections ? html`<${Badge} word=${String(door.connections)} tone="allow" />` : "0"}</td>
     <td class="number" data-label="Received">${count(door.received)}</td><td class="number" data-label="Sent">${count(door.sent)}</td>
-    <td class="number" data-label="Dropped">${count(door.dropped)}${door.refused > 0 && html`<div class="small muted">${counted(door.refused, "connection")} refused</div>`}</td>
+    <td class="number" data-label="Dropped"><div>${count(door.dropped)}${door.refused > 0 && html`<div class="small muted">${counted(door.refused, "connection")} refused</div>`}</div></td>
     <td><div class="row row-end door-verbs"><${Link} class="button small" to=${rights}>Rights</${Link}><${Button} small role="operator" onClick=${() => setOpen("ticket")}>Ticket…</${Button}><${Button} small role="admin" tone="danger" onClick=${() => setOpen("remove")}>Remove</${Button}></div>
       ${open === "ticket" && html`<${Ticket} door=${door} again=${again} close=${close} />`}
       ${open === "remove" && html`<${Dialog} title=${`Remove ${door.name}?`} close=${close} foot=${html`<button class="button" onClick=${close}>Keep it</button><${Button} role="admin" tone="danger" onClick=${remove}>Remove</${Button}>`}>
