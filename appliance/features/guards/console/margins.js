@@ -43,7 +43,7 @@ function speeds(/** @type {any} */ guard, /** @type {Record<string, any[]>} */ s
   if (guard.preset !== "speed") return [];
   const twists = (seen[guard.topics.command] ?? []).map(({ fields }) => fields?.twist ?? fields);
   const fastest = (/** @type {any[]} */ values) => Math.max(...values.flatMap((one) => Object.values(one ?? {})).filter((one) => typeof one === "number").map(Math.abs));
-  const linear = fastest(twists.map((one) => one?.linear ?? { x: one?.drive?.speed ?? one?.speed }));
+  const linear = fastest(twists.map((twist) => twist?.linear ?? { x: twist?.drive?.speed ?? twist?.speed }));
   const angular = fastest(twists.map((one) => one?.angular));
   return /** @type {[string, string, number, string][]} */ ([["fastest", "vMax", linear, "m/s"], ["fastest turn", "wMax", angular, "rad/s"]]).flatMap(([name, of, value, unit]) => {
     const bound = constant(guard, of);

@@ -15,6 +15,7 @@ const SECTIONS = /** @type {Record<string, {keys?: string[], names?: "nodes" | "
   Clients: { keys: ["default"], names: "services" },
   Parameters: { keys: ["read default", "write default"] },
   Limits: { names: "topics", values: ["publisher", "subscriber", "topic"] },
+  Authority: {},
   Options: { keys: ["takeover", "audit-only", "tell"] },
 });
 const OPTIONS = /** @type {Record<string, string[]>} */ ({ takeover: ["same-host", "granted"], tell: ["rule", "full", "id"], "audit-only": ["all"] });
