@@ -33,6 +33,7 @@ def test_a_fence_is_drawn_changed_and_enforced(
     row = page.locator("tr[data-guard=fence]")
     with RosSession(appliance.master_uri, tmp_path) as ros:
         ros.start(["rostopic", "pub", "-r", "20", "/odom", "nav_msgs/Odometry", _ODOMETRY])
+        appliance.recorded("--category", "publish", resource="/odom")  # from now on it can be watched
         expect(page.get_by_role("img", name="Map of fence")).to_be_visible()
         page.get_by_role("button", name="Watch").click()
         expect(page.get_by_text("The robot is at 1.5, 0, 0.5 m from the edge.")).to_be_visible()
