@@ -24,6 +24,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -197,10 +198,9 @@ def until_whole(site: StandbySite, robot: StandbyRobot) -> None:
     """Wait until nothing is lost, the robot admits the holder alone, and both appliances report no trouble."""
     robot.lost_nothing()
     eventually(lambda: robot.admitted() == {ADDRESSES[site.holder()]}, site.story)
+    wanted = standby_requests.StandbyWanted()
     for one in site.appliances.values():
-        eventually(
-            lambda one=one: not [*standby_troubles(one.ask(standby_requests.StandbyWanted()))], site.story
-        )  # type: ignore[misc]  # mypy infers no type for a lambda's default
+        eventually(partial(lambda it: not [*standby_troubles(it.ask(wanted))], one), site.story)
 
 
 def one(

@@ -15,3 +15,7 @@ class UnavailableError(Exception):
 
 class StateError(Exception):
     """A file of the state cannot be used; the text names the file, the reason and the remedy."""
+
+
+class TokenRefusedError(Exception):
+    """The token cannot be made or revoked; the message gives the reason."""

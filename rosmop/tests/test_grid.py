@@ -64,7 +64,7 @@ SLOW = {
         [("/t", "event s.e", 2, "publishes a message")],
     ),
     "a stop": (
-        f"safe std_msgs/Int32 {{}} on /t every 1s; {EVENT} {{ if (x > 3) {{\n STOP; }} }}",
+        f"safe std_msgs/Int32 {{}} on /other every 1s; {EVENT} {{ if (x > 3) {{\n STOP; }} }}",
         [("/t", "event s.e", 2, "sends the safe message")],
     ),
     "a helper function": (

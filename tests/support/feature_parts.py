@@ -7,7 +7,8 @@ from appliance.channel.answers.graph_answers import Graph
 from appliance.configuration.sections import DEFAULTS
 from appliance.control.assembly.policies import Policies
 from appliance.features.feature import Feature, FeatureContext
-from appliance.features.table import FEATURES, FeatureParts
+from appliance.features.parts import FeatureParts
+from appliance.features.table import FEATURES
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.state_file import StateStore
@@ -35,6 +36,6 @@ def answered_later() -> list[tuple[Feature, type[Any]]]:
     return [
         (feature, request)
         for feature in FEATURES
-        if feature.inherit is not None or feature.may_start is not None
+        if feature.operate is None and (feature.inherit is not None or feature.may_start is not None)
         for request in feature.operations()
     ]

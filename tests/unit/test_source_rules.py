@@ -174,8 +174,8 @@ LOOKUPS = {
     "appliance/formats/bundle_verifier.py regular": _LIBRARY,
     "appliance/features/syslog/log_forwarder.py step": _TEXT,
     "appliance/features/table.py start_gate": _IMPORTED,
-    "appliance/features/table.py keep": _OF_FEATURES,
-    "appliance/features/table.py inherit": _IMPORTED,
+    "appliance/features/parts.py keep": _OF_FEATURES,
+    "appliance/features/parts.py inherit": _IMPORTED,
     "appliance/features/views.py pair_view": _IMPORTED,
     "appliance/features/views.py states_of": "states are fields of the status, which the core does not name",
     "appliance/features/views.py with_states": "the extended struct has the name of the struct in the contract",
@@ -301,6 +301,7 @@ WALL_CLOCK = {
         "supervisor/supervisor.py",
     ],
     "an end that is a date: of a certificate, a token, a revocation": [
+        "features/sso/sessions.py", "features/sso/sign_on.py",
         "features/metrics/metrics_route.py", "features/fleet/view.py", "api/process.py",
         "features/selftest/file_checks.py",
         "base/deadlines.py", "features/fleet/verified_bundles.py",

@@ -114,6 +114,8 @@ DENIALS: dict[str, str | Callable[[AuditRecord], DecidedRequest]] = {
     "specifications refused": "the specifications were rejected; their findings say why",
     "order refused": "tokens, their roles (rosrv token list) and signatures decide on REST, not the policy",
     "rest call": "tokens and their roles (rosrv token list) decide on REST, not the policy",
+    "authority refused": "[Authority] and the present holder decide it (rosrv drive status)",
+    "sign-on refused": "the provider and `sso.roles` decide who signs on",
     "door entry refused": "a valid ticket opens a door (rosrv door ticket NAME)",
     "enrolment refused": "enrolment needs a valid one-time token (rosrv host add)",
     "renewal refused": "a host renews its certificate in its own tunnel",

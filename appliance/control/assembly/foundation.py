@@ -22,7 +22,7 @@ from appliance.control.assembly.robot import robot_addresses
 from appliance.control.links.signer_requests import ReceiptFloor, SignerRequests
 from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.features.feature import FeatureContext
-from appliance.features.table import FeatureParts
+from appliance.features.parts import FeatureParts
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHosts
 from appliance.hosts.tunnel_state import Tunnels

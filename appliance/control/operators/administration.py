@@ -14,10 +14,9 @@ from appliance.channel.admin import A
 from appliance.channel.operations import CHANGES
 from appliance.control.assembly.policies import RevisionChangedError
 from appliance.control.assembly.policy_gate import PolicyRefusedError
-from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
+from appliance.control.errors import SenselessError, TokenRefusedError, UnavailableError, UnknownThingError
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_method import RequestMethod
-from appliance.control.operators.token_orders import TokenRefusedError
 from appliance.hosts.host_table import (
     HostForbiddenError,
     HostRefusedError,

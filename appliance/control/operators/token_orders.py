@@ -15,6 +15,7 @@ from appliance.base.deadlines import Deadlines
 from appliance.channel import admin
 from appliance.channel.answers import token_answers as answers
 from appliance.channel.messages.api import TokenKept
+from appliance.control.errors import TokenRefusedError
 from appliance.control.operators.sessions import Sessions
 from appliance.store.access_tokens import BadTokenNameError, TokenRow, make_token
 from appliance.store.state_file import StateStore
@@ -28,10 +29,6 @@ _LEAST_SECONDS = 30.0  # between two stored uses of a token; an api that works r
 DEFAULT_SECONDS = 90 * 86_400.0
 LONGEST_SECONDS = 3650 * 86_400.0
 _MOST = 1000
-
-
-class TokenRefusedError(Exception):
-    """The token cannot be made or revoked; the message gives the reason."""
 
 
 class TokenOrders:

@@ -29,10 +29,10 @@ class GroupGift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class GroupState(msgspec.Struct, frozen=True):
     """One group of `[Authority]`."""
 
-    group: str
+    group: Annotated[str, doc("its name")]
     names: Annotated[list[str], doc("its topics and services")]
-    holder: Annotated[str, doc("address of the host that holds it; empty: nobody")]
-    held_seconds: float | None
+    holder: Annotated[str, doc("address of the host that holds it; empty: none")]
+    held_seconds: Annotated[float | None, doc("since the holder got it; null: no host holds it")]
     lease: Annotated[float, doc("seconds of silence after which a holder loses the group")]
     left_seconds: Annotated[float | None, doc("until silence ends the authority")]
     waiting: Annotated[list[str], doc("addresses of the hosts that asked for it, the first one first")]
@@ -41,7 +41,7 @@ class GroupState(msgspec.Struct, frozen=True):
 class GroupStates(msgspec.Struct, frozen=True):
     """All groups of `[Authority]`, by name."""
 
-    groups: list[GroupState]
+    groups: Annotated[list[GroupState], doc("by name")]
 
 
 @rest("viewer", "GET", "/v1/drive", name="drive")

@@ -38,24 +38,38 @@ class KeptDoors:
         return self.table.addresses()
 
 
-def operate(context: OperatorContext) -> FeaturePart:
-    """Return the part that answers operators' requests."""
+class LateOrders(Orders):
+    """The orders about doors, which exist once control has its other parts."""
 
-    def orders() -> Orders:
-        kept = context.kept["doors"]
+    def __init__(self, context: OperatorContext) -> None:
+        self._context = context
+
+    async def listed(self, request: requests.DoorsWanted) -> requests.DoorList:
+        return await self._orders().listed(request)
+
+    async def add(self, request: requests.DoorAdd, who: str) -> requests.DoorState:
+        return await self._orders().add(request, who)
+
+    async def remove(self, request: requests.DoorRemove, who: str) -> requests.DoorState:
+        return await self._orders().remove(request, who)
+
+    async def ticket(self, request: requests.DoorTicket, who: str) -> requests.NewTicket:
+        return await self._orders().ticket(request, who)
+
+    def _orders(self) -> Orders:
+        kept = self._context.kept["doors"]
         assert isinstance(kept, KeptDoors)  # noqa: S101  `control_part.keep` made it
         return kept.orders
 
+
+def operate(context: OperatorContext) -> FeaturePart:
+    """Return the part that answers operators' requests."""
+    orders = LateOrders(context)
     return FeaturePart(
         methods=(
-            RequestMethod(requests.DoorsWanted, lambda request: orders().listed(request)),
-            RequestMethod(requests.DoorAdd, lambda request, who: orders().add(request, who), who=True),
-            RequestMethod(
-                requests.DoorRemove,
-                lambda request, who: orders().remove(request, who),
-                who=True,
-                full_disk=True,
-            ),
-            RequestMethod(requests.DoorTicket, lambda request, who: orders().ticket(request, who), who=True),
+            RequestMethod(requests.DoorsWanted, orders.listed),
+            RequestMethod(requests.DoorAdd, orders.add, who=True),
+            RequestMethod(requests.DoorRemove, orders.remove, who=True, full_disk=True),
+            RequestMethod(requests.DoorTicket, orders.ticket, who=True),
         )
     )

@@ -9,14 +9,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from appliance.features.sso.errors import SignOnRefusedError
-from appliance.features.sso.link import Identity
+from appliance.features.sso.link import SignedInPerson
 from appliance.features.sso.settings import Sso
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@+|:-]{0,127}")
 _MOST_VALUES = 1000
 
 
-def identity_of(claims: Mapping[str, Any], wanted: Sso, now: float) -> Identity:
+def identity_of(claims: Mapping[str, Any], wanted: Sso, now: float) -> SignedInPerson:
     """Return the person of these claims. Raises `SignOnRefusedError`."""
     mail = _verified_mail(claims)
     if wanted.domains and mail.rpartition("@")[2] not in wanted.domains:
@@ -43,7 +43,7 @@ def identity_of(claims: Mapping[str, Any], wanted: Sso, now: float) -> Identity:
         ends = min(ends, float(claims["exp"]))
     if ends <= now:
         raise SignOnRefusedError("the ID token has just expired: compare the clocks")
-    return Identity(claims["sub"], name, mail, role, wanted.door_groups_of(values), ends)
+    return SignedInPerson(claims["sub"], name, mail, role, wanted.door_groups_of(values), ends)
 
 
 def _verified_mail(claims: Mapping[str, Any]) -> str:

@@ -14,7 +14,7 @@ class SessionKeys(msgspec.Struct, frozen=True):
     verifying: bytes
 
 
-class Identity(msgspec.Struct, frozen=True):
+class SignedInPerson(msgspec.Struct, frozen=True):
     """A person whom the provider identified, and their rights; `ends` is seconds since the epoch.
 
     `subject` is the provider's `sub`. `name` is unique among the people of the provider. `mail` is empty unless it is
@@ -59,7 +59,7 @@ class SignOnConfirmed(Message, frozen=True):
     """The provider identified the person who began with these keys at this address."""
 
     number: int
-    identity: Identity
+    identity: SignedInPerson
     keys: SessionKeys
     address: str
 

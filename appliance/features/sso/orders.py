@@ -6,9 +6,8 @@ from typing import Any, TypeVar
 from appliance.channel import messages
 from appliance.channel.channel import ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
-from appliance.control.errors import UnavailableError, UnknownThingError
+from appliance.control.errors import TokenRefusedError, UnavailableError, UnknownThingError
 from appliance.control.operators.sessions import Session
-from appliance.control.operators.token_orders import TokenRefusedError
 from appliance.features.sso import requests
 from appliance.features.sso.link import (
     SignOnBegun,
@@ -28,7 +27,7 @@ class SsoOrders:
     """Sign people in and out; `changed()` is called when the usable sessions have changed."""
 
     def __init__(self, trail: AuditTrail, changed: Callable[[], None], *, configured: bool) -> None:
-        """Make the parts. Unless `configured`, nobody can sign on."""
+        """Make the parts. Unless `configured`, all sign-ons are refused."""
         self.link = Link(self._received)
         self.sessions = SessionTable()
         self._trail = trail

@@ -5,7 +5,7 @@ Invariants:
 1. The discovery document has the configured issuer, so a document of another issuer is not used (OpenID Connect
    Discovery 1.0, 4.3).
 2. Keys are fetched when they are older than `_FRESH_SECONDS`, and for an unknown key at most once in
-   `_AGAIN_SECONDS`. So a stranger's tokens cannot make the appliance flood the provider.
+   `_AGAIN_SECONDS`. So an unknown host's tokens cannot make the appliance flood the provider.
 3. While the provider serves no keys, the last ones are used until `keys_seconds` after they were fetched.
 """
 
@@ -27,7 +27,7 @@ _DISCOVERY = "/.well-known/openid-configuration"
 _OK = 200
 
 
-class Endpoints(msgspec.Struct, frozen=True):
+class ProviderEndpoints(msgspec.Struct, frozen=True):
     """The parts of the discovery document that are used."""
 
     issuer: str
@@ -46,16 +46,16 @@ class Provider:
         self.issuer = issuer
         self._exchange = exchange
         self._keys_seconds = keys_seconds
-        self._endpoints: tuple[float, Endpoints] | None = None
+        self._endpoints: tuple[float, ProviderEndpoints] | None = None
         self._keys: tuple[float, list[dict[str, Any]]] | None = None
         self._tried = float("-inf")
 
-    async def endpoints(self) -> Endpoints:
+    async def endpoints(self) -> ProviderEndpoints:
         """Return the endpoints, at most an hour old. Raises `ProviderError`."""
         if self._endpoints is None or clock.now() - self._endpoints[0] >= _FRESH_SECONDS:
             url = self.issuer.removesuffix("/") + _DISCOVERY
             try:
-                found = msgspec.json.decode(await self._get(url), type=Endpoints)
+                found = msgspec.json.decode(await self._get(url), type=ProviderEndpoints)
                 for place in (found.authorization_endpoint, found.token_endpoint, found.jwks_uri):
                     origin_of(place)
             except ValueError as error:

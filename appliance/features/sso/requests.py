@@ -36,7 +36,7 @@ class SignedOn(msgspec.Struct, frozen=True):
 class SignedOnList(msgspec.Struct, frozen=True):
     """The sessions of all people, the oldest first."""
 
-    sessions: list[SignedOn]
+    sessions: Annotated[list[SignedOn], doc("the oldest first")]
 
 
 @rest(None, seconds=EXCHANGE_SECONDS)

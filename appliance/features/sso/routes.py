@@ -2,8 +2,8 @@
 
 Invariants:
 
-1. Both calls count against the limit of their address, and few run at once, so neither a stranger nor a slow provider
-   occupies control.
+1. Both calls count against the limit of their address, and few run at once, so neither an unknown host nor a slow
+   provider occupies control.
 2. No answer redirects: the page goes to the provider's URL itself, and nothing in a request becomes a part of the URL's
    host.
 """

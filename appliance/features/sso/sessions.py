@@ -13,10 +13,9 @@ Invariants:
 from typing import NamedTuple
 
 from appliance.base import clock
-from appliance.control.errors import UnknownThingError
+from appliance.control.errors import TokenRefusedError, UnknownThingError
 from appliance.control.operators.sessions import Session
-from appliance.control.operators.token_orders import TokenRefusedError
-from appliance.features.sso.link import Identity, SessionKeys
+from appliance.features.sso.link import SessionKeys, SignedInPerson
 from appliance.features.sso.quotas import SESSIONS
 from appliance.signing.request_signing import TokenKeys
 from appliance.store.access_tokens import TokenRow
@@ -49,7 +48,7 @@ class SessionTable:
         """Return the person of a session, or None if it has ended."""
         return next((one for one in self.sessions() if one.id == session_id), None)
 
-    def open(self, identity: Identity, keys: SessionKeys) -> tuple[Session, list[Session]]:
+    def open(self, identity: SignedInPerson, keys: SessionKeys) -> tuple[Session, list[Session]]:
         """Open a session; return it, and the person's sessions that this ends. Raises `TokenRefusedError`."""
         name, now = f"{_PREFIX}{identity.name}", clock.wall()
         present = self.sessions()

@@ -15,7 +15,7 @@ Algorithm = Literal["RS256", "RS384", "RS512", "PS256", "PS384", "PS512", "ES256
 
 Origin = tuple[str, str, int]
 _RANKING: tuple[TokenRole, ...] = ("admin", "operator", "investigator", "viewer")
-_DOMAIN = re.compile(r"[a-z0-9-]+(\.[a-z0-9-]+)+")
+_DOMAIN = re.compile(r"[a-z0-9-]++(?:\.[a-z0-9-]++)++")
 _DOOR_GROUP = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 _PORTS = {"https": 443, "http": 80}
 
@@ -137,7 +137,7 @@ class Sso(FeatureSection):
     )
     roles: dict[TokenRole, _Values] = key(
         default_factory=dict,
-        description="values of `roles_claim` that give each role; the highest role counts, and without a role nobody"
+        description="values of `roles_claim` that give each role; the highest role counts, and without a role no person"
         " signs in",
     )
     doors: dict[Annotated[str, AfterValidator(_checked_door_group)], _Values] = key(

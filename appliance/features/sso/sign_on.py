@@ -5,7 +5,7 @@ Invariants:
 1. Each sign-on has its own state, nonce and code verifier, of 256 random bits each. A state is accepted once, within
    `PENDING_SECONDS`.
 2. The keys of the browser's session are bound to the sign-on when it begins. So a stolen code, state or URL gives
-   nobody else a session.
+   no other browser a session.
 3. There are at most `_MOST` unfinished sign-ons. A further one replaces the oldest of the address that has most, so
    that a flood from one address ends only its own sign-ons.
 """
@@ -24,8 +24,8 @@ from appliance.base import clock
 from appliance.features.sso.errors import ProviderError, SignOnRefusedError
 from appliance.features.sso.id_token import Expected, key_id_of, verify
 from appliance.features.sso.identity import identity_of
-from appliance.features.sso.link import Identity, SessionKeys
-from appliance.features.sso.provider import Endpoints, Provider
+from appliance.features.sso.link import SessionKeys, SignedInPerson
+from appliance.features.sso.provider import Provider, ProviderEndpoints
 from appliance.features.sso.quotas import SIGN_ONS
 from appliance.features.sso.settings import Sso
 
@@ -72,7 +72,7 @@ class SignOns:
         url = endpoints.authorization_endpoint
         return f"{url}{'&' if '?' in url else '?'}{urlencode(asked, quote_via=quote)}", state
 
-    async def finish(self, state: str, code: str, issuer: str) -> tuple[Identity, SessionKeys, str]:
+    async def finish(self, state: str, code: str, issuer: str) -> tuple[SignedInPerson, SessionKeys, str]:
         """Return the identity, the keys and the address of the sign-on with this state.
 
         `issuer` is the parameter `iss` of the response (RFC 9207), or empty. Raises `SignOnRefusedError` and
@@ -107,7 +107,7 @@ class SignOns:
             pending.address,
         )
 
-    async def _token(self, endpoints: Endpoints, code: str, verifier: str) -> str:
+    async def _token(self, endpoints: ProviderEndpoints, code: str, verifier: str) -> str:
         """Exchange the code for the ID token."""
         url, client = endpoints.token_endpoint, self._wanted.client_id
         form = {

@@ -93,7 +93,7 @@ def test_each_process_has_a_list_except_the_starter_of_charon() -> None:
         sandbox = role.sandbox(FACTS)
         assert sandbox.allowlist is (role.name not in {"rosmaster", "rosout", "charon"}), role.name
         assert bool(sandbox.programs) is not sandbox.allowlist
-        assert (sandbox.families == UNIX) is (role.name in {"signer", "compiler", "api", "recorder"})
+        assert (sandbox.families == UNIX) is (role.name in {"signer", "compiler", "api", "recorder", "door"})
         assert role.network or (sandbox.families, sandbox.binds, sandbox.connects) == (UNIX, (), ())
 
 

@@ -91,9 +91,9 @@ def test_a_person_signs_in_and_a_restart_ends_the_session(running: Appliance) ->
     assert again.who().status_code == 401
 
 
-def test_a_stranger_and_a_used_code_get_no_session(running: Appliance) -> None:
-    stranger = Browser(running)
-    refused = stranger.sign_on("mallory")
+def test_a_person_without_a_role_and_a_used_code_get_no_session(running: Appliance) -> None:
+    other = Browser(running)
+    refused = other.sign_on("mallory")
     assert refused.status_code == 422
     assert "mallory has no role here" in refused.json()["detail"]
     browser, thief = Browser(running), Browser(running)

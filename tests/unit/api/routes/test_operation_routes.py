@@ -23,8 +23,7 @@ from appliance.channel.operations import CHANGES, OPERATIONS
 from appliance.channel.rest_meaning import call_of, filled_in, meant
 from appliance.channel.rest_operation import Operation
 from appliance.control.assembly.policies import RevisionChangedError
-from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.control.operators.token_orders import TokenRefusedError
+from appliance.control.errors import SenselessError, TokenRefusedError, UnknownThingError
 from appliance.hosts.host_table import HostForbiddenError
 from appliance.specifications.specification_manager import MonitorsChangedError
 from appliance.store.writer_thread import StoreError
@@ -183,8 +182,12 @@ def fields_of(operation: Operation) -> set[str]:
     return {field.name for field in operation.fields().values() if field.required}
 
 
+def role_for(target: str) -> str:
+    return "investigator" if target == "/v1/recordings/memory" else "admin"
+
+
 def ordered(method: str, target: str, body: Any, tag: str = "*") -> RequestMade:
-    role = "investigator" if target == "/v1/recordings/memory" else "admin"
+    role = role_for(target)
     answer = world().asked(method, target, body, role, tag)
     assert answer.status_code in (200, 201), answer.text
     [made] = world().made
@@ -291,7 +294,7 @@ def test_a_rejection_by_control_is_a_problem(
     world().carried.error = error
     try:
         with capture_logs():
-            answer = world().asked(method, target, body, tag="*")
+            answer = world().asked(method, target, body, role_for(target), tag="*")
     finally:
         world().carried.error = None
     assert answer.status_code == status, answer.text
@@ -308,7 +311,7 @@ BODIES = [one for one in REQUESTS if one[2] is not None]
 @pytest.mark.parametrize("sent", BODIES, ids=[f"{one[0]} {one[1]} {n}" for n, one in enumerate(BODIES)])
 def test_an_invalid_body_changes_nothing(sent: tuple[str, str, Any]) -> None:
     method, target, body = sent
-    role = "investigator" if target == "/v1/recordings/memory" else "admin"
+    role = role_for(target)
     text = target.partition("?")[0] == "/v1/policy" or (method, target[:13]) == ("PUT", "/v1/monitors/")
     other = (415, "wrong-type") if text else (422, "bad-input")
     more = json.dumps({**(body if isinstance(body, dict) else {"text": body}), "unknown": 1}).encode()

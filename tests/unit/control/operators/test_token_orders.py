@@ -15,8 +15,9 @@ from appliance.base.clock import using, wall
 from appliance.base.deadlines import Deadlines
 from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke, TokenRotate
 from appliance.channel.answers.token_answers import RotatedToken
+from appliance.control.errors import TokenRefusedError
 from appliance.control.operators import token_orders
-from appliance.control.operators.token_orders import TokenOrders, TokenRefusedError
+from appliance.control.operators.token_orders import TokenOrders
 from appliance.signing.request_signing import keys_of
 from appliance.store.access_tokens import is_secret, parse_token
 from appliance.store.state_file import StateStore

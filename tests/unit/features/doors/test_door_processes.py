@@ -44,10 +44,12 @@ class Bench:
         )
         self.processes = DoorProcesses(cast(Foundation, base), cast(DoorTable, table))
         self.link = self.processes.links()["door"][0]
-        monkeypatch.setattr(
-            self.link, "send", lambda message, *_rest, **_more: self.sent.append(message) or True
-        )
+        monkeypatch.setattr(self.link, "send", self._send)
         monkeypatch.setattr(self.processes, "_given", self._given)
+
+    def _send(self, message: Any, *_rest: Any, **_more: Any) -> bool:
+        self.sent.append(message)
+        return True
 
     async def _given(self, _slot: Any, row: DoorRow, _request: int, port: int) -> None:
         assert row == ALICE

@@ -10,11 +10,11 @@ from appliance.base import clock
 from appliance.base.deadlines import Deadlines
 from appliance.channel.admin import AlarmSilence, StatusWanted, TokenAdd
 from appliance.channel.messages.api import RequestMade
-from appliance.control.errors import UnavailableError, UnknownThingError
-from appliance.control.operators.token_orders import TokenOrders, TokenRefusedError
+from appliance.control.errors import TokenRefusedError, UnavailableError, UnknownThingError
+from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest_proof import RequestAuthenticator, UnprovenError
 from appliance.features.sso import requests
-from appliance.features.sso.link import Identity, SessionKeys, SignOnConfirmed, SignOnFailed
+from appliance.features.sso.link import SessionKeys, SignedInPerson, SignOnConfirmed, SignOnFailed
 from appliance.features.sso.orders import SsoOrders
 from appliance.features.sso.quotas import SESSIONS
 from appliance.features.sso.sessions import SessionTable
@@ -38,8 +38,8 @@ def _keys(number: int) -> SessionKeys:
 
 def _person(
     subject: str = "u-1", name: str = "alice", role: Any = "operator", doors: tuple[str, ...] = ()
-) -> Identity:
-    return Identity(subject, name, "", role, doors, clock.wall() + 3600)
+) -> SignedInPerson:
+    return SignedInPerson(subject, name, "", role, doors, clock.wall() + 3600)
 
 
 class World:
@@ -70,7 +70,7 @@ class World:
             raise self.answer
         return self.answer
 
-    async def sign_on(self, number: int, person: Identity | None = None) -> requests.SignedOn:
+    async def sign_on(self, number: int, person: SignedInPerson | None = None) -> requests.SignedOn:
         self.answer = SignOnConfirmed(1, person or _person(), _keys(number), "10.0.0.9")
         return await self.sso.complete(requests.SignOnComplete("s", "c", "", "10.0.0.9"))
 

@@ -1,0 +1,121 @@
+"""Keep the parts of control that the features of the table add."""
+
+import pkgutil
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any
+
+from appliance.features.feature import FeatureContext, FeaturePart, KeptHosts, OperatorContext
+from appliance.features.table import FEATURES
+
+if TYPE_CHECKING:
+    from appliance.audit.log.record import Severity
+    from appliance.channel.answers.limit_answers import LimitUse
+    from appliance.channel.link import Link
+    from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
+    from appliance.control.operators.request_method import RequestMethod
+    from appliance.control.operators.sessions import Sessions
+    from appliance.policy.model import Address
+
+LONGEST = 64 << 20
+"""The most bytes of a message on a link of a feature, unless its part has a smaller limit."""
+
+
+class FeatureParts:
+    """The parts of all features in control."""
+
+    def __init__(self, core: FeatureContext) -> None:
+        self._core = core
+        self.kept: dict[str, KeptHosts] = {}
+        self._parts = [feature.make(core) for feature in FEATURES if feature.make is not None]
+
+    async def keep(self, store: Any, lifeline: Any) -> None:
+        """Read the hosts that features keep in the state, before the policy comes into force."""
+        for feature in FEATURES:
+            if feature.keep is not None:
+                keep = pkgutil.resolve_name(feature.keep)
+                self.kept[feature.name] = await keep(self._core.sections, store, lifeline)
+
+    def addresses(self) -> "dict[str, Address]":
+        """Return the addresses of the features' hosts, by their names in the policy."""
+        return {name: address for kept in self.kept.values() for name, address in kept.addresses().items()}
+
+    def connected(self, door: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
+        """Pass a WebSocket of the api on; return an HTTP status and why it is refused, or an empty text."""
+        connected = next(filter(None, (part.connected for part in self._parts)), None)
+        return (
+            connected(door, ticket, peer, descriptor)
+            if connected is not None
+            else (404, "there are no doors")
+        )
+
+    def operate(self, **later: Any) -> None:
+        """Add the parts that need objects of control that exist now: the fields of `OperatorContext`."""
+        context = OperatorContext(self._core, **later, kept=self.kept)
+        self._parts += [feature.operate(context) for feature in FEATURES if feature.operate is not None]
+
+    async def inherit(self, foundation: Any, parts: Any) -> None:
+        """Add the parts that need the other parts of control."""
+        for feature in FEATURES:
+            if feature.inherit is not None:
+                part: FeaturePart = await pkgutil.resolve_name(feature.inherit)(foundation, parts)
+                self._parts.append(part)
+
+    def add(self, part: FeaturePart | None) -> None:
+        """Add the part of the feature that let control serve, if there is one."""
+        if part is not None:
+            self._parts.append(part)
+
+    def link(self, role: str, index: int = 0) -> "tuple[Link, Any] | None":
+        """Return control's end of the link to a process, with the accepted messages; None for an unknown one.
+
+        The second process of a role has the name `ROLE-2`.
+        """
+        name = f"{role}-{index + 1}" if index else role
+        return next((part.links[name] for part in self._parts if name in part.links), None)
+
+    def longest(self, role: str) -> int:
+        """Return the most bytes of a message of a role."""
+        return next((part.longest[role] for part in self._parts if role in part.longest), LONGEST)
+
+    def methods(self) -> "tuple[RequestMethod[Any], ...]":
+        """Return the methods that answer the features' requests."""
+        return tuple(method for part in self._parts for method in part.methods)
+
+    def state(self) -> dict[str, Any]:
+        """Return the present states of all features by their fields in the status; `with_states` defines the fields."""
+        return {field: state for part in self._parts for field, state in part.status_fields().items()}
+
+    def limits(self) -> "tuple[LimitUse, ...]":
+        """Return how much of the features' resources is used."""
+        return tuple(use for part in self._parts for use in part.limits())
+
+    def details(
+        self, event: str, decision: str | None, severity: "Severity", host: str | None, now: int
+    ) -> dict[str, str]:
+        """Return what the features add to the details of a record."""
+        details: dict[str, str] = {}
+        for part in self._parts:
+            details |= part.details(event, decision, severity, host, now)
+        return details
+
+    async def called(self, call: "OwnServiceCalled") -> "OwnServiceAnswered":
+        """Answer a node's call of one of the appliance's own services."""
+        (called,) = (
+            answer
+            for part in self._parts
+            for name, answer in part.called.items()
+            if call.service.endswith(f"/{name}")
+        )
+        return await called(call)
+
+    def holders(self) -> "dict[str, Address]":
+        """Return the host that holds each group of `[Authority]`."""
+        return {group: host for part in self._parts for group, host in part.holders().items()}
+
+    def sessions(self) -> "Sessions | None":
+        """Return the sessions of people, or None if people sign in with tokens only."""
+        return next((part.sessions for part in self._parts if part.sessions is not None), None)
+
+    def work(self) -> dict[str, Callable[[], Awaitable[None]]]:
+        """Return the work that runs until control ends."""
+        return {what: one for part in self._parts for what, one in part.work.items()}
