@@ -64,8 +64,9 @@ SLOW = {
         [("/t", "event s.e", 2, "publishes a message")],
     ),
     "a stop": (
-        f"safe std_msgs/Int32 {{}} on /other every 1s; {EVENT} {{ if (x > 3) {{\n STOP; }} }}",
-        [("/t", "event s.e", 2, "sends the safe message")],
+        f"safe std_msgs/Int32 {{}} on /other every 1s; event o() /other std_msgs/Int32 '{{}}' {{ }} {EVENT} {{"
+        " if (x > 3) {\n STOP; } }",
+        [("/t", "event s.e", 2, "publishes safe messages")],
     ),
     "a helper function": (
         f"int f(int x) {{ if (x > 3) {{\n return exp(x); }} return x; }} {EVENT} {{ n = f(x); }}",

@@ -15,7 +15,7 @@ Algorithm = Literal["RS256", "RS384", "RS512", "PS256", "PS384", "PS512", "ES256
 
 Origin = tuple[str, str, int]
 _RANKING: tuple[TokenRole, ...] = ("admin", "operator", "investigator", "viewer")
-_DOMAIN = re.compile(r"[a-z0-9-]++(?:\.[a-z0-9-]++)++")
+_DOMAIN_LABEL = re.compile(r"[a-z0-9-]{1,63}")
 _DOOR_GROUP = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 _PORTS = {"https": 443, "http": 80}
 
@@ -70,7 +70,8 @@ def _checked_proxy(text: str) -> str:
 
 
 def _checked_domain(text: str) -> str:
-    if not _DOMAIN.fullmatch(text):
+    labels = text.split(".")
+    if len(labels) < 2 or not all(map(_DOMAIN_LABEL.fullmatch, labels)):
         raise ValueError(f"{text!r} is not a domain in lower case, for example example.org")
     return text
 

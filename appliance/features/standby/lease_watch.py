@@ -25,6 +25,8 @@ BECOMES_STANDBY = (
     "this appliance lost its lease, and is starting again as the standby: try again in some seconds"
 )
 
+_ROUNDING = 1e-6  # seconds; a timer that was rounded to a time before the end would be set again and again
+
 
 class LeaseWatch(ServiceGate):
     """The role of one of two appliances, by the reports of the process `lease`."""
@@ -97,7 +99,7 @@ class LeaseWatch(ServiceGate):
     def _check(self) -> None:
         self._stop_timer()
         left = self._left()
-        if left <= 0:
+        if left <= _ROUNDING:
             self.lapsed()
         elif self.epoch is not None:
             self._timer = asyncio.get_running_loop().call_later(left, self._check)

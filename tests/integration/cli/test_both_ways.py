@@ -83,6 +83,9 @@ LOOKING = [
     ("alarm", "list"), ("alarm", "acknowledge", "nothing", "--note", "seen"),
     ("alarm", "silence", "nothing", "--for", "1h"),
     ("guard", "list"), ("guard", "suggest"), ("guard", "new", "nothing", "/cmd_vel"),
+    ("door", "list"), ("door", "ticket", "nobody"), ("door", "remove", "nobody"), ("drive", "status"),
+    ("drive", "take", "base", "--host", "robot"), ("drive", "give", "base"),
+    ("drive", "ask", "base", "--host", "robot"), ("sso", "list"), ("sso", "end", "nobody"),
     ("guard", "set", "nobody", "vMax=1"), ("guard", "enforce", "nobody"), ("guard", "remove", "nobody"),
 ]  # fmt: skip
 

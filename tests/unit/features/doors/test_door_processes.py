@@ -7,7 +7,7 @@ import pytest
 
 from appliance.channel import messages
 from appliance.control.assembly.foundation import Foundation
-from appliance.features.doors import door_link
+from appliance.features.doors import door_link, door_processes
 from appliance.features.doors.door_processes import DoorProcesses
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.settings import Doors
@@ -42,10 +42,13 @@ class Bench:
             live=lambda: self.rows,
             in_slot=lambda number: next((row for row in self.rows if row.slot == number), None),
         )
+        monkeypatch.setattr(door_processes, "Link", self._link)
         self.processes = DoorProcesses(cast(Foundation, base), cast(DoorTable, table))
-        self.link = self.processes.links()["door"][0]
-        monkeypatch.setattr(self.link, "send", self._send)
+        self.link = cast(Any, self.processes.links()["door"][0])
         monkeypatch.setattr(self.processes, "_given", self._given)
+
+    def _link(self, heard: Any, lost: Any) -> SimpleNamespace:
+        return SimpleNamespace(heard=heard, lost=lost, send=self._send, channel=object())
 
     def _send(self, message: Any, *_rest: Any, **_more: Any) -> bool:
         self.sent.append(message)
@@ -57,7 +60,7 @@ class Bench:
 
     def hears(self, message: messages.Message) -> None:
         """Receive a message of the process."""
-        self.link._heard(message)
+        self.link.heard(message)
 
 
 @pytest.fixture
@@ -96,8 +99,8 @@ def test_the_process_of_a_removed_or_replaced_door_ends(bench: Bench) -> None:
 def test_the_death_of_a_process_is_recorded(bench: Bench) -> None:
     """Not that of a door which was removed."""
     bench.hears(door_link.DoorStarted("", None))
-    bench.link._lost("")
+    bench.link.lost("")
     assert bench.records == ["door failed"]
     bench.rows.clear()
-    bench.link._lost("")
+    bench.link.lost("")
     assert bench.records == ["door failed"]

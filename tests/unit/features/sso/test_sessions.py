@@ -192,7 +192,7 @@ def test_a_person_and_all_people_have_a_quota_of_sessions() -> None:
     ],
     ids=["refused", "provider down", "process down"],
 )
-async def test_a_failure_is_said_and_recorded(
+async def test_a_failure_is_answered_and_recorded(
     world: World, answer: Any, error: type[Exception], reason: str
 ) -> None:
     world.answer = answer

@@ -2,16 +2,18 @@
 
 import msgspec
 
-from appliance.features.metrics.metrics_route import rendered_standby
 from appliance.features.standby.samples import samples_of
 from appliance.features.standby.standby_answers import StandbyState
 from tests.support.answers import example
 
 
 def numbers(state: StandbyState) -> dict[str, float]:
-    page = rendered_standby(state, {("GET", "200"): 8}).decode()
-    rows = [line.rsplit(" ", 1) for line in page.splitlines() if not line.startswith("#")]
-    return {name: float(value) for name, value in rows if not name.startswith("rosrv_rest_calls_total")}
+    """Return the samples as a page of metrics names them."""
+    return {
+        f'{name}{{role="{labels[0]}"}}' if labels else name: float(value)
+        for name, samples in samples_of(state).items()
+        for labels, value in samples
+    }
 
 
 def test_the_active_appliance_has_the_lag_of_the_standby() -> None:
