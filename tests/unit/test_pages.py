@@ -205,3 +205,13 @@ def test_the_quickstart_is_quick() -> None:
     words = re.sub(r"<!--.*?-->|^```.*$", "", text, flags=re.MULTILINE).split()
     denied = [step for step in steps("quickstart.md") if step.how == "fails"]
     assert (text.count("\n## "), len(denied), len(words) <= 250) == (5, 1, True), len(words)
+
+
+def test_the_changelog_is_short() -> None:
+    """The next release has at most 40 bullets of three lines, after upgrade notes of at most 12 lines."""
+    section = re.split(r"^## ", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[1]
+    notes, bullets = section.split("### Security")[0], re.findall(r"^- (?:.|\n  )*", section, re.MULTILINE)
+    assert 0 < len(bullets) <= 40
+    assert [one for one in bullets if one.count("\n") > 2] == []
+    assert "### Upgrade from" in notes
+    assert notes.count("\n|") <= 12
