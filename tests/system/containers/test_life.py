@@ -137,38 +137,6 @@ def test_down_leaves_nothing(site: Site, tmp_path: Path) -> None:
         assert machine() == before
 
 
-def test_the_state_is_copied_and_restored(alone: Compose, tmp_path: Path) -> None:
-    """After the commands of docs/next-to-your-robot.md, an appliance on the copy continues as the original."""
-
-    def tar(what: str) -> None:
-        volumes = ("--volume", "alone_state:/state", "--volume", f"{tmp_path}:/copy")
-        alone.engine.docker(
-            "run",
-            "--rm",
-            *volumes,
-            "--entrypoint",
-            "tar",
-            APPLIANCE,
-            "-C",
-            "/state",
-            what,
-            "/copy/state.tar",
-            ".",
-        )
-
-    before = alone.audit("--oldest-first")[0]["id"]
-    alone("stop")
-    tar("-cf")
-    alone("down", "--volumes")
-    alone("up", "--no-start", "--no-build")
-    tar("-xf")
-    alone("start")
-    alone.wait_healthy()
-    assert alone.audit("--oldest-first")[0]["id"] == before
-    verified = alone.exec("appliance", "rosrv", "audit", "verify", check=False)
-    assert verified.returncode == 0, verified.stdout + verified.stderr
-
-
 def test_backup_and_restore_as_documented(alone: Compose, tmp_path: Path) -> None:
     """With the commands of docs/operating.md, a backup of the running appliance is restored into a new volume."""
     container, entry = alone.container("appliance"), ("--entrypoint", "rosrv", APPLIANCE)
