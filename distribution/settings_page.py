@@ -58,7 +58,7 @@ def _rows(
             sections.append((prefix + key, defined[value["$ref"].rpartition("/")[2]]))
             continue
         default = f"`{json.dumps(value['default'])}`" if "default" in value else "by machine"
-        meaning = " ".join(value.get("description", "").split()) or key.replace("_", " ")
+        meaning = " ".join(value["description"].split())
         yield f"| `{key}` | {default} | {_values(value, defined)} | {meaning} |\n".replace("`null`", "none")
 
 
@@ -71,6 +71,8 @@ def _values(value: dict[str, Any], defined: dict[str, Any]) -> str:
     bounds = " ".join(text.format(value[name]) for name, text in _BOUNDS.items() if name in value)
     if "anyOf" in value:
         kinds = list(dict.fromkeys(_values(one, defined) for one in value["anyOf"]))
+        if "size with a unit" in kinds:
+            kinds = ["size" if one == "size with a unit" else one for one in kinds if one != "integer from 0"]
         return " ".join(
             [" or ".join("size" if one == "text of size" else one for one in kinds), bounds]
         ).strip()

@@ -157,10 +157,12 @@ class LimitsSection:
         default=10.0, description="until request line and headers must have arrived"
     )
     idle_seconds: Seconds = key(default=300.0, description="a kept-alive connection without a request")
-    connections_per_host: Count = 512
+    connections_per_host: Count = key(default=512, description="open connections of one host")
     connections: Count = key(default=4096, description="of all hosts")
-    nodes_per_host: Count = 500
-    topics_per_host: Count = 5000
+    nodes_per_host: Count = key(default=500, description="registered nodes of one host")
+    topics_per_host: Count = key(
+        default=5000, description="registrations of one host: topics, services and parameters"
+    )
     node_call_seconds: Seconds = key(default=3.0, description="a call that the appliance makes to a node")
     offload_bytes: Size = key(
         default=256 << 10, description="larger bodies are parsed outside the event loop"
@@ -209,7 +211,7 @@ class Relay:
     """The limits of the relay; each key is a field of `appliance.relay.relay_limits.Limits`."""
 
     connections: Count = key(default=16_384, description="of all hosts")
-    connections_per_host: Count = 8_192
+    connections_per_host: Count = key(default=8_192, description="connections of one host")
     header_bytes: Size = key(default=64 << 10, description="TCPROS connection header")
     header_seconds: Seconds = key(default=10.0, description="until the connection header must have arrived")
     message_bytes: SizeOfMebibytes = key(default=256 << 20, description="one message")
@@ -221,7 +223,7 @@ class Relay:
     )
     budget: Milliseconds = key(
         default=10.0,
-        description="processor time that monitors may take for one message; one that takes longer is a fault",
+        description="milliseconds of processor time that monitors may take for one message; more is a fault",
     )
 
 
@@ -291,7 +293,7 @@ class ApiLimits:
     burst: Count = key(default=200, description="requests of one host at once")
     failures_per_minute: Count = key(default=20, description="requests of one host without a good token")
     connections: Count = key(default=512, description="of all hosts")
-    connections_per_host: Count = 64
+    connections_per_host: Count = key(default=64, description="connections of one host")
     header_seconds: Seconds = key(default=10.0, description="until the request's headers must have arrived")
     streams: Count = key(default=16, description="clients that follow the audit log, at once")
 
@@ -395,11 +397,11 @@ class Settings:
         description="HOST:PORT of REST, or off; by default, another free port if this one is in use",
     )
     api_tls: Annotated[bool, AfterValidator(_clear_text_stays_here)] = key(
-        default=True, description="off: clear text, on a loopback address only"
+        default=True, description="false: clear text, on a loopback address only"
     )
     api_require_proof: bool = key(
         default=False,
-        description="on: changes over REST need signed requests (docs/reference/rest.md); a bare token is not enough",
+        description="true: changes over REST need signed requests (docs/reference/rest.md), not only a bare token",
     )
     api_networks: list[Annotated[str, _NETWORK, AfterValidator(str)]] = key(
         default=[], description="who may connect to REST besides this machine (the firewall's rule)"
@@ -428,7 +430,10 @@ class Settings:
         default_factory=relays_for_this_machine,
         description="relay processes that share topics and monitors; by default one for every two cores, at most 4",
     )
-    advertise: list[Advertisement] = key(default=[])
+    advertise: list[Advertisement] = key(
+        default=[],
+        description="the appliance's address for nodes of each network; by default the address that reaches the node",
+    )
     limits: LimitsSection = LimitsSection()
     audit: Audit = Audit()
     liveness: LivenessSection = LivenessSection()

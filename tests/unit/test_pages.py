@@ -215,3 +215,15 @@ def test_the_changelog_is_short() -> None:
     assert [one for one in bullets if one.count("\n") > 2] == []
     assert "### Upgrade from" in notes
     assert notes.count("\n|") <= 12
+
+
+@pytest.mark.parametrize("page", WITH_LINKS[:-1], ids=lambda page: page.name)
+def test_file_names_of_pages_have_no_version(page: Path) -> None:
+    """A command with the version of an earlier release would install nothing."""
+    assert re.findall(r"rosrv[\w-]*[_-]\d+\.\d+\.\d+[\w.-]*", page.read_text()) == []
+
+
+def test_sizes_have_one_bound_on_the_settings_page() -> None:
+    """Integers and sizes with a unit are one kind of value, so their bounds are not joined."""
+    assert "size above 0" in settings_page.page()
+    assert "size with a unit or integer" not in settings_page.page()

@@ -157,8 +157,8 @@ EVENTS: dict[str, str] = {
     "records lost": "The queue was full while the log could not be written; `detail` has the number of lost records.",
     "checkpoint": "The state of the chain up to the preceding record was sealed for signing.",
     "signature refused": "The signer rejected a checkpoint, or its signature is invalid or by another key.",
-    "bundle in force": "A bundle of the fleet passed its trial and is in force; `detail.bundle` names it.",
-    "bundle refused": "A bundle of the fleet was refused, or rolled back after its trial; `detail.findings` has the"
+    "bundle in force": "A bundle of the fleet passed its commit-confirm and is in force; `detail.bundle` names it.",
+    "bundle refused": "A bundle of the fleet was refused, or rolled back during commit-confirm; `detail.findings` has the"
     " reasons. The last good one stays in force.",
     "bundle metadata rejected": "The collector serves bundles or metadata that are not accepted: badly signed, expired,"
     " older than known, or for other robots.",

@@ -4,7 +4,8 @@ import ast
 from pathlib import Path
 
 from appliance.quotas import table
-from appliance.quotas.table import QUOTA_ROWS, QuotaRow
+from appliance.quotas.table import QUOTA_ROWS, RELAY_MESSAGE, QuotaRow
+from appliance.relay.monitors.time_budget import TimeBudget
 from distribution.quotas_page import all_rows, page
 
 ROOT = Path(__file__).parents[3]
@@ -30,3 +31,11 @@ def test_each_row_is_attacked_by_a_test_that_exists() -> None:
             folder = ROOT if file.startswith("rosmop/") else ROOT / "tests"
             tree = ast.parse((folder / file).read_text())
             assert name in {node.name for node in ast.walk(tree) if isinstance(node, _FUNCTIONS)}, place
+
+
+def test_the_reduction_of_a_message_over_budget_is_that_of_the_relay() -> None:
+    """The page names the seconds for which the relay gives a tenth of the time."""
+    budget = TimeBudget()
+    budget.cut(0)
+    seconds = next(second for second in range(60) if budget.part(second * 10**9) == 1)
+    assert f"for {seconds} s, up to" in RELAY_MESSAGE.at_limit
