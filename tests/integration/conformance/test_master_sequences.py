@@ -91,7 +91,7 @@ def misformed(draw: st.DrawFn) -> Step:
         case "none":
             return (method,)
     position = draw(st.integers(0, len(arguments) - 1))
-    # A caller without a name may only read (docs/limits.md), see `conversations/attacks.txt`.
+    # A caller without a name may only read (docs/reference/limits.md), see `conversations/attacks.txt`.
     arguments[position] = draw(WRONG.filter(lambda wrong: position > 0 or wrong != ""))
     return method, *arguments
 
