@@ -83,8 +83,15 @@ def _below(words: tuple[str, ...], command: Any, context: Any) -> Iterator[tuple
 
 
 def _markdown(text: str) -> str:
-    paragraphs = (" ".join(one.split()) for one in text.strip().split("\n\n"))
+    paragraphs = (
+        _code(one) if one.startswith("\b\n") else " ".join(one.split()) for one in text.strip().split("\n\n")
+    )
     return "\n\n".join(re.sub(r"^(Examples?): (.*)", r"\1: `\2`", one) for one in paragraphs)
+
+
+def _code(paragraph: str) -> str:
+    """Return a paragraph whose lines stay as they are: its commands are code."""
+    return f"```text\n{paragraph.removeprefix(chr(8)).strip()}\n```"
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from difflib import get_close_matches
 from typing import Any
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from appliance.base.option_group import GroupedVerb
 from appliance.base.validation_messages import refusal
@@ -62,6 +62,10 @@ def _group_of(verbs: Verbs, further: Callable[[], Verbs]) -> type[TyperGroup]:
             """The commands of `verbs` and `further`, in the order of the help."""
             own, table = self.own_commands, joined(verbs, further())
             return {name: own.get(name) or _command_of(verb, name, dict) for name, verb in table.items()}
+
+        def get_params(self, ctx: Any) -> list[Any]:
+            """Return the options of the group itself."""
+            return _without_type_of_flags(super().get_params(ctx))
 
         def get_command(self, ctx: Any, cmd_name: str) -> Any:
             """Return a command; import features only for a command that the core lacks."""
@@ -131,4 +135,14 @@ def loaded(verb: Verb, name: str) -> Any:
     )
     words = "\n\n".join(filter(None, (verb.first, inspect.getdoc(function))))
     app.command(name, cls=kind, help=words)(function)  # type: ignore[arg-type]  # typer only calls `cls`
-    return typer.main.get_command(app)
+    command = typer.main.get_command(app)
+    _without_type_of_flags(command.get_params(typer.Context(command, info_name=name)))
+    return command
+
+
+def _without_type_of_flags(options: list[Any]) -> list[Any]:
+    """Remove the `<bool>` that typer prints for a flag, which takes no value."""
+    for option in options:
+        if isinstance(option, TyperOption) and option.is_flag:
+            option.metavar = ""
+    return options

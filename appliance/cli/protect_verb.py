@@ -67,21 +67,26 @@ def protect(
     """Nodes listen on ports of the local port range. Without --apply, --check or --remove, print the nftables rules.
 
     \b
-      rosrv protect --appliance 192.168.1.20                    print the rules
-      rosrv protect --state /var/lib/rosrv                      rules for the appliance on this machine
+    Print the rules, for an appliance elsewhere or on this machine:
+      rosrv protect --appliance 192.168.1.20
+      rosrv protect --state /var/lib/rosrv
+    Close the ports, and open them again:
       sudo rosrv protect --appliance 192.168.1.20 --open tcp/40022 --apply
-      rosrv protect --check 192.168.1.10                        on ANOTHER machine: is it closed?
-      rosrv protect --check 192.168.1.10 --api https://192.168.1.20:8443      and report to the appliance (role operator)
       sudo rosrv protect --remove
+    Check another machine, and report to the appliance (role operator):
+      rosrv protect --check 192.168.1.10
+      rosrv protect --check 192.168.1.10 --api https://192.168.1.20:8443
 
     \b
     The rules last until the next boot. To keep them, install the file:
-      rosrv protect --appliance 192.168.1.20 | sudo tee /etc/rosrv-protect.nft
-      echo 'include "/etc/rosrv-protect.nft"' | sudo tee -a /etc/nftables.conf
+      rosrv protect --appliance 192.168.1.20 | \\
+        sudo tee /etc/rosrv-protect.nft
+      echo 'include "/etc/rosrv-protect.nft"' | \\
+        sudo tee -a /etc/nftables.conf
       sudo systemctl enable --now nftables
 
     The check tries TCP. Run it on a machine other than the appliance, which is allowed in.
-    """  # noqa: E501  a line of the help, as the terminal shows it
+    """
     if sum((apply, check is not None, remove)) > 1:
         _fail("--apply, --check and --remove exclude one another")
     try:

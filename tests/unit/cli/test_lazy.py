@@ -48,6 +48,7 @@ def test_every_verb_has_help_with_an_example(name: str, command: Any) -> None:
         if one.param_type_name == "option":
             assert one.help, (name, one.opts)
     shown = CliRunner().invoke(app, [*name.split(), "--help"])
+    assert "<bool>" not in shown.output, "a flag takes no value"
     assert shown.exit_code == 0
     assert "Usage: " in shown.output
 
