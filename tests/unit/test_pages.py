@@ -227,3 +227,12 @@ def test_sizes_have_one_bound_on_the_settings_page() -> None:
     """Integers and sizes with a unit are one kind of value, so their bounds are not joined."""
     assert "size above 0" in settings_page.page()
     assert "size with a unit or integer" not in settings_page.page()
+
+
+def test_the_architecture_lists_each_folder_once() -> None:
+    """Two rows for one folder, such as after a merge, would contradict each other."""
+    rows = re.findall(
+        r"^\| `(appliance/[\w/]+)` \|", (ROOT / "docs/dev/architecture.md").read_text(), re.MULTILINE
+    )
+    assert len(rows) > 20
+    assert len(rows) == len(set(rows))
