@@ -158,8 +158,8 @@ EVENTS: dict[str, str] = {
     "checkpoint": "The state of the chain up to the preceding record was sealed for signing.",
     "signature refused": "The signer rejected a checkpoint, or its signature is invalid or by another key.",
     "bundle in force": "A bundle of the fleet passed its commit-confirm and is in force; `detail.bundle` names it.",
-    "bundle refused": "A bundle of the fleet was refused, or rolled back during commit-confirm; `detail.findings` has the"
-    " reasons. The last good one stays in force.",
+    "bundle refused": "A bundle of the fleet was refused, or rolled back during commit-confirm; `detail.findings` has"
+    " the reasons. The last good one stays in force.",
     "bundle metadata rejected": "The collector serves bundles or metadata that are not accepted: badly signed, expired,"
     " older than known, or for other robots.",
     "fleet not joined": "After a takeover, this appliance of a pair is not in the other one's fleet: both must join.",
