@@ -1,1 +1,1 @@
-"""Guards: presets of specifications that stop a robot, and the commands that bring them into force."""
+"""The demonstration: a simulated robot, its operator and an attacker, on this machine."""
