@@ -23,6 +23,11 @@ _Host = Annotated[
 ]
 
 
+_NO_GROUPS = (
+    "the policy has no section [Authority], so each host commands what [Publishers] and [Clients] grant it"
+)
+
+
 @speaks
 def status(
     appliance: Appliance,
@@ -35,7 +40,8 @@ def status(
     body = appliance.answer_or_exit(DriveStatus())
     rows = [one for one in body.groups if group in (None, one.group)]
     if not rows:
-        say("the policy has no such group in [Authority]")
+        names = ", ".join(one.group for one in body.groups)
+        say(f"[Authority] has no group {group!r}; its groups: {names}" if names else _NO_GROUPS)
         raise typer.Exit(1)
     for one in rows:
         _show(one)
