@@ -249,7 +249,18 @@ def test_a_clean_end_leaves_nothing(start: Any, state: Path) -> None:
     assert running.process.stop(with_signal=signal.SIGTERM) == 0
     assert time.monotonic() - began < allowed(5)
     assert running.children() == []
-    parts = {"compiler", "control", "ipsec", "monitors", "relay", "rosmaster", "rosout", "run", "signer"}
+    parts = {
+        "compiler",
+        "control",
+        "doors",
+        "ipsec",
+        "monitors",
+        "relay",
+        "rosmaster",
+        "rosout",
+        "run",
+        "signer",
+    }
     assert {path.name for path in state.iterdir()} == {"lock", *parts}
     assert running.process.seen(event="process did not stop") == []
 

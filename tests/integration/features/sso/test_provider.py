@@ -1,8 +1,9 @@
 """Single sign-on at a provider that is not ours (oidc-provider-mock), over REST as a browser does it."""
 
 import base64
+import contextlib
 import secrets
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
@@ -75,9 +76,24 @@ class Browser:
         return self.rest.get("/v1/whoami", headers={"Authorization": f"Bearer {reading_key(self.token)}"})
 
 
-def test_a_person_signs_in_and_a_restart_ends_the_session(running: Appliance) -> None:
+@pytest.fixture
+def opened(running: Appliance) -> Iterator[Callable[[], Browser]]:
+    """Provide a function that opens a browser; all are closed after the test."""
+    with contextlib.ExitStack() as stack:
+
+        def open_browser() -> Browser:
+            browser = Browser(running)
+            stack.callback(browser.rest.close)
+            return browser
+
+        yield open_browser
+
+
+def test_a_person_signs_in_and_a_restart_ends_the_session(
+    running: Appliance, opened: Callable[[], Browser]
+) -> None:
     """The session has the role of the claim, its own keys only, and ends with the appliance."""
-    browser = Browser(running)
+    browser = opened()
     signed = browser.sign_on("alice").raise_for_status().json()
     assert (signed["name"], signed["role"], signed["groups"]) == ("sso:alice", "operator", ["floor"])
     assert browser.who().json()["name"] == "sso:alice"
@@ -86,17 +102,17 @@ def test_a_person_signs_in_and_a_restart_ends_the_session(running: Appliance) ->
     assert bare.status_code == 401
     running.stop()
     running.start()
-    again = Browser(running)
+    again = opened()
     again.token = browser.token
     assert again.who().status_code == 401
 
 
-def test_a_person_without_a_role_and_a_used_code_get_no_session(running: Appliance) -> None:
-    other = Browser(running)
+def test_a_person_without_a_role_and_a_used_code_get_no_session(opened: Callable[[], Browser]) -> None:
+    other = opened()
     refused = other.sign_on("mallory")
     assert refused.status_code == 422
     assert "mallory has no role here" in refused.json()["detail"]
-    browser, thief = Browser(running), Browser(running)
+    browser, thief = opened(), opened()
     back = browser.return_from(browser.begin(), "alice")
     own = thief.return_from(thief.begin(), "mallory")
     stolen = thief.rest.post("/v1/sso/complete", json={**own, "code": back["code"]})
