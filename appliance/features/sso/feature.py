@@ -39,7 +39,7 @@ def _sandbox(facts: Facts) -> SandboxPlan:
 
 
 def _operations() -> "tuple[type[AdminRequest[Any]], ...]":
-    from appliance.features.sso import requests  # noqa: PLC0415  only processes with requests need it
+    from appliance.features.sso import sso_requests as requests  # noqa: PLC0415  only processes with requests need it
 
     return (
         requests.SignOnBegin,
@@ -52,7 +52,7 @@ def _operations() -> "tuple[type[AdminRequest[Any]], ...]":
 
 def _operate(context: OperatorContext) -> FeaturePart:
     from appliance.control.operators.request_method import RequestMethod  # noqa: PLC0415  only control needs it
-    from appliance.features.sso import requests  # noqa: PLC0415  as above
+    from appliance.features.sso import sso_requests as requests  # noqa: PLC0415  as above
     from appliance.features.sso.link import SsoLink  # noqa: PLC0415  as above
     from appliance.features.sso.orders import SsoOrders  # noqa: PLC0415  as above
 

@@ -26,7 +26,7 @@ from appliance.base import clock
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.rest_bodies import WHOLE
 from appliance.features.sso.link import SessionKeys
-from appliance.features.sso.requests import SignedOn, SignOnBegin, SignOnComplete, SignOnPlace
+from appliance.features.sso.sso_requests import SignedOn, SignOnBegin, SignOnComplete, SignOnPlace
 
 _MOST_AT_ONCE = 6  # of the 16 requests that may wait for other processes
 _KEY = r"^[A-Za-z0-9_-]{43}$"
