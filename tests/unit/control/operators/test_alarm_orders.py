@@ -18,11 +18,11 @@ from tests.support.engines import InlineDatabase
 from tests.support.virtual_clock import VirtualClock
 
 GOOD: dict[str, Any] = {"probe": "passed", "relay": "connected", "rosmaster": "reachable"}
-BAD = {**GOOD, "recorder": {"running": False}}
+BAD = {**GOOD, "rosmaster": "being rebuilt"}
 
 
 class Robot:
-    """The alarms of a robot, whose flight recorder is not running at first; its state survives `restart`."""
+    """The alarms of a robot, whose ROS master is being rebuilt at first; its state survives `restart`."""
 
     def __init__(self, state: Path) -> None:
         self.state = state
@@ -47,11 +47,11 @@ class Robot:
 
     def silence(self, seconds: float | None) -> None:
         """Silence the alarm, or end that."""
-        asyncio.run(self.orders.silence(AlarmSilence("recorder", seconds), "ann"))
+        asyncio.run(self.orders.silence(AlarmSilence("rosmaster", seconds), "ann"))
 
     def acknowledge(self) -> None:
         """Acknowledge the alarm."""
-        asyncio.run(self.orders.acknowledge(AlarmAcknowledge("recorder", "spare part"), "ann"))
+        asyncio.run(self.orders.acknowledge(AlarmAcknowledge("rosmaster", "spare part"), "ann"))
 
 
 @pytest.fixture(name="robot")
@@ -73,7 +73,7 @@ def test_an_acknowledged_alarm_stays_one_until_it_is_over(robot: Robot) -> None:
     alarm = robot.alarm()
     assert alarm is not None
     assert alarm.handled == ""
-    assert robot.events == ["alarm acknowledged by ann: recorder is acknowledged: spare part"]
+    assert robot.events == ["alarm acknowledged by ann: rosmaster is acknowledged: spare part"]
 
 
 @pytest.mark.parametrize(("passed", "severity"), [(3599, "notice"), (3601, "warning"), (-1, "warning")])
@@ -112,5 +112,5 @@ def test_only_a_present_alarm_is_handled(robot: Robot) -> None:
     with pytest.raises(UnknownThingError, match="neither silenced"):
         robot.silence(None)
     robot.fields = GOOD
-    with pytest.raises(UnknownThingError, match="'recorder'; there is none now"):
+    with pytest.raises(UnknownThingError, match="'rosmaster'; there is none now"):
         robot.acknowledge()
