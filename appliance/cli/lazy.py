@@ -17,6 +17,7 @@ from typer.core import TyperCommand, TyperGroup, TyperOption
 from appliance.base.option_group import GroupedVerb
 from appliance.base.validation_messages import refusal
 from appliance.cli.verb_table import Group, Verb, Verbs, joined
+from rosmop.tool.renamed_options import renamed
 
 
 def application(
@@ -117,7 +118,7 @@ class _Deferred(TyperCommand):
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         command = loaded(self._verb, str(self.name))
         try:
-            return command.make_context(info_name, args, parent, **extra)
+            return command.make_context(info_name, renamed(command, args), parent, **extra)
         except typer.BadParameter as error:
             from pydantic import ValidationError  # noqa: PLC0415  a correct command line does not need it
 

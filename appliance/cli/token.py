@@ -31,13 +31,16 @@ def add(
             " and fetch the messages of recordings"
         ),
     ] = "viewer",
-    expires: Annotated[str, typer.Option(help="Time until it expires: 12h, 90d, 52w")] = "90d",
+    *,
+    lifetime: Annotated[
+        str, typer.Option("--for", metavar="TIME", help="Time until it expires: 12h, 90d, 52w")
+    ] = "90d",
 ) -> None:
     """Create a token. It is printed once and stored nowhere.
 
-    Example: rosrv token add alice --role operator --expires 30d
+    Example: rosrv token add alice --role operator --for 30d
     """
-    seconds = span_given("--expires", expires, "30m, 12h, 90d or 52w")
+    seconds = span_given("--for", lifetime, "30m, 12h, 90d or 52w")
     _say_new(appliance.answer_or_exit(TokenAdd(name, role, seconds)))
 
 

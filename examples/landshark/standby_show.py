@@ -42,7 +42,7 @@ class StandbyStage(Stage):
     def join(self) -> None:
         """Make both appliances a pair, and start witness and follower as their kits' services do."""
         first = ["--address", APPLIANCE, "--other", OTHER, "--witness", ROBOT, "--fixed", FIXED]
-        first += ["--follower", f"ocu={OPERATOR}", "--ports", "11311,19001-26000", "--out", str(self.kit)]
+        first += ["--follower", f"ocu={OPERATOR}", "--ports", "11311,19001-26000", "--output", str(self.kit)]
         self.rosrv("standby", "join", *first, "--state", str(self.state))
         self.rosrv("standby", "join", str(self.kit / "standby-b.json"), "--state", str(self.other_state))
         for folder, host, verb in (

@@ -31,6 +31,7 @@ from rosmop.tool.options import (
     WhySlow,
     Workers,
 )
+from rosmop.tool.renamed_options import RenamedCommand
 
 
 def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
@@ -118,7 +119,7 @@ def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
     for name, command, example in (
         ("check", check, "monitors/*.rv"),
         ("run", run, "monitors/safe_triggering.rv --bag drive.bag"),
-        ("learn", learn, "--bag monday.bag --bag tuesday.bag --out learnt.rv"),
+        ("learn", learn, "--bag monday.bag --bag tuesday.bag --output learnt.rv"),
         ("coverage", coverage, "monitors/*.rv --bag drive.bag --fail-under 80"),
     ):
         more = [inspect.cleandoc(command.__doc__)] if command.__doc__ else []
@@ -136,4 +137,4 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 for _name, _command in commands_of(CommandContext("rosmop", Path.write_bytes)).items():
-    app.command(_name, help=f"{SUMMARIES[_name]}\n\n{_command.__doc__}")(_command)
+    app.command(_name, cls=RenamedCommand, help=f"{SUMMARIES[_name]}\n\n{_command.__doc__}")(_command)

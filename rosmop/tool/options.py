@@ -44,17 +44,27 @@ ReportFile = Annotated[
 ]
 ShowProgress = Annotated[
     bool,
-    typer.Option("--progress", help="Print the progress on standard error, also if it is not a terminal"),
+    typer.Option(
+        "--progress", metavar="", help="Print the progress on standard error, even if it is not a terminal"
+    ),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
+Json = Annotated[
+    bool, typer.Option("--json", metavar="", help="Machine-readable output, one object per line")
+]
 Prove = Annotated[
     bool,
-    typer.Option("--prove", help="Also prove that the compiled code of each event matches its specification"),
+    typer.Option(
+        "--prove",
+        metavar="",
+        help="Also prove that the compiled code of each event matches its specification",
+    ),
 ]
 WhySlow = Annotated[
     bool,
     typer.Option(
-        "--why-slow", help="Also list the messages that the interpreter processes, with file, line and reason"
+        "--why-slow",
+        metavar="",
+        help="Also list the messages that the interpreter processes, with file, line and reason",
     ),
 ]
 Dot = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automata for Graphviz (.dot)")]
@@ -71,7 +81,9 @@ Topics = Annotated[
 ]
 Out = Annotated[
     Path | None,
-    typer.Option(metavar="FILE.rv", help="Write a new file; message definitions go into msg/ beside it"),
+    typer.Option(
+        "--output", metavar="FILE.rv", help="Write a new file; message definitions go into msg/ beside it"
+    ),
 ]
 HoldOut = Annotated[
     float, typer.Option(min=0.0, max=0.9, help="The fraction of the recordings that tests the result")

@@ -116,7 +116,7 @@ def test_a_laptop_joins_renews_and_leaves_without_python(
         path.rename(hidden / path.name)
     script = system / "root/join.sh"
     added = site.appliance.rosrv(
-        "host", "add", "laptop", "--appliance", MIDDLE, "--token", "--out", str(script), "--json"
+        "host", "add", "laptop", "--appliance", MIDDLE, "--token", "--output", str(script), "--json"
     )
     with ScriptHost(site.ocu, tmp_path / "laptop", root=system) as laptop:
         assert laptop.run("python3", "--version", check=False).returncode == 127

@@ -64,7 +64,7 @@ class TunnelSite:
         """Enrol a host, or renew its certificate, and return its kit."""
         self.kits += 1
         path = self.home / f"kit-{self.kits}.tar.gz"
-        self.appliance.rosrv("host", verb, name, "--appliance", MIDDLE, "--out", str(path), *options)
+        self.appliance.rosrv("host", verb, name, "--appliance", MIDDLE, "--output", str(path), *options)
         return path
 
     def join(self, kit: Path, host: Host | None = None, *, log: str = "") -> JoinedHost:

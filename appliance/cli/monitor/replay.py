@@ -59,7 +59,7 @@ def replay_monitor(
     most: Annotated[
         int,
         typer.Option(
-            "--most", min=0, metavar="N", help="Number of places to show for each monitor, topic and kind"
+            "--limit", min=0, metavar="N", help="Number of places to show for each monitor, topic and kind"
         ),
     ] = 10,
     margins: Annotated[

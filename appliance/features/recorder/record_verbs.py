@@ -200,7 +200,7 @@ def fetch(
     *,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="File to write (default: rosrv-ID.bag)", show_default=False),
+        typer.Option("--output", "-o", help="File to write (default: rosrv-ID.bag)", show_default=False),
     ] = None,
     mcap: Annotated[
         bool, typer.Option("--mcap", help="As MCAP (rosrv-ID.mcap), for Foxglove and others")
@@ -212,7 +212,7 @@ def fetch(
     """
     target = out or Path(f"rosrv-{recording}.{'mcap' if mcap else 'bag'}")
     if os.path.lexists(target):
-        raise usage_error(f"{target} already exists: remove it, or name another file with --out")
+        raise usage_error(f"{target} already exists: remove it, or name another file with --output")
     part = name_to_make(target)
     try:
         os.close(_private(part))

@@ -203,7 +203,7 @@ def _write_kits(kits: Kits, out: Path) -> None:
         out.mkdir(mode=0o700, parents=True)
     except FileExistsError:
         raise usage_error(
-            f"{out} already exists: remove it, or name another folder with --out", _VERB
+            f"{out} already exists: remove it, or name another folder with --output", _VERB
         ) from None
     except OSError as error:
         raise usage_error(f"{out}: {error.strerror}", _VERB) from None

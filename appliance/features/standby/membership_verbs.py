@@ -65,7 +65,8 @@ def join(
         typer.Option(help="Configuration file, for the default of --ports (default: ./appliance.yaml)"),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="New folder for the files of the other machines; it has private keys")
+        Path | None,
+        typer.Option("--output", help="New folder for the files of the other machines; it has private keys"),
     ] = None,
     again: Annotated[
         bool, typer.Option("--again", help="Replace an earlier membership; all machines are set up again")
@@ -77,7 +78,7 @@ def join(
     Run it first on the appliance that has all data. Then give the file that it wrote to the other appliance.
 
     Example: rosrv standby join --address 192.168.1.2 --other 192.168.1.3 --witness 192.168.1.10 --fixed 192.168.1.100
-    --out standby-kit
+    --output standby-kit
 
     Example: rosrv standby join standby-b.json
     """
@@ -86,7 +87,7 @@ def join(
             raise usage_error(f"{file} has all settings: give --state and --again only", _VERB)
         join_second(file, state, again=again, as_json=as_json)
         return
-    given = {"--address": address, "--other": other, "--witness": witness, "--fixed": fixed, "--out": out}
+    given = {"--address": address, "--other": other, "--witness": witness, "--fixed": fixed, "--output": out}
     missing = [option for option, value in given.items() if value is None]
     if address is None or other is None or witness is None or fixed is None or out is None:
         raise usage_error(

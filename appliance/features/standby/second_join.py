@@ -58,7 +58,7 @@ def _given(file: Path) -> Membership:
         raise usage_error(f"{file}: {error.strerror}", _VERB) from None
     if membership is None:
         raise usage_error(
-            f"{file} does not exist; the first appliance writes it: rosrv standby join --out", _VERB
+            f"{file} does not exist; the first appliance writes it: rosrv standby join --output", _VERB
         )
     if not (
         membership.witness_key and membership.peer_key and membership.key and membership.other_certificate

@@ -42,8 +42,9 @@ _Days = Annotated[float, typer.Option(help="Days until the certificate expires")
 _Out = Annotated[
     Path | None,
     typer.Option(
+        "--output",
         help="File to write; must not exist (default: rosrv-NAME.tar.gz; with --token rosrv-NAME-join.sh); - for"
-        " standard output"
+        " standard output",
     ),
 ]
 _Open = Annotated[list[str] | None, typer.Option("--open", help="Services of the host to keep open: tcp/22")]

@@ -58,7 +58,7 @@ def write_kit(
     """Write the archive. If the appliance chose the endpoint, `reason` explains the choice; otherwise it is empty."""
     again = (
         f"{body.name} is enrolled, but its kit was not written; run:"
-        f" rosrv host kit {body.name} --appliance {wishes.endpoint} --out FILE"
+        f" rosrv host kit {body.name} --appliance {wishes.endpoint} --output FILE"
     )
     output.write(archive(kit_of(body, wishes, key)), again)
     if body.warning:

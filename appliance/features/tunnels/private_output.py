@@ -63,9 +63,9 @@ def new_output(out: Path | None, default: str, *, as_json: bool) -> Iterator[Out
     name = default.replace("/", "_")
     if out == STANDARD_OUTPUT:
         if as_json:
-            raise usage_error("--out - and --json both use standard output: give one")
+            raise usage_error("--output - and --json both use standard output: give one")
         if sys.stdout.isatty():
-            raise usage_error("standard output is a terminal; redirect it: --out - > FILE")
+            raise usage_error("standard output is a terminal; redirect it: --output - > FILE")
         yield Output(out, name, sys.stdout.buffer)
         return
     path = out or Path(name)
@@ -83,13 +83,17 @@ def _opened(path: Path) -> BinaryIO:
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     except FileExistsError:
-        raise usage_error(f"{shown} already exists: remove it, or name another file with --out") from None
+        raise usage_error(f"{shown} already exists: remove it, or name another file with --output") from None
     except OSError as error:
-        raise usage_error(f"{shown}: {error.strerror}; name another: --out FILE, or --out - > FILE") from None
+        raise usage_error(
+            f"{shown}: {error.strerror}; name another: --output FILE, or --output - > FILE"
+        ) from None
     try:
         os.posix_fallocate(descriptor, 0, _RESERVED)
     except OSError as error:
         os.close(descriptor)
         path.unlink()
-        raise usage_error(f"{shown}: {error.strerror}; name another: --out FILE, or --out - > FILE") from None
+        raise usage_error(
+            f"{shown}: {error.strerror}; name another: --output FILE, or --output - > FILE"
+        ) from None
     return os.fdopen(descriptor, "wb")

@@ -119,7 +119,7 @@ def withdraw(
 
 @bundle.command()
 def sign(
-    root: Annotated[bool, typer.Option("--root", help="Also sign the root again")] = False,
+    root: Annotated[bool, typer.Option("--root", metavar="", help="Also sign the root again")] = False,
     repository: Repository = _HERE,
     keys: Keys = None,
     passphrase_file: Secret = None,

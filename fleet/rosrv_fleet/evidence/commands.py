@@ -53,7 +53,9 @@ def list_evidence(
     token_file: Token = NO_TOKEN,
     robot: Annotated[str, typer.Option("--robot", help="Name of the robot; default: all")] = "",
     *,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line (NDJSON)")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", metavar="", help="One JSON object a line (NDJSON)")
+    ] = False,
 ) -> None:
     """List the evidence bundles, the latest first.
 

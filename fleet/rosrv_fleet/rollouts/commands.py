@@ -15,7 +15,7 @@ rollout = typer.Typer(
 )
 
 Place = Annotated[str, typer.Argument(metavar="SITE/GROUP")]
-Json = Annotated[bool, typer.Option("--json", help="Machine-readable output")]
+Json = Annotated[bool, typer.Option("--json", metavar="", help="Machine-readable output")]
 _NO_BUNDLES = "; without the section `bundles` of its configuration, a collector has no rollouts"
 _GOOD = ("in force", "no bundle")
 

@@ -19,7 +19,7 @@ def rest(running: Appliance) -> Rest:
 
 
 def new_token(appliance: Appliance, name: str, role: str, expires: str = "1h") -> str:
-    made = appliance.rosrv("token", "add", name, "--role", role, "--expires", expires, "--json").stdout
+    made = appliance.rosrv("token", "add", name, "--role", role, "--for", expires, "--json").stdout
     return str(json.loads(made)["token"])
 
 

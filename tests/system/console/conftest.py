@@ -78,7 +78,7 @@ def token(appliance: Appliance) -> Callable[..., str]:
 
     def make(role: str, name: str | None = None, expires: str = "1d") -> str:
         made = appliance.rosrv(
-            "token", "add", name or f"some-{role}", "--role", role, "--expires", expires, "--json"
+            "token", "add", name or f"some-{role}", "--role", role, "--for", expires, "--json"
         )
         return str(json.loads(made.stdout)["token"])
 

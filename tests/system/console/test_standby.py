@@ -66,7 +66,7 @@ def tokens(site: StandbySite) -> dict[str, str]:
     made = {}
     for role in ("viewer", "operator", "admin"):
         done = site.appliances["a"].rosrv(
-            "token", "add", f"some-{role}", "--role", role, "--expires", "1d", "--json"
+            "token", "add", f"some-{role}", "--role", role, "--for", "1d", "--json"
         )
         made[role] = str(json.loads(done.stdout)["token"])
     standby = site.appliances["b"]

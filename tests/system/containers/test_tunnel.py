@@ -27,7 +27,7 @@ default = laptop
 [Commands]
 default = laptop
 """
-ENROL = ("rosrv", "host", "add", "laptop", "--appliance", MACHINE, "--out", "/tmp/laptop.tar.gz")
+ENROL = ("rosrv", "host", "add", "laptop", "--appliance", MACHINE, "--output", "/tmp/laptop.tar.gz")
 
 
 def enrolled_as_documented(alone: Compose, kit: Path) -> Path:
@@ -40,7 +40,7 @@ def enrolled_as_documented(alone: Compose, kit: Path) -> Path:
     command = ["docker-compose", "--project-name", alone.project, "exec", "-T", "appliance"]
     with kit.open("wb") as file:
         subprocess.run(
-            [*command, "rosrv", "host", "add", "laptop", "--out", "-"],
+            [*command, "rosrv", "host", "add", "laptop", "--output", "-"],
             stdin=subprocess.DEVNULL,
             stdout=file,
             cwd=alone.directory,
@@ -71,7 +71,7 @@ def test_a_laptop_joins_publishes_and_is_revoked(site: Site, alone: Compose, tmp
             nowhere_to_write = alone.exec("appliance", "rosrv", "host", "kit", "laptop", check=False)
             assert nowhere_to_write.returncode == 2
             assert (
-                "Read-only file system; name another: --out FILE, or --out - > FILE"
+                "Read-only file system; name another: --output FILE, or --output - > FILE"
                 in nowhere_to_write.stderr
             )
             assert not alone.audit("--event", "host renewed"), "its certificate and its tunnel were kept"
@@ -89,7 +89,7 @@ def test_a_laptop_joins_publishes_and_is_revoked(site: Site, alone: Compose, tmp
 def test_no_token_is_made_that_no_host_can_use(alone: Compose) -> None:
     """REST is published for this machine only: the command says that no host could use a token, and adds no host."""
     add = ("rosrv", "host", "add", "laptop", "--appliance", MACHINE)
-    done = alone.exec("appliance", *add, "--token", "--out", "-", check=False)
+    done = alone.exec("appliance", *add, "--token", "--output", "-", check=False)
     assert done.returncode == 1
     assert done.stdout == ""
     assert "publish port 8443 of the container" in done.stderr

@@ -65,7 +65,7 @@ def laptop(site: TunnelSite, tmp_path: Path) -> Iterator[ScriptHost]:
 def awaited(site: TunnelSite, name: str, out: Path, *options: str, verb: str = "add") -> str:
     """Return a one-time token; its script is in `out`."""
     done = site.appliance.rosrv(
-        "host", verb, name, "--appliance", MIDDLE, "--token", "--out", str(out), "--json", *options
+        "host", verb, name, "--appliance", MIDDLE, "--token", "--output", str(out), "--json", *options
     )
     return str(json.loads(done.stdout)["token"])
 

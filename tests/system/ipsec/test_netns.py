@@ -37,7 +37,7 @@ def test_the_host_forwards_the_tunnel(tmp_path: Path) -> None:
         robot, ocu = lab.host("robot", f"{ROBOT}/24"), lab.host("ocu", f"{OCU}/24")
         with Appliance(bare, policy=POLICY, isolation="netns") as appliance:
             kit = tmp_path / "kit.tar.gz"
-            said = appliance.rosrv("host", "add", "ocu-1", "--out", str(kit)).stdout
+            said = appliance.rosrv("host", "add", "ocu-1", "--output", str(kit)).stdout
             assert f"the appliance is at {BARE} (this machine's address towards its default route)" in said
             with JoinedHost(ocu, kit, tmp_path / "ocu") as joined:
                 joined.wait_until_up()
@@ -109,7 +109,7 @@ def test_a_host_enrols_itself_through_the_forwarding(tmp_path: Path) -> None:
             ScriptHost(robot, tmp_path / "robot") as unknown,
         ):
             done = appliance.rosrv(
-                "host", "add", "ocu-1", "--appliance", BARE, "--token", "--out", str(script), "--json"
+                "host", "add", "ocu-1", "--appliance", BARE, "--token", "--output", str(script), "--json"
             )
             token = json.loads(done.stdout)["token"]
             refused = unknown.run("sh", str(script), token, check=False)

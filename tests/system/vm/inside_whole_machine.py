@@ -70,7 +70,7 @@ def test_the_appliance_on_a_machine(lab: Lab, tmp_path: Path, isolation: str, ba
     with root_host(lab, f"{MIDDLE}/24") as machine:
         before = state_of_the_machine()
         with Appliance(machine, policy=POLICY, isolation=isolation, options=options) as one:
-            one.rosrv("host", "add", "ocu-1", "--appliance", MIDDLE, "--out", str(kit))
+            one.rosrv("host", "add", "ocu-1", "--appliance", MIDDLE, "--output", str(kit))
             with JoinedHost(ocu, kit, tmp_path / "ocu") as joined:
                 joined.wait_until_up()
                 with (

@@ -73,7 +73,7 @@ def recordings(appliance: Appliance, count: int = 1) -> list[dict[str, Any]]:
 def fetched(appliance: Appliance, recording: str, folder: Path) -> Path:
     """Return the bag of a recording, as an operator gets it."""
     bag = folder / f"{recording}.bag"
-    appliance.rosrv("record", "fetch", recording, "--out", str(bag))
+    appliance.rosrv("record", "fetch", recording, "--output", str(bag))
     assert stat.S_IMODE(bag.stat().st_mode) == 0o600
     return bag
 
@@ -204,7 +204,7 @@ def test_a_drop_makes_a_recording_that_stock_tools_read(
     nothing = appliance.rosrv("monitor", "replay", "censor", *long_ago, check=False)
     assert (nothing.returncode, "there are no recordings of 2020-01-01" in nothing.stderr) == (1, True)
     mcap = tmp_path / "a.mcap"
-    appliance.rosrv("record", "fetch", row["id"], "--mcap", "--out", str(mcap))
+    appliance.rosrv("record", "fetch", row["id"], "--mcap", "--output", str(mcap))
     assert mcap.read_bytes() == b"".join(as_mcap(bag))
     appliance.rosrv("record", "remove", row["id"])
     assert not folder.exists()
@@ -338,7 +338,7 @@ def test_over_rest_messages_are_for_investigators(
     taken = tmp_path / "taken.bag"
     done = {}
     for group, *verb in (
-        ("record", "fetch", row["id"], "--out", str(taken)), ("record", "timeline", row["id"]),
+        ("record", "fetch", row["id"], "--output", str(taken)), ("record", "timeline", row["id"]),
         ("record", "messages", row["id"]), ("monitor", "replay", "censor", "--since", "1h"),
     ):  # fmt: skip
         certificate = appliance.state / "api" / "certificate.pem"

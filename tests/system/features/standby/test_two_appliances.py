@@ -73,7 +73,7 @@ class TunnelledStandbySite:
         self.kits += 1
         path = self.home / f"kit-{self.kits}.tar.gz"
         one, address = self.serving(), ADDRESSES[self.site.holder()]
-        one.rosrv("host", verb, name, "--appliance", address, "--out", str(path))
+        one.rosrv("host", verb, name, "--appliance", address, "--output", str(path))
         return path
 
     def serving(self) -> Appliance:
@@ -236,7 +236,7 @@ def test_revoked_certificates_and_new_ones(tunnelled: TunnelledStandbySite) -> N
         tunnelled.serving()
         for order in (("add", "ocu-2"), ("kit", "ocu-1")):
             out = str(tunnelled.home / "never.tar.gz")
-            refused = second.rosrv("host", *order, "--appliance", ADDRESSES["b"], "--out", out, check=False)
+            refused = second.rosrv("host", *order, "--appliance", ADDRESSES["b"], "--output", out, check=False)
             assert refused.returncode != 0
             assert WAITS in refused.stderr
         assert any(WAITS in trouble for trouble in second.status()["ipsec"]["troubles"])

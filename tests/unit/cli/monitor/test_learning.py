@@ -20,7 +20,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 def test_a_learned_specification_accepts_its_recording(drive: str, tmp_path: Path) -> None:
     out = str(tmp_path / "learnt.rv")
-    assert rosrv("monitor", "learn", "--bag", drive, "--out", out).returncode == 0
+    assert rosrv("monitor", "learn", "--bag", drive, "--output", out).returncode == 0
     checked = rosrv("monitor", "check", out)
     assert checked.returncode == 0
     assert "specifications OK\n" in checked.stdout
@@ -28,7 +28,7 @@ def test_a_learned_specification_accepts_its_recording(drive: str, tmp_path: Pat
     ran = rosrv("monitor", "run", out, "--bag", drive).stdout
     assert " 0 changed, 0 dropped" in ran
     assert "0 faults" in ran
-    again = rosrv("monitor", "learn", "--bag", drive, "--out", out)
+    again = rosrv("monitor", "learn", "--bag", drive, "--output", out)
     assert again.returncode == 2, "existing files are not overwritten"
 
 

@@ -63,7 +63,7 @@ def test_recordings_are_read_and_written(
             writer.write(connection, number * 10**9, scan(number))
     (tmp_path / "near.rv").write_text(SPECIFICATION)
     commands = [
-        ["monitor", "learn", "--bag", "a.bag", "--out", "learnt.rv"],
+        ["monitor", "learn", "--bag", "a.bag", "--output", "learnt.rv"],
         ["monitor", "check", "near.rv", "learnt.rv"],
         ["monitor", "run", "near.rv", "--bag", "a.bag", "--output", "passed.bag"],
         ["monitor", "run", "near.rv", "--bag", "passed.bag"],

@@ -41,16 +41,16 @@ def test_a_refused_request_leaves_no_file(monkeypatch: pytest.MonkeyPatch, tmp_p
     monkeypatch.setattr(AdminSocket, "ask", refuse)
     for interrupted[0] in (False, True):
         for flags in ((), ("--token",), ("--csr", str(tmp_path / "missing"))):
-            done = run("kit", "laptop", "--appliance", "10.0.0.1", "--out", str(out), *flags)
+            done = run("kit", "laptop", "--appliance", "10.0.0.1", "--output", str(out), *flags)
             assert done.exit_code != 0
             assert list(tmp_path.iterdir()) == []
 
 
 def test_a_kit_on_standard_output(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """With `--out -` standard output has only the archive, with the same bytes as in a file; messages go elsewhere."""
+    """With `--output -` standard output has only the archive, with the same bytes as in a file; messages go elsewhere."""
     monkeypatch.setattr(AdminSocket, "ask", lambda *_: AdminAnswer(True, KIT))
     monkeypatch.chdir(tmp_path)
-    done = run("add", "laptop", "--appliance", "10.0.0.1", "--out", "-")
+    done = run("add", "laptop", "--appliance", "10.0.0.1", "--output", "-")
     assert done.exit_code == 0, done.output
     with tarfile.open(fileobj=io.BytesIO(done.stdout_bytes)) as archive:
         assert any(name.endswith("join.sh") for name in archive.getnames())

@@ -30,7 +30,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def join_first(out: str = "kit", *more: str, state: str = "first") -> None:
-    done = rosrv("standby", "join", "--state", state, *FIRST, "--out", out, *more)
+    done = rosrv("standby", "join", "--state", state, *FIRST, "--output", out, *more)
     assert done.returncode == 0, done.stderr
 
 
@@ -89,7 +89,7 @@ def test_the_first_lease_has_a_greater_epoch_than_the_appliance() -> None:
 def test_a_damaged_epoch_is_refused() -> None:
     """A kit with a smaller epoch would be useless."""
     write_epoch("first", 1).write_text("damaged")
-    done = rosrv("standby", "join", "--state", "first", *FIRST, "--out", "kit")
+    done = rosrv("standby", "join", "--state", "first", *FIRST, "--output", "kit")
     assert done.returncode == 1 and "does not contain an epoch" in done.stderr
     assert not Path("kit").exists()
 
@@ -147,7 +147,7 @@ def joined_secrets(path: str) -> list[str]:
 def test_a_failed_write_leaves_neither_kit_nor_membership(monkeypatch: pytest.MonkeyPatch) -> None:
     Path("first/standby/membership.json").mkdir(parents=True)
     Path("first/lock").touch()
-    done = rosrv("standby", "join", "--state", "first", *FIRST, "--out", "kit")
+    done = rosrv("standby", "join", "--state", "first", *FIRST, "--output", "kit")
     assert done.returncode == 1, done.stdout
 
     Path("first/standby/membership.json").rmdir()
@@ -156,6 +156,6 @@ def test_a_failed_write_leaves_neither_kit_nor_membership(monkeypatch: pytest.Mo
         raise OSError(28, os.strerror(28))
 
     monkeypatch.setattr(os, "fchmod", full)
-    done = rosrv("standby", "join", "--state", "first", *FIRST, "--out", "kit")
+    done = rosrv("standby", "join", "--state", "first", *FIRST, "--output", "kit")
     assert done.returncode == 1 and "No space left on device; nothing was changed" in done.stderr
     assert not Path("kit").exists() and not path_of(Path("first")).exists()
