@@ -3,4 +3,4 @@
 `docs/dev/architecture.md` starts with diagrams of the folders, the calls between them, and the path of a request.
 """
 
-__version__ = "0.2.0"
+__version__ = "0.3.0.dev0"

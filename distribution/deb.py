@@ -25,6 +25,7 @@ from distribution.extension import IN_PLACE, ExtensionError
 from distribution.man import write_pages
 
 HERE = ROOT / "distribution"
+VERSION = __version__.replace(".dev", "~dev")  # dpkg sorts 0.3.0~dev0 before 0.3.0
 LIBRARY = "usr/lib/rosrv"
 _TOOLS = {"dh_installsystemd": "debhelper", "dpkg-buildpackage": "dpkg-dev", "lintian": "lintian"}
 COMPLETIONS = {
@@ -68,7 +69,7 @@ def build(architecture: Architecture, *, moment: int) -> Path:
         stderr=subprocess.STDOUT,
         check=True,
     )
-    made = work / f"rosrv_{__version__}_{architecture.debian}.deb"
+    made = work / f"rosrv_{VERSION}_{architecture.debian}.deb"
     dist = ROOT / "dist" / made.name
     dist.parent.mkdir(exist_ok=True)
     shutil.move(made, dist)
@@ -152,7 +153,7 @@ def _debian_folder(target: Path, moment: int) -> None:
     control = control.replace("@RUNS@", ", ".join(RUNS)).replace("@MAINTAINER@", maintainer)
     (target / "control").write_text(control)
     (target / "changelog").write_text(
-        f"rosrv ({__version__}) stable; urgency=medium\n\n  * See CHANGELOG.md.\n\n"
+        f"rosrv ({VERSION}) stable; urgency=medium\n\n  * See CHANGELOG.md.\n\n"
         f" -- {maintainer}  {formatdate(moment)}\n"
     )
     lines = [f'u {name} - "ROSRV appliance" - -' for name in NUMERIC_IDS]
@@ -181,8 +182,8 @@ def main(arguments: list[str]) -> int:
     if missing := _missing_packages(arguments):
         sys.stderr.write(f"package: tools are missing: sudo apt-get install {' '.join(missing)}\n")
         return 1
-    if re.fullmatch(r"\d+\.\d+\.\d+(~\w+)?", __version__) is None:
-        sys.stderr.write(f"package: {__version__} is not a package version\n")
+    if re.fullmatch(r"\d+\.\d+\.\d+(~\w+)?", VERSION) is None:
+        sys.stderr.write(f"package: {VERSION} is not a package version\n")
         return 1
     if "DEBEMAIL" not in os.environ:
         sys.stderr.write(f"package: DEBEMAIL is not set: the maintainer's address is {_NO_ADDRESS}\n")

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from distribution.deb import LIBRARY
+from appliance import __version__
+from distribution.deb import LIBRARY, VERSION
 from distribution.environment import ARCHITECTURES
 from distribution.extension import IN_PLACE, build
 from tests.package.conftest import SLOW_SECONDS, build_later, clean_machine, elsewhere
@@ -25,12 +26,12 @@ EVERYWHERE = {"ROS_MASTER_URI": "http://localhost:11311"}
 
 @pytest.fixture
 def newer(package: Path, tmp_path: Path) -> Path:
-    """Return the same package as 0.2.1."""
+    """Return the same package as a later version."""
     tree = tmp_path / "newer"
     subprocess.run(["dpkg-deb", "--raw-extract", str(package), str(tree)], check=True)
     control = tree / "DEBIAN/control"
-    control.write_text(control.read_text().replace("Version: 0.2.0", "Version: 0.2.1"))
-    made = tmp_path / "rosrv_0.2.1_amd64.deb"
+    control.write_text(control.read_text().replace(f"Version: {VERSION}", "Version: 999.0.0"))
+    made = tmp_path / "rosrv_999.0.0_amd64.deb"
     # compressed as the package itself: xz takes minutes, in which the machine cannot use the processor
     build = ["dpkg-deb", "--root-owner-group", "-Zgzip", "-z1", "--build", str(tree), str(made)]
     subprocess.run(build, check=True, capture_output=True)
@@ -80,7 +81,7 @@ def test_the_life_of_the_package(machine: Machine) -> None:
     machine.start()
     before = state_of(machine)
     machine.run("dpkg", "--install", "old.deb", seconds=SLOW_SECONDS)
-    assert serves(machine)["version"] == "0.2.0"
+    assert serves(machine)["version"] == __version__
     assert machine.run("rosrv", "policy", "check", "/etc/rosrv/policies/default.ini").status == 0
     assert "/etc/rosrv/policies/default.ini" in machine.run("rosrv", "config", "show").output
     assert (
@@ -108,7 +109,7 @@ def test_the_life_of_the_package(machine: Machine) -> None:
     machine.run("systemctl", "reload", "rosrv")
     machine.run("dpkg", "--install", "new.deb", seconds=SLOW_SECONDS)
     serves(machine)
-    assert machine.run("dpkg-query", "--show", "--showformat=${Version}", "rosrv").output == "0.2.1"
+    assert machine.run("dpkg-query", "--show", "--showformat=${Version}", "rosrv").output == "999.0.0"
     assert "a line of mine" in machine.run("tail", "-1", "/etc/rosrv/policies/default.ini").output
     assert "hello" in ros(machine, "rostopic", "echo", "-n", "1", "/chatter").output, (
         "the upgrade ended the talker"
