@@ -25,7 +25,7 @@ class Alarm(msgspec.Struct, frozen=True, kw_only=True):
     severity: Annotated[Severity, doc("`notice` for a silenced alarm")]
     text: Annotated[str, doc("the problem and what to do, for a person")]
     about: Annotated[About, doc("what it belongs to")]
-    handled: Annotated[str, doc("who acknowledged or silenced it; empty: nobody")] = ""
+    handled: Annotated[str, doc("the operator who acknowledged or silenced it, if any")] = ""
 
 
 class AlarmList(msgspec.Struct, frozen=True):

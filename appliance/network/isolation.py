@@ -409,7 +409,7 @@ def isolation_rules(
     for family, end in ends.items():
         if family not in routers:
             no_router = partial(forwarded, family=family, arrives_on=outward, leaves_on=outward)
-            rules.append(no_router(f"the host is no IPv{family} router", PacketVerdict.DROP))
+            rules.append(no_router(f"the host is not an IPv{family} router", PacketVerdict.DROP))
         rules += [_loopback(family, inward), *_true_sources(family, end, inward)]
         rules += [_forward("TCP", ports, end, outward) for ports in (*settings.ports, *tcp)]
         rules += [_forward("UDP", ports, end, outward) for ports in (*settings.datagrams, *udp)]

@@ -191,7 +191,9 @@ class SegmentStore:
         bucket = self.path(place).parent
         for folder, most, what in ((bucket, _MOST_BUCKETS, "ranges"), (bucket.parent, _MOST_LOGS, "logs")):
             if not folder.exists() and len(_folders(folder.parent)) >= most:
-                raise NotStorableError(f"{folder.parent} has {most} {what}: remove those that nobody needs")
+                raise NotStorableError(
+                    f"{folder.parent} has {most} {what}: remove those that are no longer needed"
+                )
 
     def _note_newest(self, place: SegmentPlace) -> None:
         newest = self.newest(place.robot)

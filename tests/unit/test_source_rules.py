@@ -413,6 +413,21 @@ def habits(source: Source) -> Iterator[tuple[int, str]]:
     yield from bad_habits(said_in(source.text, source.nodes))
 
 
+def shown_habits(source: Source) -> Iterator[tuple[int, str]]:
+    """Yield the bad habits in texts that people are shown: errors, help, descriptions of fields."""
+    parts = {id(part) for node in source.nodes if isinstance(node, ast.JoinedStr) for part in node.values}
+    for node in source.nodes:
+        match node:
+            case ast.Constant(value=str(text)) if id(node) not in parts:
+                pass
+            case ast.JoinedStr(values=values):
+                text = "".join(str(part.value) if isinstance(part, ast.Constant) else "X" for part in values)
+            case _:
+                continue
+        if text.count(" ") > 1 and not text.startswith("ROSMaster port "):  # the original ROSRV printed it so
+            yield from ((node.lineno, what) for _line, what in bad_habits(text))
+
+
 def foreign_imports(source: Source) -> Iterator[tuple[int, str]]:
     """Yield each import by a test of the language that needs the appliance or its tests."""
     for node in source.nodes:
@@ -467,6 +482,10 @@ RULES = {
     ),
     "messages": Rule(("appliance/",), printed, quoted),
     "English": Rule(FOLDERS, habits, forbid("plain English")),
+    "English that is shown": Rule(
+        (*WITH_FLEET, "distribution/"), shown_habits, forbid("plain English"),
+        ["raise ValueError(f'{name} is no group of hosts')"], ["raise ValueError(f'{name} is not a group')"],
+    ),
     "language": Rule(
         (LANGUAGE_TESTS,), foreign_imports, forbid("tests of the language run without the appliance"),
         ["from appliance.base import clock", "from tests.support.site import Site"], ["from rosmop.run import engine"],

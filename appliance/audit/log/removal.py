@@ -68,7 +68,7 @@ class Remover:
             self._remove(writer, wanted, {})
             return True
         if self._approve is None:
-            self.unremoved = "old records are not removed: nobody signs their removal"
+            self.unremoved = "old records are not removed: no process signs their removal"
             return False
         checkpoint = writer.checkpoint_text(wanted.gone.last_checkpoint)
         if checkpoint is not None:

@@ -94,11 +94,11 @@ class CheckpointVerifier:
                 FindingKind.CHECKPOINT_MISSING,
                 number + 1,
                 self._remembered.last,
-                "signed by the signer, but not in the log: its end was cut off, or an old copy was put back",
+                "signed by the signer, but not in the log: its end was cut off, or an old copy was restored",
             )
         if self._key is None and self._signed_seen:
             yield LogFinding(
-                FindingKind.NO_KEY, 0, 0, "checkpoints are signed, but there is no key to hold them against"
+                FindingKind.NO_KEY, 0, 0, "checkpoints are signed, but there is no key to verify them with"
             )
 
     def _check_row(

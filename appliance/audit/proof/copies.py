@@ -213,7 +213,7 @@ class CopiesVerifier:
     def _rewritten(self, copy: SignedCheckpoint, proven: int) -> LogFinding:
         message = (
             f"records {proven + 1} to {copy.sequence} are not those that checkpoint {copy.number}, kept elsewhere,"
-            " sealed: history was rewritten, by somebody who could sign"
+            " sealed: history was rewritten with the signer's key"
         )
         return LogFinding(FindingKind.REWRITTEN, proven + 1, copy.sequence, message)
 

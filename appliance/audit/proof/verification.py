@@ -165,7 +165,7 @@ class _Verifier:
     def run(self) -> Verification:
         self._check_structure()
         if not self._log:
-            self._structure("table log does not have the one id of a log: what it sealed cannot be told")
+            self._structure("table log does not have the one id of a log: what it sealed is unknown")
         removed = self._last_removal()
         try:
             sequences = self._connection.execute("SELECT sequence FROM checkpoint")

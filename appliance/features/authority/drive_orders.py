@@ -85,7 +85,7 @@ class DriveOrders:
             )
         async with self._turn:
             if self._groups.holder(group.name) is None and to is None:
-                raise SenselessError(f"nobody holds {group.name}: `rosrv drive status` lists all groups")
+                raise SenselessError(f"no host holds {group.name}: `rosrv drive status` lists all groups")
             await self._hand_over(group, to or self._next(group), f"given by {who}", who)
         return self._state(group)
 
@@ -175,7 +175,7 @@ class DriveOrders:
         if self._claim(group, host) is None:
             raise SenselessError(self._refusal(group, host, None, who))
         if self._groups.holder(group.name) is None and self._groups.may_take(group, host):
-            await self._hand_over(group, host, "asked while nobody held it", who)
+            await self._hand_over(group, host, "asked while no host held it", who)
             return
         if not self._groups.wait(group, host, clock.now()):
             raise UnavailableError(f"too many hosts wait for {group.name}: ask again later")

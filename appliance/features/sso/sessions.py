@@ -98,7 +98,7 @@ class SessionTable:
         ended = [one for one in self.sessions() if one.name in (name, f"{_PREFIX}{name}")]
         if not ended:
             names = ", ".join(sorted({one.name for one in self.sessions()})[:20]) or "none"
-            raise UnknownThingError(f"nobody is signed in as {name[:140]!r}; there are: {names}")
+            raise UnknownThingError(f"no person is signed in as {name[:140]!r}; there are: {names}")
         for one in ended:
             del self._kept[one.id]
         return ended

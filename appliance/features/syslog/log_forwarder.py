@@ -203,5 +203,7 @@ def _in_log(path: Path, position: ForwardingPosition) -> ForwardingPosition:
         before = ask(later, position.record) if position.record else None
         sequence = min(position.sequence, head) if before is None else int(before)
         number = ask("SELECT coalesce(max(number), 0) FROM checkpoint WHERE sequence <= ?", sequence)
-    _log.warning("the audit log was put back from a copy: it is forwarded from there", sequence=sequence)
+    _log.warning(
+        "the audit log was restored from a copy: forwarding continues from its end", sequence=sequence
+    )
     return ForwardingPosition(position.log, sequence, min(position.checkpoint, int(number)))

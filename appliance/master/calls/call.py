@@ -99,7 +99,8 @@ def _check_members(value: Value, place: str) -> None:
         if not names.is_relative_member(name):
             where = f"in {place!a} " if place else ""
             raise InvalidNameError(
-                f"has a member {where}named {name[:80]!a}, which is no relative name: write 'name' or 'namespace/name'"
+                f"has a member {where}named {name[:80]!a}, which is not a relative name: "
+                "write 'name' or 'namespace/name'"
             )
         _check_members(member, f"{place}/{name}"[:80])
 

@@ -333,7 +333,7 @@ def appliance_rules(settings: FirewallSettings) -> tuple[PacketRule, ...]:
             for rule in _tunnel_only(network, settings.tunnel_interface)
         ),
         *_own_network(settings.own_network),
-        *inner_port("ROSMaster port", settings.rosmaster_port, "control", settings.control_uid),
+        *inner_port("ROS master port", settings.rosmaster_port, "control", settings.control_uid),
         *inner_port("inner node face", settings.inner_port, "rosmaster", settings.rosmaster_uid),
         *_rosmaster(settings),
         *_own_node(settings),

@@ -330,7 +330,7 @@ def test_the_report_counts_packets_and_misses_removed_rules(protected: Host, bac
         firewall.install(settings(port))
         connect(protected, OTHER, *((address, port) for address in LOOPBACKS))
         report = firewall.report()
-        refused = next(rule for rule in report.rules if rule.purpose == "ROSMaster port: no other user")
+        refused = next(rule for rule in report.rules if rule.purpose == "ROS master port: no other user")
         assert (report.backend, report.intact, refused.packets) == (backend, True, 2)
         if backend == "nft":
             run_in(protected, "nft flush chain inet rosrv ROSRV-OUT-OUTPUT")
@@ -338,7 +338,9 @@ def test_the_report_counts_packets_and_misses_removed_rules(protected: Host, bac
             run_in(protected, "ip6tables-legacy -D OUTPUT 1")
         report = firewall.report()
         assert not report.intact
-        assert "ROSMaster port: no other user" in {rule.purpose for rule in report.rules if not rule.in_force}
+        assert "ROS master port: no other user" in {
+            rule.purpose for rule in report.rules if not rule.in_force
+        }
         firewall.update(settings(port))
         assert firewall.report().intact
 

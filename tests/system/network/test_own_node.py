@@ -113,7 +113,7 @@ def test_a_compromised_rosout_or_rosmaster_reaches_nothing() -> None:
         with Appliance(host, options=("--api", "10.77.0.2:8443")) as appliance, listening(robot) as outside:
             rows = {row["purpose"]: row["rule"] for row in appliance.status()["firewall"]["rules"]}
             own = int(rows["own node's master: rosout may"].split("tcp ")[1].split(",")[0])
-            hidden = int(rows["ROSMaster port: control may"].split("tcp ")[1].split(",")[0])
+            hidden = int(rows["ROS master port: control may"].split("tcp ")[1].split(",")[0])
             for user, reaches_own in (
                 ("rosrv-rosout", "reached"),
                 ("rosmaster", "refused"),

@@ -51,8 +51,8 @@ def test_packets_to_the_appliance_keep_their_source() -> None:
 def test_a_host_that_routed_before_is_not_cut_off() -> None:
     """The rule against routing for others is left out for each family in which the host was already a router."""
     purposes = [rule.purpose for rule in isolation_rules(SETTINGS, ENDS, (4,)) if rule.chain is Chain.FORWARD]
-    assert "the host is no IPv6 router" in purposes
-    assert "the host is no IPv4 router" not in purposes
+    assert "the host is not an IPv6 router" in purposes
+    assert "the host is not an IPv4 router" not in purposes
 
 
 def test_a_port_is_needed() -> None:

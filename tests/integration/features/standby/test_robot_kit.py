@@ -98,7 +98,9 @@ class RobotSite:
         self.kit = self.kit.with_name(kit)
         arguments = [f"--address={ADDRESSES['a']}", f"--other={ADDRESSES['b']}", f"--witness={ROBOT}"]
         arguments += [f"--fixed={FIXED}", f"--follower=arm={FOLLOWER}", "--ports=11311,20000-20999"]
-        done = rosrv("standby", "join", "--state", str(self.state), *arguments, "--output", str(self.kit), *more)
+        done = rosrv(
+            "standby", "join", "--state", str(self.state), *arguments, "--output", str(self.kit), *more
+        )
         assert done.returncode == 0, done.stderr
 
     def _host(self, outer: Host, folder: Path) -> ScriptHost:

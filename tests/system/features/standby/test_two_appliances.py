@@ -236,7 +236,9 @@ def test_revoked_certificates_and_new_ones(tunnelled: TunnelledStandbySite) -> N
         tunnelled.serving()
         for order in (("add", "ocu-2"), ("kit", "ocu-1")):
             out = str(tunnelled.home / "never.tar.gz")
-            refused = second.rosrv("host", *order, "--appliance", ADDRESSES["b"], "--output", out, check=False)
+            refused = second.rosrv(
+                "host", *order, "--appliance", ADDRESSES["b"], "--output", out, check=False
+            )
             assert refused.returncode != 0
             assert WAITS in refused.stderr
         assert any(WAITS in trouble for trouble in second.status()["ipsec"]["troubles"])

@@ -72,7 +72,7 @@ def test_hosts_are_counted_after_the_handshake_only() -> None:
 
 def test_the_owner_passes_before_all_others_are_refused() -> None:
     """For an inner port, from the first packet on, the owner's RETURN precedes the rule that refuses all users."""
-    outside, owner, others = inner_port("ROSMaster port", 11312, "control", 61011)
+    outside, owner, others = inner_port("ROS master port", 11312, "control", 61011)
     assert (outside.chain, outside.arrives_on, outside.verdict) == (
         Chain.IN,
         Interface("lo", other=True),
@@ -207,7 +207,7 @@ def test_a_kernel_without_a_family_lacks_no_rule_of_it() -> None:
 
 def test_a_rule_describes_itself() -> None:
     """The description has the matches and the verdict in words of netfilter."""
-    _, owner, _ = inner_port("ROSMaster port", 11312, "control", 61011)
+    _, owner, _ = inner_port("ROS master port", 11312, "control", 61011)
     assert owner.describe() == "out lo, tcp 11312, uid 61011, syn -> RETURN"
 
 

@@ -21,7 +21,7 @@ SYN = ("tcp-flags", ("SYN,ACK", "SYN"))
 
 def test_the_owner_rule_in_words_of_xtables() -> None:
     """The owner match has the SYN flag and the port, once for each family."""
-    _, owner, others = inner_port("ROSMaster port", 11312, "control", 61011)
+    _, owner, others = inner_port("ROS master port", 11312, "control", 61011)
     header = HeaderMatch(protocol="tcp", out_interface="lo")
     assert render_rule(owner) == [
         RenderedRule(
@@ -31,7 +31,7 @@ def test_the_owner_rule_in_words_of_xtables() -> None:
             (
                 ("tcp", (("dport", "11312"), SYN)),
                 ("owner", (("uid-owner", "61011"),)),
-                ("comment", (("comment", "ROSMaster port: control may"),)),
+                ("comment", (("comment", "ROS master port: control may"),)),
             ),
             ("RETURN", ()),
         )

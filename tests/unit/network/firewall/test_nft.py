@@ -35,7 +35,7 @@ SYN = {
 
 def test_the_owner_rule_in_libnftables_json() -> None:
     """One rule serves both families: interface, port, SYN, user, counter, verdict."""
-    _, owner, others = inner_port("ROSMaster port", 11312, "control", 61011)
+    _, owner, others = inner_port("ROS master port", 11312, "control", 61011)
     assert render_rule(owner) == [
         {
             "chain": "ROSRV-OUT",
@@ -47,7 +47,7 @@ def test_the_owner_rule_in_libnftables_json() -> None:
                 {"counter": None},
                 {"return": None},
             ],
-            "comment": "ROSMaster port: control may",
+            "comment": "ROS master port: control may",
         }
     ]
     assert render_rule(others)[0]["expr"][-1] == {"reject": {"type": "tcp reset"}}
