@@ -1,7 +1,7 @@
 """Takeovers by a second appliance, as the robot's nodes see them, and the cost of a registration.
 
-    python -m benchmarks.standby cuts [--cuts 50] [--load 0] [--seed 1]
-    python -m benchmarks.standby switchovers [--cuts 10] [--load 0]
+    python -m benchmarks.standby cuts [--cuts 50] [--load 0] [--seed 1] [--monitors FOLDER]
+    python -m benchmarks.standby switchovers [--cuts 10] [--load 0] [--monitors FOLDER]
     python -m benchmarks.standby registrations [--rounds 40] [--load 0]
 
 `cuts`: the power of the active appliance is cut at a random time; it comes back as the standby before the next cut.
@@ -11,7 +11,7 @@ for topics and calls. Afterwards no node has ended and no answered change is mis
 
 `registrations`: one node registers and unregisters a topic behind a single appliance, two appliances with
 `availability.wait: none`, and two with `standby`. They take turns, so that other load affects all; ratios are of
-medians. `--load` starts processes that keep the machine's cores busy.
+medians. `--load` starts processes that keep the machine's cores busy. `--monitors` loads the specifications there.
 """
 
 import argparse
@@ -154,13 +154,14 @@ def _burn() -> None:
         pass
 
 
-def takeovers(number: int, load: int, seed: int, *, planned: bool) -> None:
+def takeovers(number: int, load: int, seed: int, monitors: Path | None, *, planned: bool) -> None:
     """Print a table of takeovers."""
     chance, pauses = random.Random(seed), dict[str, list[float]]()
+    options = () if monitors is None else ("--monitors", str(monitors), "--enable", "all")
     with (
         tempfile.TemporaryDirectory() as home,
         Lab("rosrv-bench") as lab,
-        StandbySite(lab, Path(home)) as site,
+        StandbySite(lab, Path(home), options=options) as site,
     ):
         site.start_witness()
         site.start("a")
@@ -275,11 +276,12 @@ def main() -> None:
     arguments.add_argument("--rounds", type=int, default=40, help="turns of each kind, with 20 calls each")
     arguments.add_argument("--load", type=int, default=0, help="processes that compute")
     arguments.add_argument("--seed", type=int, default=1)
+    arguments.add_argument("--monitors", type=Path, help="folder of specifications, all enabled")
     given = arguments.parse_args()
     if given.what == "registrations":
         registrations(given.rounds, given.load)
     else:
-        takeovers(given.cuts, given.load, given.seed, planned=given.what == "switchovers")
+        takeovers(given.cuts, given.load, given.seed, given.monitors, planned=given.what == "switchovers")
 
 
 if __name__ == "__main__":

@@ -127,7 +127,8 @@ def faults(kind: str, number: int, load: int = 0, seed: int = 1) -> int:
             for turn in range(number):
                 _NEVER.wait(chance.uniform(1, 2))
                 seconds = chance.uniform(least, most)
-                found, gone = _one(site, robot, make(site), seconds, after=after)
+                in_sync = 1 if kind == "alone" else 2
+                found, gone = _one(site, robot, make(site), seconds, after=after, in_sync=in_sync)
                 lost += gone
                 for name, pause in found.items():
                     pauses.setdefault(name, []).append(pause)
@@ -158,12 +159,15 @@ def _one(
     seconds: float,
     *,
     after: bool,
+    in_sync: int,
 ) -> tuple[dict[str, float], int]:
-    """Return the times without service, and the number of lost subscriptions."""
+    """Return the times without service, and the number of lost subscriptions.
+
+    `in_sync`: the number of appliances in sync some time after the fault.
+    """
     lost: list[Process] = []
     with Watch(robot) as watch:
         with fault:
-            in_sync = site.in_sync()
             _NEVER.wait(seconds)
         ended = time.monotonic()
         back = {
@@ -185,7 +189,7 @@ def _one(
         robot.ros.processes.remove(listener)
         host = site.lab.hosts["arm" if "__name:=arm_" in listener.command[-1] else "robot"]
         robot.listeners.append(robot.ros.on(host).start(listener.command, label=listener.label))
-    eventually(lambda: site.in_sync() == in_sync, site.story)
+    eventually(lambda: len(site.in_sync()) == in_sync, site.story)
     robot.works()
     return back if after else watch.longest_pauses(), len(lost)
 
