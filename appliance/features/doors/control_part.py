@@ -34,10 +34,10 @@ async def keep(sections: Sections, store: StateStore, lifeline: ControlLifeline)
     """Return the table of doors, with addresses that no other program can use, before the policy names them."""
     settings = sections.of(Doors)
     table = DoorTable(store, settings)
-    if table.live() and not table.problem:
-        table.problem = await lifeline.open_own_network(settings.network, table.ports())
-    if table.problem:
-        _log.error("doors cannot be used", reason=table.problem)
+    if table.live():
+        table.closed = await lifeline.open_own_network(settings.network, table.ports())
+        if table.problem:
+            _log.error("doors cannot be used", reason=table.problem)
     return KeptDoors(table)
 
 
@@ -77,15 +77,14 @@ class DoorOrders:
     async def add(self, request: door_requests.DoorAdd, who: str) -> door_requests.DoorState:
         """Add a door. Raises `SenselessError`, `UnavailableError` and `StoreError`."""
         async with self._one:
+            if self._table.stray:
+                raise UnavailableError(self._table.stray)
             row = self._table.planned(request.name, request.port, request.source)
             if row.port is not None and row.port in self._base.policies.current.ports:
                 raise SenselessError(f"port {row.port} is in [Ports] range of the policy: choose another one")
-            ports = [*self._table.ports(), *([row.port] if row.port is not None else [])]
-            network = self._base.settings.of(Doors).network
-            problem = await self._base.lifeline.open_own_network(network, ports)
+            problem = await self._open([*self._table.ports(), *([row.port] if row.port is not None else [])])
             if problem:
                 raise UnavailableError(problem)
-            self._table.problem = ""
             take_effect()
             self._table.save(row)
             self._base.policies.hosts_changed()
@@ -123,10 +122,7 @@ class DoorOrders:
                 who=who,
                 revoked=revoked,
             )
-            network = self._base.settings.of(Doors).network
-            if row.port is not None and (
-                problem := await self._base.lifeline.open_own_network(network, self._table.ports())
-            ):
+            if row.port is not None and (problem := await self._open(self._table.ports())):
                 _log.error("the port of a door stays open in the firewall", port=row.port, reason=problem)
             await self._base.store.settled()
             await self._parts.endpoints.relay.carried_out()
@@ -157,6 +153,13 @@ class DoorOrders:
             ticket=text,
             path=f"/door/{door.name}?ticket={text}",
         )
+
+    async def _open(self, ports: list[int]) -> str:
+        """Have the firewall reserve the network of doors and open these ports; return why it does not."""
+        problem = await self._base.lifeline.open_own_network(self._base.settings.of(Doors).network, ports)
+        if not problem:
+            self._table.closed = ""
+        return problem
 
     def enter(self, door: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
         """Pass a person's connection to a door; return an HTTP status and why it is refused, or an empty text."""

@@ -1,8 +1,8 @@
 """The table of doors: identities, their addresses and processes. It only keeps state.
 
 1. A name keeps its address for good, also after the removal of its door: records name hosts by address.
-2. The policy gets no address of a door unless the firewall reserves the network (`problem` is empty): otherwise another
-   program could use the address.
+2. The policy gets no address of a door unless the firewall reserves it (`problem` is empty): otherwise another host or
+   program could use the address. An address outside of `doors.network` is never reserved.
 """
 
 import ipaddress
@@ -23,20 +23,33 @@ _MOST_NAMES = 2000  # including removed ones
 
 
 class DoorTable:
-    """All doors that were ever added; `problem` is why none of them can be used now."""
+    """All doors that were ever added; `closed` is why the firewall does not reserve their network (empty: it does)."""
 
     def __init__(self, store: StateStore, settings: Doors) -> None:
         self._store = store
         self._network = ipaddress.IPv4Network(settings.network)
         self._gateway = settings.gateway
         self._rows = {row.name: row for row in store.doors.doors()}
-        self.problem = ""
-        strange = next((row for row in self.live() if address_of(row.address) not in self._network), None)
-        if strange is not None:
-            self.problem = (
-                f"door {strange.name} has the address {strange.address}, outside of doors.network {self._network}:"
-                " set the earlier network, or remove the door"
-            )
+        self.closed = "the firewall does not reserve doors.network yet"
+
+    @property
+    def problem(self) -> str:
+        """Return why no door can be used now; empty: they can."""
+        return self.stray or self.closed
+
+    @property
+    def stray(self) -> str:
+        """Return which door has an address outside of the network, and what to do; empty: none has."""
+        stray = next((row for row in self.live() if not self._has(row.address)), None)
+        if stray is None:
+            return ""
+        return (
+            f"door {stray.name} has the address {stray.address}, outside of doors.network {self._network}:"
+            " set the earlier network, or remove the door"
+        )
+
+    def _has(self, address: str) -> bool:
+        return address_of(address) in self._network and address != self._gateway
 
     def live(self) -> list[DoorRow]:
         """Return the doors that exist, the oldest first."""
@@ -80,6 +93,11 @@ class DoorTable:
             )
         earlier = self._rows.get(name)
         address = earlier.address if earlier is not None else self._free_address()
+        if not self._has(address):
+            raise SenselessError(
+                f"{name} keeps its earlier address {address}, outside of doors.network {self._network}: choose another"
+                " name, or set the earlier network"
+            )
         return DoorRow(name, address, clock.wall(), None, slot, port, _network(source) if source else "")
 
     def _require_name(self, name: str) -> None:

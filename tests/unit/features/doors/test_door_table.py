@@ -30,15 +30,24 @@ def test_a_name_keeps_its_address_and_no_other_name_gets_it(tmp_path: Path) -> N
         table.save(table.planned(name, None, ""))
     alice = table.of("alice")
     table.remove("alice")
+    table.closed = ""
     assert [*table.addresses()] == ["door:bob"]
     again = DoorTable(store, Doors())
     new = again.planned("carol", 9091, "10.0.0.7")
     assert new.address not in {alice.address, again.of("bob").address, Doors().gateway}
     assert new.slot == alice.slot
     assert again.planned("alice", None, "").address == alice.address
+    assert not again.addresses()  # until the firewall reserves the network
+    again.closed = ""
+    assert [*again.addresses()] == ["door:bob"]
     moved = DoorTable(store, Doors(network="10.9.0.0/24"))
+    moved.closed = ""
     assert "door bob has the address" in moved.problem
     assert not moved.addresses()
+    with pytest.raises(SenselessError, match="keeps its earlier address"):
+        moved.planned("alice", None, "")
+    moved.remove("bob")
+    assert moved.problem == ""
 
 
 @pytest.mark.parametrize(
