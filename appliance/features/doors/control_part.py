@@ -14,7 +14,7 @@ from appliance.control.errors import SenselessError, UnavailableError
 from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.features.doors import door_requests
 from appliance.features.doors.door_link import node_name
-from appliance.features.doors.door_processes import DoorProcesses
+from appliance.features.doors.door_processes import ROLE, DoorProcesses
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.door_tickets import DoorTickets
 from appliance.features.doors.kept_doors import KeptDoors
@@ -51,6 +51,7 @@ async def inherit(base: Foundation, parts: Any) -> FeaturePart:
     orders = kept.orders = DoorOrders(base, parts, table, DoorTickets(base.store, ends), processes)
     return FeaturePart(
         links=processes.links(),
+        longest={ROLE: 1 << 16},
         limits=orders.limits,
         connected=orders.enter,
         work={"the doors": orders.watch, "the ends of tickets of doors": ends.watch},
@@ -69,7 +70,6 @@ class DoorOrders:
         self._tickets = tickets
         self._processes = processes
         self._one = asyncio.Lock()
-        self._used: dict[str, str] = {}  # by ticket: the door to which connections were passed
 
     async def listed(self, _request: door_requests.DoorsWanted) -> door_requests.DoorList:
         return door_requests.DoorList([self._shown(row) for row in self._table.live()])
@@ -177,7 +177,6 @@ class DoorOrders:
             return 401, "the ticket is wrong or over: ask the operator for a new one (rosrv door ticket NAME)"
         if not self._processes.pass_on(row, descriptor, peer, found.id):
             return 503, self._processes.state(row)[1] or "the door is busy: try again"
-        self._used[found.id] = row.name
         return 101, ""
 
     async def watch(self) -> None:
@@ -185,14 +184,18 @@ class DoorOrders:
         self._processes.start()
         for number in range(1 << 62):
             await asyncio.sleep(_LOOK_SECONDS)
-            for ticket in [one for one in self._used if self._tickets.ended(one)]:
-                name = self._used.pop(ticket)
-                for row in [one for one in self._table.live() if one.name == name]:
-                    self._processes.end_ticket(row, ticket)
+            self.end_tickets()
             if number % _RETRY_SECONDS == 0:
                 self._tickets.valid()
                 with contextlib.suppress(OSError):
                     self._processes.retry()
+
+    def end_tickets(self) -> None:
+        """End the connections of tickets that are over."""
+        for row in self._table.live():
+            for ticket in self._processes.tickets(row):
+                if self._tickets.ended(ticket):
+                    self._processes.end_ticket(row, ticket)
 
     def limits(self) -> tuple[LimitUse, ...]:
         """Return how many doors exist, and how many connections they have."""

@@ -10,16 +10,22 @@ from appliance.channel.messages.message import Message
 
 
 class DoorStarted(Message, frozen=True):
-    """The first message of a process on each link: its door (empty: not known yet), and the port it listens on."""
+    """The first message of a process on each link: its door (empty: not known yet), and what it got from earlier links.
+
+    `added` is the time of the door. `tickets` are those of its connections that have not ended.
+    """
 
     name: str
-    port: int | None
+    added: float
+    listens: bool
+    tickets: list[str]
 
 
 class DoorGiven(Message, frozen=True):
     """Control names the door that the process serves, or changes the pages that may connect."""
 
     name: str
+    added: float
     address: str
     master_port: int
     origins: list[str]
@@ -35,7 +41,6 @@ class AgentListener(Message, frozen=True):
     """Control gives the listening socket of the agent's port; only this address or network may connect (empty: any)."""
 
     descriptors: ClassVar[int] = 1
-    port: int
     source: str
 
 

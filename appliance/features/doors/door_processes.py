@@ -4,8 +4,10 @@ Invariants:
 
 1. A process gets only sockets with the address of its door. It connects to RVMaster's port and to ports of proxy
    endpoints and relays, and to no other port.
-2. A process of a door that was removed, or that another door replaced, gets `DoorEnded`.
-3. A process has at most `_MOST_PENDING` requests for sockets at once; further ones are refused.
+2. A process of a door that was removed, or that another door replaced, gets `DoorEnded`. A door that was added again is
+   another door, because its tickets and its agent's address are others.
+3. A process outlives control, so it names the tickets of its connections on each link: the next control ends them too.
+4. A process has at most `_MOST_PENDING` requests for sockets at once; further ones are refused.
 """
 
 import asyncio
@@ -38,6 +40,7 @@ class _Slot:
     trouble: str = ""
     started: bool = False
     pending: int = 0
+    tickets: set[str] = field(default_factory=set)  # with which connections were passed on
 
 
 class DoorProcesses:
@@ -81,14 +84,23 @@ class DoorProcesses:
         slot.counts, slot.trouble, slot.started = door_link.DoorCounted(0, 0, 0, 0, 0), "", False
         self._send(slot, door_link.DoorEnded())
 
+    def tickets(self, row: DoorRow) -> set[str]:
+        """Return the tickets with which connections were passed to the present process of a door."""
+        return {*self._slots[row.slot or 0].tickets}
+
     def end_ticket(self, row: DoorRow, ticket: str) -> None:
         """End the connections of a ticket."""
-        self._send(self._slots[row.slot or 0], door_link.TicketEnded(ticket))
+        slot = self._slots[row.slot or 0]
+        if self._send(slot, door_link.TicketEnded(ticket)):
+            slot.tickets.discard(ticket)
 
     def pass_on(self, row: DoorRow, descriptor: int, peer: str, ticket: str) -> bool:
         """Give a person's connection to the process of a door; return whether the process runs."""
         slot = self._slots[row.slot or 0]
-        return slot.started and self._send(slot, door_link.ViewerGiven(peer, ticket), descriptor)
+        passed = slot.started and self._send(slot, door_link.ViewerGiven(peer, ticket), descriptor)
+        if passed:
+            slot.tickets.add(ticket)
+        return passed
 
     def _send(self, slot: _Slot, message: messages.Message, *descriptors: int) -> bool:
         try:
@@ -105,8 +117,8 @@ class DoorProcesses:
             self._send(slot, door_link.DoorEnded())
             return
         match message:
-            case door_link.DoorStarted(name, port):
-                self._begin(slot, row, name, port)
+            case door_link.DoorStarted():
+                self._begin(slot, row, message)
             case door_link.SocketWanted(request, port):
                 self._make(slot, row, request, port)
             case door_link.DoorCounted():
@@ -119,25 +131,26 @@ class DoorProcesses:
     def _lost(self, number: int, _reason: str) -> None:
         slot, row = self._slots[number], self._table.in_slot(number)
         slot.started = False
-        slot.counts = door_link.DoorCounted(0, 0, 0, 0, 0)
+        slot.counts, slot.tickets = door_link.DoorCounted(0, 0, 0, 0, 0), set()
         if row is not None and not self._table.problem:
             self._failed(row, f"the process of the door {row.name} ended; its connections ended with it")
 
-    def _begin(self, slot: _Slot, row: DoorRow, name: str, port: int | None) -> None:
-        if name not in ("", row.name) or (port is not None and port != row.port):
+    def _begin(self, slot: _Slot, row: DoorRow, process: door_link.DoorStarted) -> None:
+        if process.name and (process.name, process.added) != (row.name, row.added):
             self._send(slot, door_link.DoorEnded())  # it served another door of this slot
             self._base.lifeline.say(messages.ProcessWanted(ROLE, row.slot or 0))
             return
-        slot.started, slot.trouble = True, ""
+        slot.started, slot.trouble, slot.tickets = True, "", {*process.tickets}
         given = door_link.DoorGiven(
             row.name,
+            row.added,
             row.address,
             self._base.port(RVMASTER),
             [*self._settings.origins, *self._own_origins()],
             self._settings.connections,
             self._settings.connections_in_ten_seconds,
         )
-        if self._send(slot, given) and row.port is not None and port is None:
+        if self._send(slot, given) and row.port is not None and not process.listens:
             self._listen(slot, row, row.port)
 
     def _own_origins(self) -> list[str]:
@@ -159,7 +172,7 @@ class DoorProcesses:
             return
         slot.trouble = ""
         with listener:
-            self._send(slot, door_link.AgentListener(port, row.source), listener.fileno())
+            self._send(slot, door_link.AgentListener(row.source), listener.fileno())
 
     def _failed(self, row: DoorRow, reason: str) -> None:
         self._base.trail.happened("door failed", reason, host=row.address, resource=row.name)

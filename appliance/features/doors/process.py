@@ -100,8 +100,9 @@ class _Process:
         self._started = asyncio.Event()
         self._over = asyncio.Event()
         self._failure = ""
-        self._port: int | None = None
+        self._listens = False
         self._clients: set[_Client] = set()
+        self._tickets: set[str] = set()  # of connections that control passed on, until they end
         self._changes: dict[tuple[str, str], _Change] = {}
         self._totals = _Totals()
         self._counted = door_link.DoorCounted(0, 0, 0, 0, 0)
@@ -128,9 +129,8 @@ class _Process:
     # --- control ---
 
     def _linked(self) -> None:
-        self._child.tell(
-            door_link.DoorStarted(self._given.name if self._given is not None else "", self._port)
-        )
+        name, added = ("", 0.0) if self._given is None else (self._given.name, self._given.added)
+        self._child.tell(door_link.DoorStarted(name, added, self._listens, sorted(self._tickets)))
 
     def _heard(self, message: Any) -> None:
         match message:
@@ -138,12 +138,13 @@ class _Process:
                 if self._given is None:
                     self._network = GivenNetwork(message.address, self._child.tell)
                     self._tasks.start(self._start(message, self._network))
-                elif self._given.name != message.name:  # the slot has another door now
+                elif self._given.added != message.added:  # the slot has another door now
                     self._over.set()
                 self._given = message
             case door_link.DoorEnded():
                 self._over.set()
             case door_link.TicketEnded(ticket):
+                self._tickets.discard(ticket)
                 for client in [one for one in self._clients if one.ticket == ticket]:
                     client.session.disconnect("the ticket is over; ask the operator for a new one")
             case door_link.SocketRefused(number, reason):
@@ -154,10 +155,11 @@ class _Process:
         match message:
             case door_link.SocketGiven(number) if self._network is not None:
                 self._network.given(number, descriptors[0])
-            case door_link.AgentListener(port, source):
-                self._port = port
+            case door_link.AgentListener(source):
+                self._listens = True
                 self._tasks.start(self._accept(socket.socket(fileno=descriptors[0]), source))
             case door_link.ViewerGiven(peer, ticket):
+                self._tickets.add(ticket)
                 self._tasks.start(self._view(descriptors[0], peer, ticket))
 
     # --- the node ---
@@ -219,7 +221,8 @@ class _Process:
 
     async def _serve(self, peer: str, ticket: str, reader: asyncio.StreamReader, writer: ByteWriter) -> None:
         door, given = self._door, self._given
-        if door is None or given is None:
+        if door is None or given is None or (ticket and ticket not in self._tickets):
+            writer.close()  # the ticket was over before the door could serve
             return
         queues: list[ViewerQueue[Any]] = []
         session = DoorSession(

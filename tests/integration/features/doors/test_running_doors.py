@@ -104,7 +104,10 @@ def test_an_agent_hears_publishes_and_calls_within_its_rights(
 def test_a_ticket_opens_the_door_of_a_person_until_it_is_over(
     appliance: Appliance, common_robot: Host, tmp_path: Path
 ) -> None:
-    """The secret is in no record. A wrong ticket is refused, and the connection ends with its ticket."""
+    """The secret is in no record. A wrong ticket is refused, and the connection ends with its ticket.
+
+    It also ends if the control that passed it on has died.
+    """
     appliance.rosrv("door", "add", "alice")
     made = appliance.rosrv("door", "ticket", "alice", "--for", "8s").stdout.strip()
     url = made.replace("ADDRESS:8443", "10.77.0.2:8443")
@@ -126,6 +129,7 @@ def test_a_ticket_opens_the_door_of_a_person_until_it_is_over(
         with connect(url, ssl=trusting, subprotocols=[Subprotocol("foxglove.sdk.v1")]) as client:
             assert client.subprotocol == "foxglove.sdk.v1"
             assert frame(client, op="serverInfo")
+            appliance.kill("control")
             with pytest.raises(ConnectionClosed, match="ticket is over"):
                 while True:
                     client.recv(SECONDS)

@@ -8,12 +8,14 @@ import pytest
 from appliance.channel import messages
 from appliance.control.assembly.foundation import Foundation
 from appliance.features.doors import door_link, door_processes
+from appliance.features.doors.control_part import DoorOrders
 from appliance.features.doors.door_processes import DoorProcesses
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.settings import Doors
 from appliance.store.door_tables import DoorRow
 
 ALICE = DoorRow("alice", "198.19.240.2", 1.0, None, 0, None, "")
+NEW = door_link.DoorStarted("", 0.0, False, [])
 
 
 class Bench:
@@ -85,20 +87,35 @@ async def test_a_door_that_asks_for_many_sockets_at_once_waits(bench: Bench) -> 
 
 
 def test_the_process_of_a_removed_or_replaced_door_ends(bench: Bench) -> None:
-    """It ends when it links up again, and another one starts for the new door of the slot."""
-    bench.hears(door_link.DoorStarted("", None))
+    """It ends when it links up again, and another one starts for the new door of the slot, also of the same name."""
+    bench.hears(NEW)
     assert [type(one) for one in bench.sent] == [door_link.DoorGiven]
-    bench.hears(door_link.DoorStarted("bob", 9091))
-    assert type(bench.sent[-1]) is door_link.DoorEnded
-    assert bench.asked == [messages.ProcessWanted("door", 0)]
+    for name, added in (("bob", 1.0), ("alice", 0.5)):
+        bench.hears(door_link.DoorStarted(name, added, True, []))
+        assert type(bench.sent[-1]) is door_link.DoorEnded
+        assert bench.asked.pop() == messages.ProcessWanted("door", 0)
     bench.rows.clear()
     bench.hears(door_link.SocketWanted(1, 11311))
     assert type(bench.sent[-1]) is door_link.DoorEnded
 
 
+def test_the_connections_of_a_ticket_end_although_control_was_restarted(bench: Bench) -> None:
+    """The process outlives control, and names the tickets with which earlier controls passed connections on."""
+    bench.hears(door_link.DoorStarted("alice", 1.0, False, ["earlier", "valid"]))
+    assert bench.processes.pass_on(ALICE, 0, "10.0.0.9", "new")
+    assert bench.processes.tickets(ALICE) == {"earlier", "valid", "new"}
+    tickets = SimpleNamespace(ended=lambda ticket: ticket != "valid")
+    table = SimpleNamespace(live=lambda: bench.rows)
+    orders = DoorOrders(*cast(Any, (None, None, table, tickets, bench.processes)))
+    orders.end_tickets()
+    ended = {one.ticket for one in bench.sent if isinstance(one, door_link.TicketEnded)}
+    assert ended == {"earlier", "new"}
+    assert bench.processes.tickets(ALICE) == {"valid"}
+
+
 def test_the_death_of_a_process_is_recorded(bench: Bench) -> None:
     """Not that of a door which was removed."""
-    bench.hears(door_link.DoorStarted("", None))
+    bench.hears(NEW)
     bench.link.lost("")
     assert bench.records == ["door failed"]
     bench.rows.clear()
