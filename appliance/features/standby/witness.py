@@ -21,9 +21,10 @@ This file runs alone, with the standard library of Python 3.5 to 3.12 and the pr
 The firewall translates one fixed address to the holder, and rejects all other traffic of the appliance that is not the
 holder with TCP resets, also in established connections. An idle connection sends nothing that could be rejected.
 Therefore the witness sends each such local socket one segment outside its window. The socket answers with an
-acknowledgement, and the firewall rejects that with the reset that the socket accepts. Tunnels, ping, resets and
-requests to the witness pass. With nft, a request without the tag of its sender's key is dropped in the kernel. The
-rules are for IPv4: give the appliances no IPv6 address that the robot reaches.
+acknowledgement, and the firewall rejects that with the reset that the socket accepts. A socket that still waits for the
+answer to its first packet repeats that after 1, 3 and 7 seconds only. It gets such a packet itself, and answers that.
+Tunnels, ping, resets and requests to the witness pass. With nft, a request without the tag of its sender's key is
+dropped in the kernel. The rules are for IPv4: give the appliances no IPv6 address that the robot reaches.
 
 A robot has one witness. Its other computers, and other machines that use the fixed address, are followers: they ask the
 witness (`look`, which changes nothing) and write the same firewall rules.
@@ -87,10 +88,13 @@ _MOST_FOLLOWERS = 32
 _LINES, _LINES_SECONDS = 20, 10.0
 _COPY = 4096  # bytes of each of the two copies of the lease: a block of the disk
 _DISK_SECONDS, _SLOW_SECONDS = 30.0, 5.0  # between two checks of the disk; that a write may take
-_ESTABLISHED = ("01", "04", "05", "06", "08")  # in /proc/net/tcp: all states in which the peer may still send
+# States in /proc/net/tcp: the peer may still send; it has not answered yet.
+_ESTABLISHED, _CONNECTING = ("01", "03", "04", "05", "06", "08"), ("02",)
+_ACK, _SYN = 0x10, 0x02
 _MAPPED = "0000000000000000FFFF0000"  # an IPv4 address in /proc/net/tcp6
 
 Program = Callable[[List[str], str], str]
+Ends = Tuple[str, int, str, int]  # of a connection: the own address and port, those of the peer
 
 
 class WitnessError(Exception):
@@ -865,15 +869,17 @@ class LeaseFirewall:
 # ---- Idle connections
 
 
-def sockets_with(addresses: Set[str], tables: List[str]) -> List[Tuple[str, int, str, int]]:
-    """Return local address and port, and those of the peer, of each connection with one of these addresses.
+def sockets_with(
+    addresses: Set[str], tables: List[str], states: Tuple[str, ...] = _ESTABLISHED
+) -> List[Ends]:
+    """Return the ends of each connection with one of these addresses.
 
-    `tables` are the contents of /proc/net/tcp and /proc/net/tcp6.
+    `tables` are the contents of /proc/net/tcp and /proc/net/tcp6; only connections in these `states` are returned.
     """
     found = []
     for line in [line for table in tables for line in table.splitlines()[1:]]:
         fields = line.split()
-        if fields[3] in _ESTABLISHED:
+        if fields[3] in states:
             (own, own_port), (peer, peer_port) = (_end(fields[1]), _end(fields[2]))
             if peer in addresses:
                 found.append((own, own_port, peer, peer_port))
@@ -889,10 +895,11 @@ def _end(text: str) -> Tuple[str, int]:
     return socket.inet_ntoa(struct.pack("=I", int(address, 16))), int(port, 16)
 
 
-def segment_outside_window(own: str, own_port: int, peer: str, peer_port: int, number: int) -> bytes:
-    """Return an IPv4 packet from the peer to the own socket: an acknowledgement with some sequence number."""
+def segment(connection: Ends, flags: int, number: int) -> bytes:
+    """Return an IPv4 packet from the peer to the own socket, with some sequence number."""
+    own, own_port, peer, peer_port = connection
     ends = socket.inet_aton(peer) + socket.inet_aton(own)
-    tcp = struct.pack("!HHIIBBHHH", peer_port, own_port, number, number, 5 << 4, 0x10, 0, 0, 0)
+    tcp = struct.pack("!HHIIBBHHH", peer_port, own_port, number, number, 5 << 4, flags, 0, 0, 0)
     words = struct.unpack("!16H", ends + struct.pack("!BBH", 0, socket.IPPROTO_TCP, len(tcp)) + tcp)
     total = sum(words)
     total = (total & 0xFFFF) + (total >> 16)
@@ -909,13 +916,22 @@ class IdleConnections:
         self._raw = socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW)
         self._raw.setsockopt(socket.SOL_SOCKET, _SO_MARK, MARK)
         self._raw.setblocking(False)
-        self._left = []  # type: List[Tuple[str, int, str, int]]
+        self._left = []  # type: List[Ends]
         self._rounds = 0
 
-    def reset(self, admitted: str) -> None:
-        """Begin to reset all present connections with other appliances, and with the fixed address."""
-        addresses = {peer.address for name, peer in self._settings.appliances.items() if name != admitted}
-        self._left = sockets_with(addresses | {self._settings.fixed}, _socket_tables())
+    def connecting(self) -> List[Ends]:
+        """Return the connections to an appliance that wait for its first answer."""
+        return sockets_with(self._addresses(""), _socket_tables(), _CONNECTING)
+
+    def reset(self, admitted: str, connecting: Iterable[Ends] = ()) -> None:
+        """Begin to reset all present connections with other appliances, and with the fixed address.
+
+        Of those that wait for a first answer, only `connecting` are reset: they began before the rules changed, so the
+        connection tracker leads their first packet to the earlier appliance for good.
+        """
+        addresses = self._addresses(admitted)
+        self._left = sockets_with(addresses, _socket_tables())
+        self._left += [ends for ends in connecting if ends[2] in addresses]
         self._rounds = _RESET_ROUNDS
         self.go_on()
 
@@ -923,19 +939,24 @@ class IdleConnections:
         """Send a segment to each connection that remains; return whether another round is needed."""
         if not self._left:
             return False
-        peers = {peer for _, _, peer, _ in self._left}
-        present = set(sockets_with(peers, _socket_tables()))
+        peers, tables = {peer for _, _, peer, _ in self._left}, _socket_tables()
+        present = dict.fromkeys(sockets_with(peers, tables), _ACK)
+        present.update((ends, _SYN) for ends in sockets_with(peers, tables, _CONNECTING))
         self._left = [ends for ends in self._left if ends in present]
         self._rounds -= 1
-        for own, own_port, peer, peer_port in self._left:
+        for ends in self._left:
             number = struct.unpack("!I", os.urandom(4))[0]
             try:
-                self._raw.sendto(segment_outside_window(own, own_port, peer, peer_port, number), (own, 0))
+                self._raw.sendto(segment(ends, present[ends], number), (ends[0], 0))
             except OSError:
                 continue  # the next round sends it again
         if self._rounds <= 0:
             self._left = []
         return bool(self._left)
+
+    def _addresses(self, admitted: str) -> Set[str]:
+        appliances = self._settings.appliances.items()
+        return {peer.address for name, peer in appliances if name != admitted} | {self._settings.fixed}
 
 
 def _socket_tables() -> List[str]:
@@ -1057,8 +1078,9 @@ class LeaseEnforcement:
 
     def admit(self, name: str) -> None:
         """Admit one appliance, or none (""), and reset the connections with the other one. Raises `WitnessError`."""
+        connecting = self._idle.connecting()
         self._firewall.admit(name)
-        self._idle.reset(name)
+        self._idle.reset(name, connecting)
         self._log.add("the robot admits %s" % (name or "no appliance"))
 
     def go_on(self, enforce_again: Callable[[], None]) -> bool:

@@ -2,7 +2,9 @@
 
 import asyncio
 import contextlib
+import errno
 import os
+import select
 import signal
 import socket
 import subprocess
@@ -81,6 +83,26 @@ def test_a_new_holder_resets_the_connections_of_the_old_one(site: Site) -> None:
     assert seconds_until_reset([new]) < AT_ONCE
     site.connect(site.robot, FIXED, MASTER).close()
     site.accepted(site.servers["a"])
+
+
+def test_a_connection_that_the_old_holder_never_answered_is_reset(site: Site) -> None:
+    """It does not wait until its kernel repeats its first packet, up to seconds later; the next one works."""
+    site.serve()
+    a, b = site.peer("a"), site.peer("b")
+    epoch = a.granted(1)
+    site.lab.unplug(site.hosts["a"])
+    waiting = [site.connecting(address) for address in (FIXED, ADDRESSES["a"])]
+    lost = "oif != lo tcp flags & (syn | ack) == syn drop"
+    rules = f"table ip lost {{ chain out {{ type filter hook output priority -50; {lost}; }}; }}"
+    with Process(site.robot, ["nft", rules], env=site.environment, label="nft") as process:
+        assert process.wait() == 0, process.errors
+    b.granted(epoch)
+    for one in waiting:
+        assert select.select([], [one], [], AT_ONCE)[1]
+        assert one.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR) == errno.ECONNRESET
+    with Process(site.robot, ["nft", "delete table ip lost"], env=site.environment, label="nft") as process:
+        process.wait()
+    site.connect(site.robot, FIXED, MASTER).close()
 
 
 def test_a_reboot_shuts_out_both_until_the_holder_renews(site: Site) -> None:

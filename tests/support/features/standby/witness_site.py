@@ -75,7 +75,7 @@ class Site:
     """The machines, the witness's files, and its process."""
 
     def __init__(self, lab: Lab, folder: Path, backend: str, sockets: contextlib.ExitStack) -> None:
-        self.sockets = sockets
+        self.lab, self.sockets = lab, sockets
         self.robot = lab.host("robot", f"{ROBOT}/24")
         self.hosts = {name: lab.host(name, f"{address}/24") for name, address in ADDRESSES.items()}
         self.attacker = lab.host("attacker", "10.77.0.66/24")
@@ -159,6 +159,13 @@ class Site:
     def connect(self, host: Host, address: str, port: int, seconds: float = LIMIT) -> socket.socket:
         made = host.run(lambda: socket.create_connection((address, port), timeout=seconds))
         return self.sockets.enter_context(made)
+
+    def connecting(self, address: str) -> socket.socket:
+        """Begin a connection of the robot to the port of the ROS master."""
+        made = self.sockets.enter_context(self.robot.run(socket.socket))
+        made.setblocking(False)
+        made.connect_ex((address, MASTER))
+        return made
 
     def accepted(self, server: socket.socket) -> socket.socket:
         """Return the next connection of a server."""
