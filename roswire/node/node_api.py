@@ -1,6 +1,6 @@
 """The node API (slave API): the master's and other nodes' calls to a node."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 from roswire.node.services import ServiceServer
@@ -28,6 +28,9 @@ class NodeTables(Protocol):
     @property
     def tcpros(self) -> tuple[str, int]:
         """Return the address of the topics and services."""
+
+    def follow(self, subscriber: NodeSubscription, uris: Sequence[Value]) -> None:
+        """Follow the publishers of a list."""
 
 
 class NodeApi:
@@ -72,7 +75,7 @@ class NodeApi:
         subscriber = self._node.subscribers.get(topic)
         if subscriber is None:
             return [0, f"this node does not subscribe to {topic[:200]}", 0]
-        subscriber.update([uri for uri in uris if isinstance(uri, str)])
+        self._node.follow(subscriber, uris)
         return _DONE
 
     def _request_topic(self, topic: str, protocols: list[Value]) -> Value:

@@ -11,7 +11,7 @@ Invariants:
 import asyncio
 import contextlib
 import os
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Literal
 from weakref import WeakValueDictionary
 
@@ -137,10 +137,14 @@ class RosNode:
                 await self.subscribers.pop(topic).close()
                 raise
             if not subscriber.updates:  # else an update, which is newer, overtook the answer
-                subscriber.update(
-                    [uri for uri in uris if isinstance(uri, str)] if isinstance(uris, list) else []
-                )
+                self.follow(subscriber, uris if isinstance(uris, list) else [])
+            if topic in self.publishers:
+                self.publishers[topic].begin_own(subscriber)
             return subscriber
+
+    def follow(self, subscriber: NodeSubscription, uris: Sequence[Value]) -> None:
+        """Follow the publishers of a list, except the node itself, whose messages take no connection."""
+        subscriber.update([uri for uri in uris if isinstance(uri, str) and uri != self._uri])
 
     async def unsubscribe(self, topic: str) -> None:
         """End a subscription, if there is one."""
@@ -160,8 +164,15 @@ class RosNode:
         async with self._lock("publisher", topic):
             if topic in self.publishers:
                 raise ValueError(f"{self.name} already publishes {topic}")
-            publisher = NodePublication(self._link, topic, kind, latched=latched, queue=queue, replay=replay)
-            self.publishers[topic] = publisher
+            publisher = self.publishers[topic] = NodePublication(
+                self._link,
+                topic,
+                kind,
+                latched=latched,
+                queue=queue,
+                replay=replay,
+                own=lambda: self.subscribers.get(topic),
+            )
             try:
                 await self.master("registerPublisher", topic, kind.name, self._uri)
             except BaseException:

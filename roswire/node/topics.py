@@ -76,6 +76,11 @@ class NodeSubscription:
         await self._connection.wait()
         return [*self.connected.values()]
 
+    def hear_own(self, body: bytes, header: Mapping[str, str]) -> None:
+        """Take a message that the node itself publishes, if it has the wanted type."""
+        if self.wanted.md5sum in (ANY, header["md5sum"]):
+            self._received(body, header)
+
     async def close(self) -> None:
         """End all connections."""
         self._followed.clear()
@@ -154,11 +159,20 @@ class NodePublication:
 
     At most `queue` messages wait for each subscriber; if more come, the oldest are dropped, which `dropped` counts. A
     latched publication sends its last message to each new subscriber. Subscribers connect some time after the
-    registration; those that connect within `replay` seconds get the messages that were published until then.
+    registration; those that connect within `replay` seconds get the messages that were published until then. `own`
+    returns the node's own subscription to the topic: as with rospy and roscpp, its messages take no connection.
     """
 
     def __init__(
-        self, link: NodeLink, topic: str, kind: MessageType, *, latched: bool, queue: int, replay: float
+        self,
+        link: NodeLink,
+        topic: str,
+        kind: MessageType,
+        *,
+        latched: bool,
+        queue: int,
+        replay: float,
+        own: Callable[[], NodeSubscription | None],
     ) -> None:
         if queue < 1:
             raise ValueError(f"a queue of {queue} messages; give at least 1")
@@ -167,6 +181,15 @@ class NodePublication:
         self.latched = latched
         self.dropped = 0
         self._link = link
+        self._own = own
+        self._header = {
+            "callerid": link.name,
+            "topic": topic,
+            "type": kind.name,
+            "md5sum": kind.md5sum,
+            "message_definition": kind.definition,
+            "latching": str(int(latched)),
+        }
         self._queue = queue
         self._replay_until = asyncio.get_running_loop().time() + replay
         self._kept: deque[bytes] = deque(maxlen=1 if latched else queue)  # for subscribers that connect later
@@ -180,13 +203,21 @@ class NodePublication:
 
     def publish(self, body: bytes) -> None:
         """Send a serialised message to all subscribers."""
-        frame = encode_frame(body)
         if self.latched or self._replays():
-            self._kept.append(frame)
+            self._kept.append(body)
         else:
             self._kept.clear()
+        frame = encode_frame(body) if self._served else b""
         for one in self._served:
             self.dropped += one.put(frame)
+        if (own := self._own()) is not None:
+            own.hear_own(body, self._header)
+
+    def begin_own(self, subscription: NodeSubscription) -> None:
+        """Give a new subscription of the node itself the last message, if the publication is latched."""
+        if self.latched:
+            for body in self._kept:
+                subscription.hear_own(body, self._header)
 
     def _replays(self) -> bool:
         return asyncio.get_running_loop().time() < self._replay_until
@@ -202,19 +233,11 @@ class NodePublication:
                 f"wants {header.get('type', '')[:200]} with {header.get('md5sum', '')[:32]}",
             )
             return
-        fields = {
-            "callerid": self._link.name,
-            "topic": self.topic,
-            "type": self.type.name,
-            "md5sum": self.type.md5sum,
-            "message_definition": self.type.definition,
-            "latching": str(int(self.latched)),
-        }
-        writer.write(encode_header(fields))
+        writer.write(encode_header(self._header))
         queue = _SendQueue(header.get("callerid", "")[:200], self._queue, self._link.limits.queue_bytes)
         if self.latched or self._replays():
-            for frame in self._kept:
-                queue.put(frame)
+            for body in self._kept:
+                queue.put(encode_frame(body))
         self._served.add(queue)
         sending = self._tasks.start(queue.send_to(writer))
         try:

@@ -107,6 +107,31 @@ async def test_a_latched_message_reaches_a_late_subscriber() -> None:
         assert heard == [b"new"]
 
 
+async def test_a_node_hears_its_own_topic_without_a_connection() -> None:
+    """As with rospy and roscpp; a latched message also reaches a later subscription."""
+    async with nodes() as world:
+        node = await world.node("10.0.0.2")
+        heard: list[tuple[str, bytes, str]] = []
+
+        def hear(body: bytes, header: Any) -> None:
+            heard.append((header["topic"], body, header["type"]))
+
+        await node.subscribe("/chatter", hear)
+        await node.subscribe(
+            "/other", hear, MessageType("std_msgs/Bool", "8b94c1b53db61fb6aed406028ad6332a", "")
+        )
+        for topic in ("/map", "/chatter", "/other"):
+            publisher = await node.advertise(topic, STRING, latched=topic == "/map", queue=1)
+            await later()
+            publisher.publish(b"one")
+        await node.subscribe("/map", hear)
+        await later()
+        assert heard == [("/chatter", b"one", "std_msgs/String"), ("/map", b"one", "std_msgs/String")]
+        assert {host for source, (host, _port) in world.network.connections if source == "10.0.0.2"} == {
+            "10.0.0.1"
+        }
+
+
 @pytest.mark.parametrize(("wait", "heard"), [(0.5, [b"early", b"next"]), (1.5, [])])
 async def test_early_messages_are_replayed_only_for_a_while(wait: float, heard: list[bytes]) -> None:
     """A subscriber that connects within the time of the replay gets them; a later one gets no old command."""
