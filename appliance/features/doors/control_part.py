@@ -47,7 +47,7 @@ async def inherit(base: Foundation, parts: Any) -> FeaturePart:
     assert isinstance(kept, KeptDoors)  # noqa: S101  `keep` made it
     table = kept.table
     ends = StoredDeadlines(base.store)
-    processes = DoorProcesses(base, table)
+    processes = DoorProcesses(base, table, lambda: parts.monitors.sources.definitions)
     orders = kept.orders = DoorOrders(base, parts, table, DoorTickets(base.store, ends), processes)
     return FeaturePart(
         links=processes.links(),
@@ -180,10 +180,11 @@ class DoorOrders:
         return 101, ""
 
     async def watch(self) -> None:
-        """Start the processes of doors, end connections whose tickets are over, and retry what failed."""
+        """Start and define the processes of doors, end connections whose tickets are over, and retry what failed."""
         self._processes.start()
         for number in range(1 << 62):
             await asyncio.sleep(_LOOK_SECONDS)
+            self._processes.define()
             self.end_tickets()
             if number % _RETRY_SECONDS == 0:
                 self._tickets.valid()

@@ -33,6 +33,12 @@ class DoorGiven(Message, frozen=True):
     in_ten_seconds: int
 
 
+class TypesGiven(Message, frozen=True):
+    """Control gives the operator's definitions by `package/Type.msg` or `.srv`, before `DoorGiven` and at each change."""
+
+    definitions: dict[str, str]
+
+
 class DoorEnded(Message, frozen=True):
     """The door was removed, and its process ends."""
 
@@ -100,7 +106,7 @@ class DoorCounted(Message, frozen=True):
 
 
 DoorLink = (
-    DoorStarted | DoorGiven | DoorEnded | AgentListener | ViewerGiven | TicketEnded | SocketWanted | SocketGiven
+    DoorStarted | DoorGiven | TypesGiven | DoorEnded | AgentListener | ViewerGiven | TicketEnded | SocketWanted | SocketGiven
     | SocketRefused | ConnectionsChanged | DoorCounted
 )  # fmt: skip
 

@@ -7,11 +7,13 @@ Invariants:
 2. A process of a door that was removed, or that another door replaced, gets `DoorEnded`. A door that was added again is
    another door, because its tickets and its agent's address are others.
 3. A process outlives control, so it names the tickets of its connections on each link: the next control ends them too.
-4. A process has at most `_MOST_PENDING` requests for sockets at once; further ones are refused.
+4. A process knows the operator's definitions that are in force.
+5. A process has at most `_MOST_PENDING` requests for sockets at once; further ones are refused.
 """
 
 import asyncio
 import socket
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -41,14 +43,18 @@ class _Slot:
     started: bool = False
     pending: int = 0
     tickets: set[str] = field(default_factory=set)  # with which connections were passed on
+    definitions: Mapping[str, str] = field(default_factory=dict)
 
 
 class DoorProcesses:
-    """The processes of all doors."""
+    """The processes of all doors; `definitions()` are those beside the specifications in force."""
 
-    def __init__(self, base: Foundation, table: DoorTable) -> None:
+    def __init__(
+        self, base: Foundation, table: DoorTable, definitions: Callable[[], Mapping[str, str]]
+    ) -> None:
         self._base = base
         self._table = table
+        self._definitions = definitions
         self._settings = base.settings.of(Doors)
         self._tasks: set[asyncio.Task[None]] = set()
         self._slots = [
@@ -150,8 +156,21 @@ class DoorProcesses:
             self._settings.connections,
             self._settings.connections_in_ten_seconds,
         )
+        slot.definitions = {}
+        self._define(slot)
         if self._send(slot, given) and row.port is not None and not process.listens:
             self._listen(slot, row, row.port)
+
+    def define(self) -> None:
+        """Give the definitions in force to the processes that have others."""
+        for slot in self._slots:
+            if slot.started:
+                self._define(slot)
+
+    def _define(self, slot: _Slot) -> None:
+        now = self._definitions()
+        if now != slot.definitions and self._send(slot, door_link.TypesGiven(dict(now))):
+            slot.definitions = now
 
     def _own_origins(self) -> list[str]:
         address = self._base.settings.api_address

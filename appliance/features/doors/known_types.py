@@ -2,7 +2,7 @@
 
 A message type is known if ROS's own packages define it, or if a publisher sent its definition in a connection header.
 Headers carry no definitions of services: a service type is known if ROS's own packages define it, or if the operator
-gave its file.
+gave its file, beside the specifications.
 """
 
 from collections import OrderedDict
@@ -48,12 +48,20 @@ class DoorMessage:
 class KnownTypes:
     """The types of one door. If they are many, those that were not used for the longest time are forgotten."""
 
-    def __init__(self, defined: Definitions, limits: ValueLimits) -> None:
-        self._defined = defined
+    def __init__(self, standard: Definitions, limits: ValueLimits) -> None:
+        self._standard = self._defined = standard
         self._limits = limits
         self._codecs: OrderedDict[tuple[str, str], tuple[MessageCodec, Definitions]] = OrderedDict()
         self._sizes: dict[tuple[str, str], int] = {}
         self._latest: dict[str, str] = {}  # the md5sum of each type that a header defined
+
+    def define(self, given: Definitions) -> None:
+        """Replace the operator's definitions."""
+        earlier, self._defined = self._defined, self._standard.extended(given)
+        names = {*earlier.message_types, *self._defined.message_types}
+        for name, md5sum in [key for key in self._codecs if key[0] in names]:
+            del self._codecs[name, md5sum], self._sizes[name, md5sum]
+            self._latest.pop(name, None)
 
     def learn(self, header: Mapping[str, str]) -> MessageCodec:
         """Return the codec for a publisher's messages; raises `DefinitionError`."""
@@ -76,8 +84,9 @@ class KnownTypes:
         if known is None:
             if name not in self._defined.message_types:
                 raise DefinitionError(
-                    "the door does not know this message type: no publisher of it has been heard, and it is not "
-                    "one of ROS's own packages",
+                    "the door does not know this message type: no publisher of it has been heard, and it is not one "
+                    "of ROS's own packages; put its .msg file in msg/PACKAGE of the folder of specifications "
+                    "(rosrv monitor reload)",
                     name[:200],
                 )
             self._keep(name, self._defined.md5sum(name), self._defined)
@@ -89,7 +98,9 @@ class KnownTypes:
         """Return the codecs of the request and the response of a service type; raises `DefinitionError`."""
         if name not in self._defined.service_types:
             raise DefinitionError(
-                "the door does not know this service type: it is not one of ROS's own packages", name[:200]
+                "the door does not know this service type, which is not one of ROS's own packages: put its .srv file "
+                "in msg/PACKAGE of the folder of specifications (rosrv monitor reload)",
+                name[:200],
             )
         service = self._defined.service(name)
         return (

@@ -30,6 +30,8 @@ from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
 from appliance.features.doors.session import ClientProtocol, DoorSession, SessionOptions
 from appliance.features.doors.values import ValueLimits
 from appliance.features.doors.viewer_queue import ViewerQueue
+from roswire.definitions import Definitions
+from roswire.errors import DefinitionError
 from roswire.node import NodeLimits, RosNode
 from roswire.node.network import ByteWriter, OwnedTasks
 from roswire.standard import standard_definitions
@@ -96,6 +98,7 @@ class _Process:
         )
         self._given: door_link.DoorGiven | None = None
         self._network: GivenNetwork | None = None
+        self._types = KnownTypes(standard_definitions(), ValueLimits())
         self._door: _Door | None = None
         self._started = asyncio.Event()
         self._over = asyncio.Event()
@@ -141,6 +144,8 @@ class _Process:
                 elif self._given.added != message.added:  # the slot has another door now
                     self._over.set()
                 self._given = message
+            case door_link.TypesGiven(definitions):
+                self._define(definitions)
             case door_link.DoorEnded():
                 self._over.set()
             case door_link.TicketEnded(ticket):
@@ -162,6 +167,12 @@ class _Process:
                 self._tickets.add(ticket)
                 self._tasks.start(self._view(descriptors[0], peer, ticket))
 
+    def _define(self, texts: dict[str, str]) -> None:
+        try:
+            self._types.define(Definitions.from_files(texts))
+        except DefinitionError as error:  # the compiler of the specifications checks the same texts
+            _log.error("the door keeps its earlier definitions", reason=str(error))
+
     # --- the node ---
 
     async def _start(self, given: door_link.DoorGiven, network: GivenNetwork) -> None:
@@ -180,7 +191,7 @@ class _Process:
                 _log.warning("the door's node cannot listen; it tries again", reason=str(error))
                 await asyncio.sleep(_AGAIN_SECONDS)
                 continue
-            types = KnownTypes(standard_definitions(), ValueLimits())
+            types = self._types
             sight = MasterSight(node, present_time)
             door = DoorNode(node, types, Rosapi(sight, types).answer, most_topics=_MOST_TOPICS)
             limits = ConnectionLimits(given.connections, given.in_ten_seconds)

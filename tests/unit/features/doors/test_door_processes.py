@@ -45,7 +45,10 @@ class Bench:
             in_slot=lambda number: next((row for row in self.rows if row.slot == number), None),
         )
         monkeypatch.setattr(door_processes, "Link", self._link)
-        self.processes = DoorProcesses(cast(Foundation, base), cast(DoorTable, table))
+        self.definitions: dict[str, str] = {}
+        self.processes = DoorProcesses(
+            cast(Foundation, base), cast(DoorTable, table), lambda: self.definitions
+        )
         self.link = cast(Any, self.processes.links()["door"][0])
         monkeypatch.setattr(self.processes, "_given", self._given)
 
@@ -121,3 +124,13 @@ def test_the_death_of_a_process_is_recorded(bench: Bench) -> None:
     bench.rows.clear()
     bench.link.lost("")
     assert bench.records == ["door failed"]
+
+
+def test_a_process_gets_the_definitions_in_force_before_its_door_and_each_change_once(bench: Bench) -> None:
+    bench.definitions = {"own/Add.srv": "---"}
+    bench.processes.define()
+    bench.hears(door_link.DoorStarted("", None))
+    bench.processes.define()
+    bench.definitions = {}
+    bench.processes.define()
+    assert [getattr(one, "definitions", None) for one in bench.sent] == [{"own/Add.srv": "---"}, None, {}]

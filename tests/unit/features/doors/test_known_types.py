@@ -63,3 +63,19 @@ def test_many_large_definitions_are_forgotten_in_order(types: KnownTypes) -> Non
     with pytest.raises(DefinitionError):
         types.message("own/Large0")
     assert types.learn(header("own/Large0", large)) is types.message("own/Large0")[0]
+
+
+def test_the_operators_files_define_types_until_they_change(types: KnownTypes) -> None:
+    """Publishers' definitions of other types stay known."""
+    types.learn(header("own/Heard", "int8 x"))
+    with pytest.raises(DefinitionError, match="rosrv monitor reload"):
+        types.service("own/Add")
+    for field in ("a", "b"):
+        types.define(Definitions.from_files({"own/Add.srv": f"int8 {field}\n---\nint8 sum\n"}))
+        assert types.service("own/Add")[0].writer.fields == [field]
+    assert types.message("own/Heard")[0].name == "own/Heard"
+    types.define(Definitions.from_files({}))
+    with pytest.raises(DefinitionError, match="does not know this service type"):
+        types.service("own/Add")
+    with pytest.raises(DefinitionError, match="does not know this message type"):
+        types.message("own/AddRequest")
