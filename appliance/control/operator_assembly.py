@@ -96,6 +96,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         received=base.receipts.received,
         graph=partial(graph_of, parts),
         tokens_changed=lambda: rest().state_tokens(),
+        bearers=lambda: frozenset(row.name for row in tokens.usable()),
     )
     handled = HandledAlarms(base.store)
     looks = Queries(

@@ -76,8 +76,8 @@ class OperatorContext:
 
     `appliance` is the name of one of two appliances, empty on a single one. `processes` returns the processes of the
     appliance. `received` notes that another machine has all records up to a sequence. `graph` returns the present
-    graph. `tokens_changed` sends the api the usable tokens and sessions. `kept` has the
-    results of `Feature.keep`.
+    graph. `bearers` returns the names of the tokens and sessions that may be used now. `tokens_changed` sends the api
+    the usable tokens and sessions. `kept` has the results of `Feature.keep`.
     """
 
     core: FeatureContext
@@ -90,6 +90,7 @@ class OperatorContext:
     received: Callable[[int], None]
     graph: "Callable[[], Graph]"
     tokens_changed: Callable[[], None]
+    bearers: Callable[[], frozenset[str]]
     kept: Mapping[str, KeptHosts]
 
 

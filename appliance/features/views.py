@@ -8,13 +8,14 @@ from typing import Annotated, Any
 import msgspec
 
 from appliance.channel.answers.field_docs import doc
+from appliance.features.doors.view import DOORS_VIEW
 from appliance.features.fleet.view import FLEET_VIEW
 from appliance.features.recorder.view import RECORDER_VIEW
 from appliance.features.standby.view import STANDBY_VIEW
 from appliance.features.syslog.view import SYSLOG_VIEW
 from appliance.features.view import FeatureView, PairView, StateView
 
-VIEWS: tuple[FeatureView, ...] = (SYSLOG_VIEW, STANDBY_VIEW, FLEET_VIEW, RECORDER_VIEW)
+VIEWS: tuple[FeatureView, ...] = (SYSLOG_VIEW, STANDBY_VIEW, FLEET_VIEW, RECORDER_VIEW, DOORS_VIEW)
 STATES: tuple[StateView[Any], ...] = tuple(state for view in VIEWS for state in view.states)
 
 

@@ -27,6 +27,7 @@ def idle_parts() -> FeatureParts:
     parts.operate(
         appliance="", store=store, policies=idle(Policies), monitors=monitors, hosts=hosts, processes=tuple,
         received=lambda _sequence: None, graph=lambda: Graph([], [], []), tokens_changed=lambda: None,
+        bearers=frozenset,
     )  # fmt: skip
     return parts
 

@@ -10,15 +10,18 @@ from appliance.base.withdrawal import take_effect
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.configuration.sections import Sections
 from appliance.control.assembly.foundation import Foundation
-from appliance.control.errors import SenselessError, UnavailableError
+from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
 from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.features.doors import door_requests
 from appliance.features.doors.door_link import node_name
 from appliance.features.doors.door_processes import ROLE, DoorProcesses
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.door_tickets import DoorTickets
+from appliance.features.doors.door_visits import DoorVisits
 from appliance.features.doors.kept_doors import KeptDoors
+from appliance.features.doors.own_doors import OwnDoors
 from appliance.features.doors.settings import MOST_DOORS, Doors
+from appliance.features.doors.view import DoorsState
 from appliance.features.feature import FeaturePart
 from appliance.policy.model import address_of
 from appliance.store.door_tables import DoorRow, TicketRow
@@ -47,12 +50,20 @@ async def inherit(base: Foundation, parts: Any) -> FeaturePart:
     assert isinstance(kept, KeptDoors)  # noqa: S101  `keep` made it
     table = kept.table
     ends = StoredDeadlines(base.store)
-    processes = DoorProcesses(base, table, lambda: parts.monitors.sources.definitions)
-    orders = kept.orders = DoorOrders(base, parts, table, DoorTickets(base.store, ends), processes)
+    tickets, visits = DoorTickets(base.store, ends), DoorVisits(kept.bearers)
+    processes = DoorProcesses(
+        base,
+        table,
+        tickets=lambda door: [row.id for row in (*tickets.valid(door), *visits.present(door))],
+        left=visits.left,
+        definitions=lambda: parts.monitors.sources.definitions,
+    )
+    orders = kept.orders = DoorOrders(base, parts, table, tickets=tickets, visits=visits, processes=processes)
     return FeaturePart(
         links=processes.links(),
         longest={ROLE: 1 << 16},
         limits=orders.limits,
+        status_fields=orders.state,
         connected=orders.enter,
         work={"the doors": orders.watch, "the ends of tickets of doors": ends.watch},
     )
@@ -62,14 +73,25 @@ class DoorOrders:
     """The operators' requests about doors."""
 
     def __init__(
-        self, base: Foundation, parts: Any, table: DoorTable, tickets: DoorTickets, processes: DoorProcesses
+        self,
+        base: Foundation,
+        parts: Any,
+        table: DoorTable,
+        *,
+        tickets: DoorTickets,
+        visits: DoorVisits,
+        processes: DoorProcesses,
     ) -> None:
         self._base = base
         self._parts = parts
         self._table = table
         self._tickets = tickets
+        self._visits = visits
         self._processes = processes
+        self._own = OwnDoors(table, base.features.sessions)
         self._one = asyncio.Lock()
+        # By ticket: the door to which connections were passed, also by an earlier control.
+        self._used = {row.id: row.door for row in tickets.valid()}
 
     async def listed(self, _request: door_requests.DoorsWanted) -> door_requests.DoorList:
         return door_requests.DoorList([self._shown(row) for row in self._table.live()])
@@ -109,6 +131,7 @@ class DoorOrders:
             take_effect()
             row = self._table.remove(request.name)
             self._tickets.forget(row.name)
+            self._visits.forget(row.name)
             self._processes.end(row)
             self._base.policies.hosts_changed()
             enforcement = self._parts.endpoints.enforcement
@@ -133,26 +156,44 @@ class DoorOrders:
         door = self._table.of(request.name)
         take_effect()
         row, text = self._tickets.make(door.name, request.seconds, who)
+        self._record_ticket(
+            door, row, f"ticket {row.id} opens the door {door.name} for {request.seconds:g} s"
+        )
+        await self._base.store.settled()
+        return _new_ticket(row, text)
+
+    # --- the caller's own door ---
+
+    async def own(self, _request: door_requests.OwnDoorWanted, who: str) -> door_requests.OwnDoor:
+        """Return the door of the caller."""
+        name, row, reason = self._own.of(who)
+        return door_requests.OwnDoor(name=name, door=None if row is None else self._shown(row), reason=reason)
+
+    async def visit(self, _request: door_requests.DoorVisit, who: str) -> door_requests.NewTicket:
+        """Make a ticket for one connection to the caller's door. Raises `UnknownThingError`."""
+        _name, door, reason = self._own.of(who)
+        if door is None:
+            raise UnknownThingError(reason)
+        take_effect()
+        row, text = self._visits.make(door.name, who)
+        self._record_ticket(
+            door, row, f"ticket {row.id} opens the door {door.name} once, for the session of {who}"
+        )
+        return _new_ticket(row, text)
+
+    def _record_ticket(self, door: DoorRow, row: TicketRow, text: str) -> None:
         self._base.trail.happened(
             "door ticket made",
-            f"ticket {row.id} opens the door {door.name} for {request.seconds:g} s",
+            text,
             host=door.address,
             whole=True,
             resource=door.name,
-            who=who,
+            who=row.who,
             ticket=row.id,
             expires=row.expires,
         )
-        await self._base.store.settled()
-        return door_requests.NewTicket(
-            id=row.id,
-            created=row.created,
-            expires=row.expires,
-            who=who,
-            door=door.name,
-            ticket=text,
-            path=f"/door/{door.name}?ticket={text}",
-        )
+
+    # --- connections ---
 
     async def _open(self, ports: list[int]) -> str:
         """Have the firewall reserve the network of doors and open these ports; return why it does not."""
@@ -164,7 +205,8 @@ class DoorOrders:
     def enter(self, door: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
         """Pass a person's connection to a door; return an HTTP status and why it is refused, or an empty text."""
         row = next((one for one in self._table.live() if one.name == door), None)
-        found = self._tickets.find(door, ticket)
+        visit = self._visits.find(door, ticket)
+        found = visit or self._tickets.find(door, ticket)
         if row is None or found is None:
             self._base.trail.happened(
                 "door entry refused",
@@ -177,6 +219,10 @@ class DoorOrders:
             return 401, "the ticket is wrong or over: ask the operator for a new one (rosrv door ticket NAME)"
         if not self._processes.pass_on(row, descriptor, peer, found.id):
             return 503, self._processes.state(row)[1] or "the door is busy: try again"
+        if visit is None:
+            self._used[found.id] = row.name
+        else:
+            self._visits.opened(found.id)
         return 101, ""
 
     async def watch(self) -> None:
@@ -185,18 +231,20 @@ class DoorOrders:
         for number in range(1 << 62):
             await asyncio.sleep(_LOOK_SECONDS)
             self._processes.define()
-            self.end_tickets()
+            ended = {row.id: row.door for row in self._visits.ended()}
+            ended |= {one: self._used.pop(one) for one in [*self._used] if self._tickets.ended(one)}
+            for ticket, name in ended.items():
+                for row in [one for one in self._table.live() if one.name == name]:
+                    self._processes.end_ticket(row, ticket)
             if number % _RETRY_SECONDS == 0:
                 self._tickets.valid()
                 with contextlib.suppress(OSError):
                     self._processes.retry()
 
-    def end_tickets(self) -> None:
-        """End the connections of tickets that are over."""
-        for row in self._table.live():
-            for ticket in self._processes.tickets(row):
-                if self._tickets.ended(ticket):
-                    self._processes.end_ticket(row, ticket)
+    def state(self) -> dict[str, Any]:
+        """Return the state of all doors for the status."""
+        rows = self._table.live()
+        return {"doors": DoorsState([self._processes.health(row) for row in rows]) if rows else None}
 
     def limits(self) -> tuple[LimitUse, ...]:
         """Return how many doors exist, and how many connections they have."""
@@ -233,7 +281,38 @@ class DoorOrders:
             dropped=counts.dropped,
             refused=counts.refused,
             tickets=[_ticket(one) for one in self._tickets.valid(row.name)],
+            clients=self._clients(row),
         )
+
+    def _clients(self, row: DoorRow) -> list[door_requests.DoorClient]:
+        makers = {
+            one.id: one.who for one in (*self._tickets.valid(row.name), *self._visits.present(row.name))
+        }
+        return [
+            door_requests.DoorClient(
+                address=one.peer[:64],
+                since=one.since,
+                protocol=one.protocol[:32],
+                ticket=one.ticket[:12],
+                who=makers.get(one.ticket, ""),
+                received=one.received,
+                sent=one.sent,
+                refused=one.refusals,
+            )
+            for one in self._processes.clients(row)
+        ]
+
+
+def _new_ticket(row: TicketRow, text: str) -> door_requests.NewTicket:
+    return door_requests.NewTicket(
+        id=row.id,
+        created=row.created,
+        expires=row.expires,
+        who=row.who,
+        door=row.door,
+        ticket=text,
+        path=f"/door/{row.door}?ticket={text}",
+    )
 
 
 def _ticket(row: TicketRow) -> door_requests.Ticket:

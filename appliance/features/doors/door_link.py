@@ -6,23 +6,24 @@ compromised door can use no other address, and reaches nothing but RVMaster, pro
 
 from typing import ClassVar
 
+import msgspec
+
 from appliance.channel.messages.message import Message
 
 
 class DoorStarted(Message, frozen=True):
-    """The first message of a process on each link: its door (empty: not known yet), and what it got from earlier links.
-
-    `added` is the time of the door. `tickets` are those of its connections that have not ended.
-    """
+    """The first message of a process on each link: its door (empty: not known yet), and when the door was added."""
 
     name: str
     added: float
     listens: bool
-    tickets: list[str]
 
 
 class DoorGiven(Message, frozen=True):
-    """Control names the door that the process serves, or changes the pages that may connect."""
+    """Control names the door that the process serves, or changes the pages that may connect.
+
+    `tickets` are the ids of those that are valid. Connections of others end: they may be over since control ended.
+    """
 
     name: str
     added: float
@@ -31,10 +32,11 @@ class DoorGiven(Message, frozen=True):
     origins: list[str]
     connections: int
     in_ten_seconds: int
+    tickets: list[str]
 
 
 class TypesGiven(Message, frozen=True):
-    """Control gives the operator's definitions by `package/Type.msg` or `.srv`, before `DoorGiven` and at each change."""
+    """The operator's definitions by `package/Type.msg` or `.srv`, before `DoorGiven` and at each change."""
 
     definitions: dict[str, str]
 
@@ -96,18 +98,46 @@ class ConnectionsChanged(Message, frozen=True):
 
 
 class DoorCounted(Message, frozen=True):
-    """The counts of the process since its start, once a second when they have changed; `connections` is the present."""
+    """The counts of the process since its start, once a second when they have changed; `connections` is the present.
 
-    connections: int
+    `refused` counts connections, and `refusals` requests of clients.
+    """
+
+    connections: int = 0
+    received: int = 0
+    sent: int = 0
+    dropped: int = 0
+    refused: int = 0
+    received_bytes: int = 0
+    sent_bytes: int = 0
+    refusals: int = 0
+
+
+MOST_SHOWN = 50
+"""Connections of a door that operators see one by one."""
+
+
+class ClientShown(msgspec.Struct, frozen=True):
+    """A connection, with its counts of the last minute; `since` is seconds since the epoch."""
+
+    peer: str
+    ticket: str
+    protocol: str
+    since: float
     received: int
     sent: int
-    dropped: int
-    refused: int
+    refusals: int
+
+
+class ClientsShown(Message, frozen=True):
+    """The present connections, the oldest first, at most `MOST_SHOWN`."""
+
+    clients: list[ClientShown]
 
 
 DoorLink = (
-    DoorStarted | DoorGiven | TypesGiven | DoorEnded | AgentListener | ViewerGiven | TicketEnded | SocketWanted | SocketGiven
-    | SocketRefused | ConnectionsChanged | DoorCounted
+    DoorStarted | DoorGiven | TypesGiven | DoorEnded | AgentListener | ViewerGiven | TicketEnded | SocketWanted
+    | SocketGiven | SocketRefused | ConnectionsChanged | DoorCounted | ClientsShown
 )  # fmt: skip
 
 

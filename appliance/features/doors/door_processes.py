@@ -6,18 +6,20 @@ Invariants:
    endpoints and relays, and to no other port.
 2. A process of a door that was removed, or that another door replaced, gets `DoorEnded`. A door that was added again is
    another door, because its tickets and its agent's address are others.
-3. A process outlives control, so it names the tickets of its connections on each link: the next control ends them too.
+3. A process outlives control. It gets the valid tickets on each link, and ends the connections of all others.
 4. A process knows the operator's definitions that are in force.
 5. A process has at most `_MOST_PENDING` requests for sockets at once; further ones are refused.
 """
 
 import asyncio
 import socket
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.channel import ChannelFullError
 from appliance.channel.link import Link
@@ -25,6 +27,7 @@ from appliance.control.assembly.foundation import RVMASTER, Foundation
 from appliance.features.doors import door_link
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.settings import MOST_DOORS, Doors
+from appliance.features.doors.view import LATELY_SECONDS, DoorHealth
 from appliance.rpc.server import listen
 from appliance.store.door_tables import DoorRow
 
@@ -32,28 +35,49 @@ ROLE = "door"
 _CONNECT_SECONDS = 5.0
 _MOST_PENDING = 64
 _BACKLOG = 128
+_MOST_DEATHS = 16
 _EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104  compared only
 
 
 @dataclass(slots=True)
 class _Slot:
     link: Link
-    counts: door_link.DoorCounted = field(default_factory=lambda: door_link.DoorCounted(0, 0, 0, 0, 0))
+    counts: door_link.DoorCounted = field(default_factory=door_link.DoorCounted)
+    clients: list[door_link.ClientShown] = field(default_factory=list)
     trouble: str = ""
     started: bool = False
     pending: int = 0
-    tickets: set[str] = field(default_factory=set)  # with which connections were passed on
     definitions: Mapping[str, str] = field(default_factory=dict)
+    restarts: int = 0
+    deaths: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_DEATHS))
+    full_since: float | None = None
+
+    def clear(self) -> None:
+        """Forget what the process reported."""
+        self.counts, self.clients = door_link.DoorCounted(), []
+        self.started, self.full_since = False, None
 
 
 class DoorProcesses:
-    """The processes of all doors; `definitions()` are those beside the specifications in force."""
+    """The processes of all doors.
+
+    `tickets(door)` returns the ids of the valid tickets. `left(door, ticket)` is called when a connection ended.
+    `definitions()` returns those beside the specifications in force.
+    """
 
     def __init__(
-        self, base: Foundation, table: DoorTable, definitions: Callable[[], Mapping[str, str]]
+        self,
+        base: Foundation,
+        table: DoorTable,
+        *,
+        tickets: Callable[[str], list[str]],
+        left: Callable[[str, str], None],
+        definitions: Callable[[], Mapping[str, str]],
     ) -> None:
         self._base = base
         self._table = table
+        self._tickets = tickets
+        self._left = left
         self._definitions = definitions
         self._settings = base.settings.of(Doors)
         self._tasks: set[asyncio.Task[None]] = set()
@@ -77,6 +101,32 @@ class DoorProcesses:
         trouble = self._table.problem or slot.trouble
         return slot.counts, trouble or ("" if slot.started else "its process is starting")
 
+    def clients(self, row: DoorRow) -> list[door_link.ClientShown]:
+        """Return the connections of a door."""
+        return self._slots[row.slot or 0].clients
+
+    def health(self, row: DoorRow) -> DoorHealth:
+        """Return the counts of a door and its process for metrics and alarms."""
+        slot, now = self._slots[row.slot or 0], clock.now()
+        counts = slot.counts
+        return DoorHealth(
+            name=row.name,
+            up=slot.started and not self._table.problem,
+            trouble=self._table.problem or slot.trouble,
+            connections=counts.connections,
+            limit=self._settings.connections,
+            full_seconds=0.0 if slot.full_since is None else round(now - slot.full_since, 1),
+            received=counts.received,
+            sent=counts.sent,
+            received_bytes=counts.received_bytes,
+            sent_bytes=counts.sent_bytes,
+            dropped=counts.dropped,
+            refusals=counts.refusals,
+            refused_connections=counts.refused,
+            restarts=slot.restarts,
+            restarts_lately=sum(now - one < LATELY_SECONDS for one in slot.deaths),
+        )
+
     def start(self) -> None:
         """Have the processes of all doors run."""
         for row in self._table.live():
@@ -87,26 +137,19 @@ class DoorProcesses:
     def end(self, row: DoorRow) -> None:
         """End the process of a door that was removed."""
         slot = self._slots[row.slot or 0]
-        slot.counts, slot.trouble, slot.started = door_link.DoorCounted(0, 0, 0, 0, 0), "", False
+        slot.clear()
+        slot.trouble, slot.restarts = "", 0
+        slot.deaths.clear()
         self._send(slot, door_link.DoorEnded())
-
-    def tickets(self, row: DoorRow) -> set[str]:
-        """Return the tickets with which connections were passed to the present process of a door."""
-        return {*self._slots[row.slot or 0].tickets}
 
     def end_ticket(self, row: DoorRow, ticket: str) -> None:
         """End the connections of a ticket."""
-        slot = self._slots[row.slot or 0]
-        if self._send(slot, door_link.TicketEnded(ticket)):
-            slot.tickets.discard(ticket)
+        self._send(self._slots[row.slot or 0], door_link.TicketEnded(ticket))
 
     def pass_on(self, row: DoorRow, descriptor: int, peer: str, ticket: str) -> bool:
         """Give a person's connection to the process of a door; return whether the process runs."""
         slot = self._slots[row.slot or 0]
-        passed = slot.started and self._send(slot, door_link.ViewerGiven(peer, ticket), descriptor)
-        if passed:
-            slot.tickets.add(ticket)
-        return passed
+        return slot.started and self._send(slot, door_link.ViewerGiven(peer, ticket), descriptor)
 
     def _send(self, slot: _Slot, message: messages.Message, *descriptors: int) -> bool:
         try:
@@ -129,6 +172,10 @@ class DoorProcesses:
                 self._make(slot, row, request, port)
             case door_link.DoorCounted():
                 slot.counts = message
+                full = message.connections >= self._settings.connections
+                slot.full_since = (slot.full_since or clock.now()) if full else None
+            case door_link.ClientsShown(clients):
+                slot.clients = clients[: door_link.MOST_SHOWN]
             case door_link.ConnectionsChanged():
                 self._record(row, message)
             case _:
@@ -136,9 +183,10 @@ class DoorProcesses:
 
     def _lost(self, number: int, _reason: str) -> None:
         slot, row = self._slots[number], self._table.in_slot(number)
-        slot.started = False
-        slot.counts, slot.tickets = door_link.DoorCounted(0, 0, 0, 0, 0), set()
+        slot.clear()
         if row is not None and not self._table.problem:
+            slot.restarts += 1
+            slot.deaths.append(clock.now())
             self._failed(row, f"the process of the door {row.name} ended; its connections ended with it")
 
     def _begin(self, slot: _Slot, row: DoorRow, process: door_link.DoorStarted) -> None:
@@ -146,7 +194,7 @@ class DoorProcesses:
             self._send(slot, door_link.DoorEnded())  # it served another door of this slot
             self._base.lifeline.say(messages.ProcessWanted(ROLE, row.slot or 0))
             return
-        slot.started, slot.trouble, slot.tickets = True, "", {*process.tickets}
+        slot.started, slot.trouble = True, ""
         given = door_link.DoorGiven(
             row.name,
             row.added,
@@ -155,6 +203,7 @@ class DoorProcesses:
             [*self._settings.origins, *self._own_origins()],
             self._settings.connections,
             self._settings.connections_in_ten_seconds,
+            self._tickets(row.name),
         )
         slot.definitions = {}
         self._define(slot)
@@ -252,6 +301,7 @@ class DoorProcesses:
                 count=change.began,
             )
         if change.ended:
+            self._left(row.name, change.ticket)
             reason = change.reason or "the client left"
             happened(
                 "door disconnected",

@@ -24,6 +24,19 @@ class Ticket(msgspec.Struct, frozen=True):
     who: Annotated[str, doc("who made it")]
 
 
+class DoorClient(msgspec.Struct, frozen=True, kw_only=True):
+    """A connection to a door. The counts are of the last minute."""
+
+    address: Annotated[str, doc("of the client")]
+    since: Moment
+    protocol: Annotated[str, doc("`rosbridge`, or the subprotocol of Foxglove")]
+    ticket: Annotated[str, doc("id of its ticket; empty: it came to an agent's port")]
+    who: Annotated[str, doc("who made the ticket; empty: nobody, or the ticket is over")]
+    received: Annotated[int, doc("frames from the client")]
+    sent: Annotated[int, doc("frames to the client")]
+    refused: Annotated[int, doc("requests of the client that were refused")]
+
+
 class DoorState(msgspec.Struct, frozen=True, kw_only=True):
     """The door of one identity. The policy names it `door:NAME`."""
 
@@ -40,6 +53,15 @@ class DoorState(msgspec.Struct, frozen=True, kw_only=True):
     dropped: Annotated[int, doc("messages for clients that read too slowly")]
     refused: Annotated[int, doc("connections in excess of the limits")]
     tickets: Annotated[list[Ticket], doc("that can be used now")]
+    clients: Annotated[list[DoorClient], doc("that are connected, the oldest first, at most 50")]
+
+
+class OwnDoor(msgspec.Struct, frozen=True, kw_only=True):
+    """The door of the caller: that of a token has its name, that of a person the name of a group in `sso.doors`."""
+
+    name: Annotated[str, doc("its name, also if it does not exist; empty: the caller can have none")]
+    door: Annotated[DoorState | None, doc("null: there is none")]
+    reason: Annotated[str, doc("why there is none, and what to do; empty: there is one")]
 
 
 class DoorList(msgspec.Struct, frozen=True):
@@ -109,4 +131,17 @@ class DoorTicket(WaitingRequest[NewTicket], frozen=True, tag="door ticket"):
     seconds: float
 
 
-REQUESTS = (DoorsWanted, DoorAdd, DoorRemove, DoorTicket)
+@rest("viewer", "GET", "/v1/door", name="own_door", tag="doors")
+class OwnDoorWanted(AdminRequest[OwnDoor], frozen=True, tag="own door"):
+    """The door of the caller, which the console opens."""
+
+
+@rest(
+    "viewer", "POST", "/v1/door/tickets", name="make_own_ticket", tag="doors", status=201,
+    good="The ticket was made.", problems={404: "The caller has no door."},
+)  # fmt: skip
+class DoorVisit(WaitingRequest[NewTicket], frozen=True, tag="door visit"):
+    """Make a ticket for one connection to the caller's own door. The connection ends with the caller's token."""
+
+
+REQUESTS = (DoorsWanted, DoorAdd, DoorRemove, DoorTicket, OwnDoorWanted, DoorVisit)

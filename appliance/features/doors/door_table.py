@@ -135,6 +135,11 @@ class DoorTable:
         return row
 
 
+def is_door_name(text: str) -> bool:
+    """Whether a door can have this name."""
+    return _NAME.fullmatch(text) is not None
+
+
 def _network(text: str) -> str:
     try:
         return str(ipaddress.ip_network(text))

@@ -9,6 +9,7 @@ import hashlib
 import hmac
 import re
 import secrets
+from collections.abc import Mapping
 
 from appliance.base import clock
 from appliance.base.deadlines import Deadlines
@@ -43,20 +44,16 @@ class DoorTickets:
             raise SenselessError("a ticket is valid for one second to 30 days: write 8h or 7d")
         if len(self.valid()) >= _MOST:
             raise SenselessError(f"there are {_MOST} tickets, the limit: wait until some are over")
-        number, secret = secrets.token_hex(6), secrets.token_urlsafe(32)
-        now = clock.wall()
-        row = self._rows[number] = TicketRow(number, door, _hash(secret), now, now + seconds, who)
+        row, text = new_ticket(door, seconds, who)
+        self._rows[row.id] = row
         self._ends.passed(row.id, row.expires)
         self._store.doors.save_tickets(row)
-        return row, f"{number}.{secret}"
+        return row, text
 
     def find(self, door: str, text: str) -> TicketRow | None:
         """Return the valid ticket for this door with this text, or None."""
-        parts = _FORM.fullmatch(text)
-        row = self._rows.get(parts[1]) if parts is not None else None
-        if parts is None or row is None or not hmac.compare_digest(row.hash, _hash(parts[2])):
-            return None
-        return None if row.door != door or self._ends.passed(row.id, row.expires) else row
+        row = shown(text, self._rows)
+        return None if row is None or row.door != door or self._ends.passed(row.id, row.expires) else row
 
     def ended(self, ticket: str) -> bool:
         """Whether a ticket that was valid is over."""
@@ -71,6 +68,23 @@ class DoorTickets:
     def _forget(self, ticket: str) -> None:
         del self._rows[ticket]
         self._store.doors.forget_ticket(ticket)
+
+
+def new_ticket(door: str, seconds: float, who: str) -> tuple[TicketRow, str]:
+    """Return a new ticket: its row, and its text, which is stored nowhere."""
+    number, secret, now = secrets.token_hex(6), secrets.token_urlsafe(32), clock.wall()
+    return TicketRow(number, door, _hash(secret), now, now + seconds, who), f"{number}.{secret}"
+
+
+def shown(text: str, rows: Mapping[str, TicketRow]) -> TicketRow | None:
+    """Return the ticket with this text, or None."""
+    parts = _FORM.fullmatch(text)
+    row = rows.get(parts[1]) if parts is not None else None
+    return (
+        row
+        if parts is not None and row is not None and hmac.compare_digest(row.hash, _hash(parts[2]))
+        else None
+    )
 
 
 def _hash(secret: str) -> bytes:

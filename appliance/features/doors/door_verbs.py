@@ -7,7 +7,14 @@ import typer
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import moment, say_json
-from appliance.features.doors.door_requests import DoorAdd, DoorRemove, DoorState, DoorsWanted, DoorTicket
+from appliance.features.doors.door_requests import (
+    DoorAdd,
+    DoorClient,
+    DoorRemove,
+    DoorState,
+    DoorsWanted,
+    DoorTicket,
+)
 from rosmop.tool.terminal import counted, say
 
 _Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the door", show_default=False)]
@@ -53,7 +60,7 @@ def add(
 
 @speaks
 def list_doors(appliance: Appliance) -> None:
-    """List the doors: address, clients, tickets, and why a door does not serve.
+    """List the doors: address, tickets, why a door does not serve, and its clients with their last minute.
 
     Example: rosrv door list
     """
@@ -65,9 +72,17 @@ def list_doors(appliance: Appliance) -> None:
             say(f"{row.name:<20}  {row.address:<15}  {_entry(row)}, {counted(row.connections, 'connection')}")
             for one in row.tickets:
                 say(f"    ticket {one.id} until {moment(one.expires)}, by {one.who}")
+            for client in row.clients:
+                say(f"    {_client(client)}")
+            if row.connections > len(row.clients) > 0:
+                say(f"    and {row.connections - len(row.clients)} more")
             if row.trouble:
                 say(f"    ! {row.trouble}", "yellow")
-    if not doors and not appliance.as_json:
+    if appliance.as_json:
+        return
+    if doors:
+        say("What one may do: rosrv policy explain --host door:NAME")
+    else:
         say("no doors; add one: rosrv door add NAME")
 
 
@@ -104,6 +119,15 @@ def remove(appliance: Appliance, name: _Name) -> None:
     """
     body = appliance.answer_or_exit(DoorRemove(name))
     say(f"{body.name} ({body.address}) is removed")
+
+
+def _client(one: DoorClient) -> str:
+    origin = f" by {one.who}" if one.who else ""
+    refused = f", {counted(one.refused, 'refusal')}" if one.refused else ""
+    return (
+        f"{one.address}{origin} since {moment(one.since)}, {one.protocol}: {one.received} received, {one.sent} sent"
+        f"{refused} in the last minute"
+    )
 
 
 def _entry(row: DoorState) -> str:

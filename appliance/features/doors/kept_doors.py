@@ -1,6 +1,6 @@
 """The doors in the state, which control reads before the policy comes into force, and the requests about them."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from appliance.control.operators.request_method import RequestMethod
@@ -25,13 +25,27 @@ class Orders(Protocol):
     async def ticket(self, request: requests.DoorTicket, who: str) -> requests.NewTicket:
         """Make a ticket."""
 
+    async def own(self, request: requests.OwnDoorWanted, who: str) -> requests.OwnDoor:
+        """Return the door of the caller."""
+
+    async def visit(self, request: requests.DoorVisit, who: str) -> requests.NewTicket:
+        """Make a ticket for one connection to the caller's door."""
+
 
 class KeptDoors:
-    """The doors in the state, and the orders about them once control has its other parts."""
+    """The doors in the state, and the orders about them once control has its other parts.
+
+    `usable` is `OperatorContext.bearers`.
+    """
 
     def __init__(self, table: DoorTable) -> None:
         self.table = table
         self.orders: Orders
+        self.usable: Callable[[], frozenset[str]]
+
+    def bearers(self) -> frozenset[str]:
+        """Return the names of the tokens and sessions that may be used now."""
+        return self.usable()
 
     def addresses(self) -> Mapping[str, Address]:
         """Return the addresses of `door:NAME` in the policy."""
@@ -56,20 +70,34 @@ class LateOrders(Orders):
     async def ticket(self, request: requests.DoorTicket, who: str) -> requests.NewTicket:
         return await self._orders().ticket(request, who)
 
+    async def own(self, request: requests.OwnDoorWanted, who: str) -> requests.OwnDoor:
+        return await self._orders().own(request, who)
+
+    async def visit(self, request: requests.DoorVisit, who: str) -> requests.NewTicket:
+        return await self._orders().visit(request, who)
+
     def _orders(self) -> Orders:
-        kept = self._context.kept["doors"]
-        assert isinstance(kept, KeptDoors)  # noqa: S101  `control_part.keep` made it
-        return kept.orders
+        return _kept(self._context).orders
 
 
 def operate(context: OperatorContext) -> FeaturePart:
     """Return the part that answers operators' requests."""
     orders = LateOrders(context)
+    if "doors" in context.kept:
+        _kept(context).usable = context.bearers
     return FeaturePart(
         methods=(
             RequestMethod(requests.DoorsWanted, orders.listed),
             RequestMethod(requests.DoorAdd, orders.add, who=True),
             RequestMethod(requests.DoorRemove, orders.remove, who=True, full_disk=True),
             RequestMethod(requests.DoorTicket, orders.ticket, who=True),
+            RequestMethod(requests.OwnDoorWanted, orders.own, who=True),
+            RequestMethod(requests.DoorVisit, orders.visit, who=True, full_disk=True),
         )
     )
+
+
+def _kept(context: OperatorContext) -> KeptDoors:
+    kept = context.kept["doors"]
+    assert isinstance(kept, KeptDoors)  # noqa: S101  `control_part.keep` made it
+    return kept

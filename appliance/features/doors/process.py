@@ -7,7 +7,8 @@ present connections go on, and no new one of the node can be made. The process e
 import asyncio
 import ipaddress
 import socket
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -18,6 +19,7 @@ from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 from appliance.features.doors import door_link
+from appliance.features.doors.client_counts import SAMPLE_SECONDS, DoorClient, shown
 from appliance.features.doors.connections import ConnectionLimits, DoorConnections
 from appliance.features.doors.door_link import node_name
 from appliance.features.doors.door_node import DoorNode, present_time
@@ -62,17 +64,18 @@ class _Totals:
     received: int = 0
     sent: int = 0
     dropped: int = 0
+    received_bytes: int = 0
+    sent_bytes: int = 0
+    refusals: int = 0
 
-
-@dataclass(slots=True, eq=False)
-class _Client:
-    session: DoorSession
-    ticket: str
-    queues: list[ViewerQueue[Any]] = field(default_factory=list)
-
-    @property
-    def dropped(self) -> int:
-        return sum(queue.dropped for queue in self.queues)
+    def add(self, client: DoorClient) -> None:
+        session = client.session
+        self.received += session.received
+        self.sent += session.sent
+        self.dropped += client.dropped
+        self.received_bytes += session.received_bytes
+        self.sent_bytes += session.sent_bytes
+        self.refusals += session.refusals
 
 
 @dataclass(slots=True)
@@ -104,11 +107,12 @@ class _Process:
         self._over = asyncio.Event()
         self._failure = ""
         self._listens = False
-        self._clients: set[_Client] = set()
+        self._clients: set[DoorClient] = set()
         self._tickets: set[str] = set()  # of connections that control passed on, until they end
+        self._shown: list[door_link.ClientShown] = []
         self._changes: dict[tuple[str, str], _Change] = {}
         self._totals = _Totals()
-        self._counted = door_link.DoorCounted(0, 0, 0, 0, 0)
+        self._counted = door_link.DoorCounted()
         self._tasks = OwnedTasks()
 
     async def run(self) -> None:
@@ -132,8 +136,9 @@ class _Process:
     # --- control ---
 
     def _linked(self) -> None:
+        self._counted, self._shown = door_link.DoorCounted(), []  # this control has no counts yet
         name, added = ("", 0.0) if self._given is None else (self._given.name, self._given.added)
-        self._child.tell(door_link.DoorStarted(name, added, self._listens, sorted(self._tickets)))
+        self._child.tell(door_link.DoorStarted(name, added, self._listens))
 
     def _heard(self, message: Any) -> None:
         match message:
@@ -144,17 +149,21 @@ class _Process:
                 elif self._given.added != message.added:  # the slot has another door now
                     self._over.set()
                 self._given = message
+                self._end_tickets(lambda ticket: ticket not in message.tickets)
             case door_link.TypesGiven(definitions):
                 self._define(definitions)
             case door_link.DoorEnded():
                 self._over.set()
             case door_link.TicketEnded(ticket):
-                self._tickets.discard(ticket)
-                for client in [one for one in self._clients if one.ticket == ticket]:
-                    client.session.disconnect("the ticket is over; ask the operator for a new one")
+                self._end_tickets(lambda one: one == ticket)
             case door_link.SocketRefused(number, reason):
                 if self._network is not None:
                     self._network.refused(number, reason)
+
+    def _end_tickets(self, ended: Callable[[str], bool]) -> None:
+        self._tickets = {one for one in self._tickets if not ended(one)}
+        for client in [one for one in self._clients if one.ticket and ended(one.ticket)]:
+            client.session.disconnect("the ticket is over; ask the operator for a new one")
 
     def _took(self, message: Any, descriptors: tuple[int, ...]) -> None:
         match message:
@@ -245,16 +254,14 @@ class _Process:
             subprotocols=SUBPROTOCOLS,
             options=SessionOptions(origins=tuple(given.origins)),
         )
-        client = _Client(session, ticket, queues)
+        client = DoorClient(session, peer, ticket, queues)
         self._clients.add(client)
         self._changed(peer, ticket, began=1)
         try:
             await session.run()
         finally:
             self._clients.discard(client)
-            self._totals.received += session.received
-            self._totals.sent += session.sent
-            self._totals.dropped += client.dropped
+            self._totals.add(client)
             self._changed(peer, ticket, ended=1, reason=session.end)
 
     # --- reports ---
@@ -269,7 +276,7 @@ class _Process:
         change.reason = reason or change.reason
 
     async def _report(self) -> None:
-        while True:
+        for second in range(1 << 62):
             await asyncio.sleep(_REPORT_SECONDS)
             changes, self._changes = self._changes, {}
             for (peer, ticket), one in changes.items():
@@ -279,16 +286,23 @@ class _Process:
             counted = self._counts()
             if counted != self._counted and self._child.tell(counted):
                 self._counted = counted
+            self._show_clients(sample=second % SAMPLE_SECONDS == 0, changed=bool(changes))
+
+    def _show_clients(self, *, sample: bool, changed: bool) -> None:
+        if not sample and not changed:
+            return
+        clients = [*shown(self._clients)]
+        if clients != self._shown and self._child.tell(door_link.ClientsShown(clients)):
+            self._shown = clients
+        for client in self._clients if sample else ():
+            client.sample()
 
     def _counts(self) -> door_link.DoorCounted:
-        totals, clients = self._totals, self._clients
-        return door_link.DoorCounted(
-            connections=len(clients),
-            received=totals.received + sum(one.session.received for one in clients),
-            sent=totals.sent + sum(one.session.sent for one in clients),
-            dropped=totals.dropped + sum(one.dropped for one in clients),
-            refused=self._door.connections.refused if self._door is not None else 0,
-        )
+        totals = replace(self._totals)
+        for client in self._clients:
+            totals.add(client)
+        refused = self._door.connections.refused if self._door is not None else 0
+        return door_link.DoorCounted(connections=len(self._clients), refused=refused, **asdict(totals))
 
 
 def _protocol(node: str, queues: list[ViewerQueue[Any]], subprotocol: str | None) -> ClientProtocol:

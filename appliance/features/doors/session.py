@@ -112,6 +112,7 @@ class DoorSession:
     ) -> None:
         self.end = ""
         self.received = self.sent = 0  # frames
+        self.received_bytes = self.sent_bytes = self.refusals = 0
         self._reader, self._writer = reader, writer
         self._door = door
         self._lookout = lookout
@@ -133,6 +134,11 @@ class DoorSession:
             select_subprotocol=lambda _socket, offered: self._choose(offered),
             max_size=options.frame_bytes,
         )
+
+    @property
+    def protocol_name(self) -> str:
+        """Return the name of the protocol that the client speaks."""
+        return self._socket.subprotocol or "rosbridge"
 
     def _choose(self, offered: Sequence[Subprotocol]) -> Subprotocol | None:
         return next((one for one in offered if one in self._subprotocols), None)
@@ -216,6 +222,7 @@ class DoorSession:
             if not data:
                 self._socket.receive_eof()
                 break
+            self.received_bytes += len(data)
             self._socket.receive_data(data)
             for event in self._socket.events_received():
                 if isinstance(event, WebSocketFrame):
@@ -249,6 +256,7 @@ class DoorSession:
             try:
                 await self._door.carry_out(request, self)
             except RosError as error:
+                self.refusals += 1
                 self._protocol.failed(request, str(error))
                 self._wake.set()
                 return
@@ -291,6 +299,7 @@ class DoorSession:
             pieces = [b"".join(pieces)]
         for data in pieces:
             if data:
+                self.sent_bytes += len(data)
                 self._writer.write(data)
         await self._writer.drain()
 
@@ -322,6 +331,7 @@ class DoorSession:
 
     def failed(self, request: DoorRequest, reason: str) -> None:
         """Queue the refusal of a call."""
+        self.refusals += 1
         self._tell(lambda: self._protocol.failed(request, reason))
 
     def ask(self, service: str, values: Raw) -> str:

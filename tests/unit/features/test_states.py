@@ -14,9 +14,14 @@ AUDIT = "lag_records lag_seconds failed on_failure degraded forwarding collector
 STATUS = (
     "version since master processes isolation relaying mediation firewall probe policy ipsec monitors rosmaster relay"
     " nodes shadows topics services connections messages dropped audit clock recorder switched_off blocks last_minute"
-    " name standby bundles handled_alarms"
+    " name standby bundles doors handled_alarms"
 )
 TO: dict[str, Any] = {"to": "tls://log:6514", "behind": 7}
+DOOR = {
+    "name": "alice", "up": False, "trouble": "port 9091 cannot be listened on", "connections": 32, "limit": 32,
+    "full_seconds": 60.0, "received": 1, "sent": 2, "received_bytes": 3, "sent_bytes": 4, "dropped": 5, "refusals": 6,
+    "refused_connections": 7, "restarts": 9, "restarts_lately": 3,
+}  # fmt: skip
 BAD: dict[str, tuple[dict[str, Any], list[tuple[str, str]]]] = {
     "forwarding": (TO | {"trouble": "refused"}, [("audit-not-forwarded", "warning")]),
     "collector": (TO | {"trouble": "refused"}, [("audit-not-collected", "warning")]),
@@ -24,6 +29,10 @@ BAD: dict[str, tuple[dict[str, Any], list[tuple[str, str]]]] = {
     "standby": (
         {"role": "active", "obstacle": "other keys"},
         [("standby-unready", "alarm"), ("witness-silent", "warning")],
+    ),
+    "doors": (
+        {"doors": [DOOR]},
+        [("doors-down", "warning"), ("doors-restarting", "warning"), ("doors-full", "warning")],
     ),
     "bundles": (
         {"refused": "a/b/2.tar", "reason": "no", "trouble": "bad", "rejected": True, "changed": True},

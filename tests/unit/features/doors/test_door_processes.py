@@ -5,17 +5,19 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.base import clock
 from appliance.channel import messages
 from appliance.control.assembly.foundation import Foundation
 from appliance.features.doors import door_link, door_processes
-from appliance.features.doors.control_part import DoorOrders
 from appliance.features.doors.door_processes import DoorProcesses
 from appliance.features.doors.door_table import DoorTable
 from appliance.features.doors.settings import Doors
+from appliance.features.doors.view import DOORS_VIEW, DoorsState
 from appliance.store.door_tables import DoorRow
+from tests.support.virtual_clock import VirtualClock
 
 ALICE = DoorRow("alice", "198.19.240.2", 1.0, None, 0, None, "")
-NEW = door_link.DoorStarted("", 0.0, False, [])
+NEW = door_link.DoorStarted("", 0.0, False)
 
 
 class Bench:
@@ -26,6 +28,7 @@ class Bench:
         self.asked: list[Any] = []
         self.records: list[str] = []
         self.made: list[int] = []
+        self.left: list[tuple[str, str]] = []
         settings = SimpleNamespace(
             of=lambda _kind: Doors(),
             listen_address=("0.0.0.0", 11311),
@@ -47,7 +50,11 @@ class Bench:
         monkeypatch.setattr(door_processes, "Link", self._link)
         self.definitions: dict[str, str] = {}
         self.processes = DoorProcesses(
-            cast(Foundation, base), cast(DoorTable, table), lambda: self.definitions
+            cast(Foundation, base),
+            cast(DoorTable, table),
+            tickets=lambda _door: ["3f9a0c5d17e2"],
+            left=lambda *left: self.left.append(left),
+            definitions=lambda: self.definitions,
         )
         self.link = cast(Any, self.processes.links()["door"][0])
         monkeypatch.setattr(self.processes, "_given", self._given)
@@ -94,7 +101,7 @@ def test_the_process_of_a_removed_or_replaced_door_ends(bench: Bench) -> None:
     bench.hears(NEW)
     assert [type(one) for one in bench.sent] == [door_link.DoorGiven]
     for name, added in (("bob", 1.0), ("alice", 0.5)):
-        bench.hears(door_link.DoorStarted(name, added, True, []))
+        bench.hears(door_link.DoorStarted(name, added, True))
         assert type(bench.sent[-1]) is door_link.DoorEnded
         assert bench.asked.pop() == messages.ProcessWanted("door", 0)
     bench.rows.clear()
@@ -102,25 +109,12 @@ def test_the_process_of_a_removed_or_replaced_door_ends(bench: Bench) -> None:
     assert type(bench.sent[-1]) is door_link.DoorEnded
 
 
-def test_the_connections_of_a_ticket_end_although_control_was_restarted(bench: Bench) -> None:
-    """The process outlives control, and names the tickets with which earlier controls passed connections on."""
-    bench.hears(door_link.DoorStarted("alice", 1.0, False, ["earlier", "valid"]))
-    assert bench.processes.pass_on(ALICE, 0, "10.0.0.9", "new")
-    assert bench.processes.tickets(ALICE) == {"earlier", "valid", "new"}
-    tickets = SimpleNamespace(ended=lambda ticket: ticket != "valid")
-    table = SimpleNamespace(live=lambda: bench.rows)
-    orders = DoorOrders(*cast(Any, (None, None, table, tickets, bench.processes)))
-    orders.end_tickets()
-    ended = {one.ticket for one in bench.sent if isinstance(one, door_link.TicketEnded)}
-    assert ended == {"earlier", "new"}
-    assert bench.processes.tickets(ALICE) == {"valid"}
-
-
 def test_the_death_of_a_process_is_recorded(bench: Bench) -> None:
     """Not that of a door which was removed."""
     bench.hears(NEW)
     bench.link.lost("")
     assert bench.records == ["door failed"]
+    assert bench.processes.health(ALICE).restarts_lately == 1
     bench.rows.clear()
     bench.link.lost("")
     assert bench.records == ["door failed"]
@@ -129,8 +123,42 @@ def test_the_death_of_a_process_is_recorded(bench: Bench) -> None:
 def test_a_process_gets_the_definitions_in_force_before_its_door_and_each_change_once(bench: Bench) -> None:
     bench.definitions = {"own/Add.srv": "---"}
     bench.processes.define()
-    bench.hears(door_link.DoorStarted("", None))
+    bench.hears(NEW)
     bench.processes.define()
     bench.definitions = {}
     bench.processes.define()
     assert [getattr(one, "definitions", None) for one in bench.sent] == [{"own/Add.srv": "---"}, None, {}]
+
+
+def test_a_process_gets_the_valid_tickets_and_reports_ended_connections(bench: Bench) -> None:
+    """So connections of a ticket that ended while control was away end, and visits are forgotten."""
+    bench.hears(door_link.DoorStarted("alice", 1.0, False))
+    assert bench.sent[0].tickets == ["3f9a0c5d17e2"]
+    bench.hears(door_link.ConnectionsChanged("10.0.0.7", "3f9a0c5d17e2", 1, 0, ""))
+    bench.hears(door_link.ConnectionsChanged("10.0.0.7", "3f9a0c5d17e2", 0, 1, ""))
+    assert bench.left == [("alice", "3f9a0c5d17e2")]
+
+
+def test_a_full_door_and_one_that_keeps_ending_are_alarms(bench: Bench) -> None:
+    """A door that was full for a moment is not, nor one whose process ended ten minutes ago."""
+    machine = VirtualClock()
+
+    def alarms() -> list[str]:
+        state = DoorsState([bench.processes.health(ALICE)])
+        return [one.kind for one in DOORS_VIEW.states[0].alarms(state)]
+
+    with clock.using(machine):
+        for _death in range(3):
+            bench.hears(NEW)
+            bench.link.lost("")
+        assert alarms() == ["doors-restarting"]
+        machine.advance(600.0)
+        bench.hears(NEW)
+        bench.hears(door_link.DoorCounted(connections=32))
+        machine.advance(59.0)
+        assert alarms() == []
+        bench.hears(door_link.DoorCounted(connections=32, received=1))
+        machine.advance(1.0)
+        assert alarms() == ["doors-full"]
+        bench.hears(door_link.DoorCounted(connections=31))
+        assert alarms() == []

@@ -1,0 +1,88 @@
+"""The visits of signed-in people: the console opens the caller's own door, with a ticket for one connection.
+
+Invariants:
+
+1. Nothing is stored. A visit ends with control's process, as the sessions of people do.
+2. A ticket opens one connection, within `_OPEN_SECONDS`.
+3. A visit ends when the last token and session of its person's name ends.
+4. A person has at most `_MOST_OF_PERSON` visits; a further one ends the oldest.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from appliance.base import clock
+from appliance.features.doors.door_tickets import new_ticket, shown
+from appliance.store.door_tables import TicketRow
+
+_OPEN_SECONDS = 60.0
+_MOST_OF_PERSON = 8
+
+
+@dataclass(slots=True)
+class _Visit:
+    row: TicketRow
+    until: float | None  # seconds since the boot, until the ticket is used
+    over: bool = False
+
+
+class DoorVisits:
+    """All visits. `bearers()` returns the names of the tokens and sessions that may be used now."""
+
+    def __init__(self, bearers: Callable[[], frozenset[str]]) -> None:
+        self._bearers = bearers
+        self._visits: dict[str, _Visit] = {}
+
+    def make(self, door: str, who: str) -> tuple[TicketRow, str]:
+        """Make a ticket; return its row and its text."""
+        own = [one for one in self._visits.values() if one.row.who == who and not one.over]
+        for visit in own[: max(0, len(own) + 1 - _MOST_OF_PERSON)]:
+            visit.over = True
+        row, text = new_ticket(door, _OPEN_SECONDS, who)
+        self._visits[row.id] = _Visit(row, clock.since_boot() + _OPEN_SECONDS)
+        return row, text
+
+    def find(self, door: str, text: str) -> TicketRow | None:
+        """Return the ticket for this door with this text, or None if it was used or is over."""
+        row = shown(text, {one.row.id: one.row for one in self._visits.values()})
+        return None if row is None or row.door != door or not self._may_open(self._visits[row.id]) else row
+
+    def opened(self, ticket: str) -> None:
+        """Note that a connection was made with a ticket."""
+        self._visits[ticket].until = None
+
+    def left(self, door: str, ticket: str) -> None:
+        """Forget a visit whose connection ended, by the report of its door."""
+        visit = self._visits.get(ticket)
+        if visit is not None and visit.row.door == door:
+            del self._visits[ticket]
+
+    def forget(self, door: str) -> None:
+        """Forget all visits of a door that was removed; its process ends with their connections."""
+        self._visits = {ticket: one for ticket, one in self._visits.items() if one.row.door != door}
+
+    def present(self, door: str) -> list[TicketRow]:
+        """Return the visits of a door that are not over."""
+        return [one.row for one in self._visits.values() if one.row.door == door and not one.over]
+
+    def ended(self) -> list[TicketRow]:
+        """Return the visits that are over since the last call, and forget them."""
+        if not self._visits:
+            return []
+        bearers = self._bearers()
+        ended = [
+            one
+            for one in self._visits.values()
+            if one.over or one.row.who not in bearers or (one.until is not None and not self._may_open(one))
+        ]
+        for visit in ended:
+            del self._visits[visit.row.id]
+        return [visit.row for visit in ended]
+
+    def _may_open(self, visit: _Visit) -> bool:
+        return (
+            visit.until is not None
+            and not visit.over
+            and clock.since_boot() < visit.until
+            and visit.row.who in self._bearers()
+        )

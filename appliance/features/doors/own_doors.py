@@ -1,0 +1,57 @@
+"""Find the door of a signed-in caller: that of a token has the token's name, that of a person the name of a group.
+
+The rights of a door are those of `door:NAME` in the policy, so the names decide who gets them. An administrator gives
+all three names: that of a token, that of a door, and those of `sso.doors`. A name that the provider gives a person
+opens no door, because people can choose it at some providers.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from appliance.control.operators.sessions import Sessions
+from appliance.features.doors.door_table import DoorTable, is_door_name
+from appliance.store.door_tables import DoorRow
+
+
+class OwnDoor(NamedTuple):
+    """The door of a caller; without a `row`, `reason` says why there is none and what to do.
+
+    `name` is that of the door, also if it does not exist. It is empty if the caller can have none.
+    """
+
+    name: str
+    row: DoorRow | None
+    reason: str
+
+
+class OwnDoors:
+    """The doors of all callers; `sessions()` returns the sessions of people."""
+
+    def __init__(self, table: DoorTable, sessions: Callable[[], Sessions | None]) -> None:
+        self._table = table
+        self._sessions = sessions
+
+    def of(self, who: str) -> OwnDoor:
+        """Return the door of the token or person with this name."""
+        groups = self._groups(who)
+        names = [name for name in ([who] if groups is None else groups) if is_door_name(name)]
+        live = {row.name: row for row in self._table.live()}
+        found = next((name for name in names if name in live), None)
+        if found is not None:
+            return OwnDoor(found, live[found], "")
+        if names:
+            return OwnDoor(names[0], None, f"there is no door {names[0]}: rosrv door add {names[0]}")
+        if groups is None:
+            text = f"no door can have the name {who[:80]}: use a token with the name of a door (a-z, 0-9, _ and -)"
+        else:
+            text = f"no group of {who[:140]} has the name of a door: name one in sso.doors of appliance.yaml"
+        return OwnDoor("", None, text)
+
+    def _groups(self, who: str) -> list[str] | None:
+        """Return the groups of doors of a person; None for a token."""
+        sessions = self._sessions()
+        found = (
+            [] if sessions is None else [sessions.of(row.id) for row in sessions.rows() if row.name == who]
+        )
+        people = [one for one in found if one is not None]
+        return [group for person in people for group in person.groups] if people else None

@@ -1,0 +1,125 @@
+"""The state of doors, with its alarms, metrics and line of `rosrv status`."""
+
+from collections.abc import Iterator, Mapping
+
+import msgspec
+
+from appliance.base.metric import Metric, counter, gauge
+from appliance.features.view import FeatureView, Samples, StateView, Trouble
+
+LATELY_SECONDS = 600.0
+_MANY_RESTARTS = 3  # within `LATELY_SECONDS`
+_FULL_SECONDS = 60.0
+_MOST_NAMED = 5
+
+
+class DoorHealth(msgspec.Struct, frozen=True, kw_only=True):
+    """A door's counts since the start of its process; `restarts` counts its processes since the start of RVMaster."""
+
+    name: str
+    up: bool
+    trouble: str
+    connections: int
+    limit: int
+    full_seconds: float
+    received: int
+    sent: int
+    received_bytes: int
+    sent_bytes: int
+    dropped: int
+    refusals: int
+    refused_connections: int
+    restarts: int
+    restarts_lately: int
+
+
+class DoorsState(msgspec.Struct, frozen=True):
+    """The doors: of each its connections, counts and restarts."""
+
+    doors: list[DoorHealth]
+
+
+_METRICS: Mapping[str, Metric] = {
+    "up": gauge("rosrv_door_up", "1 while the door serves; absent without doors", "door"),
+    "connections": gauge("rosrv_door_connections", "clients connected", "door"),
+    "limit": gauge("rosrv_door_connections_limit", "the most clients at the same time (`doors.connections`)", "door"),
+    "received": counter("rosrv_door_messages_received_total", "frames from clients", "door"),
+    "sent": counter("rosrv_door_messages_sent_total", "frames to clients", "door"),
+    "dropped": counter("rosrv_door_messages_dropped_total", "messages dropped for clients that are too slow", "door"),
+    "received_bytes": counter("rosrv_door_bytes_received_total", "bytes from clients, as on the wire", "door"),
+    "sent_bytes": counter("rosrv_door_bytes_sent_total", "bytes to clients, as on the wire", "door"),
+    "refusals": counter("rosrv_door_refusals_total", "requests of clients that were refused", "door"),
+    "refused_connections": counter(
+        "rosrv_door_connections_refused_total", "connections in excess of the limits", "door"
+    ),
+    "restarts": counter("rosrv_door_restarts_total", "times the process of the door ended by itself", "door"),
+}  # fmt: skip
+"""The metrics by the fields of `DoorHealth`. All but the restarts begin at zero when the door's process starts."""
+
+
+def _alarms(state: DoorsState) -> Iterator[Trouble]:
+    down = [f"{one.name} ({one.trouble})" for one in state.doors if one.trouble]
+    if down:
+        yield Trouble("warning", "doors-down", f"doors do not serve: {_listed(down)}; see rosrv door list")
+    dying = [
+        f"{one.name} ({one.restarts_lately} times)"
+        for one in state.doors
+        if one.restarts_lately >= _MANY_RESTARTS
+    ]
+    if dying:
+        text = f"processes of doors keep ending, in the last ten minutes of {_listed(dying)}"
+        yield Trouble(
+            "warning", "doors-restarting", f"{text}; see rosrv audit search --event 'door failed' --since 10m"
+        )
+    full = [
+        f"{one.name} ({one.connections} of {one.limit})"
+        for one in state.doors
+        if one.full_seconds >= _FULL_SECONDS
+    ]
+    if full:
+        text = f"doors have been at their limit of connections for a minute: {_listed(full)}"
+        yield Trouble(
+            "warning",
+            "doors-full",
+            f"{text}; rosrv door list shows who is connected, doors.connections is the limit",
+        )
+
+
+def _listed(names: list[str]) -> str:
+    more = len(names) - _MOST_NAMED
+    return ", ".join(names[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _samples(state: DoorsState) -> dict[str, Samples]:
+    return {
+        metric.name: [((one.name,), getattr(one, field)) for one in state.doors]
+        for field, metric in _METRICS.items()
+    }
+
+
+def _line(state: DoorsState) -> tuple[str, str]:
+    connected = sum(one.connections for one in state.doors)
+    down = [one.name for one in state.doors if one.trouble]
+    words = [
+        f"{len(state.doors)} {'door' if len(state.doors) == 1 else 'doors'}",
+        f"{connected} {'connection' if connected == 1 else 'connections'}",
+        *([f"{_listed(down)} not serving"] if down else []),
+    ]
+    return "doors", ", ".join(words)
+
+
+DOORS_VIEW = FeatureView(
+    "doors",
+    (
+        StateView(
+            "doors",
+            DoorsState,
+            "null: there are no doors",
+            before="handled_alarms",
+            alarms=_alarms,
+            metrics=tuple(_METRICS.values()),
+            samples=_samples,
+            line=_line,
+        ),
+    ),
+)

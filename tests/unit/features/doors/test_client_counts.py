@@ -1,0 +1,29 @@
+"""The counts of connections in the last minute."""
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+from appliance.base import clock
+from appliance.features.doors.client_counts import SAMPLE_SECONDS, DoorClient, shown
+from appliance.features.doors.door_link import MOST_SHOWN
+from tests.support.virtual_clock import VirtualClock
+
+
+def test_operators_see_the_last_minute_of_the_oldest_connections() -> None:
+    """Frames of earlier minutes do not count, and a door with many connections shows some of them."""
+    session: Any = SimpleNamespace(received=0, sent=0, refusals=0, protocol_name="rosbridge")
+    machine = VirtualClock()
+    clients = []
+    with clock.using(machine):
+        for number in range(MOST_SHOWN + 10):
+            machine.advance(1.0)
+            clients.append(DoorClient(cast(Any, session), f"10.0.0.{number}", "", []))
+    session.received, session.refusals = 600, 2
+    for _sample in range(60 // SAMPLE_SECONDS):
+        session.received += 5
+        for client in clients:
+            client.sample()
+    session.sent += 7
+    first = next(shown(reversed(clients)))
+    assert (first.peer, first.received, first.sent, first.refusals) == ("10.0.0.0", 55, 7, 0)
+    assert len([*shown(clients)]) == MOST_SHOWN

@@ -1,0 +1,86 @@
+"""The door of a signed-in person: who gets which, and how long a visit lasts."""
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from appliance.base import clock
+from appliance.features.doors.door_table import DoorTable
+from appliance.features.doors.door_visits import DoorVisits
+from appliance.features.doors.own_doors import OwnDoors
+from appliance.store.door_tables import DoorRow
+from tests.support.virtual_clock import VirtualClock
+
+
+def people(**groups: tuple[str, ...]) -> Any:
+    """Return the sessions of people, by their names without `sso:`."""
+    rows = [SimpleNamespace(id=name, name=f"sso:{name}") for name in groups]
+    return SimpleNamespace(rows=lambda: rows, of=lambda one: SimpleNamespace(groups=groups[one]))
+
+
+@pytest.mark.parametrize(
+    ("who", "door", "reason"),
+    [
+        ("alice", "alice", ""),
+        ("shift", "shift", "rosrv door add shift"),
+        ("Alice", "", "name of a door"),
+        ("sso:bob", "floor", ""),
+        ("sso:alice", "hall", "rosrv door add hall"),
+        ("sso:agent-1", "", "sso.doors"),
+        ("sso:gone", "", "name of a door"),
+    ],
+)
+def test_a_token_has_the_door_of_its_name_and_a_person_that_of_a_group(
+    who: str, door: str, reason: str
+) -> None:
+    """A name that a provider gives a person opens no door, also if a door has this name."""
+    rows = [
+        DoorRow(name, "198.19.240.2", 1.0, None, 0, None, "") for name in ("alice", "agent-1", "bob", "floor")
+    ]
+    sessions = people(bob=("Floor 1", "hall", "floor"), alice=("hall",), **{"agent-1": ()})
+    table = cast(DoorTable, SimpleNamespace(live=lambda: rows))
+    found = OwnDoors(table, lambda: sessions).of(who)
+    assert found.name == door
+    assert reason in found.reason
+    assert (found.row is None) is bool(reason)
+    assert found.row is None or found.row.name == door
+
+
+def test_a_visit_is_one_connection_and_ends_with_its_token() -> None:
+    machine, bearers = VirtualClock(), {"alice"}
+    with clock.using(machine):
+        visits = DoorVisits(lambda: frozenset(bearers))
+        row, text = visits.make("alice", "alice")
+        assert visits.find("bob", text) is None
+        assert visits.find("alice", text) == row
+        visits.opened(row.id)
+        assert visits.find("alice", text) is None
+        machine.advance(86_400.0)
+        assert visits.ended() == []
+        bearers.clear()
+        assert visits.ended() == [row]
+        assert visits.present("alice") == []
+
+
+def test_an_unused_ticket_is_over_after_a_minute_whatever_the_clock_says() -> None:
+    machine = VirtualClock(wall=1_790_000_000.0)
+    with clock.using(machine):
+        visits = DoorVisits(lambda: frozenset({"alice"}))
+        row, text = visits.make("alice", "alice")
+        machine.set_wall(1_789_990_000.0)
+        machine.advance(61.0)
+        assert visits.find("alice", text) is None
+        assert visits.ended() == [row]
+
+
+def test_visits_of_a_person_are_bounded_and_only_their_door_reports_their_end() -> None:
+    with clock.using(VirtualClock()):
+        visits = DoorVisits(lambda: frozenset({"alice"}))
+        rows = [visits.make("alice", "alice")[0] for _ in range(10)]
+        assert visits.ended() == rows[:2]
+        visits.left("bob", rows[2].id)
+        visits.left("alice", rows[3].id)
+        assert visits.present("alice") == [rows[2], *rows[4:]]
+        visits.forget("alice")
+        assert visits.present("alice") == []
