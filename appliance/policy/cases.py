@@ -1,4 +1,4 @@
-"""Run the test cases of a policy. `FILE.tests.yaml` lists actions of hosts, and whether they are allowed or denied.
+"""Run the test cases of a policy. `FILE.tests.yaml` lists actions that are allowed, denied, or need an approval.
 
     given:
       robot: 192.168.1.10
@@ -8,6 +8,7 @@
         node: /joystick
         allow: [publish /landshark_control/trigger]
         deny: [command shutdown]
+        ask: [publish /cmd_vel]
 
 The policy is compiled with the `given` addresses, so its cases pass wherever it is deployed (docs/policy.md).
 """
@@ -15,6 +16,7 @@ The policy is compiled with the `given` addresses, so its cases pass wherever it
 import ipaddress
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import yaml
 
@@ -31,25 +33,28 @@ from roswire.names import is_global_name
 MAXIMUM_CHARACTERS = 1024 * 1024
 MAXIMUM_CHECKS = 100_000
 
+Expected = Literal["allow", "deny", "ask"]
+_EXPECTED: tuple[Expected, ...] = ("allow", "deny", "ask")
 _Node = yaml.nodes.Node
 _Pairs = dict[str, tuple[_Node, _Node]]
 
 
 @dataclass(frozen=True, slots=True)
 class CaseResult:
-    """The result of one check. `expected`: the case wants `request` to be allowed. `line` and `column` count from 1."""
+    """The result of one check. The case wants the answer `expected` for `request`. `line` and `column` count from 1."""
 
     file: str
     line: int
     column: int
     request: Request
-    expected: bool
+    expected: Expected
     decision: Decision
 
     @property
     def passed(self) -> bool:
         """Whether the rules decide as expected. A request that passes only because of audit-only mode is denied."""
-        return (self.decision.allowed and not self.decision.would_deny) == self.expected
+        verdict = self.decision.verdict
+        return self.expected == ("deny" if verdict == "would deny" else verdict)
 
     def __str__(self) -> str:
         """`landshark.ini.tests.yaml:7:13: expected allow: 10.0.0.9 is not among …`."""
@@ -58,8 +63,7 @@ class CaseResult:
     @property
     def finding(self) -> PolicyFinding:
         """Return the finding for a check that failed."""
-        expected = "allow" if self.expected else "deny"
-        text = f"expected {expected}: {self.decision.reason}"
+        text = f"expected {self.expected}: {self.decision.reason}"
         return PolicyFinding(self.file, self.line, self.column, FindingSeverity.ERROR, text)
 
 
@@ -131,7 +135,7 @@ class _CaseReader:
                     self._error(scalar, f"{quoted(text)} is not an IP address")
 
     def _case(self, node: _Node) -> Iterator[CaseResult]:
-        case = self._mapping(node, "a case", ("host", "node", "allow", "deny"))
+        case = self._mapping(node, "a case", ("host", "node", *_EXPECTED))
         if not case:
             return
         hosts = list(self._hosts(node, case))
@@ -140,10 +144,10 @@ class _CaseReader:
             caller_id = self._text(case["node"][1], "node")
             if not is_global_name(caller_id):
                 self._error(case["node"][1], f"{quoted(caller_id)} is not a node name, such as /joystick")
-        if not ("allow" in case or "deny" in case):
-            self._error(node, "a case needs allow: or deny: with the actions of the host")
-        for word, expected in (("allow", True), ("deny", False)):
-            for action in self._sequence(case[word][1], word) if word in case else ():
+        if case.keys().isdisjoint(_EXPECTED):
+            self._error(node, "a case needs allow:, deny: or ask: with the actions of the host")
+        for expected in _EXPECTED:
+            for action in self._sequence(case[expected][1], expected) if expected in case else ():
                 yield from self._check(action, hosts, caller_id, expected)
 
     def _hosts(self, node: _Node, case: _Pairs) -> Iterator[Address]:
@@ -159,7 +163,7 @@ class _CaseReader:
                 self._error(scalar, f"{fault}; addresses can be given below given:")
 
     def _check(
-        self, node: _Node, hosts: list[Address], caller_id: str, expected: bool
+        self, node: _Node, hosts: list[Address], caller_id: str, expected: Expected
     ) -> Iterator[CaseResult]:
         text = self._text(node, "what the host does")
         try:

@@ -10,6 +10,13 @@ from appliance.policy.rate_limits import NO_LIMIT, LimitScope
 from appliance.policy.rights import Right, decide_right, rights_of
 from appliance.policy.sections import PARAMETERS
 
+_VERDICTS = {
+    "allow": "allowed",
+    "deny": "denied",
+    "ask": "needs an approval",
+    "would deny": "would be denied (audit-only: passes)",
+}
+
 
 @dataclass(frozen=True, slots=True)
 class OverruledRule:
@@ -44,8 +51,14 @@ class DecisionExplanation:
 
     @property
     def allowed(self) -> bool:
-        """Whether the request has all rights that it needs."""
-        return self.decision.allowed and all(other.allowed for other in self.also)
+        """Whether the request has all rights that it needs, without an approval."""
+        return self.together == "allow"
+
+    @property
+    def together(self) -> str:
+        """Return the answer on all rights: allow, ask or deny."""
+        verdicts = {each.decision.verdict for each in (self, *self.also)}
+        return "deny" if "deny" in verdicts else "ask" if "ask" in verdicts else "allow"
 
     @property
     def node(self) -> "DecisionExplanation | None":
@@ -84,7 +97,7 @@ def _explain(policy: Policy, right: Right) -> DecisionExplanation:
     namespace = policy.decide_parameter(request, namespace=True) if parameter and decision.allowed else None
     if namespace is not None and namespace.allowed:
         namespace = None
-    told = None if decision.allowed else text_for_caller(decision, policy.tell)
+    told = None if decision.allowed or decision.asks else text_for_caller(decision, policy.tell)
     limit = _limit(policy, request) if decision.allowed else ""
     return DecisionExplanation(request, decision, through, lost, (), namespace, told, limit, blocked)
 
@@ -101,13 +114,14 @@ def render(explanation: DecisionExplanation) -> Iterator[str]:
             yield f"and the rule for {other.request.resource}, the call that does it:"
         yield from ("  " + line for line in _render_one(other))
     if explanation.also:
-        yield f"together: {'allowed' if explanation.allowed else 'denied'}"
+        yield f"together: {_VERDICTS[explanation.together]}"
 
 
 def _render_one(explanation: DecisionExplanation) -> Iterator[str]:
     decision = explanation.decision
-    verdict = "allowed" if decision.allowed else "denied"
-    yield f"{'would be denied (audit-only: passes)' if decision.would_deny else verdict}: {decision.reason}"
+    yield f"{_VERDICTS[decision.verdict]}: {decision.reason}"
+    if decision.asks is not None:
+        yield "  an operator approves it with `rosrv approve`, each time or for some time"
     if not explanation.blocked:
         yield f"  rule: {decision.rule or 'no rule'}"
     if explanation.told is not None:

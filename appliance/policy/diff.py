@@ -22,13 +22,15 @@ class Difference:
     @property
     def granted(self) -> bool:
         """Whether the new policy grants a request that the old policy denied, or limits it less."""
-        return _answer(self.new) > _answer(self.old) or self.limited > 0
+        return self.new.rank > self.old.rank or self.limited > 0
 
     @property
     def word(self) -> str:
-        """Return the change: granted, denied, limited, or limited less."""
+        """Return the change: granted, denied, needs approval, limited, or limited less."""
         if self.limited:
             return "limited" if self.limited < 0 else "limited less"
+        if self.new.verdict == "ask":
+            return "needs approval"
         return "granted" if self.granted else "denied"
 
 
@@ -44,7 +46,7 @@ def diff(old: Policy, new: Policy, requests: Iterable[Request]) -> list[Differen
     return [
         difference
         for difference in differences
-        if _answer(difference.old) != _answer(difference.new) or difference.limited
+        if difference.old.rank != difference.new.rank or difference.limited
     ]
 
 
@@ -60,9 +62,3 @@ def _difference(old: Policy, new: Policy, request: Request, count: int) -> Diffe
         count,
         1 if was == was.strictest(now) else -1,
     )
-
-
-def _answer(decision: Decision) -> int:
-    if decision.would_deny:
-        return 1
-    return 2 if decision.allowed else 0

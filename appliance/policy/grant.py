@@ -8,6 +8,7 @@ not change. Comments, order and blanks of the text stay. The key for the anonymo
 
 import difflib
 import ipaddress
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Self
@@ -22,7 +23,7 @@ from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import Findings, PolicyError
 from appliance.policy.policy_settings import TAKEOVERS
 from appliance.policy.rights import Right, decide_right, rights_of, rights_of_call
-from appliance.policy.sections import BY_CATEGORY, DEFAULT, GROUPS, OPTIONS, PARAMETERS
+from appliance.policy.sections import ASK, BY_CATEGORY, DEFAULT, GROUPS, OPTIONS, PARAMETERS
 from appliance.policy.stock_tools import StockTool, stock_tool
 
 _MOST_LINES = 8  # the most lines that one grant may change, besides one for each right
@@ -149,7 +150,9 @@ def _changed(policy: Policy, text: str, right: Right, word: str) -> tuple[str, s
     if entry is not None:
         return _with_word(text, entry, word)
     holders = [] if section is None or rule is None else _holders(section, rule.key)
-    return _with_line(text, section, name, f"{written} = {' '.join(dict.fromkeys([*holders, word]))}")
+    asking = holders.index(ASK) if ASK in holders else len(holders)
+    words = dict.fromkeys([*holders[:asking], word, *holders[asking:]])
+    return _with_line(text, section, name, f"{written} = {' '.join(words)}")
 
 
 def _key(request: Request) -> str:
@@ -177,12 +180,17 @@ def _holders(section: SectionText, key: str) -> list[str]:
 def _with_word(text: str, entry: Entry, word: str) -> tuple[str, str]:
     lines = text.split("\n")
     line = lines[entry.key.line - 1]
-    last: Word | None = entry.values[-1] if entry.values else None
+    plain = [*itertools.takewhile(lambda value: value.text != ASK, entry.values)]
+    last: Word | None = plain[-1] if plain else None
     end = line.index("=") + 1 if last is None else last.column - 1 + len(last.text)
     comma = "," if last is not None and "," in line[:end] else ""
     rule = f"{line[:end]}{comma} {word}"
     lines[entry.key.line - 1] = rule + line[end:]
-    return "\n".join(lines), " ".join(rule.split())
+    return "\n".join(lines), " ".join(f"{rule} {' '.join(map(_text, entry.values[len(plain) :]))}".split())
+
+
+def _text(word: Word) -> str:
+    return word.text
 
 
 def _with_takeover(text: str) -> tuple[str, str]:

@@ -10,6 +10,7 @@ from appliance.policy.host_sets import EVERYONE, Atom, HostSets, Network, canoni
 from appliance.policy.ini_reader import Entry, SectionText, Word
 from appliance.policy.model import DOOR, HOST, Address, known_name
 from appliance.policy.policy_findings import Findings, quoted
+from appliance.policy.sections import ASK
 
 ROBOT = "robot"
 _GROUP_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*+", re.ASCII)
@@ -62,6 +63,11 @@ class HostGroups:
         first = self.groups.get(word.text)
         if word.text == ROBOT:
             text = 'the group "robot" is predefined (the machine next to the appliance): use another name'
+            self._findings.error(word.line, word.column, text)
+        elif word.text == ASK:
+            text = (
+                'the word "ask" is reserved for hosts that need an approval: use another name for the group'
+            )
             self._findings.error(word.line, word.column, text)
         elif first is not None and first.word is not None:
             text = f"the group {quoted(word.text)} is already defined at line {first.word.line}"

@@ -1,17 +1,22 @@
 """Check the text, signature and test cases of a policy, for a load, a dry run or the command line."""
 
 import ipaddress
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Self
 
 from appliance.policy.cases import CaseResult, run_cases
 from appliance.policy.host_sets import Network
-from appliance.policy.model import Address
-from appliance.policy.policy import Policy
+from appliance.policy.model import Address, Category
+from appliance.policy.policy import Approval, Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import FindingSeverity, PolicyError, PolicyFinding
 from appliance.signing.site_keys import UnsignedError, signer
+
+
+def approvals_of(rows: Iterable[tuple[str, str, str]]) -> frozenset[Approval]:
+    """Return approvals that were sent as text."""
+    return frozenset((ipaddress.ip_address(host), Category(category), name) for host, category, name in rows)
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,8 +25,8 @@ class PolicyContext:
 
     `cases` is None if the policy has no test cases. `cases_error` is the reason if they could not be read; it rejects
     the policy. If `site_keys` is not empty, one of these keys must have signed the policy. `blocks` has the hosts that
-    an operator blocks (`Policy.blocks`), and `holders` the hosts that hold groups (`Policy.holders`); neither affects
-    checks and test cases.
+    an operator blocks (`Policy.blocks`), `holders` the hosts that hold groups (`Policy.holders`), and `approved` the
+    approvals that last (`Policy.approved`); none of them affects checks and test cases.
     """
 
     hosts: Mapping[str, Address] = field(default_factory=dict)
@@ -32,6 +37,7 @@ class PolicyContext:
     site_keys: Sequence[str] = ()
     blocks: Mapping[Address, str] = field(default_factory=dict)
     holders: Mapping[str, Address] | None = None
+    approved: frozenset[Approval] | None = None
 
     @classmethod
     def of(cls, fields: Mapping[str, Any]) -> Self:
@@ -42,6 +48,7 @@ class PolicyContext:
             **{name: fields[name] for name in ("cases_file", "cases", "cases_error", "site_keys")},
             blocks={ipaddress.ip_address(address): block for address, block in fields["blocks"].items()},
             holders={group: ipaddress.ip_address(host) for group, host in (fields["holders"] or {}).items()},
+            approved=approvals_of(fields["approved"]),
         )
 
     def fields(self) -> dict[str, Any]:
@@ -55,6 +62,7 @@ class PolicyContext:
             "site_keys": list(self.site_keys),
             "blocks": {str(address): block for address, block in self.blocks.items()},
             "holders": {group: str(host) for group, host in (self.holders or {}).items()},
+            "approved": [(str(host), category.value, name) for host, category, name in self.approved or ()],
         }
 
 

@@ -9,6 +9,8 @@ that used it; nothing else is granted. Three keys are wider than observed, becau
 3. The key of a parameter becomes the key of its namespace (`/arm` becomes `/arm/**`). A call on a namespace needs the
    right on every parameter in it. So a host that may access a namespace may also access narrower keys in it.
 
+A host that used a right with approvals only is written behind `ask`.
+
 The result is written for engineers: every line names the nodes that used the right, and how often. Hosts that occur
 together on several lines become a group. A parameter's key is left out if the key above it has the same hosts.
 """
@@ -23,7 +25,7 @@ from appliance.policy.commands import ALIASES
 from appliance.policy.host_sets import Network, canonical_address
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.rights import rights_of_call
-from appliance.policy.sections import DECIDERS, PARAMETERS
+from appliance.policy.sections import ASK, ASKING, DECIDERS, PARAMETERS
 from roswire.names import is_global_name, searched
 
 _SHOWN_NODES = 3
@@ -31,16 +33,21 @@ _SHOWN_NODES = 3
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """A recorded request that passed. `call` is the name of the call on the wire, `key` its parameter."""
+    """A recorded request that passed, `asked`: with an approval.
+
+    `call` is the name of the call on the wire, `key` its parameter.
+    """
 
     request: Request
     call: str = ""
     key: str = ""
+    asked: bool = False
 
 
 @dataclass(slots=True)
 class _Right:
     hosts: set[Address] = field(default_factory=set)
+    asked: set[Address] = field(default_factory=set)
     nodes: set[str] = field(default_factory=set)
     used: int = 0
 
@@ -68,7 +75,8 @@ def learn(observations: Iterable[Observation], robot: Collection[Address | Netwo
         for request in needed:
             right = rights.setdefault((request.category, _key(request)), _Right())
             right.used += 1
-            right.hosts.add(canonical_address(request.host))
+            asked = observation.asked and request.category in ASKING
+            (right.asked if asked else right.hosts).add(canonical_address(request.host))
             if is_global_name(request.caller_id):
                 right.nodes.add(key_of(request.caller_id))
     _hand_down(rights)
@@ -112,6 +120,7 @@ def _hand_down(rights: dict[tuple[Category, str], _Right]) -> None:
                 above = rights.get((category, "/".join(levels[:length]) + "/**"))
                 if above is not None:
                     right.hosts |= above.hosts
+                    right.asked |= above.asked
 
 
 def _needful(rights: dict[tuple[Category, str], _Right]) -> dict[tuple[Category, str], _Right]:
@@ -124,7 +133,7 @@ def _needful(rights: dict[tuple[Category, str], _Right]) -> dict[tuple[Category,
             for length in range(len(levels) - 1, 0, -1)
         )
         nearest = next(filter(None, above), None)
-        if nearest is not None and nearest.hosts == right.hosts:
+        if nearest is not None and (nearest.hosts, nearest.asked) == (right.hosts, right.asked):
             del left[category, key]
     return left
 
@@ -146,7 +155,8 @@ def _text(rights: dict[tuple[Category, str], _Right], robot: Collection[Address 
             verb = f"{category.value} " if category in PARAMETERS else ""
             for key in keys:
                 right, (known, others) = rights[category, key], hosts[category, key]
-                who = " ".join(filter(None, [known, groups.get(others, others)]))
+                asked = _hosts(right.asked - right.hosts, robot)
+                who = " ".join(filter(None, [known, groups.get(others, others), ASK * any(asked), *asked]))
                 nodes = "" if category is Category.NODE else f"{_nodes(right.nodes)} "
                 yield f"{verb}{key:<{width}} = {who}  # {nodes.lstrip()}({right.used}x)\n"
 

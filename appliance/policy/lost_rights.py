@@ -17,7 +17,9 @@ class LostRights:
     def __init__(self, old: Policy, new: Policy) -> None:
         self.old, self.new = old, new
         self._names = {category: tuple(dict.fromkeys(_names(old, new, category))) for category in Category}
-        self._before, self._after = (replace(one, blocks={}, holders=None) for one in (old, new))
+        self._before, self._after = (
+            replace(one, blocks={}, holders=None, approved=None) for one in (old, new)
+        )
         self._lost: dict[tuple[str, str], bool] = {}  # by the networks that both policies name
 
     def took_from(self, host: Address) -> bool:

@@ -120,7 +120,8 @@ class Decision:
     `rosrv policy explain` and the console. `told` is the reason without names and addresses of other hosts, for the
     answer to the caller; it is None if `reason` contains none (`text_for_caller`). In audit-only mode, `would_deny` is
     true if the rules deny the request, and `allowed` is true. `needs` names the further right that decided, such as
-    `write /arm/**`; it is empty if the request itself decided.
+    `write /arm/**`; it is empty if the request itself decided. `asks` is the request that needs an operator's approval,
+    also while it has one. A call of a service that asks passes the gate, and the relay holds each of its requests.
     """
 
     allowed: bool
@@ -129,6 +130,17 @@ class Decision:
     would_deny: bool = False
     told: str | None = None
     needs: str = ""
+    asks: Request | None = None
+
+    @property
+    def rank(self) -> int:
+        """Return how much the rules grant: nothing, with an approval, only in audit-only mode, or all."""
+        return 2 if self.would_deny else 1 if self.asks is not None else 3 if self.allowed else 0
+
+    @property
+    def verdict(self) -> Literal["allow", "deny", "would deny", "ask"]:
+        """Return the answer in the words of the policy's tools, which also know `ask`."""
+        return "ask" if self.rank == 1 else self.word
 
     @property
     def word(self) -> Literal["allow", "deny", "would deny"]:

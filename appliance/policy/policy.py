@@ -32,13 +32,17 @@ _KEPT_DECISIONS = 8192
 _KEPT_NAME = 256
 _LONGEST_REASON = 299
 
+Approval = tuple[Address, Category, str]
+"""An operator's approval: this host may publish this topic, or write this parameter."""
+
 
 @dataclass(frozen=True, slots=True)
 class CompiledRule:
     """One line of a deciding section.
 
     `key` is None for `default`. `atoms` is the value as atoms, `words` the value as written, and `shown` the value as
-    text for messages. `place` is the rule's position as text; `column` is the column of its key.
+    text for messages. `place` is the rule's position as text; `column` is the column of its key. `asked` has the atoms
+    of hosts that need an approval.
     """
 
     rule: Rule
@@ -48,6 +52,16 @@ class CompiledRule:
     shown: str
     place: str
     column: int
+    asked: frozenset[Atom] = frozenset()
+
+    @property
+    def hosts(self) -> frozenset[Atom]:
+        """Return the atoms of all hosts that the rule names, with those that need an approval."""
+        return self.atoms | self.asked
+
+    def asks(self, atoms: frozenset[Atom]) -> bool:
+        """Whether a host with these atoms needs an approval."""
+        return self.atoms.isdisjoint(atoms) and not self.asked.isdisjoint(atoms)
 
     def grants(self, atoms: frozenset[Atom]) -> bool:
         """Whether a host with these atoms is among the hosts of the rule."""
@@ -78,7 +92,8 @@ class Policy:
     `enrolled` and `robot` are the given addresses of `host:NAME` and `robot`. `blocks` has the hosts that an operator
     blocks, by canonical address: the end of a sentence, such as `blocked by ann`. `authority` has the groups of
     `[Authority]`, and `holders` the host that holds each of them; a group without an entry is free. Without `holders`
-    (for checks of a text), each host with a claim counts as the holder.
+    (for checks of a text), each host with a claim counts as the holder. `approved` has the approvals that last, as
+    host, category and name. Without it, no request that needs an approval passes.
     """
 
     text: str
@@ -99,6 +114,7 @@ class Policy:
     robot: tuple[Network, ...]
     blocks: Mapping[Address, str] = field(default_factory=dict)
     holders: Mapping[str, Address] | None = None
+    approved: frozenset[Approval] | None = None
     kept: dict[tuple[int, int, Category, str], Decision] = field(default_factory=dict, init=False)
     _kept_below: dict[tuple[int, int, Category, str, bool], Decision] = field(
         default_factory=dict, init=False
@@ -155,10 +171,15 @@ class Policy:
                 reason = f"{_what(request, 'may not')}: no key of [Parameters] matches what is below it"
                 return _decided(False, None, reason, table.audit_only)
             deciding.append(inherited)
-        for rule in deciding:
-            if not rule.grants(atoms):
+        denying = [rule for rule in deciding if not rule.grants(atoms)]
+        for rule in sorted(
+            denying, key=lambda rule: rule.asks(atoms)
+        ):  # an approval cannot help against a denial
+            if not rule.asks(atoms):
                 what = f"{_what(request, 'may not')} with what is below it"
                 return _by_rule(what, rule, table.audit_only)
+            if not self._is_approved(request):
+                return self._asking(request, rule, table.audit_only)
         return None
 
     def limit_rule(self, topic: str) -> LimitRule | None:
@@ -216,6 +237,11 @@ class Policy:
         if host is None or self.blocked(host) is not None or group.claim(self.atoms_of(host)) is None:
             return None
         return host
+
+    def asks_for(self, category: Category, name: str) -> bool:
+        """Whether some hosts need an approval to access this name."""
+        rule = self.tables[category].tree.find(name) or self.tables[category].default
+        return rule is not None and bool(rule.asked)
 
     def named_as(self, address: Address) -> Network:
         """Return the smallest network of the policy that contains the address, or the address itself as a network."""
@@ -278,7 +304,7 @@ class Policy:
         The publication of a host with a claim stays registered, because a ROS 1 node never registers again. The relay
         carries its messages only while the host holds the group.
         """
-        if not decision.allowed:
+        if not decision.allowed and decision.asks is None:
             return decision
         if group.claim(self.atoms_of(request.host)) is None:
             reason = f"{_what(request, 'may not')}: no line of {place_of(group.rule)} lets it take, override or ask"
@@ -304,10 +330,31 @@ class Policy:
             section = BY_CATEGORY[request.category].name
             reason = f"{_what(request, 'may not')}: no key of [{section}] matches and it has no default"
             return _decided(False, None, reason, table.audit_only)
-        if found.grants(self.hosts.atoms_of(request.host)):
+        atoms = self.hosts.atoms_of(request.host)
+        if found.grants(atoms):
             return Decision(True, found.rule, f"{_what(request, 'may')} by {found.place}")
+        if found.asks(atoms):
+            return self._asking(request, found, table.audit_only)
         what = _what(request, "is not among the hosts that may")
         return _by_rule(what, found, table.audit_only)
+
+    def _asking(self, request: Request, rule: CompiledRule, audit_only: bool) -> Decision:
+        """Decide for a host that needs an approval.
+
+        A call of a service passes here in operation, because the relay holds each of its requests.
+        """
+        if self._is_approved(request):
+            reason = f"{_what(request, 'may')} by {rule.place}, while an approval lasts"
+            return Decision(True, rule.rule, reason, asks=request)
+        reason = f"{_what(request, 'needs an approval to')}, by {rule.place}"
+        if audit_only:
+            return _decided(False, rule.rule, reason, audit_only)
+        held = self.approved is not None and request.category is Category.CALL
+        return Decision(held, rule.rule, reason, asks=request)
+
+    def _is_approved(self, request: Request) -> bool:
+        approval = canonical_address(request.host), request.category, request.resource
+        return self.approved is not None and approval in self.approved
 
     def _without_section(self, request: Request, table: RuleTable) -> Decision:
         decider = BY_CATEGORY[request.category]

@@ -54,7 +54,7 @@ def compile_policy(
             compiler.tables[category].audit_only = decider.name in options.audit_only
     findings.raise_errors()
     lint(compiler.tables, present, written, groups=groups, hosts=table, findings=findings)
-    named = {atom for rules in compiler.tables.values() for rule in rules.rules for atom in rule.atoms}
+    named = {atom for rules in compiler.tables.values() for rule in rules.rules for atom in rule.hosts}
     return Policy(
         text=text,
         file=file,

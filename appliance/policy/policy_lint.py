@@ -51,7 +51,7 @@ def _dead_rules(tables: Tables, table: HostSets, findings: Findings) -> None:
     nameless = _nameless(named, table)
     seen: dict[Network, tuple[CompiledRule, int]] = {}
     for rule in (rule for category in _NODE_CATEGORIES for rule in tables[category].rules):
-        for host in {nameless[atom] for atom in rule.atoms if atom in nameless}:
+        for host in {nameless[atom] for atom in rule.hosts if atom in nameless}:
             first, count = seen.get(host, (rule, 0))
             seen[host] = (first, count + 1)
     for host, (rule, count) in seen.items():

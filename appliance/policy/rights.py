@@ -108,17 +108,17 @@ def needs_node(request: Request) -> bool:
 
 
 def decide(policy: Policy, rights: Iterable[Right]) -> Decision:
-    """Return one decision on all rights: the first denial, otherwise the first audit-only pass, otherwise the first."""
+    """Return one decision on all rights: the first of the lowest rank, so a denial before a missing approval."""
     first, *others = rights
     verdict = decide_right(policy, first)
     for right in others:
-        if not verdict.allowed:
+        if verdict.rank == 0:
             break
         category = right.request.category
         if category in PARAMETERS and not policy.has_section(category):
             continue  # without the section, all access to parameters is allowed
         decision = decide_right(policy, right)
-        if not decision.allowed or (decision.would_deny and not verdict.would_deny):
+        if decision.rank < verdict.rank:
             verdict = replace(decision, needs=str(right))
     return verdict
 

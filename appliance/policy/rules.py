@@ -8,7 +8,7 @@ from appliance.policy.keys import BadKeyError, Key, command_key, parse_key
 from appliance.policy.model import Category, Rule
 from appliance.policy.policy import CompiledRule, RuleTable, place_of
 from appliance.policy.policy_findings import Findings, quoted
-from appliance.policy.sections import DEFAULT, PARAMETERS, Decider
+from appliance.policy.sections import ASK, ASKING, DEFAULT, PARAMETERS, Decider
 
 MAXIMUM_INNER_STARS = 1000
 """The most keys with a star before the end, in all sections together. Such keys make the search for a name branch."""
@@ -31,11 +31,13 @@ class RuleCompiler:
         for entry in section.entries:
             if self._findings.full:
                 return
-            words = self._groups.read(entry.values)
             split = self._category_and_name(decider, entry)
             if split is None:
+                self._groups.read(entry.values)
                 continue
             category, name = split
+            plain, asking = self._asking(category, entry)
+            words, asked = self._groups.read(plain), self._groups.read(asking)
             if category is Category.COMMAND:
                 name = Word(commands.ALIASES.get(name.text, name.text), name.line, name.column)
             first = first_lines.setdefault((category, name.text), name.line)
@@ -49,11 +51,31 @@ class RuleCompiler:
             if key is not None and not key.exact and not self._fits(category, key, name):
                 continue
             rule = Rule(decider.name, entry.key.text, self._file, entry.key.line)
-            shown = f"only {self._groups.shown(entry.values)} may" if entry.values else "no host may"
-            atoms = frozenset(atom for _, atom in words)
+            shown = f"only {self._groups.shown(plain)} may" if plain else "no host may"
+            if asking:
+                shown += f", and with an approval {self._groups.shown(asking)}"
+            atoms, asked_atoms = (frozenset(atom for _, atom in some) for some in (words, asked))
+            place = place_of(rule)
             self._add(
-                category, CompiledRule(rule, key, atoms, words, shown, place_of(rule), entry.key.column)
+                category,
+                CompiledRule(rule, key, atoms, (*words, *asked), shown, place, entry.key.column, asked_atoms),
             )
+
+    def _asking(self, category: Category, entry: Entry) -> tuple[tuple[Word, ...], tuple[Word, ...]]:
+        """Return the words of a value before and after `ask`."""
+        places = [place for place, word in enumerate(entry.values) if word.text == ASK]
+        if not places:
+            return entry.values, ()
+        plain, asking = entry.values[: places[0]], entry.values[places[0] + 1 :]
+        if category not in ASKING:
+            text = "ask is for [Publishers], [Clients] and the write keys of [Parameters]"
+            self._error(entry.values[places[0]], text)
+        elif len(places) > 1:
+            text = "ask is already in this line: all hosts after it need an approval"
+            self._error(entry.values[places[1]], text)
+        elif not asking:
+            self._error(entry.values[places[0]], "name the hosts that need an approval after ask")
+        return plain, tuple(word for word in asking if word.text != ASK)
 
     def _fits(self, category: Category, key: Key, name: Word) -> bool:
         """Whether a pattern can be added: it ties with no earlier pattern, and there are not too many patterns."""

@@ -43,6 +43,12 @@ BY_CATEGORY = {category: decider for decider in DECIDERS for category in decider
 PARAMETERS = frozenset({Category.READ, Category.WRITE})
 """The categories of access to parameters."""
 
+ASK = "ask"
+"""The word in a value after which the hosts need an operator's approval."""
+
+ASKING = frozenset({Category.PUBLISH, Category.CALL, Category.WRITE})
+"""The categories whose rules may have `ask`."""
+
 DEFAULT = "default"
 """The key that applies to names without another matching key in the section."""
 

@@ -99,6 +99,8 @@ class AuditTrail:
             detail["node"] = asker.node
         if decision.needs:
             detail["needs"] = decision.needs
+        if decision.asks is not None:
+            detail["approval"] = f"{decision.asks.category} {decision.asks.resource}"
         now = clock.wall_ns()
         severity = Severity.INFO if decision.allowed and not decision.would_deny else Severity.WARNING
         detail |= self._details("decision", word, severity, asker.host, now)

@@ -13,7 +13,7 @@ from appliance.policy.model import Category
 OneRevision = Annotated[
     int, Path(ge=1, le=LONGEST_REVISION, description="number of the revision", examples=[1])
 ]
-Decided = Literal["allow", "deny", "would deny"]
+Decided = Literal["allow", "deny", "would deny", "ask"]
 
 
 class Change(msgspec.Struct, frozen=True):

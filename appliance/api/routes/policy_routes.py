@@ -45,7 +45,7 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
     caller_id: str
     category: str
     resource: str
-    expected: Literal["allow", "deny"]
+    expected: Literal["allow", "deny", "ask"]
     decision: Decided
     reason: str
     passed: bool
@@ -132,8 +132,8 @@ def _case(case: CaseResult) -> Case:
         line=case.line,
         column=case.column,
         **case.request.fields(),
-        expected="allow" if case.expected else "deny",
-        decision=case.decision.word,
+        expected=case.expected,
+        decision=case.decision.verdict,
         reason=case.decision.reason,
         passed=case.passed,
     )
@@ -143,7 +143,7 @@ def _explained(found: DecisionExplanation) -> Explained:
     decision = found.decision
     return Explained(
         **found.request.fields(),
-        decision=decision.word,
+        decision=decision.verdict,
         rule=RuleText(**asdict(decision.rule)) if decision.rule else None,
         reason=decision.reason,
         told=found.told,

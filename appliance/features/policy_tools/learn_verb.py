@@ -80,7 +80,9 @@ def _observations(appliance: Appliance, since: str | None) -> Iterator[Observati
                 record.host, record.caller_id or "", str(record.category), record.resource or ""
             )
             detail = record.detail
-            yield Observation(request, str(detail.get("call", "")), str(detail.get("key", "")))
+            yield Observation(
+                request, str(detail.get("call", "")), str(detail.get("key", "")), "approval" in detail
+            )
     except (LogUnreadableError, NotRunningError, TimestampError, FilterError) as error:
         raise usage_error(str(error)) from error
 

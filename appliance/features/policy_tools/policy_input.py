@@ -22,7 +22,7 @@ from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance
 from appliance.policy.actions import BadWordError, find_host
 from appliance.policy.host_sets import Network, canonical_address, canonical_network
-from appliance.policy.judgement import PolicyContext
+from appliance.policy.judgement import PolicyContext, approvals_of
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.policy import Policy
@@ -94,6 +94,7 @@ def policy_in_force(
         [ipaddress.ip_network(place) for place in body.robot],
         blocks={ipaddress.ip_address(address): block for address, block in body.blocks.items()},
         holders={group: ipaddress.ip_address(host) for group, host in body.holders.items()},
+        approved=approvals_of(body.approved),
     )
     return body.text, body.file, known_of(robot, enrolled, known)
 

@@ -98,7 +98,7 @@ def _say_finding(finding: PolicyFinding, *, as_json: bool) -> None:
 def decision_fields(decision: Decision) -> dict[str, object]:
     """Return a decision's fields as in the audit log."""
     place = asdict(decision.rule) if decision.rule else None
-    return {"decision": decision.word, "rule": place, "reason": decision.reason}
+    return {"decision": decision.verdict, "rule": place, "reason": decision.reason}
 
 
 def _impact(
@@ -136,7 +136,7 @@ def compiled(
         policy = compile_policy(text, file=name, hosts=known.hosts, robot=known.robot)
     except PolicyError as error:  # the appliance has another version
         raise refused(error.findings) from error
-    return replace(policy, blocks=known.blocks, holders=known.holders)
+    return replace(policy, blocks=known.blocks, holders=known.holders, approved=known.approved)
 
 
 @speaks
@@ -164,7 +164,9 @@ def explain_request(
     robot: Robot = None,
     enrolled: Enrolled = None,
 ) -> None:
-    """Explain whether a request is allowed, by which rule, and which rules were overridden. Exit status 1 if denied.
+    """Explain whether a request is allowed, by which rule, and which rules were overridden.
+
+    Exit status 1 if it is denied or needs an approval.
 
     Without a file, explain the decision of the policy in force.
 
@@ -197,7 +199,7 @@ def explain_request(
     else:
         for line in render(explanation):
             say(line, "green" if explanation.allowed else "red")
-        if not explanation.allowed and not explanation.blocked:
+        if explanation.together == "deny" and not explanation.blocked:
             for line in _allowing(policy, request):
                 say(line)
     raise typer.Exit(0 if explanation.allowed else 1)
@@ -226,7 +228,7 @@ def _explanation_fields(explanation: DecisionExplanation) -> dict[str, object]:
         if also is not None:
             fields[word] = _explanation_fields(also)
     if explanation.also:
-        fields["together"] = "allow" if explanation.allowed else "deny"
+        fields["together"] = explanation.together
     return fields
 
 
@@ -251,7 +253,7 @@ def test(
     for result in results if as_json else failed:
         if as_json:
             place = {"file": result.file, "line": result.line, "column": result.column}
-            expected = {"passed": result.passed, "expected": "allow" if result.expected else "deny"}
+            expected = {"passed": result.passed, "expected": result.expected}
             say_json({**place, **expected, **result.request.fields(), **decision_fields(result.decision)})
         else:
             say(str(result), "red")

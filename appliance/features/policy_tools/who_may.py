@@ -41,10 +41,10 @@ class HostAnswer:
 def who_may(policy: Policy, category: Category, resource: str, node: str = "") -> Iterator[HostAnswer]:
     """Yield the answer for each network in order of addresses, then for all other hosts.
 
-    Without the name of a `node`, the right to a node's name is not decided. Blocks of hosts are ignored, and which host
-    holds a group.
+    Without the name of a `node`, the right to a node's name is not decided. Blocks of hosts, approvals, and
+    the holders of groups are ignored.
     """
-    policy = replace(policy, blocks={}, holders=None)
+    policy = replace(policy, blocks={}, holders=None, approved=None)
     networks = sorted(policy.hosts.networks(), key=lambda one: (one.version, one))
     inside = [
         (network, _only_in(policy, network, networks[place:]))

@@ -40,13 +40,13 @@ def list_who_may(
         raise usage_error(str(error)) from error
     policy = compiled(appliance, file, robot, enrolled)
     answers = list(who_may(policy, category, resource, node))
-    shown = [answer for answer in answers if answer.decision.allowed or answer.near]
+    shown = [answer for answer in answers if answer.decision.rank or answer.near]
     for answer in shown:
         if appliance.as_json:
             say_json(_fields(answer))
         else:
-            say(_line(answer), "" if answer.decision.word == "allow" else "yellow")
-    may = any(answer.decision.allowed for answer in answers)
+            say(_line(answer), "" if answer.decision.verdict == "allow" else "yellow")
+    may = any(answer.decision.rank for answer in answers)
     if not appliance.as_json:
         for line in _notes(category, resource, node, may=may):
             say(line)
@@ -55,11 +55,17 @@ def list_who_may(
     raise typer.Exit(0 if may else 1)
 
 
+_ONLY = {
+    "deny": "denied",
+    "ask": "needs an approval each time (rosrv approve)",
+    "would deny": "passes only in audit-only mode",
+}
+
+
 def _line(answer: HostAnswer) -> str:
     hosts = f"{', '.join(answer.names)} ({answer.hosts})" if answer.names else answer.hosts
-    if answer.decision.word != "allow":
-        only = "passes only in audit-only mode" if answer.decision.would_deny else "denied"
-        return f"{hosts}: {only}: {answer.decision.reason}"
+    if answer.decision.verdict != "allow":
+        return f"{hosts}: {_ONLY[answer.decision.verdict]}: {answer.decision.reason}"
     if answer.decision.rule is None:
         return f"{hosts}: {answer.decision.reason}"
     through = ", ".join(answer.through)

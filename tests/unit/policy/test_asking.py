@@ -1,0 +1,122 @@
+"""`ask` in a value: the hosts after it need an operator's approval, and every reader of a policy says so."""
+
+from dataclasses import replace
+
+import pytest
+
+from appliance.features.policy_tools.who_may import who_may
+from appliance.policy.cases import run_cases
+from appliance.policy.decision_reasons import explain, render
+from appliance.policy.diff import diff
+from appliance.policy.grant import DecidedRequest, grant
+from appliance.policy.judgement import PolicyContext, approvals_of
+from appliance.policy.learn import Observation, learn
+from appliance.policy.lost_rights import LostRights
+from appliance.policy.model import Category, Request, address_of
+from appliance.policy.policy import Policy
+from appliance.policy.policy_compiler import compile_policy
+from appliance.policy.policy_findings import PolicyError
+from appliance.policy.rights import Right, decide, rights_of
+
+TEXT = """
+[Groups]
+operator = 10.0.0.1
+agent-1 = 10.0.0.7
+[Nodes]
+default = operator agent-1
+[Publishers]
+/cmd_vel = operator, ask agent-1
+[Subscribers]
+default = operator
+[Commands]
+default = operator agent-1
+[Clients]
+/reset = operator ask agent-1
+[Parameters]
+read default = operator
+write /arm/** = operator ask agent-1
+write /arm/max = ask agent-1
+write /arm/secret = operator
+"""
+AGENT, OPERATOR = address_of("10.0.0.7"), address_of("10.0.0.1")
+
+
+def policy(text: str = TEXT, *approved: tuple[str, str, str]) -> Policy:
+    compiled = compile_policy(text, file="site.ini")
+    return replace(compiled, approved=approvals_of(approved)) if approved else compiled
+
+
+def verdict(policy: Policy, category: Category, name: str, host: object = AGENT) -> tuple[str, bool]:
+    decision = decide(policy, rights_of(Request(host, "/it", category, name)))  # type: ignore[arg-type]
+    return decision.verdict, decision.allowed
+
+
+def test_a_host_behind_ask_passes_only_while_its_approval_lasts() -> None:
+    """Without approvals (checks of a text) nothing passes; in operation the relay holds each call of a service."""
+    bare, live = policy(), policy(TEXT, ("10.0.0.7", "publish", "/cmd_vel"))
+    for category, name in (
+        (Category.PUBLISH, "/cmd_vel"),
+        (Category.CALL, "/reset"),
+        (Category.WRITE, "/arm/x"),
+    ):
+        assert verdict(bare, category, name) == ("ask", False)
+        assert verdict(bare, category, name, OPERATOR) == ("allow", True)
+    assert verdict(live, Category.PUBLISH, "/cmd_vel") == ("ask", True)
+    assert verdict(live, Category.CALL, "/reset") == ("ask", True)
+    assert verdict(live, Category.WRITE, "/arm/x") == ("ask", False)
+    assert verdict(live, Category.PUBLISH, "/other") == ("deny", False)
+
+
+def test_a_denial_goes_before_a_missing_approval() -> None:
+    """No operator is asked for what would be denied anyway, such as a node name, or a parameter below."""
+    nameless = policy(TEXT.replace("default = operator agent-1", "default = operator", 1))
+    assert verdict(nameless, Category.PUBLISH, "/cmd_vel") == ("deny", False)
+    below = Right(Request(AGENT, "/it", Category.WRITE, "/arm"), namespace=True)
+    assert decide(policy(TEXT, ("10.0.0.7", "write", "/arm")), [below]).verdict == "deny"
+    open_below = policy(TEXT.replace("secret = operator", "secret = * "), ("10.0.0.7", "write", "/arm"))
+    assert decide(open_below, [below]).allowed, "an approval of a namespace covers what asks below it"
+
+
+def test_a_blocked_host_and_a_group_without_a_claim_are_not_asked_for() -> None:
+    blocked = replace(policy(TEXT, ("10.0.0.7", "publish", "/cmd_vel")), blocks={AGENT: "blocked by ann"})
+    assert verdict(blocked, Category.PUBLISH, "/cmd_vel") == ("deny", False)
+    grouped = policy(f"{TEXT}[Authority]\nbase = /cmd_vel\ntake base = operator\n")
+    assert verdict(grouped, Category.PUBLISH, "/cmd_vel") == ("deny", False)
+
+
+def test_every_reader_of_a_policy_knows_ask() -> None:
+    asked, plain = policy(), policy(TEXT.replace("ask agent-1", "agent-1"))
+    request = Request(AGENT, "/it", Category.PUBLISH, "/cmd_vel")
+    assert [*render(explain(asked, request))][-1] == "together: needs an approval"
+    assert [answer.decision.verdict for answer in who_may(asked, Category.PUBLISH, "/cmd_vel")] == [
+        "allow", "ask", "deny"
+    ]  # fmt: skip
+    assert [one.word for one in diff(plain, asked, [request])] == ["needs approval"]
+    assert not diff(asked, asked, [request])
+    assert LostRights(plain, asked).took_from(AGENT)
+    granted = grant(TEXT, "site.ini", PolicyContext(), DecidedRequest(request, rights_of(request)))
+    assert "/cmd_vel = operator agent-1, ask agent-1" in granted.text
+    learned = learn([Observation(request, "registerPublisher", asked=True)]).text
+    assert "/cmd_vel = ask 10.0.0.7" in learned
+    assert "[Nodes]\n/it = 10.0.0.7" in learned, "only the right that was approved is behind ask"
+    assert not compile_policy(learned, file="learned").decide(request).allowed
+    cases = "cases: [{host: 10.0.0.7, node: /it, ask: [publish /cmd_vel], deny: [call /other]}]"
+    assert [one.passed for one in run_cases(asked, cases, "cases")] == [True, True]
+    assert [one.passed for one in run_cases(plain, cases, "cases")] == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("[Groups]\nask = 10.0.0.1", "reserved"),
+        ("[Subscribers]\n/x = ask 10.0.0.1", "is for [Publishers]"),
+        ("[Parameters]\nread /x = ask 10.0.0.1", "is for [Publishers]"),
+        ("[Publishers]\n/x = ask", "name the hosts"),
+        ("[Publishers]\n/x = ask 10.0.0.1 ask 10.0.0.2", "already in this line"),
+        ("[Limits]\n/x = publisher 1/s ask", ""),
+    ],
+)
+def test_ask_elsewhere_is_an_error(text: str, fault: str) -> None:
+    with pytest.raises(PolicyError) as caught:
+        compile_policy(text, file="site.ini")
+    assert any(fault in one.text for one in caught.value.findings)
