@@ -7,6 +7,7 @@ The front process identifies the client, and passes its connection here as a str
    do not hold up later requests.
 3. Frames are sent only as fast as the client reads. In the meantime, its queue keeps the newest messages of each topic.
 4. A client that sends nothing, and does not answer pings, is disconnected.
+5. Once the session disconnects a client, it carries out no further request, and ends even if the client does not read.
 """
 
 import asyncio
@@ -37,6 +38,7 @@ from roswire.errors import RosError
 from roswire.node.network import ByteWriter
 
 _READ_BYTES = 1 << 16
+_READ_DEFLATED_BYTES = 1 << 12  # the frames that are read at once take up to 1000 times as much inflated
 _BATCH_BYTES = 1 << 15
 _CLOSING_SECONDS = 2.0
 _WATCH_SECONDS = 2.0  # between two looks at the surroundings
@@ -120,9 +122,10 @@ class DoorSession:
         self._subprotocols = subprotocols
         self._options = options
         self._protocol: ClientProtocol
-        self._parts: list[bytes] = []
+        self._frame = bytearray()  # the fragments that have come; empty ones take nothing
         self._is_text = False
         self._wake = asyncio.Event()
+        self._over = asyncio.Event()
         self._socket = ServerProtocol(
             extensions=[
                 ServerPerMessageDeflateFactory(
@@ -182,9 +185,7 @@ class DoorSession:
         return True
 
     async def _serve(self) -> None:
-        sending = asyncio.ensure_future(self._send())
-        receiving = asyncio.ensure_future(self._receive())
-        tasks = [sending, receiving]
+        tasks = [asyncio.ensure_future(work) for work in (self._send(), self._receive(), self._leave())]
         if self._protocol.wants_surroundings:
             tasks.append(asyncio.ensure_future(self._watch()))
         try:
@@ -213,12 +214,18 @@ class DoorSession:
                 await self._door.carry_out(request, self)
             await asyncio.sleep(_WATCH_SECONDS)
 
+    async def _leave(self) -> None:
+        """Give a client that is disconnected a short time to close its end."""
+        await self._over.wait()
+        await asyncio.sleep(_CLOSING_SECONDS)
+
     # --- frames of the client ---
 
     async def _receive(self) -> None:
+        size = _READ_DEFLATED_BYTES if self._socket.extensions else _READ_BYTES
         while not self._socket.close_expected():
             async with asyncio.timeout(self._options.silent_seconds):
-                data = await self._reader.read(_READ_BYTES)
+                data = await self._reader.read(size)
             if not data:
                 self._socket.receive_eof()
                 break
@@ -231,15 +238,17 @@ class DoorSession:
         self.end = self.end or f"the client ended the connection{_reason(self._socket)}"
 
     async def _take(self, frame: WebSocketFrame) -> None:
-        if frame.opcode in (Opcode.TEXT, Opcode.BINARY):
-            self._is_text = frame.opcode is Opcode.TEXT
-            self._parts = [bytes(frame.data)]
-        elif frame.opcode is Opcode.CONT:
-            self._parts.append(bytes(frame.data))
-        else:
+        if frame.opcode not in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT) or self._over.is_set():
             return
+        if frame.opcode is not Opcode.CONT:
+            self._is_text = frame.opcode is Opcode.TEXT
+        data = bytes(frame.data)
+        if self._frame or not frame.fin:
+            self._frame += data
         if frame.fin:
-            data, self._parts = b"".join(self._parts), []
+            if self._frame:
+                data = bytes(self._frame)
+                self._frame.clear()
             try:
                 await self._carry_out(data.decode() if self._is_text else data)
             except UnicodeDecodeError:
@@ -253,6 +262,8 @@ class DoorSession:
         requests = self._protocol.receive(frame)
         self._wake.set()
         for request in requests:
+            if self._over.is_set():
+                return
             try:
                 await self._door.carry_out(request, self)
             except RosError as error:
@@ -312,6 +323,7 @@ class DoorSession:
         if self._socket.state is State.OPEN:
             with contextlib.suppress(WebSocketError):
                 self._socket.send_close(code, reason[:120])
+        self._over.set()
         self._wake.set()
 
     # --- the door's side: a `DoorClient` ---

@@ -2,6 +2,7 @@
 
 import asyncio
 import struct
+import tracemalloc
 from typing import Any
 
 import pytest
@@ -200,6 +201,53 @@ async def test_fragments_of_websocket_frames_have_one_limit_together() -> None:
         client.flush()
         await client.closed()
         assert client.socket.close_code == 1009
+
+
+async def test_fragments_take_the_memory_of_their_bytes() -> None:
+    """An endless frame of empty fragments takes none."""
+    async with door_world() as world:
+        client = await world.client()
+        client.socket.send_text(b'{"op":"x"', fin=False)
+        client.flush()
+        await asyncio.sleep(0.1)
+        tracemalloc.start()
+        for part in (b"", b" "):
+            for _ in range(5000):
+                client.socket.send_continuation(part, fin=False)
+            client.flush()
+            await asyncio.sleep(1)
+        taken, _peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert taken < 60_000
+        client.socket.send_continuation(b"}", fin=True)
+        client.flush()
+        assert "unknown operation 'x'" in (await client.next())["msg"]
+
+
+@pytest.mark.parametrize("reads", [True, False])
+async def test_a_client_that_is_disconnected_is_heard_no_more_and_leaves_in_time(reads: bool) -> None:
+    """Neither the frames that it has sent already, nor a client that does not read, keep the connection."""
+    async with door_world() as world:
+        robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
+        heard: list[bytes] = []
+        await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
+        publication = await talks(robot, "/image")
+        client.send({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String"})
+        client.send({"op": "subscribe", "topic": "/image"})
+        await asyncio.sleep(1)
+        if not reads:
+            client.stop_reading()
+            for _ in range(9):
+                publication.publish(string("x" * 100_000))
+            await asyncio.sleep(1)
+            client.send({"op": "nonsense"})  # its answer cannot be sent either
+            await asyncio.sleep(1)
+        world.sessions[0].disconnect("the ticket is over")
+        client.send({"op": "publish", "topic": "/cmd", "msg": {"data": "late"}})
+        await asyncio.sleep(5)
+        assert heard == []
+        assert world.sessions[0].end == "the ticket is over"
+        assert client.writer.peer.closed
 
 
 async def test_a_text_frame_that_is_not_utf_8_ends_the_connection() -> None:
