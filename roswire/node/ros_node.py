@@ -139,8 +139,14 @@ class RosNode:
             if not subscriber.updates:  # else an update, which is newer, overtook the answer
                 self.follow(subscriber, uris if isinstance(uris, list) else [])
             if topic in self.publishers:
-                self.publishers[topic].begin_own(subscriber)
+                self.publishers[topic].repeat(subscriber.hear_own)
             return subscriber
+
+    def repeat(self, topic: str, received: Received) -> None:
+        """Give `received` the last message of each latched publisher of a subscribed topic."""
+        self.subscribers[topic].repeat(received)
+        if topic in self.publishers:
+            self.publishers[topic].repeat(received)
 
     def follow(self, subscriber: NodeSubscription, uris: Sequence[Value]) -> None:
         """Follow the publishers of a list, except the node itself, whose messages take no connection."""

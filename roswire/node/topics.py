@@ -4,9 +4,10 @@ A publisher never waits: if a subscriber is slower than its topic, the oldest wa
 """
 
 import asyncio
+import contextlib
 import itertools
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from roswire.errors import ProtocolError, RosError
@@ -59,6 +60,7 @@ class NodeSubscription:
         self._received = received
         self._tasks = OwnedTasks()
         self._followed: dict[str, asyncio.Task[None]] = {}
+        self._heard: dict[str, int] = {}  # how many messages came over the present connection
 
     def update(self, uris: Sequence[str]) -> None:
         """Follow exactly the publishers of this list of node API URIs."""
@@ -96,6 +98,7 @@ class NodeSubscription:
                 self.problems[uri] = str(error) or f"{uri} did not answer in time"
             finally:
                 self.connected.pop(uri, None)
+                self._heard.pop(uri, None)
             if asyncio.get_running_loop().time() - before > _LONGEST_PAUSE:  # it was connected for a while
                 pause = _FIRST_PAUSE
             await asyncio.sleep(pause)
@@ -103,6 +106,20 @@ class NodeSubscription:
 
     async def _receive(self, uri: str) -> None:
         """Receive messages until the connection ends."""
+        async with self._connection_to(uri) as (reader, header):
+            self.connected[uri] = header
+            self._connection.set()
+            self.problems.pop(uri, None)
+            for number in itertools.count(1):
+                body = await read_frame(reader, self._link.limits.message_bytes)
+                self._heard[uri] = number
+                self._received(body, header)
+                if number % _TURN == 0:
+                    await asyncio.sleep(0)
+
+    @contextlib.asynccontextmanager
+    async def _connection_to(self, uri: str) -> AsyncIterator[tuple[asyncio.StreamReader, Mapping[str, str]]]:
+        """Yield a connection, and the header of the publisher."""
         host, port = await self._request_topic(uri)
         limits = self._link.limits
         async with asyncio.timeout(limits.call_seconds):
@@ -118,15 +135,25 @@ class NodeSubscription:
             }
             header = await exchange_headers(reader, writer, fields, limits.header_seconds)
             self._check(uri, header)
-            self.connected[uri] = header
-            self._connection.set()
-            self.problems.pop(uri, None)
-            for number in itertools.count(1):
-                self._received(await read_frame(reader, limits.message_bytes), header)
-                if number % _TURN == 0:
-                    await asyncio.sleep(0)
+            yield reader, header
         finally:
             writer.close()
+
+    def repeat(self, received: Received) -> None:
+        """Give `received` the last message of each latched publisher, which sends it over a connection of its own."""
+        for uri in [uri for uri, header in self.connected.items() if header.get("latching") == "1"]:
+            self._tasks.start(self._repeat(uri, received))
+
+    async def _repeat(self, uri: str, received: Received) -> None:
+        before = self._heard.get(uri)
+        with contextlib.suppress(RosError, OSError):
+            async with (
+                asyncio.timeout(self._link.limits.call_seconds),
+                self._connection_to(uri) as (reader, header),
+            ):
+                body = await read_frame(reader, self._link.limits.message_bytes)
+                if self._heard.get(uri) == before:  # else a newer message has come
+                    received(body, header)
 
     def _check(self, uri: str, header: Mapping[str, str]) -> None:
         md5sum = header.get("md5sum", "")
@@ -213,11 +240,11 @@ class NodePublication:
         if (own := self._own()) is not None:
             own.hear_own(body, self._header)
 
-    def begin_own(self, subscription: NodeSubscription) -> None:
-        """Give a new subscription of the node itself the last message, if the publication is latched."""
+    def repeat(self, received: Received) -> None:
+        """Give `received` the last message, if the publication is latched."""
         if self.latched:
             for body in self._kept:
-                subscription.hear_own(body, self._header)
+                received(body, self._header)
 
     def _replays(self) -> bool:
         return asyncio.get_running_loop().time() < self._replay_until

@@ -1,9 +1,9 @@
 """The node of a door, which all connections of its identity share.
 
 Agents make a new connection for each call. So a topic stays registered for some seconds after its last client left,
-and a client that comes back finds it. The master sees one publication and one subscription for each topic, however
-many connections use it. Every registration and every call of a service is decided by the master and the relay, as for
-any host; the door decides nothing.
+and a client that comes back finds it. Each new client of a topic gets the last messages of latched publishers. The
+master sees one publication and one subscription for each topic, however many connections use it. Every registration
+and every call of a service is decided by the master and the relay, as for any host; the door decides nothing.
 """
 
 import asyncio
@@ -222,6 +222,7 @@ class DoorNode:
         async with self._lock(f"subscriber {topic}"):
             if topic in self._heard:
                 self._heard[topic].add(client)
+                self.node.repeat(topic, lambda body, header: client.heard(self._message(topic, body, header)))
                 return
             self._check_room(self._heard)
             self._heard[topic] = {client}
@@ -235,8 +236,11 @@ class DoorNode:
                 del self._heard[topic]
                 raise
 
+    def _message(self, topic: str, body: bytes, header: Mapping[str, str]) -> DoorMessage:
+        return DoorMessage(topic, body, header, clock.wall_ns(), self._types.learn)
+
     def _hear(self, topic: str, body: bytes, header: Mapping[str, str]) -> None:
-        message = DoorMessage(topic, body, header, clock.wall_ns(), self._types.learn)
+        message = self._message(topic, body, header)
         for client in self._heard.get(topic, ()):
             client.heard(message)
 

@@ -118,6 +118,10 @@ def service_fields(number: int, seen: SeenService) -> dict[str, Any]:
         "id": number,
         "name": seen.service,
         "type": seen.type,
-        "requestSchema": seen.request,
-        "responseSchema": seen.response,
+        "request": _part(f"{seen.type}Request", seen.request),
+        "response": _part(f"{seen.type}Response", seen.response),
     }
+
+
+def _part(name: str, schema: str) -> dict[str, str]:
+    return {"encoding": "ros1", "schemaName": name, "schemaEncoding": "ros1msg", "schema": schema}

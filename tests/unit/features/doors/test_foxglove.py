@@ -110,7 +110,7 @@ async def test_a_viewer_calls_services_and_reads_parameters() -> None:
         world.master.answers |= {"getParamNames": ["/a"], "hasParam": True, "getParam": [1, 2.5]}
         client = await world.client(subprotocols=SUBPROTOCOLS)
         (service,) = (await next_op(client, "advertiseServices"))["services"]
-        assert (service["name"], service["requestSchema"]) == ("/brake", "bool data")
+        assert (service["name"], service["request"]["schema"]) == ("/brake", "bool data")
         for call, request in enumerate((b"\x01", b"\x00")):
             client.send(struct.pack("<BIII", 2, service["id"], call, 4) + b"ros1" + request)
         frame = await client.next()

@@ -20,9 +20,9 @@ def string(text: str) -> bytes:
     return struct.pack("<I", len(text)) + text.encode()
 
 
-async def talks(node: RosNode, topic: str) -> Any:
+async def talks(node: RosNode, topic: str, *, latched: bool = False) -> Any:
     kind = MessageType.defined(standard_definitions(), "std_msgs/String")
-    return await node.advertise(topic, kind, latched=False, queue=100)
+    return await node.advertise(topic, kind, latched=latched, queue=100)
 
 
 async def test_messages_pass_in_both_directions() -> None:
@@ -39,6 +39,31 @@ async def test_messages_pass_in_both_directions() -> None:
         publication.publish(string("ready"))
         assert await client.next() == {"op": "publish", "topic": "/state", "msg": {"data": "ready"}}
         assert client.frames.empty()  # nothing unsolicited
+
+
+async def test_each_new_client_of_a_topic_gets_the_last_message_of_latched_publishers() -> None:
+    """The publishers are other nodes and clients of the door. Earlier clients do not get the message again."""
+    async with door_world() as world:
+        publication = await talks(await world.robot("10.0.0.3", "/robot"), "/map", latched=True)
+        await talks(await world.robot("10.0.0.4", "/other"), "/map")
+        publication.publish(string("old"))
+        publication.publish(string("map"))
+        painter = await world.client()
+        for op in (
+            {"op": "advertise", "type": "std_msgs/String", "latch": True},
+            {"op": "publish", "msg": {"data": "own"}},
+        ):
+            painter.send({"topic": "/map"} | op)
+        clients = []
+        for _number in range(3):
+            clients.append(await world.client())
+            clients[-1].send({"op": "subscribe", "topic": "/map"})
+            await asyncio.sleep(1)
+            assert {(await clients[-1].next())["msg"]["data"] for _message in range(2)} == {"map", "own"}
+        publication.publish(string("new"))
+        for client in clients:
+            assert (await client.next())["msg"]["data"] == "new"
+            assert client.frames.empty()
 
 
 @pytest.mark.parametrize("deflate", [False, True])
