@@ -68,6 +68,8 @@ class MonitorCallGate:
         record = self.trail.decided(asker, _CALL, request.category.value, service, decision)
         if not decision.allowed:
             return f"denied: {decision.reason} [{record}]"
+        if decision.asks is not None:
+            return f"denied: {decision.reason}, for which a monitor cannot wait [{record}]"
         if self.trail.strict and await self.trail.durable() is not None:
             return f"denied: {NOT_RECORDED}"
         if not self.mediation.carries_service(service):

@@ -25,11 +25,17 @@ if TYPE_CHECKING:
     from appliance.channel.answers.limit_answers import LimitUse
     from appliance.channel.answers.status import ProcessInfo
     from appliance.channel.link import Link
-    from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
+    from appliance.channel.messages import (
+        ApprovalAnswered,
+        ApprovalWanted,
+        OwnServiceAnswered,
+        OwnServiceCalled,
+    )
     from appliance.control.assembly.policies import Policies
     from appliance.control.operators.request_method import RequestMethod
     from appliance.control.operators.sessions import Sessions
-    from appliance.policy.model import Address
+    from appliance.policy.model import Address, Request
+    from appliance.policy.policy import Approval
     from appliance.specifications.specification_manager import SpecificationManager
     from appliance.store.state_file import StateStore
     from appliance.supervisor.service_gate import Pairing
@@ -105,6 +111,8 @@ class FeaturePart:
     is refused, or an empty text. `details` returns what it adds to the details of a record (`RecordDetails`). `called`
     answers nodes' calls of its services, by name without the appliance's own name. `sessions` are those of people whom
     the feature signs in; they count beside tokens. `holders` returns the host that holds each group (`Policy.holders`).
+    `approved` returns the approvals that last (`Policy.approved`), `held` holds a call that needs one, and `approve`
+    decides about a request to a service.
 
     `status_fields()` returns the present states of the feature by their fields in `rosrv status --json`. The feature's
     view defines the fields (`StateView`). A state that is None or missing is null there.
@@ -120,6 +128,9 @@ class FeaturePart:
         default_factory=dict
     )
     holders: "Callable[[], Mapping[str, Address]]" = dict
+    approved: "Callable[[], frozenset[Approval]]" = frozenset
+    held: "Callable[[Request], str] | None" = None
+    approve: "Callable[[ApprovalWanted], Awaitable[ApprovalAnswered]] | None" = None
     work: Mapping[str, Callable[[], Awaitable[None]]] = field(default_factory=dict)
     connected: "Callable[[str, str, str, int], tuple[int, str]] | None" = None
     sessions: "Sessions | None" = None

@@ -11,10 +11,16 @@ if TYPE_CHECKING:
     from appliance.audit.log.record import Severity
     from appliance.channel.answers.limit_answers import LimitUse
     from appliance.channel.link import Link
-    from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
+    from appliance.channel.messages import (
+        ApprovalAnswered,
+        ApprovalWanted,
+        OwnServiceAnswered,
+        OwnServiceCalled,
+    )
     from appliance.control.operators.request_method import RequestMethod
     from appliance.control.operators.sessions import Sessions
-    from appliance.policy.model import Address
+    from appliance.policy.model import Address, Request
+    from appliance.policy.policy import Approval
 
 LONGEST = 64 << 20
 """The most bytes of a message on a link of a feature, unless its part has a smaller limit."""
@@ -111,6 +117,24 @@ class FeatureParts:
     def holders(self) -> "dict[str, Address]":
         """Return the host that holds each group of `[Authority]`."""
         return {group: host for part in self._parts for group, host in part.holders().items()}
+
+    def approved(self) -> "frozenset[Approval]":
+        """Return the approvals that last."""
+        return frozenset(approval for part in self._parts for approval in part.approved())
+
+    def held(self, request: "Request") -> str:
+        """Hold a request that needs an approval; return what its host is told."""
+        held = next((part.held for part in self._parts if part.held is not None), None)
+        return "no operator can approve calls on this appliance" if held is None else held(request)
+
+    async def approve(self, wanted: "ApprovalWanted") -> "ApprovalAnswered":
+        """Decide about one request of a client to a service."""
+        approve = next((part.approve for part in self._parts if part.approve is not None), None)
+        if approve is not None:
+            return await approve(wanted)
+        from appliance.channel.messages import ApprovalAnswered  # noqa: PLC0415  few processes need it
+
+        return ApprovalAnswered(wanted.number, "no operator can approve calls on this appliance")
 
     def sessions(self) -> "Sessions | None":
         """Return the sessions of people, or None if people sign in with tokens only."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appliance.configuration.sections import Sections
+from appliance.features.approvals.feature import APPROVALS
 from appliance.features.authority.feature import AUTHORITY
 from appliance.features.backup.feature import BACKUP
 from appliance.features.demo.feature import DEMO
@@ -45,6 +46,7 @@ FEATURES: tuple[Feature, ...] = (
     DEMO,
     SSO,
     AUTHORITY,
+    APPROVALS,
     METRICS,
     LIVE,
 )

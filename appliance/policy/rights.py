@@ -129,5 +129,10 @@ def decide_right(policy: Policy, right: Right) -> Decision:
     return policy.decide(right.request)
 
 
+def asks_to_call(policy: Policy, host: Address, service: str) -> bool:
+    """Whether a host needs an approval for each request to a service."""
+    return policy.decide(Request(host, "", Category.CALL, service)).asks is not None
+
+
 def _of(request: Request, category: Category, resource: str) -> Request:
     return Request(request.host, request.caller_id, category, resource)

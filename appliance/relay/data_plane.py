@@ -18,7 +18,7 @@ from appliance.relay.connections.headers import kept
 from appliance.relay.connections.incoming_connection import IncomingConnection, RefusedConnection
 from appliance.relay.connections.listening_ports import ListeningPorts
 from appliance.relay.connections.message_sink import MessageSink
-from appliance.relay.connections.monitor_calls import ServiceCalls
+from appliance.relay.connections.monitor_calls import OwnAnswer, ServiceCalls
 from appliance.relay.connections.named_subscribers import ActionServers
 from appliance.relay.connections.own_topic import OwnTopicPublisher
 from appliance.relay.connections.pending_connections import PendingConnections
@@ -118,7 +118,7 @@ class DataPlane:
             self._upstream_answered(message)
         elif isinstance(message, messages.SpecificationsStated | messages.StateWanted):
             self.interceptor.state(message)
-        elif isinstance(message, messages.MonitorSwitched | messages.MonitorGiven):
+        elif isinstance(message, messages.MonitorSwitched | messages.MonitorGiven | messages.StopWanted):
             self.interceptor.order(message)
         elif isinstance(message, messages.MonitorResumed):
             self._ask_for_latched(self.interceptor.resume(message.name))
@@ -126,7 +126,7 @@ class DataPlane:
             self._tap(message)
         elif isinstance(message, messages.OwnHeaderStated | messages.OwnPublished):
             self._own_topic(message)
-        elif isinstance(message, messages.OwnServiceAnswered | messages.MonitorCallAnswered):
+        elif isinstance(message, OwnAnswer):
             self._calls.answered(message)
         elif isinstance(message, messages.OrdersAsked):
             self._reporter.send(messages.OrdersCarriedOut())
@@ -506,6 +506,8 @@ class DataPlane:
             refuse=self._peer_refused,
             ended=self._peer_ended,
             own=self._calls.own if node is not None and node.monitors else None,
+            approvals=self._calls.approvals,
+            asks=lambda: self._table.asks(service.key, service.service, incoming.host, caller_id),
         )
         self.clients.add(client)
         self._by_grant.setdefault(client.grant, set()).add(client)

@@ -153,6 +153,11 @@ class GrantTable:
         """Whether this client may call this service of that incarnation."""
         return ("client", key, service, host, caller_id) in self._facts
 
+    def asks(self, key: str, service: str, host: str, caller_id: str) -> bool:
+        """Whether control approves each request of this client."""
+        granted = self._facts.get(("client", key, service, host, caller_id))
+        return not isinstance(granted, messages.ClientGranted) or granted.asks
+
     def client_of(self, key: str, service: str, host: str) -> str | None:
         """Return a node name under which this host may call this service, or None."""
         return next(iter(self._clients.get(("client", key, service, host), ())), None)

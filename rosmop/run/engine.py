@@ -526,6 +526,14 @@ class MonitorSet:
         monitor.hold(why)
         self._agenda.schedule()
 
+    def stop(self, topic: str) -> list[str]:
+        """Send the safe messages on a topic until a message comes on it; return the monitors that have one."""
+        found = [monitor for monitor in self._monitors if monitor.enabled and topic in monitor.safes]
+        for monitor in found:
+            monitor.starting.add(topic)
+        self._agenda.schedule()
+        return [monitor.name for monitor in found]
+
     def holds_if_lost(self, code: SpecificationCode) -> bool:
         """Whether a specification holds its topics if its state is lost."""
         return code.hold or (code.name in self._guards.names and not code.begins)

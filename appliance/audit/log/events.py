@@ -33,6 +33,14 @@ EVENTS: dict[str, str] = {
     "host block ended": "The time of a host's block was over; the host is decided by the policy again.",
     "authority handed over": "A group of [Authority] has another holder, or none; `resource` is the group, `detail` has"
     " the earlier holder, the holder, and who ordered it.",
+    "approval ended": "A held call was not answered in time, or an approval is over; `reason` says why.",
+    "approval given": "An operator approved a held call (rosrv approve), once or for some time.",
+    "approval refused": "An operator refused a held call.",
+    "approval used": "A host made the one call that an operator approved.",
+    "approval wanted": "A host behind `ask` in the policy made a call that needs an approval; `detail.approval` is its"
+    " number.",
+    "motion not stopped": "A host lost the right to command a motion, and no guard has a safe message that stops it.",
+    "motion stopped": "A host lost the right to command a motion, and guards send their safe messages.",
     "authority asked": "A host waits for a group of [Authority]; `resource` is the group.",
     "authority refused": "A host may not take a group of [Authority], or not now; `resource` is the group.",
     "alarm acknowledged": "An operator takes care of an alarm; `resource` is its kind, `detail` has who and the note.",
@@ -183,7 +191,8 @@ SEVERITIES: dict[str, Severity] = {
     name: severity
     for severity, names in {
         Severity.NOTICE: (
-            "authority asked", "authority handed over", "host block ended", "host unblocked",
+            "approval ended", "approval given", "approval refused", "approval used", "approval wanted",
+            "authority asked", "authority handed over", "host block ended", "motion stopped", "host unblocked",
             "appliance started", "appliance stopped", "bundle in force", "clock not synchronised", "clock synchronised",
             "evidence exported", "forwarding resumed", "handed over", "host awaited", "host awaited no longer",
             "host enrolled", "host renewed", "hosts reloaded", "monitor resumed", "monitor set", "policy loaded",
@@ -193,7 +202,7 @@ SEVERITIES: dict[str, Severity] = {
             "tunnel down", "tunnel moved", "tunnel up", "probe passed",
         ),
         Severity.WARNING: (
-            "authority refused", "bundle metadata rejected", "bundle refused",
+            "authority refused", "motion not stopped", "bundle metadata rejected", "bundle refused",
             "certificate ended", "certificate ends soon", "clock set back", "clock set forward", "enrolment refused",
             "door entry refused", "door failed", "forwarding failed", "host authority replaced",
             "host blocked", "host revoked", "limit exceeded", "malformed", "packets refused",

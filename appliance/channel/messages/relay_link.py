@@ -130,7 +130,8 @@ class GrantRevoked(Message):
 class ClientGranted(Message):
     """A client (host, caller_id) may call this service of the incarnation.
 
-    `named`: the policy names the host, not only all hosts (`*`).
+    `named`: the policy names the host, not only all hosts (`*`). `asks`: control approves each request
+    (`ApprovalWanted`). Sending this message again changes both.
     """
 
     key: str
@@ -138,6 +139,7 @@ class ClientGranted(Message):
     host: str
     caller_id: str
     named: bool = True
+    asks: bool = False
 
 
 class ClientRevoked(Message):
@@ -374,6 +376,20 @@ class MonitorResumed(Message):
     name: str
 
 
+class StopWanted(Message):
+    """Control has the monitors of a topic send their safe messages until a message comes on it."""
+
+    number: int
+    topic: str
+
+
+class StopBegun(Message):
+    """The answer to the `StopWanted` with this number: the names of the monitors that send a safe message."""
+
+    number: int
+    monitors: list[str]
+
+
 class SpecificationsTaken(Message):
     """The relay has brought the specifications into force.
 
@@ -427,6 +443,28 @@ class OwnServiceAnswered(Message):
     number: int
     success: bool
     text: str
+
+
+class ApprovalWanted(Message):
+    """A client's request to a service needs an approval, and waits for `ApprovalAnswered`.
+
+    `digest` is the SHA-256 of the request, and `shown` its first bytes. `type` is the service's type.
+    """
+
+    number: int
+    service: str
+    host: str
+    caller_id: str
+    type: str
+    digest: str
+    shown: bytes
+
+
+class ApprovalAnswered(Message):
+    """Control has decided a request that needs an approval: `refused` has the reason, or is empty."""
+
+    number: int
+    refused: str
 
 
 class MonitorCallWanted(Message):
@@ -565,5 +603,5 @@ RelayLink = (
     | MonitorSwitched | MonitorGiven | MonitorResumed | OwnHeaderStated | OwnPublished | SpecificationsTaken
     | SpecificationsRefused | PublicationRefused | MonitorsReported | MonitorsCounted | LookWanted | LookEnded
     | MessageSeen | OrdersAsked | OrdersCarriedOut | OwnServiceCalled | OwnServiceAnswered
-    | MonitorCallWanted | MonitorCallAnswered
+    | MonitorCallWanted | MonitorCallAnswered | ApprovalWanted | ApprovalAnswered | StopWanted | StopBegun
 )  # fmt: skip

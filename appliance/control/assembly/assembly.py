@@ -191,6 +191,7 @@ def _make_calls(
         liveness=ends.liveness,
         parameters=registration.parameters,
         redecide_for=ends.enforcement.redecide_for,
+        held=base.features.held,
         large=offload,
         large_writes=LargeWrites(offload, base.quota_class, base.role.before_answer),
     )

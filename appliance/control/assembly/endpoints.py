@@ -76,6 +76,8 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         own_call=lambda asked: (
             gate().answer(asked)
             if isinstance(asked, messages.MonitorCallWanted)
+            else base.features.approve(asked)
+            if isinstance(asked, messages.ApprovalWanted)
             else base.features.called(asked)
         ),
     )

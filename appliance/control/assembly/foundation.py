@@ -169,6 +169,7 @@ async def make_foundation(
         hosts=lambda: {**tunnels().addresses, **features().addresses()},
         blocks=lambda: blocks.reasons,
         holders=lambda: features().holders(),
+        approved=lambda: features().approved(),
         live=lambda: enforcement().revocation.live(),  # noqa: PLW0108  it is assembled later
         changed=lambda before, policy: enforcement().policy_changed(before, policy),
         carried_out=lambda: enforcement().carried_out(),

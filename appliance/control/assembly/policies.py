@@ -36,7 +36,7 @@ from appliance.policy.host_sets import Network
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.live_rights import LiveRight, deprived
 from appliance.policy.model import Address
-from appliance.policy.policy import Policy
+from appliance.policy.policy import Approval, Policy
 from appliance.signing.fingerprints import fingerprint
 from appliance.signing.site_keys import signer
 from appliance.store.revisions import LIMITS, Revisions, reloaded_by
@@ -83,6 +83,7 @@ class Policies(Revisions[RevisionRow]):
         hosts: Callable[[], Mapping[str, Address]],
         blocks: Callable[[], Mapping[Address, str]],
         holders: Callable[[], Mapping[str, Address]],
+        approved: Callable[[], frozenset[Approval]],
         live: Callable[[], Iterable[LiveRight]],
         changed: Callable[[Policy, Policy], int],
         carried_out: Callable[[], Awaitable[None]],
@@ -91,10 +92,11 @@ class Policies(Revisions[RevisionRow]):
         """Prepare; `start` brings a policy into force.
 
         `hosts()` returns the addresses for `host:NAME`; the owner calls `hosts_changed` when they change. `blocks()`
-        returns the blocked hosts (`Policy.blocks`), and `holders()` the hosts that hold groups (`Policy.holders`); the
-        owner calls `decide_again` when they change. `live()` returns the live rights of all hosts.
-        `changed(before, policy)` decides all live rights again, and returns the number of revocations. `carried_out()`
-        waits until the relays have carried out all orders. With `site_keys`, one of these keys must sign every policy.
+        returns the blocked hosts (`Policy.blocks`), `holders()` the hosts that hold groups (`Policy.holders`), and
+        `approved()` the approvals that last (`Policy.approved`); their owners call `decide_again` when they change.
+        `live()` returns the live rights of all hosts. `changed(before, policy)` decides all live rights again, and
+        returns the number of revocations. `carried_out()` waits until the relays have carried out all orders. With
+        `site_keys`, one of these keys must sign every policy.
         """
         nothing = RevisionRow(0, "", "", 0.0, "", "")
         super().__init__(store, store.revisions, store.save_revision, nothing, LIMITS[0])
@@ -104,6 +106,7 @@ class Policies(Revisions[RevisionRow]):
         self._hosts = hosts
         self._blocks = blocks
         self._holders = holders
+        self._approved = approved
         self._live = live
         self._changed = changed
         self._carried_out = carried_out
@@ -211,7 +214,7 @@ class Policies(Revisions[RevisionRow]):
         return self._enforce(policy)
 
     def decide_again(self) -> int:
-        """Decide by the present blocks of hosts and holders of groups. Return the number of revocations."""
+        """Decide by the present blocks of hosts, holders of groups and approvals. Return the number of revocations."""
         return self._enforce(self.current)
 
     async def roll_back(self, request: admin.PolicyRollback, who: str) -> Loaded:
@@ -284,6 +287,7 @@ class Policies(Revisions[RevisionRow]):
             site_keys=self._site_keys,
             blocks=self._blocks(),
             holders=self._holders(),
+            approved=self._approved(),
         )
 
     # --- inside ---
@@ -379,7 +383,12 @@ class Policies(Revisions[RevisionRow]):
     def _enforce(self, policy: Policy) -> int:
         before, self._current = (
             self._current,
-            replace(policy, blocks=dict(self._blocks()), holders=dict(self._holders())),
+            replace(
+                policy,
+                blocks=dict(self._blocks()),
+                holders=dict(self._holders()),
+                approved=self._approved(),
+            ),
         )
         self._trail.revision = self.revision
         return 0 if before is None else self._changed(before, self._current)

@@ -2,13 +2,13 @@
 
 from typing import TYPE_CHECKING, Any
 
+from appliance.control.motion_stop import MotionStop
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.authority import drive_requests as requests
-from appliance.features.authority.drive_orders import DriveOrders, HostSigns
+from appliance.features.authority.drive_orders import DriveOrders
 from appliance.features.authority.settings import GIVE, TAKE
 from appliance.features.feature import FeaturePart
-from appliance.master.graph.registry import Kind
-from appliance.policy.model import Address
+from appliance.master.endpoints.host_signs import host_signs
 
 if TYPE_CHECKING:
     from appliance.control.assembly.assembly import Parts
@@ -17,24 +17,12 @@ if TYPE_CHECKING:
 
 async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
     """Return the part. It begins without a holder of any group."""
-    registry, carried, relay = parts.core.registry, parts.core.carried, parts.endpoints.relay
-
-    def live(host: Address) -> bool:
-        return any(node.host == host for node in registry.live())
-
-    def moved(host: Address, names: frozenset[str]) -> float:
-        times = (
-            carried.traffic[node.key, name].moved
-            for name in names
-            for node in registry.registered(Kind.PUBLICATION, name)
-            if node.host == host and (node.key, name) in carried.traffic
-        )
-        return max(times, default=0.0)
-
+    relay = parts.endpoints.relay
     orders = DriveOrders(
         base.policies.policy,
         base.trail,
-        HostSigns(live, moved),
+        host_signs(parts.core.registry, parts.core.carried),
+        MotionStop(relay.stop, base.trail, base.policies.policy),
         decide_again=base.policies.decide_again,
         carried_out=relay.carried_out,
         relays_ready=lambda: relay.presence == "connected",

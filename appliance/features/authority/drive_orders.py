@@ -7,14 +7,15 @@ control, and after a takeover, each group is free.
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
 
 from appliance.base import clock
 from appliance.base.withdrawal import take_effect
 from appliance.channel.messages import OwnServiceAnswered, OwnServiceCalled
 from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
+from appliance.control.motion_stop import MotionStop
 from appliance.features.authority import drive_requests as requests
 from appliance.features.authority.group_holders import GroupHolders, Holding
+from appliance.master.endpoints.host_signs import HostSigns
 from appliance.policy.actions import BadWordError, find_host
 from appliance.policy.authority import AuthorityGroup, Claim
 from appliance.policy.model import Address, address_of
@@ -22,14 +23,6 @@ from appliance.policy.policy import Policy
 from appliance.telemetry.audit_trail import AuditTrail
 
 CHECK_SECONDS = 0.25
-
-
-@dataclass(frozen=True, slots=True)
-class HostSigns:
-    """The signs of life of hosts: `live(host)` whether it has a live node, `moved(host, names)` its last message."""
-
-    live: Callable[[Address], bool]
-    moved: Callable[[Address, frozenset[str]], float]
 
 
 class DriveOrders:
@@ -44,6 +37,7 @@ class DriveOrders:
         policy: Callable[[], Policy],
         trail: AuditTrail,
         signs: HostSigns,
+        stop: MotionStop,
         *,
         decide_again: Callable[[], int],
         carried_out: Callable[[], Awaitable[None]],
@@ -52,6 +46,7 @@ class DriveOrders:
         self._policy = policy
         self._trail = trail
         self._signs = signs
+        self._stop = stop
         self._decide_again = decide_again
         self._carried_out = carried_out
         self._relays_ready = relays_ready
@@ -157,7 +152,7 @@ class DriveOrders:
                 live, moved = self._signs.live(held.host), self._signs.moved(held.host, group.names)
                 loss = self._groups.loss(group, clock.now(), moved=moved, live=live)
                 if loss:
-                    await self._hand_over(group, self._next(group), loss, "")
+                    await self._hand_over(group, self._next(group), loss, "", stop=True)
 
     # --- inside; the caller has the turn ---
 
@@ -183,8 +178,13 @@ class DriveOrders:
             "authority asked", f"{host} waits for {group.name}", host=str(host), resource=group.name, who=who
         )
 
-    async def _hand_over(self, group: AuthorityGroup, to: Address | None, reason: str, who: str) -> None:
-        """Cut the holder off on all relays, then let the next host hold the group. This is one audit record."""
+    async def _hand_over(
+        self, group: AuthorityGroup, to: Address | None, reason: str, who: str, *, stop: bool = False
+    ) -> None:
+        """Cut the holder off on all relays, then let the next host hold the group. This is one audit record.
+
+        `stop`: the guards of the group stop the robot in between.
+        """
         if to is not None and not self._relays_ready():
             if who:
                 raise UnavailableError(f"a relay starts, so {group.name} cannot be handed over: try again")
@@ -195,6 +195,8 @@ class DriveOrders:
             if before is not None:
                 self._decide_again()
                 await self._carried_out()
+                if stop:
+                    await self._stop.after(str(before.host), group.names, f"{group.name}: {reason}")
             if to is not None and self._claim(group, to) is not None:
                 self._groups.hold(group.name, to, clock.now())
                 self._decide_again()

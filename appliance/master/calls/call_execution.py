@@ -14,7 +14,7 @@ An error becomes a record and a well-formed answer, never an exception.
 
 import contextlib
 from collections.abc import AsyncIterator, Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import structlog
@@ -40,7 +40,7 @@ from appliance.master.parameter_charges import LimitReachedError
 from appliance.master.reconcile.arrivals import NodeElsewhereError
 from appliance.master.reconcile.enactor import Enactor
 from appliance.master.reconcile.liveness import Liveness, Probe
-from appliance.policy.model import Address, Category, Decision
+from appliance.policy.model import Address, Category, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.rpc.bulk import Bulk, LargeWrites, weigh
 from appliance.rpc.xmlrpc_client import CallFailedError
@@ -67,6 +67,7 @@ class ServedRequest(NamedTuple):
 class Execution:
     """Carry out calls. A write of at least `large` bytes waits for other large writes.
 
+    `held(request)` holds a request that needs an approval, and returns what its host is told.
     `redecide_for(host, caller_id)` revokes the rights of a caller that the policy in force does not allow.
     """
 
@@ -78,6 +79,7 @@ class Execution:
     liveness: Liveness
     parameters: ParameterCalls
     redecide_for: Callable[[Address, str], None]
+    held: Callable[[Request], str]
     large: int
     large_writes: LargeWrites
     _names: KeyTurns = field(default_factory=KeyTurns, init=False)
@@ -224,6 +226,8 @@ class Execution:
     def _recorded(self, attempt: Attempt, decision: Decision) -> Answer | None:
         """Record a decision; return the answer of a denial, or None if the call is allowed."""
         request, call = attempt.request, attempt.call
+        if decision.asks is not None and not decision.allowed:
+            decision = replace(decision, reason=self.held(decision.asks))
         record = self.trail.decided(
             attempt.caller.asker,
             call.name,

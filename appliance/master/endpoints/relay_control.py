@@ -27,6 +27,7 @@ from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.rate_limits import LimitScope, Rate
+from appliance.policy.rights import asks_to_call
 from appliance.rpc.xmlrpc_client import CallFailedError
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Resource
 from appliance.specifications.specification_manager import SpecificationManager
@@ -81,7 +82,9 @@ class RelayOutbox(Link):
 
 
 RELAY_NAME = "/rosrv"
-OwnCall = messages.OwnServiceCalled | messages.MonitorCallWanted
+OwnCall = messages.OwnServiceCalled | messages.MonitorCallWanted | messages.ApprovalWanted
+OwnAnswer = messages.OwnServiceAnswered | messages.MonitorCallAnswered | messages.ApprovalAnswered
+_STOP_SECONDS = 5.0
 _KINDS = {TOPIC: Kind.PUBLICATION, SERVICE: Kind.SERVICE}
 _WORDS = {kind: word for word, kind in _KINDS.items()}
 
@@ -91,8 +94,8 @@ class RelayControl:
     """Control's end of the links to the relays.
 
     `broken(incarnation)` is called for lost upstreams. `own_header` is the header of control's own publications.
-    `own_call` answers calls of the appliance's own service, and decides calls of monitors. `monitors()` returns the
-    specifications that relays run.
+    `own_call` answers calls of the appliance's own service, and decides calls of monitors and requests that need an
+    approval. `monitors()` returns the specifications that relays run.
     """
 
     registry: Registry
@@ -105,10 +108,12 @@ class RelayControl:
     monitors: Callable[[], SpecificationManager]
     broken: Callable[[Incarnation], None]
     own_header: messages.OwnHeaderStated | None
-    own_call: Callable[[OwnCall], Awaitable[messages.OwnServiceAnswered | messages.MonitorCallAnswered]]
+    own_call: Callable[[OwnCall], Awaitable[OwnAnswer]]
     _posts: tuple[RelayOutbox, ...] = field(init=False)
     _asking: set[asyncio.Task[None]] = field(default_factory=set)
     _taps: TapRequests = field(default_factory=TapRequests)
+    _stops: dict[int, asyncio.Future[list[str]]] = field(default_factory=dict)
+    _stop: int = 0
 
     def __post_init__(self) -> None:
         """Create an entry for each relay."""
@@ -160,6 +165,21 @@ class RelayControl:
         """Wait until every relay has carried out its orders. A relay that starts in the meantime begins with them."""
         if waiting := [order for post in self._posts for order in post.orders()]:
             await asyncio.wait(waiting)
+
+    async def stop(self, topic: str) -> list[str]:
+        """Have monitors of a topic send their safe messages; return the names of those that have one."""
+        self._stop = number = self._stop + 1
+        begun: asyncio.Future[list[str]] = asyncio.get_running_loop().create_future()
+        self._stops[number] = begun
+        try:
+            if not self._post(TOPIC, topic).send(messages.StopWanted(number, topic)):
+                return []
+            async with asyncio.timeout(_STOP_SECONDS):
+                return await begun
+        except TimeoutError:
+            return []
+        finally:
+            del self._stops[number]
 
     async def look(
         self, topic: str, count: int, seconds: float, *, latched: bool
@@ -223,7 +243,8 @@ class RelayControl:
             post.send(_grant(self.policy(), row))
         else:
             named = _names(self.policy(), address_of(row.host))
-            post.send(messages.ClientGranted(row.key, row.resource, row.host, row.caller_id, named))
+            asks = asks_to_call(self.policy(), address_of(row.host), row.resource)
+            post.send(messages.ClientGranted(row.key, row.resource, row.host, row.caller_id, named, asks))
 
     def revoke_grant(self, row: PermissionRow) -> None:
         """Have the relay revoke a grant and cut its connection."""
@@ -294,7 +315,12 @@ class RelayControl:
     def _received(self, index: int, message: messages.Message) -> None:
         post = self._posts[index]
         match message:
-            case messages.UpstreamWanted() | messages.OwnServiceCalled() | messages.MonitorCallWanted():
+            case (
+                messages.UpstreamWanted()
+                | messages.OwnServiceCalled()
+                | messages.MonitorCallWanted()
+                | messages.ApprovalWanted()
+            ):
                 task = asyncio.get_running_loop().create_task(self._answer(post, message))
                 self._asking.add(task)
                 task.add_done_callback(self._asking.discard)
@@ -317,12 +343,18 @@ class RelayControl:
                 self.carried.refused(message)
             case messages.OrdersCarriedOut():
                 post.carried_out()
-            case messages.MessageSeen():
-                self._taps.seen(message)
+            case messages.MessageSeen() | messages.StopBegun():
+                self._seen(message)
             case messages.PublicationRefused():
                 self.carried.publication_refused(message)
             case _:
                 self.monitors().received(message, post.index)
+
+    def _seen(self, message: messages.MessageSeen | messages.StopBegun) -> None:
+        if isinstance(message, messages.MessageSeen):
+            self._taps.seen(message)
+        elif (begun := self._stops.get(message.number)) is not None and not begun.done():
+            begun.set_result(message.monitors)
 
     async def _answer(self, post: RelayOutbox, asked: messages.UpstreamWanted | OwnCall) -> None:
         if isinstance(asked, OwnCall):

@@ -37,6 +37,7 @@ from appliance.master.graph.registry import Incarnation, Kind, Life, NodeRegistr
 from appliance.policy.model import Address, Decision, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.rate_limits import LimitScope
+from appliance.policy.rights import asks_to_call
 from appliance.rpc.bulk import weigh
 from appliance.specifications.allocation import SERVICE, TOPIC
 from appliance.store.state_file import PermissionRow
@@ -238,7 +239,7 @@ class RosGraph:
         ]
 
     def limits_changed(self, before: Policy, now: Policy) -> Effects:
-        """Send the relays all changed limits, and whether a host is named or may command, if that has changed."""
+        """Send the relays all changed limits, and whether a host is named, may command or needs approvals."""
         effects: Effects = []
         for node in self.registry.live():
             for registration in node.registrations.values():
@@ -258,8 +259,16 @@ class RosGraph:
                     )
             for row in self.grants.of(node.key):
                 host = address_of(row.host)
-                if before.names(host) != now.names(host) or (
-                    row.kind == TOPIC and _differ(before, now, row.resource, ((LimitScope.SUBSCRIBER, host),))
+                if (
+                    before.names(host) != now.names(host)
+                    or (
+                        row.kind == TOPIC
+                        and _differ(before, now, row.resource, ((LimitScope.SUBSCRIBER, host),))
+                    )
+                    or (
+                        row.kind == SERVICE
+                        and asks_to_call(before, host, row.resource) != asks_to_call(now, host, row.resource)
+                    )
                 ):
                     effects.append(PlaceGrant(row))
         return effects

@@ -3,14 +3,15 @@
 The default, `relaying: all` and `mediation: full`, is a security boundary.
 
 With `relaying: monitored` (the thesis's mode), the relay carries only topics and services in the policy's `[Monitor]`
-and `[Authority]`, or with events of a specification. For all others, nodes connect directly. With `mediation:
-monitored`, nodes also get each other's real URIs; this mode requires `relaying: monitored`. Both modes are faster, but
-not a security boundary: a node that knows a port can send any request to it.
+and `[Authority]`, with events of a specification, or with a rule that has `ask`. For all others, nodes connect
+directly. With `mediation: monitored`, nodes also get each other's real URIs; this mode requires `relaying: monitored`.
+Both modes are faster, but not a security boundary: a node that knows a port can send any request to it.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from appliance.policy.model import Category
 from appliance.policy.policy import Policy
 from appliance.specifications.specification_files import CheckedSpecifications
 
@@ -30,6 +31,7 @@ class Mediation:
             or topic in self.policy().monitored_topics
             or self.policy().limit_rule(topic) is not None
             or self.policy().commanded(topic) is not None
+            or self.policy().asks_for(Category.PUBLISH, topic)
             or self.specifications().of_topic(topic)
         )
 
@@ -38,6 +40,7 @@ class Mediation:
             self.relay_all
             or service in self.policy().monitored_services
             or self.policy().commanded(service) is not None
+            or self.policy().asks_for(Category.CALL, service)
             or self.specifications().of_service(service)
         )
 

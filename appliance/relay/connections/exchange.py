@@ -7,6 +7,7 @@ request and reply, has monitors judge it, and encodes it again (`_request`, `_re
 Invariants:
 - The service has at most one request at a time. A reply without a request is an error.
 - A client that does not read its replies gets no further request through.
+- A request that needs an approval is held; it reaches monitors and the service only by `settle`.
 """
 
 from collections import deque
@@ -30,7 +31,8 @@ class ServiceExchange:
     """The requests and replies of one connection; `to_service(data)` and `to_client(data)` write them.
 
     `count(size)` is called for each request and reply. `held` counts the bytes of incomplete and waiting requests;
-    `held_replies` counts the bytes of incomplete replies. `judge(part, body)` returns the monitors' verdict on a
+    `held_replies` counts the bytes of incomplete replies. `asks(body)` returns whether a request is held until
+    `settle`. `judge(part, body)` returns the monitors' verdict on a
     `request` or `response`.
     """
 
@@ -43,12 +45,15 @@ class ServiceExchange:
         to_client: Callable[[bytes], None],
         count: Callable[[int], None],
         judge: Callable[[str, bytes], ServiceVerdict] | None = None,
+        asks: Callable[[bytes], bool] = lambda _body: False,
     ) -> None:
         self._persistent = persistent
         self._to_service = to_service
         self._to_client = to_client
         self._count = count
         self._judge = judge
+        self._asks = asks
+        self._asking: bytes | None = None
         self._requests = FrameParser(limit)
         self._replies = ServiceReplyParser(limit)
         self._waiting: deque[bytes] = deque()
@@ -60,12 +65,12 @@ class ServiceExchange:
     @property
     def may_read(self) -> bool:
         """Whether the client may be read: no request waits, and the service is not busy with one."""
-        return not self._busy and not self._waiting and not self.done
+        return not self._busy and self._asking is None and not self._waiting and not self.done
 
     @property
     def ready(self) -> bool:
         """Whether a waiting request may go to the service."""
-        return bool(self._waiting) and not self._busy and not self.done
+        return bool(self._waiting) and not self._busy and self._asking is None and not self.done
 
     @property
     def unfinished(self) -> int:
@@ -88,7 +93,20 @@ class ServiceExchange:
     def advance(self) -> None:
         """Send the next waiting request. Call this only when the client has read everything written to it."""
         if self.ready:
-            self._request(self._waiting.popleft())
+            body = self._asking = self._waiting.popleft()
+            if not self._asks(body):
+                self.settle("")
+
+    def settle(self, refused: str) -> None:
+        """Pass the held request on, or refuse it with this reason."""
+        body, self._asking = self._asking, None
+        if body is None:
+            raise RuntimeError("no request is held")
+        if refused:
+            self._pass_on(encode_frame(body))
+            self._refuse(refused)
+        else:
+            self._request(body)
 
     def _request(self, body: bytes) -> None:
         data = encode_frame(body)

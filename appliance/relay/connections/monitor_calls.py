@@ -15,7 +15,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from appliance.channel.messages import MonitorCallAnswered, MonitorCallWanted, OwnServiceAnswered
+from appliance.channel.messages import (
+    ApprovalAnswered,
+    MonitorCallAnswered,
+    MonitorCallWanted,
+    OwnServiceAnswered,
+)
+from appliance.relay.connections.call_approvals import CallApprovals
 from appliance.relay.connections.own_service import OwnService
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import LoopTimer
@@ -26,6 +32,7 @@ from roswire.tcpros import HeaderParser, ServiceReplyParser, encode_frame, encod
 if TYPE_CHECKING:
     from rosmop.run.outcomes import Published
 
+OwnAnswer = OwnServiceAnswered | MonitorCallAnswered | ApprovalAnswered
 MOST, MOST_OF_MONITOR = 64, 4
 """The maximum number of calls under way in a relay, and of one monitor, so that none takes the calls of the others."""
 
@@ -43,12 +50,13 @@ class _Call:
 
 
 class ServiceCalls:
-    """The calls under way, and those of the service that the appliance offers (`own`), whose answers also come from
-    control.
+    """The calls under way, and what control also answers: calls of the service that the appliance offers (`own`), and
+    requests that need an approval (`approvals`).
     """
 
     def __init__(self, context: RelayContext) -> None:
         self.own = OwnService(context.loop, context.reporter.send)
+        self.approvals = CallApprovals(context.loop, context.reporter.send)
         self._context = context
         self._calls: dict[int, _Call] = {}
         self._number = 0
@@ -74,10 +82,13 @@ class ServiceCalls:
         else:
             loop.after(0, lambda: self._end(number, "the appliance's control is not running"))
 
-    def answered(self, message: OwnServiceAnswered | MonitorCallAnswered) -> None:
-        """Make the call that control has granted, or report that it was denied; or pass an answer to `own` on."""
+    def answered(self, message: OwnAnswer) -> None:
+        """Make the call that control has granted, or report that it was denied; or pass an answer on."""
         if isinstance(message, OwnServiceAnswered):
             self.own.answered(message)
+            return
+        if isinstance(message, ApprovalAnswered):
+            self.approvals.answered(message)
             return
         call, number = self._calls.get(message.number), message.number
         if call is None:
@@ -110,6 +121,7 @@ class ServiceCalls:
         """End the calls that wait for a control that has gone."""
         self._connected = connected
         self.own.control_gone()
+        self.approvals.attach(connected)
         for number, call in list(self._calls.items()):
             if call.sock is None:
                 self._end(number, "the appliance's control has ended")

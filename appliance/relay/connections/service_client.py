@@ -14,6 +14,7 @@ import socket
 from collections.abc import Callable, Mapping
 
 from appliance.channel.messages import PublicationRefused, TopicTraffic
+from appliance.relay.connections.call_approvals import CallApprovals
 from appliance.relay.connections.exchange import ServiceExchange
 from appliance.relay.connections.headers import size_of, switched_on, to_client, to_service
 from appliance.relay.connections.own_service import OwnServer, OwnService
@@ -64,6 +65,8 @@ class ServiceTraffic:
 class ServiceClient:
     """One client of one service; `caller_id` is its verified name. With `own`, the appliance offers the service.
 
+    `asks()` returns whether each request needs an approval now, by the client's grant.
+
     Exactly one of two callbacks is called, once: `ended(self)` after both connections are closed, or `refuse(self,
     sock, reason)`, which takes over the client's socket.
     """
@@ -80,6 +83,8 @@ class ServiceClient:
         traffic: ServiceTraffic,
         refuse: Callable[["ServiceClient", socket.socket, str], None],
         ended: Callable[["ServiceClient"], None],
+        approvals: CallApprovals,
+        asks: Callable[[], bool],
         own: OwnService | None = None,
     ) -> None:
         self.service = service
@@ -91,6 +96,8 @@ class ServiceClient:
         self._refuse = refuse
         self._ended = ended
         self._own = own
+        self._approvals = approvals
+        self._asks = asks
         self._number = 0
         self._live = True
         memory = context.memory
@@ -112,6 +119,7 @@ class ServiceClient:
             to_client=self._to_client,
             count=traffic.count,
             judge=self._judge,
+            asks=self._ask,
         )
         self._client = BufferedSocket(
             context.loop,
@@ -231,6 +239,20 @@ class ServiceClient:
         sender = (self.host, self.caller_id) if part == "request" else (service.host, service.node)
         point = ObservationPoint(service.key, service.service, *sender)
         return self._context.interceptor.judge(point, part, body)
+
+    def _ask(self, body: bytes) -> bool:
+        """Ask control about a request that needs an approval; return whether it does."""
+        if not self._asks():
+            return False
+        caller = self.service.service, self.host, self.caller_id
+        self._approvals.ask(caller, self._header.get("type", ""), body, self._approved)
+        return True
+
+    def _approved(self, refused: str) -> None:
+        """Pass the held request on, or refuse it."""
+        if self._live:
+            self._exchange.settle(refused)
+            self._advance()
 
     def _client_received(self, data: bytes) -> None:
         if not data:

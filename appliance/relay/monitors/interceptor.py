@@ -30,6 +30,8 @@ from appliance.channel.messages import (
     SpecificationsRefused,
     SpecificationsStated,
     StateWanted,
+    StopBegun,
+    StopWanted,
 )
 from appliance.relay.loop import EventLoop, LoopTimer
 from appliance.relay.monitors.holds import hold_begun, taken
@@ -213,10 +215,12 @@ class Interceptor:
         self._changed(None if self._stated is None else frozenset())
         self._reporter.send(SpecificationsRefused(message.revision, findings[:100], message.statement))
 
-    def order(self, message: MonitorSwitched | MonitorGiven) -> None:
-        """Switch a monitor, or set its given constants, between two messages."""
+    def order(self, message: MonitorSwitched | MonitorGiven | StopWanted) -> None:
+        """Switch a monitor, set its given constants, or have it send its safe message, between two messages."""
         if isinstance(message, MonitorSwitched):
             self.switch(message.name, message.enabled)
+        elif isinstance(message, StopWanted):
+            self._reporter.send(StopBegun(message.number, self._stop(message.topic)))
         else:
             self._give(message.name, message.values)
 
@@ -249,6 +253,13 @@ class Interceptor:
             self.monitors.resume(monitor.name)
         self.keep_all()
         return self.monitors.topics_of(held)
+
+    def _stop(self, topic: str) -> list[str]:
+        """Have the monitors of a topic send their safe messages; return their names."""
+        self.invalidate_prepared()
+        names = [] if self.monitors is None else self.monitors.stop(topic)
+        self.schedule()
+        return names
 
     # --- queries when something changes ---
 

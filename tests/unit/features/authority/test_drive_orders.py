@@ -10,7 +10,7 @@ import pytest
 from appliance.base import clock
 from appliance.channel.messages import OwnServiceCalled
 from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
-from appliance.features.authority.drive_orders import CHECK_SECONDS, DriveOrders, HostSigns
+from appliance.features.authority.drive_orders import CHECK_SECONDS, DriveOrders
 from appliance.features.authority.drive_requests import (
     DriveAsk,
     DriveGive,
@@ -18,6 +18,7 @@ from appliance.features.authority.drive_requests import (
     DriveTake,
     GroupState,
 )
+from appliance.master.endpoints.host_signs import HostSigns
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
@@ -53,6 +54,7 @@ class Site:
             lambda: self.policy,
             cast(Any, self),
             HostSigns(self.live.__contains__, lambda host, _names: self.moved.get(host, 0.0)),
+            cast(Any, self),
             decide_again=self.decide_again,
             carried_out=self.carried_out,
             relays_ready=lambda: self.ready,
@@ -60,6 +62,12 @@ class Site:
 
     def happened(self, event: str, reason: str, **detail: Any) -> None:
         self.records.append({"event": event, "reason": reason, **detail})
+
+    async def after(self, host: str, topics: frozenset[str], why: str) -> None:
+        """The guards stop what a host commanded: no relay lets it through any longer, and no other holds the group."""
+        assert address_of(host) not in self.applied
+        assert self.orders.holders() == {}
+        self.records.append({"event": "motion stopped", "reason": why, "topics": sorted(topics)})
 
     def decide_again(self) -> int:
         for queue in self.ordered:
@@ -185,11 +193,13 @@ async def test_a_holder_loses_a_group(site: Site) -> None:
         await site.orders.take(take, "op")
         site.policy = compile_policy(text, file="site.ini")
         await site.pass_time(CHECK_SECONDS)
-    reasons = [one["reason"].rpartition(": ")[2] for one in site.records if one["holder"] == "nobody"]
+    reasons = [one["reason"].rpartition(": ")[2] for one in site.records if one.get("holder") == "nobody"]
     assert reasons == [
         "it was silent for 5 s", "its nodes ended", "the policy no longer lets it hold the group",
         "the policy no longer has the group",
     ]  # fmt: skip
+    stops = [one["reason"] for one in site.records if one["event"] == "motion stopped"]
+    assert stops == [f"base: {reason}" for reason in reasons[:3]], "its messages pass without a group"
 
 
 async def test_nothing_is_handed_over_while_a_relay_starts(site: Site) -> None:

@@ -1,0 +1,35 @@
+"""Stop the robot after a host lost the right to command it: the guards of its topics send their safe messages."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Iterable
+from dataclasses import dataclass
+
+from appliance.policy.policy import Policy
+from appliance.telemetry.audit_trail import AuditTrail
+
+
+@dataclass(frozen=True, slots=True)
+class MotionStop:
+    """`stop(topic)` has monitors send their safe messages, and returns the names of those that have one."""
+
+    stop: Callable[[str], Awaitable[list[str]]]
+    trail: AuditTrail
+    policy: Callable[[], Policy]
+
+    async def after(self, host: str, topics: Iterable[str], why: str) -> None:
+        """Stop what this host commanded; its messages already no longer pass. Record it, also if no guard stops it.
+
+        A topic without a guard needs no stop unless it is in a group of `[Authority]`.
+        """
+        wanted = sorted(topics)
+        begun = dict(zip(wanted, await asyncio.gather(*map(self.stop, wanted)), strict=True))
+        stopped = {topic: monitors for topic, monitors in begun.items() if monitors}
+        if stopped:
+            sent = "; ".join(f"{', '.join(names)} on {topic}" for topic, names in stopped.items())
+            self._record("motion stopped", f"safe messages of {sent}: {why}", host, stopped)
+        elif commanded := [topic for topic in wanted if self.policy().commanded(topic) is not None]:
+            text = f"no enabled guard has a safe message for {', '.join(commanded)}, so nothing stops the robot: {why}"
+            self._record("motion not stopped", text, host, commanded)
+
+    def _record(self, event: str, reason: str, host: str, topics: Iterable[str]) -> None:
+        self.trail.happened(event, reason, host=host, resource=next(iter(topics)), whole=True)

@@ -1,0 +1,275 @@
+"""Hold calls that need an approval, and give and end approvals, by orders of operators and at their time.
+
+A lease on a topic or a parameter takes the path of a change of the policy: all rights are decided again
+(`Policy.approved`). A call of a service is decided here, because the relay asks about each request. Nothing is stored:
+after a restart of control, and after a takeover, nothing is approved.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from functools import partial
+
+from appliance.base import clock
+from appliance.base.withdrawal import take_effect
+from appliance.channel.answers.limit_answers import LimitUse
+from appliance.channel.messages import ApprovalAnswered, ApprovalWanted
+from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.control.motion_stop import MotionStop
+from appliance.features.approvals import approval_requests as requests
+from appliance.features.approvals.approval_table import (
+    WAIT_SECONDS,
+    ApprovalEntry,
+    ApprovalState,
+    ApprovalTable,
+    HeldCall,
+)
+from appliance.features.approvals.quotas import APPROVALS
+from appliance.features.approvals.view import ApprovalCounts
+from appliance.master.calls.call import denial_text
+from appliance.master.endpoints.host_signs import HostSigns
+from appliance.policy.model import Address, Category, Decision, Request, address_of
+from appliance.policy.policy import Policy
+from appliance.policy.rights import Right, decide_right
+from appliance.telemetry.audit_trail import NOT_RECORDED, Asker, AuditTrail
+
+CHECK_SECONDS = 0.25
+LEASE_SECONDS = 60.0
+"""The lease of a topic or a parameter, if the operator names none."""
+UNANSWERED_SECONDS = 600.0
+"""How long the alarm about an unanswered call lasts."""
+
+
+class ApprovalOrders:
+    """The held calls, the approvals and the orders. Orders raise `SenselessError` and `UnknownThingError`.
+
+    `first` is the number of the first held call. `decide_again()` brings the present `approved` into force, and
+    `carried_out()` waits until the relays have carried out their orders.
+    """
+
+    def __init__(
+        self,
+        policy: Callable[[], Policy],
+        trail: AuditTrail,
+        signs: HostSigns,
+        stop: MotionStop,
+        *,
+        first: int,
+        decide_again: Callable[[], int],
+        carried_out: Callable[[], Awaitable[None]],
+    ) -> None:
+        self._policy = policy
+        self._trail = trail
+        self._signs = signs
+        self._stop = stop
+        self._decide_again = decide_again
+        self._carried_out = carried_out
+        self._table = ApprovalTable(first)
+        self._turn = asyncio.Lock()
+        self._unanswered: list[float] = []
+        self.approved = self._table.approved
+
+    # --- calls ---
+
+    def held(self, request: Request) -> str:
+        """Hold a publication or a write; return what its host is told."""
+        call = HeldCall(request.host, request.category, request.resource)
+        return self._held(call, request.caller_id, "", b"")
+
+    async def approve_call(self, wanted: ApprovalWanted) -> ApprovalAnswered:
+        """Decide about a request of a client to a service. An approval of one call is used up."""
+        answer = partial(ApprovalAnswered, wanted.number)
+        if obstacle := self._trail.obstacle or self._trail.shut_out(wanted.host):
+            return answer(obstacle)
+        asker = Asker(wanted.host, wanted.caller_id, clock.now_ns())
+        policy, host = self._policy(), address_of(wanted.host)
+        decision = policy.decide(Request(host, wanted.caller_id, Category.CALL, wanted.service))
+        if decision.allowed and decision.asks is not None:
+            decision = self._decided(decision, wanted, host)
+        record = self._trail.decided(asker, "call", Category.CALL, wanted.service, decision)
+        if not decision.allowed:
+            return answer(denial_text(decision, record, policy.tell))
+        if self._trail.strict and await self._trail.durable() is not None:
+            return answer(NOT_RECORDED)
+        return answer("")
+
+    def _decided(self, decision: Decision, wanted: ApprovalWanted, host: Address) -> Decision:
+        call = HeldCall(host, Category.CALL, wanted.service, wanted.digest)
+        entry = self._table.find(call)
+        if entry is None or entry.state is not ApprovalState.APPROVED:
+            told = self._held(call, wanted.caller_id, wanted.type, wanted.shown)
+            return replace(decision, allowed=False, reason=f"{told}: {decision.reason}")
+        if entry.once:
+            self._table.end(entry)
+            self._record("approval used", entry, f"used approval {entry.number}")
+        return replace(decision, reason=f"{decision.reason}; approval {entry.number} by {entry.who}")
+
+    def _held(self, call: HeldCall, caller_id: str, type_: str, arguments: bytes) -> str:
+        now = clock.now()
+        entry = self._table.find(call)
+        if entry is None:
+            entry = self._table.hold(call, now, caller_id=caller_id, type_=type_, arguments=arguments)
+            if entry is None:
+                most = APPROVALS.bounds.host
+                return f"not held: {most} calls of a host may wait for an approval; ask the operator about those first"
+            self._record("approval wanted", entry, f"waits for approval {entry.number}")
+        left = max(1, round(entry.until - now))
+        if entry.state is ApprovalState.REFUSED:
+            return f"an operator refused approval {entry.number}; ask again in {left} s"
+        return f"held for approval {entry.number}; ask the operator, then repeat; expires in {left} s"
+
+    # --- operators ---
+
+    async def listed(self, _request: requests.ApprovalsWanted) -> requests.Approvals:
+        return requests.Approvals(
+            [_shown(one) for one in sorted(self._table.entries(), key=lambda e: e.number)]
+        )
+
+    async def approve(self, request: requests.ApproveCall, who: str) -> requests.Approval:
+        """Approve a held call once, or give a lease; a lease may be given again to extend or shorten it."""
+        async with self._turn:
+            entry = self._entry(request.number)
+            seconds = request.seconds
+            if seconds is None and entry.call.category is not Category.CALL:
+                seconds = LEASE_SECONDS  # a publisher registers once, so only a lease bounds its messages
+            if seconds is not None and not requests.SHORTEST_LEASE <= seconds <= requests.LONGEST_LEASE:
+                raise SenselessError(
+                    f"{seconds:g} s is not a lease: give {requests.SHORTEST_LEASE:g}s to {requests.LONGEST_LEASE:g}s"
+                )
+            if self._ended(entry):
+                raise SenselessError(
+                    f"the policy no longer asks about {entry.call.resource}: approve nothing"
+                )
+            take_effect()
+            entry = self._table.approve(entry, seconds, who, clock.now())
+            self._unanswered.clear()
+            what = "once" if seconds is None else f"for {seconds:g} s"
+            self._record("approval given", entry, f"{who} gave approval {entry.number}, {what}", who=who)
+            await self._enforce()
+            return _shown(entry)
+
+    async def refuse(self, request: requests.RefuseCall, who: str) -> requests.Approval:
+        """Refuse a held call, so that repetitions are not held again; or end an approval."""
+        async with self._turn:
+            entry = self._entry(request.number)
+            take_effect()
+            if entry.state is ApprovalState.APPROVED:
+                await self._end(entry, f"{who} ended it", who)
+                return _shown(replace(entry, state=ApprovalState.REFUSED, until=clock.now(), who=who))
+            entry = self._table.refuse(entry, who)
+            self._record("approval refused", entry, f"{who} refused approval {entry.number}", who=who)
+            return _shown(entry)
+
+    # --- the end of a time ---
+
+    async def watch(self) -> None:
+        """End what is over; runs until cancelled."""
+        while True:
+            await self.check()
+            await asyncio.sleep(CHECK_SECONDS)
+
+    async def check(self) -> None:
+        """End the calls and approvals that are over now, and leases of hosts that stopped publishing a motion."""
+        for entry in self._table.entries():
+            async with self._turn:
+                reason = self._table.entry(entry.number) is entry and self._ended(entry)
+                if reason:
+                    if entry.state is ApprovalState.WAITS and entry.until <= clock.now():
+                        self._unanswered.append(clock.now())
+                    await self._end(entry, reason)
+
+    def _ended(self, entry: ApprovalEntry) -> str:
+        """Return why an entry ends now; empty: it goes on."""
+        now, policy, call = clock.now(), self._policy(), entry.call
+        if entry.until <= now:
+            return (
+                "its time is over"
+                if entry.state is ApprovalState.APPROVED
+                else "no operator answered in time"
+            )
+        asking = decide_right(
+            policy, Right(Request(call.host, entry.caller_id, call.category, call.resource))
+        )
+        if asking.asks is None:
+            return "the policy no longer asks"
+        group = policy.commanded(call.resource) if call.category is Category.PUBLISH else None
+        if not entry.lease or group is None:
+            return ""
+        moved = self._signs.moved(call.host, frozenset({call.resource}))
+        silent = moved > entry.since and now - moved >= group.lease
+        return f"its host was silent for {group.lease:g} s" if silent else ""
+
+    async def _end(self, entry: ApprovalEntry, reason: str, who: str = "") -> None:
+        """End an entry. The end of a lease cuts its host off on all relays; then the guards stop the robot."""
+        moved = self._signs.moved(entry.call.host, frozenset({entry.call.resource})) if entry.lease else 0.0
+        self._table.end(entry)
+        self._record("approval ended", entry, f"approval {entry.number} ended: {reason}", who=who)
+        if entry.lease:
+            await self._enforce()
+            if entry.call.category is Category.PUBLISH and moved > entry.since:
+                await self._stop.after(
+                    str(entry.call.host), {entry.call.resource}, f"approval {entry.number} ended"
+                )
+
+    async def _enforce(self) -> None:
+        """Decide all rights again if the leases differ from those in force."""
+        if self._policy().approved != self.approved():
+            self._decide_again()
+            await self._carried_out()
+
+    # --- inside ---
+
+    def state(self) -> ApprovalCounts:
+        """Return the counts for the status."""
+        self._unanswered = [at for at in self._unanswered if clock.now() - at < UNANSWERED_SECONDS]
+        entries = self._table.entries()
+        waiting = [entry for entry in entries if entry.state is ApprovalState.WAITS]
+        oldest = max((clock.now() - entry.since for entry in waiting), default=0.0)
+        leases = sum(entry.lease for entry in entries)
+        return ApprovalCounts(len(waiting), round(oldest, 1), leases, len(self._unanswered))
+
+    def limits(self) -> tuple[LimitUse, ...]:
+        """Return how much of the table is used."""
+        (host, used), bounds = self._table.most(), APPROVALS.bounds
+        whole, name = len(self._table.entries()), "" if host is None else str(host)
+        return (LimitUse("approvals", whole, bounds.whole, "", name, used, bounds.host),)
+
+    def _entry(self, number: int) -> ApprovalEntry:
+        entry = self._table.entry(number)
+        if entry is None or entry.until <= clock.now():
+            raise UnknownThingError(
+                f"no call has the approval number {number}, or its {WAIT_SECONDS:g} s are over: rosrv approve lists all"
+            )
+        return entry
+
+    def _record(self, event: str, entry: ApprovalEntry, reason: str, *, who: str = "") -> None:
+        call = entry.call
+        self._trail.happened(
+            event,
+            f"{call.host} {call.category} {call.resource}: {reason}",
+            host=str(call.host),
+            caller_id=entry.caller_id,
+            category=call.category.value,
+            resource=call.resource,
+            whole=bool(who) or entry.state is ApprovalState.APPROVED,
+            approval=entry.number,
+            sha256=call.digest,
+            who=who,
+        )
+
+
+def _shown(entry: ApprovalEntry) -> requests.Approval:
+    call = entry.call
+    return requests.Approval(
+        entry.number,
+        "lease" if entry.lease else entry.state.value,
+        str(call.host),
+        entry.caller_id,
+        call.category.value,  # type: ignore[arg-type]  # only these categories ask
+        call.resource,
+        entry.type,
+        call.digest,
+        entry.arguments.hex(),
+        round(max(0.0, entry.until - clock.now()), 1),
+        entry.who,
+    )

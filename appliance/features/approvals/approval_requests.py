@@ -1,0 +1,76 @@
+"""Define the requests of operators' tools about approvals, and their answers."""
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from appliance.channel.admin import AdminRequest, WaitingRequest
+from appliance.channel.answers.field_docs import doc
+from appliance.channel.rest_operation import parameter, rest
+
+SHORTEST_LEASE, LONGEST_LEASE = 1.0, 3600.0
+_PROBLEMS = {404: "No call has this number any longer.", 422: "The lease is not possible."}
+Number = Annotated[int, parameter("number of the held call", ge=1, examples=[48213])]
+
+
+class LeaseSeconds(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How long the approval lasts; null: one call of a service, 60 s for a topic or a parameter."""
+
+    seconds: Annotated[
+        Annotated[float, msgspec.Meta(ge=SHORTEST_LEASE, le=LONGEST_LEASE)] | None,
+        doc("for all calls of the same host and name in this time, with any arguments"),
+    ] = None
+
+
+class Approval(msgspec.Struct, frozen=True):
+    """A held call, or an approval."""
+
+    number: Annotated[int, doc("its number, for `rosrv approve`")]
+    state: Annotated[
+        Literal["waits", "approved", "lease", "refused"],
+        doc("waits: for an operator; approved: for one call; lease: for all calls of this name"),
+    ]
+    host: Annotated[str, doc("address of the host")]
+    caller_id: Annotated[str, doc("the node that called first; not verified")]
+    category: Annotated[
+        Literal["publish", "call", "write"], doc("publish a topic, call a service, write a parameter")
+    ]
+    resource: Annotated[str, doc("the topic, service or parameter")]
+    type: Annotated[str, doc("type of the service; empty for a topic or a parameter")]
+    sha256: Annotated[str, doc("hash of the arguments; empty: the approval is for any arguments")]
+    arguments: Annotated[
+        str, doc("first 4096 bytes of the arguments as the service would get them, in hexadecimal")
+    ]
+    left_seconds: Annotated[float, doc("until it ends")]
+    who: Annotated[str, doc("the operator who approved or refused it")]
+
+
+class Approvals(msgspec.Struct, frozen=True):
+    """All held calls and approvals."""
+
+    approvals: Annotated[list[Approval], doc("in the order of their numbers")]
+
+
+@rest("viewer", "GET", "/v1/approvals", name="approvals")
+class ApprovalsWanted(AdminRequest[Approvals], frozen=True, tag="approvals"):
+    """The calls that wait for an approval, and the approvals that last."""
+
+
+@rest(
+    "operator", "POST", "/v1/approvals/{number}/approve", name="approve", body=LeaseSeconds, problems=_PROBLEMS
+)  # fmt: skip
+class ApproveCall(WaitingRequest[Approval], frozen=True, tag="approve"):
+    """Approve a held call, once or for some time."""
+
+    number: Number
+    seconds: float | None = None
+
+
+@rest("operator", "POST", "/v1/approvals/{number}/refuse", name="approval_refuse", problems=_PROBLEMS)
+class RefuseCall(WaitingRequest[Approval], frozen=True, tag="approval refuse"):
+    """Refuse a held call, or end an approval."""
+
+    number: Number
+
+
+REQUESTS = (ApprovalsWanted, ApproveCall, RefuseCall)

@@ -1,0 +1,151 @@
+"""Keep the calls that wait for an approval, and the approvals. No I/O; times are monotonic seconds.
+
+Invariants:
+
+1. A call has one number while it waits, however often its host repeats it.
+2. An approval of one call is used once, by the same host, for the same service with the same arguments.
+3. A lease ends at its time, whatever happens.
+4. A host has at most `bounds.host` entries, and all hosts have at most `bounds.whole`.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import NamedTuple
+
+from appliance.features.approvals.quotas import APPROVALS
+from appliance.policy.model import Address, Category
+from appliance.policy.policy import Approval
+
+WAIT_SECONDS = 120.0
+"""How long a call waits for an answer, and how long an approval of one call waits to be used."""
+
+
+class ApprovalState(StrEnum):
+    """The state of an entry."""
+
+    WAITS = "waits"
+    APPROVED = "approved"
+    REFUSED = "refused"
+
+
+class HeldCall(NamedTuple):
+    """A call that needs an approval. `digest` is the SHA-256 of its arguments; empty for a topic or a parameter."""
+
+    host: Address
+    category: Category
+    resource: str
+    digest: str = ""
+
+    @property
+    def approval(self) -> Approval:
+        return self.host, self.category, self.resource
+
+
+@dataclass(frozen=True, slots=True)
+class ApprovalEntry:
+    """A call, and what operators said about it. `arguments` are its first bytes, `type` its service type.
+
+    It ends at `until`. `once`: the approval is for one call; otherwise it is a lease for all calls of the key, which
+    began at `since`.
+    """
+
+    number: int
+    call: HeldCall
+    caller_id: str
+    type: str
+    arguments: bytes
+    since: float
+    until: float
+    state: ApprovalState = ApprovalState.WAITS
+    once: bool = False
+    who: str = ""
+
+    @property
+    def lease(self) -> bool:
+        return self.state is ApprovalState.APPROVED and not self.once
+
+
+class ApprovalTable:
+    """The entries; the first one gets the number `first`."""
+
+    def __init__(self, first: int) -> None:
+        self._next = first
+        self._entries: dict[int, ApprovalEntry] = {}
+        self._by_call: dict[HeldCall, int] = {}
+        self._of_host: Counter[Address] = Counter()
+
+    def entries(self) -> list[ApprovalEntry]:
+        return list(self._entries.values())
+
+    def entry(self, number: int) -> ApprovalEntry | None:
+        return self._entries.get(number)
+
+    def find(self, call: HeldCall) -> ApprovalEntry | None:
+        """Return the lease for all calls of the key, or the entry of this call."""
+        for one in (call._replace(digest=""), call):
+            if (number := self._by_call.get(one)) is not None:
+                return self._entries[number]
+        return None
+
+    def most(self) -> tuple[Address | None, int]:
+        """Return the host with the most entries, and their number."""
+        return next(iter(self._of_host.most_common(1)), (None, 0))
+
+    def hold(
+        self, call: HeldCall, now: float, *, caller_id: str, type_: str, arguments: bytes
+    ) -> ApprovalEntry | None:
+        """Let a call wait. Return its new entry, or None if its host, or all hosts together, have too many."""
+        bounds = APPROVALS.bounds
+        if self._of_host[call.host] >= bounds.host or len(self._entries) >= bounds.whole:
+            return None
+        entry = ApprovalEntry(self._next, call, caller_id, type_, arguments, now, now + WAIT_SECONDS)
+        self._next += 1
+        self._of_host[call.host] += 1
+        self._put(entry)
+        return entry
+
+    def approve(self, entry: ApprovalEntry, seconds: float | None, who: str, now: float) -> ApprovalEntry:
+        """Approve one call (`seconds` is None), or all calls of its key for some seconds."""
+        call, until = entry.call, now + (WAIT_SECONDS if seconds is None else seconds)
+        if seconds is not None and call.digest:
+            call = call._replace(digest="")
+            if (other := self._by_call.get(call)) is not None:
+                self.end(self._entries[other])
+        self._by_call.pop(entry.call, None)
+        return self._put(
+            replace(
+                entry,
+                call=call,
+                since=now,
+                until=until,
+                state=ApprovalState.APPROVED,
+                once=seconds is None,
+                who=who,
+            )
+        )
+
+    def refuse(self, entry: ApprovalEntry, who: str) -> ApprovalEntry:
+        """Refuse a call until its entry ends."""
+        return self._put(replace(entry, state=ApprovalState.REFUSED, who=who))
+
+    def end(self, entry: ApprovalEntry) -> None:
+        """Remove an entry."""
+        if self._entries.pop(entry.number, None) is not None:
+            self._by_call.pop(entry.call, None)
+            self._of_host[entry.call.host] -= 1
+            if not self._of_host[entry.call.host]:
+                del self._of_host[entry.call.host]
+
+    def approved(self) -> frozenset[Approval]:
+        """Return the leases on topics and parameters. Calls of services are decided one by one."""
+        return frozenset(
+            entry.call.approval
+            for entry in self._entries.values()
+            if entry.lease and entry.call.category is not Category.CALL
+        )
+
+    def _put(self, entry: ApprovalEntry) -> ApprovalEntry:
+        self._entries[entry.number] = entry
+        self._by_call[entry.call] = entry.number
+        return entry

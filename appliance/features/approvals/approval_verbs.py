@@ -1,0 +1,87 @@
+"""`rosrv approve`: list the calls that wait for an approval, and approve or refuse them."""
+
+from typing import Annotated, Any
+
+import typer
+
+from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.durations import span_given
+from appliance.cli.output import say_json, usage_error
+from appliance.features.approvals.approval_requests import (
+    Approval,
+    ApprovalsWanted,
+    ApproveCall,
+    RefuseCall,
+)
+from rosmop.tool.terminal import say
+
+
+@speaks
+def approve(
+    appliance: Appliance,
+    number: Annotated[
+        int | None, typer.Argument(metavar="[NUMBER]", help="The number in the refusal", show_default=False)
+    ] = None,
+    *,
+    last: Annotated[
+        str | None,
+        typer.Option(
+            "--for", metavar="TIME", help="Approve all calls of this name by this host for 1s to 1h"
+        ),
+    ] = None,
+    refuse: Annotated[bool, typer.Option("--refuse", help="Refuse the call, or end the approval")] = False,
+) -> None:
+    """Approve a call that the policy holds for an operator. Without a number, list all calls and approvals.
+
+    A call of a service is approved once, for the same arguments. A topic or a parameter is approved for 60 s.
+
+    Example: rosrv approve 48213 --for 30s
+    """
+    if number is None:
+        if last is not None or refuse:
+            raise usage_error("name the call: rosrv approve NUMBER", "rosrv approve")
+        _list(appliance)
+        return
+    if refuse and last is not None:
+        raise usage_error("give --for or --refuse, not both", "rosrv approve")
+    seconds = None if last is None else span_given("--for", last, "30s, 5m or 1h", "rosrv approve")
+    _say(appliance, appliance.answer_or_exit(RefuseCall(number) if refuse else ApproveCall(number, seconds)))
+
+
+def _list(appliance: Appliance) -> None:
+    rows = appliance.answer_or_exit(ApprovalsWanted()).approvals
+    for one in rows:
+        _say(appliance, one)
+    if not rows and not appliance.as_json:
+        say("no call waits for an approval")
+
+
+def _say(appliance: Appliance, one: Approval) -> None:
+    if appliance.as_json:
+        say_json({field: getattr(one, field) for field in one.__struct_fields__})
+        return
+    who = f" by {one.who}" if one.who else ""
+    what = f"{one.number}: {one.host} {one.category} {one.resource}{_arguments(one)}"
+    say(f"{what}: {one.state}{who}, {one.left_seconds:g} s left", "yellow" if one.state == "waits" else "")
+
+
+def _arguments(one: Approval) -> str:
+    """Return the arguments of a call of a service, as far as its type is known here."""
+    if not one.sha256:
+        return " with any arguments" if one.category == "call" else ""
+    data = bytes.fromhex(one.arguments)
+    fields = _fields(one.type, data) if data else {}
+    shown = f"{data!r} ({one.type}, sha256 {one.sha256[:12]})" if fields is None else str(fields)
+    return f" {shown}"
+
+
+def _fields(service: str, data: bytes) -> dict[str, Any] | None:
+    from roswire.errors import DefinitionError  # noqa: PLC0415  few calls need the definitions
+    from roswire.message_view import read_fields  # noqa: PLC0415
+    from roswire.standard import standard_definitions  # noqa: PLC0415
+
+    try:
+        definitions = standard_definitions()
+        return read_fields(definitions, definitions.service(service).request.name, data)
+    except DefinitionError:
+        return None

@@ -1,0 +1,45 @@
+"""Make the part of approvals in control."""
+
+import secrets
+from typing import TYPE_CHECKING
+
+from appliance.control.motion_stop import MotionStop
+from appliance.control.operators.request_method import RequestMethod
+from appliance.features.approvals import approval_requests as requests
+from appliance.features.approvals.approval_orders import ApprovalOrders
+from appliance.features.feature import FeaturePart
+from appliance.master.endpoints.host_signs import host_signs
+
+if TYPE_CHECKING:
+    from appliance.control.assembly.assembly import Parts
+    from appliance.control.assembly.foundation import Foundation
+
+
+async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
+    """Return the part. It begins without an approval.
+
+    The first number is random. So an operator who answers late, after a restart, does not approve another call.
+    """
+    relay = parts.endpoints.relay
+    orders = ApprovalOrders(
+        base.policies.policy,
+        base.trail,
+        host_signs(parts.core.registry, parts.core.carried),
+        MotionStop(relay.stop, base.trail, base.policies.policy),
+        first=10_000 + secrets.randbelow(80_000),
+        decide_again=base.policies.decide_again,
+        carried_out=relay.carried_out,
+    )
+    return FeaturePart(
+        methods=(
+            RequestMethod(requests.ApprovalsWanted, orders.listed),
+            RequestMethod(requests.ApproveCall, orders.approve, who=True, full_disk=True),
+            RequestMethod(requests.RefuseCall, orders.refuse, who=True, full_disk=True),
+        ),
+        status_fields=lambda: {"approvals": orders.state()},
+        limits=orders.limits,
+        approved=orders.approved,
+        held=orders.held,
+        approve=orders.approve_call,
+        work={"the end of approvals": orders.watch},
+    )

@@ -1,0 +1,16 @@
+"""The quotas of approvals."""
+
+from appliance.quotas.pool import Bounds
+from appliance.quotas.table import QuotaRow
+
+APPROVALS = QuotaRow(
+    thing="calls that wait for an approval, and approvals",
+    bounds=Bounds(whole=256, host=8, unknown=0, kept=0),
+    at_limit="the call is refused without a number: operators decide about the host's other calls first",
+    between="a host has at most 8 of them, whatever it calls",
+    counting="repetitions of a call are one; each ends after two minutes, or with its lease",
+    alarm="`approval-unanswered`, `rosrv limits`",
+    shown_by=("unit/features/approvals/test_approval_orders.py::test_a_host_has_a_quota_of_waiting_calls",),
+)
+
+ROWS = (APPROVALS,)

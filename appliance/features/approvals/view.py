@@ -1,0 +1,54 @@
+"""The counts of approvals, with their alarm and metrics."""
+
+from collections.abc import Iterator
+from typing import Annotated
+
+import msgspec
+
+from appliance.base.metric import gauge
+from appliance.channel.answers.field_docs import doc
+from appliance.features.view import FeatureView, StateView, Trouble
+
+_METRICS = (
+    gauge("rosrv_approvals_waiting", "calls that wait for an operator's approval"),
+    gauge("rosrv_approvals_oldest_wait_seconds", "how long the oldest of these calls has waited"),
+    gauge("rosrv_approvals_leases", "approvals that let a host publish, call or write for some time"),
+    gauge("rosrv_approvals_unanswered", "calls that no operator answered in time, in the last ten minutes"),
+)
+
+
+class ApprovalCounts(msgspec.Struct, frozen=True):
+    """How many calls wait, and how many approvals last."""
+
+    waiting: Annotated[int, doc("calls that wait for an operator")]
+    oldest_seconds: Annotated[float, doc("how long the oldest of them has waited")]
+    leases: Annotated[int, doc("approvals that last for some time")]
+    unanswered: Annotated[int, doc("calls that no operator answered in time, in the last ten minutes")]
+
+
+def _alarms(state: ApprovalCounts) -> Iterator[Trouble]:
+    if state.unanswered:
+        text = (
+            f"no operator answered {state.unanswered} calls in time, in the last ten minutes: rosrv approve"
+        )
+        yield Trouble("warning", "approval-unanswered", text)
+
+
+APPROVALS_VIEW = FeatureView(
+    "approvals",
+    (
+        StateView(
+            "approvals",
+            ApprovalCounts,
+            "calls that wait for an operator's approval, and approvals",
+            alarms=_alarms,
+            metrics=_METRICS,
+            samples=lambda state: {
+                "rosrv_approvals_waiting": [((), state.waiting)],
+                "rosrv_approvals_oldest_wait_seconds": [((), state.oldest_seconds)],
+                "rosrv_approvals_leases": [((), state.leases)],
+                "rosrv_approvals_unanswered": [((), state.unanswered)],
+            },
+        ),
+    ),
+)

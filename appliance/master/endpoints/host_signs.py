@@ -1,0 +1,34 @@
+"""The signs of life of hosts: live nodes, and the last message of a host on some topics."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from appliance.master.endpoints.traffic import RelayTraffic
+from appliance.master.graph.registry import Kind, Registry
+from appliance.policy.model import Address
+
+
+@dataclass(frozen=True, slots=True)
+class HostSigns:
+    """`live(host)` returns whether it has a live node, `moved(host, names)` the time of its last message; 0: none."""
+
+    live: Callable[[Address], bool]
+    moved: Callable[[Address, frozenset[str]], float]
+
+
+def host_signs(registry: Registry, carried: RelayTraffic) -> HostSigns:
+    """Return the signs of hosts, by their registrations and the reports of relays."""
+
+    def live(host: Address) -> bool:
+        return any(node.host == host for node in registry.live())
+
+    def moved(host: Address, names: frozenset[str]) -> float:
+        times = (
+            carried.traffic[node.key, name].moved
+            for name in names
+            for node in registry.registered(Kind.PUBLICATION, name)
+            if node.host == host and (node.key, name) in carried.traffic
+        )
+        return max(times, default=0.0)
+
+    return HostSigns(live, moved)
