@@ -18,8 +18,6 @@ from appliance.api.front.services import Services
 from appliance.api.routes import (
     audit,
     audit_summary,
-    enrol,
-    host_routes,
     monitor_routes,
     operation_routes,
     policy_routes,
@@ -55,13 +53,14 @@ def build_app(services: Services) -> FastAPI:
             Exception: _defect,
         },
     )
-    answers = host_routes.ANSWERS | monitor_routes.ANSWERS | policy_routes.ANSWERS
+    answers = monitor_routes.ANSWERS | policy_routes.ANSWERS
+    for feature in FEATURES:
+        if feature.answers is not None:
+            answers = answers | pkgutil.resolve_name(feature.answers)
     app.include_router(operation_routes.routes(services, answers))
     for part in (
         health,
         policy_routes,
-        host_routes,
-        enrol,
         monitor_routes,
         audit_summary,  # before /v1/audit/{record_id}
         audit,

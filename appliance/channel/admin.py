@@ -50,14 +50,11 @@ MONITORS = Versioned(
     "The monitors were changed, switched or resumed since the ETag in If-Match was read.",
     seconds=40.0,  # RVMaster compiles first, then the relay
 )
-HOSTS = Versioned("table of hosts", "/v1/hosts", "The table of hosts is not the one that If-Match names.")
 
 _WITHIN = ("confirm_within",)
 _LOADED = (*_WITHIN, "force", "shadow", "hold")
 _NO_REVISION = {404: "There is no such revision."}
 _NO_MONITOR = {404: "There is no such monitor, or revision."}
-_NO_HOST = {404: "There is no such host."}
-_CHARON_SECONDS = 45.0  # charon may have to be started first
 
 Revision = Annotated[int, parameter("number of the revision", ge=1, le=bodies.LONGEST_REVISION, examples=[1])]
 Confirm = Annotated[
@@ -78,10 +75,6 @@ OneMonitor = Annotated[
     str, parameter("name of the monitor", min_length=1, max_length=256, examples=["censor"])
 ]
 SomeMonitors = Annotated[list[OneMonitor], parameter(name="name", min_length=1, max_length=1000)]
-OneHost = Annotated[
-    str,
-    parameter("name of the host", min_length=1, max_length=63, pattern=bodies.HOST_NAME, examples=["ocu-1"]),
-]
 
 
 class AdminRequest(msgspec.Struct, Generic[A], frozen=True, tag_field="verb", forbid_unknown_fields=True):
@@ -460,135 +453,6 @@ class TokenRevoke(AdminRequest[token_answers.Token], frozen=True, tag="token rev
 
 
 @rest(
-    "admin", "POST", "/v1/hosts", name="enrol_host", words="Enrol a host: by a one-time token that it presents with"
-    " its own signing request, or by a kit.", body=bodies.NewHost, says={"how": "token"}, fixed={"new": True},
-    of=HOSTS, status=201, good="Enrolled: the kit (how=kit); or a one-time token (how=token)",
-    seconds=_CHARON_SECONDS,
-)  # fmt: skip
-@rest(
-    "admin", "POST", "/v1/hosts/{name}/token", name="host_token", body=bodies.TokenWishes, fixed={"new": False},
-    of=HOSTS, seconds=_CHARON_SECONDS,
-)  # fmt: skip
-class HostToken(WaitingRequest[host_answers.EnrolmentToken], frozen=True, tag="host token"):
-    """A one-time token: with it the host enrols itself, for the first time or again with another key."""
-
-    name: OneHost
-    # These three are kept with the token, to make the host's kit later; endpoint None: the appliance finds it.
-    endpoint: str | None = None
-    ports: str = "32768-60999"
-    open: list[str] = []
-    token_seconds: float = 3600
-    days: float = 90
-    address: str | None = None
-    expected: int | None = None
-    new: bool = False  # rejected for a host that is enrolled; else such a host may come with another key
-
-
-@rest(
-    "admin", "POST", "/v1/hosts", says={"how": "kit"}, of=HOSTS, seconds=_CHARON_SECONDS, filled=("request",)
-)
-class HostAdd(WaitingRequest[host_answers.KitParts], frozen=True, tag="host add"):
-    """Enrol a host by a signing request (PKCS #10, PEM) for the key that it has, for `days`.
-
-    `address`: the virtual address it shall have; None: the next free one.
-    """
-
-    name: str
-    request: str
-    days: float = 90
-    address: str | None = None
-    expected: int | None = None
-
-
-@rest(None, seconds=_CHARON_SECONDS)
-class HostEnrol(WaitingRequest[host_answers.KitParts], frozen=True, tag="host enrol"):
-    """The host itself, at the real address `peer`, brings its token and a signing request (PEM)."""
-
-    token: str
-    request: str
-    peer: str
-
-
-@rest(
-    "admin", "POST", "/v1/hosts/{name}/kit", name="new_host_kit", body=bodies.NewKit, of=HOSTS, problems=_NO_HOST,
-    seconds=_CHARON_SECONDS, filled=("request",), good="The kit: an archive (.tar.gz)",
-)  # fmt: skip
-class HostRenew(WaitingRequest[host_answers.KitParts], frozen=True, tag="host renew"):
-    """A new certificate for an enrolled host, in a kit; the one before is revoked, its tunnel closed."""
-
-    name: OneHost
-    request: str
-    days: float = 90
-    expected: int | None = None
-
-
-@rest(None, seconds=_CHARON_SECONDS)
-class HostRenewItself(WaitingRequest[host_answers.NewCertificate], frozen=True, tag="host renew itself"):
-    """A host asks through its tunnel, at its virtual address `peer`, for a certificate for a new key.
-
-    `proof` is the signature of its present key over the bytes of `request`. The certificate before is good until
-    `HostRenewed`.
-    """
-
-    name: str
-    request: str
-    proof: bytes
-    peer: str
-
-
-@rest(None, seconds=_CHARON_SECONDS)
-class HostRenewed(AdminRequest[host_answers.Renewed], frozen=True, tag="host renewed"):
-    """A host at its virtual address `peer` has put its new certificate in place: the one before ends now."""
-
-    name: str
-    peer: str
-
-
-@rest("viewer", "GET", "/v1/hosts", name="hosts", of=HOSTS)
-class HostList(AdminRequest[host_answers.Hosts], frozen=True, tag="host list"):
-    """Every host that is enrolled, declared or awaited, with its tunnel; and machines that nodes run on."""
-
-
-@rest("viewer")
-class HostEndpoint(AdminRequest[host_answers.Endpoint], frozen=True, tag="host endpoint"):
-    """The address at which hosts reach the appliance if none is given: `endpoint`, and the `reason`."""
-
-
-@rest("operator")
-class HostKit(AdminRequest[host_answers.KitParts], frozen=True, tag="host kit"):
-    """The parts of an enrolled host's kit, without its private key."""
-
-    name: str
-
-
-@rest("admin", "DELETE", "/v1/hosts/{name}", name="revoke_host", of=HOSTS, problems=_NO_HOST)
-class HostRevoke(AdminRequest[host_answers.Revoked], frozen=True, tag="host revoke"):
-    """Exclude a host: its certificate, tunnel, registrations and connections end within a second."""
-
-    name: OneHost
-    expected: int | None = None
-
-
-@rest(
-    "operator", "PUT", "/v1/hosts/{name}/ports", name="tell_host_ports", body=bodies.PortsTold, of=HOSTS,
-    problems=_NO_HOST,
-)  # fmt: skip
-class HostPorts(AdminRequest[host_answers.PortsReport], frozen=True, tag="host ports"):
-    """Tell whether the ROS ports of a host are closed, as `rosrv protect --check` saw it from outside."""
-
-    name: Annotated[
-        str,
-        parameter(
-            "name of the host, or a machine's address", min_length=1, max_length=63, examples=["ocu-1"]
-        ),
-    ]
-    state: Literal["closed", "open", "unknown"]
-    open: list[int] = []
-    checked: float | None = None  # seconds since the epoch; None: now
-    expected: int | None = None
-
-
-@rest(
     "operator", "POST", "/v1/blocks", name="block_host", body=bodies.NewBlock, tag="hosts",
     problems={422: "The address cannot be blocked, or only with `force`."},
 )  # fmt: skip
@@ -619,23 +483,6 @@ class HostUnblock(AdminRequest[host_answers.HostUnblocked], frozen=True, tag="ho
 @rest("viewer", "GET", "/v1/blocks", name="host_blocks", tag="hosts")
 class HostBlocks(AdminRequest[host_answers.BlockedHosts], frozen=True, tag="host blocks"):
     """The hosts that operators block, the earliest block first."""
-
-
-@rest("operator", "POST", "/v1/hosts/reload", name="reload_hosts", of=HOSTS)
-class HostsReload(AdminRequest[host_answers.Reloaded], frozen=True, tag="hosts reload"):
-    """Read hosts.yaml again: open and close tunnels as it says. Enrolments and revocations do not change."""
-
-    expected: int | None = None
-
-
-@rest(None)
-class RevocationsWanted(AdminRequest[host_answers.RevocationList], frozen=True, tag="host revocations"):
-    """The authority's signed list of revoked certificates, in PEM."""
-
-
-@rest(None)
-class AuthorityWanted(AdminRequest[host_answers.AuthorityCertificate], frozen=True, tag="host authority"):
-    """The authority's certificate, in PEM."""
 
 
 @rest("viewer", "GET", "/v1/challenge", name="challenge", tag="status")

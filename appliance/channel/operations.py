@@ -2,14 +2,7 @@
 
 from typing import TYPE_CHECKING, Any, Union
 
-from appliance.channel.admin import (
-    CORE_REQUESTS,
-    AdminRequest,
-    ChallengeWanted,
-    HostEnrol,
-    HostRenewed,
-    HostRenewItself,
-)
+from appliance.channel.admin import CORE_REQUESTS, AdminRequest, ChallengeWanted
 from appliance.channel.rest_operation import rows
 from appliance.features.table import FEATURES
 
@@ -18,7 +11,7 @@ OPERATIONS = tuple(operation for request in REQUESTS for operation in rows().get
 CHANGES = frozenset(operation.request for operation in OPERATIONS if operation.is_change)
 """Requests that change something in the name of a token. Control requires the client's HTTP request for each."""
 
-ORDERS = CHANGES | {HostEnrol, HostRenewItself, HostRenewed}
+ORDERS = CHANGES | {operation.request for operation in OPERATIONS if operation.changes}
 """All requests that change something over REST, in the name of a token or of a host."""
 
 if TYPE_CHECKING:

@@ -98,6 +98,12 @@ class Operation:
     admin_with: Mapping[str, str] = field(default_factory=dict)
     # Fields that the appliance fills in when the client leaves them out.
     filled: tuple[str, ...] = ()
+    # A request without `path` that changes something; it has no bearer.
+    changes: bool = False
+    # Why the command line sends the request to the admin socket only, and what to do instead.
+    machine_only: str = ""
+    # The only field of control's answer that REST returns; the others have defaults.
+    answer_field: str = ""
     seconds: float = 0.0
     request: Any = None
 

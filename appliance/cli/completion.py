@@ -33,15 +33,21 @@ def _names(request: AdminRequest[A], of: Callable[[A], Iterable[str]]) -> Comple
 
 
 monitors = _names(admin.MonitorsWanted(), lambda body: [row.name for row in body.monitors])
-hosts = _names(admin.HostList(), lambda body: [row.name for row in body.hosts])
 tokens = _names(admin.TokenList(), lambda body: [row.name for row in body.tokens])
 topics = _names(admin.GraphWanted(), lambda body: [row.name for row in body.topics])
 
 
-def recordings(context: typer.Context, incomplete: str) -> list[str]:
-    """Complete the ids of recordings, if the appliance has a recorder."""
-    from appliance.channel.operations import request_named  # noqa: PLC0415  only completion needs all features
+def _names_of_feature(verb: str, of: Callable[[Any], Iterable[str]]) -> Complete:
+    """Return a function that completes names with the request of a feature; without the feature there are none."""
 
-    wanted: Any = request_named("recordings")
-    ids = _names(wanted(), lambda body: [row.id for row in body.recordings]) if wanted is not None else None
-    return [] if ids is None else ids(context, incomplete)
+    def complete(context: typer.Context, incomplete: str) -> list[str]:
+        from appliance.channel.operations import request_named  # noqa: PLC0415  only completion needs all features
+
+        wanted: Any = request_named(verb)
+        return [] if wanted is None else _names(wanted(), of)(context, incomplete)
+
+    return complete
+
+
+hosts = _names_of_feature("host list", lambda body: [row.name for row in body.hosts])
+recordings = _names_of_feature("recordings", lambda body: [row.id for row in body.recordings])

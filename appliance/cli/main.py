@@ -29,7 +29,6 @@ VERBS: Verbs = {
             "silence": Verb("alarm_verbs:silence"),
         },
     ),
-    "protect": Verb("protect_verb:protect", "Close the ROS ports of this machine to all but the appliance."),
     "audit": Group(
         "Review the audit log and verify that it is complete.",
         {

@@ -1,4 +1,4 @@
-"""Make the parts that serve operators on the admin socket and over REST: tunnels, tokens, queries and orders."""
+"""Make the parts that serve operators on the admin socket and over REST: tokens, queries and orders."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -19,9 +19,6 @@ from appliance.control.operators.switched_off import SwitchedOffWatch
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
 from appliance.control.rest.rest_certificate import RestCertificate
-from appliance.hosts.certification import Certification
-from appliance.hosts.enrolment import HostEnrolment, find_endpoint
-from appliance.hosts.rest_address import rest_address
 from appliance.store.stored_deadlines import StoredDeadlines
 
 
@@ -29,8 +26,6 @@ from appliance.store.stored_deadlines import StoredDeadlines
 class Operators:
     """The parts that serve operators."""
 
-    certification: Certification
-    hosts: HostEnrolment
     tokens: TokenOrders
     ends_of_tokens: StoredDeadlines
     clock: ClockCheck
@@ -44,25 +39,6 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
     """Make the parts that serve operators. The specifications must already be loaded."""
     settings, trail, ends = base.settings, base.trail, parts.endpoints
     ends_of_tokens = StoredDeadlines(base.store)
-    certification = Certification(
-        base.store,
-        trail,
-        base.host_authority.authority,
-        base.table,
-        base.tunnels,
-        appliances=base.host_authority.appliances,
-        master_port=settings.listen_address[1],
-        rest=rest_address(settings),
-        ends=ends_of_tokens,
-        changed=base.policies.hosts_changed,
-    )
-    hosts = HostEnrolment(
-        certification,
-        partial(find_endpoint, settings, base.lifeline.endpoint),
-        expel=ends.enforcement.expel,
-        carried_out=ends.relay.carried_out,
-        machines=parts.core.registry.machines,
-    )
     rest = Current[RestLink]()
     tokens = TokenOrders(
         base.store, trail, ends_of_tokens, lambda: rest().state_tokens(), sessions=base.features.sessions
@@ -91,7 +67,6 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         store=base.store,
         policies=base.policies,
         monitors=parts.monitors,
-        hosts=hosts,
         processes=lambda: base.lifeline.surroundings.processes,
         received=base.receipts.received,
         graph=partial(graph_of, parts),
@@ -103,7 +78,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         parts,
         trail,
         base.policies,
-        hosts,
+        base.features.hosts(),
         base.lifeline.surroundings,
         features=base.features.state,
         audit=partial(_audit_state, base),
@@ -122,8 +97,6 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
             queries=looks,
             policies=base.policies,
             monitors=parts.monitors,
-            hosts=hosts,
-            certification=certification,
             tokens=tokens,
             blocks=blocks,
             alarms=AlarmOrders(handled, trail, looks.present),
@@ -137,15 +110,13 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
             administration,
             tokens,
             trail,
-            served=certification.served_by,
+            served=base.features.hosts().served_by,
             certified=RestCertificate(base.store, trail, base.role.name).stated,
             connected=base.features.connected,
             require_proof=settings.api_require_proof,
         )
     )
     return Operators(
-        certification=certification,
-        hosts=hosts,
         tokens=tokens,
         ends_of_tokens=ends_of_tokens,
         clock=clock,

@@ -139,7 +139,7 @@ class _Control:
             self._admin = await AdminServer(operators.administration).start(sockets[_ADMIN].dup())
         if base.role.api is not None:
             operators.rest.attach(base.role.api)
-            operators.certification.served_by(base.role.pin)  # the api has stated it already
+            base.features.hosts().served_by(base.role.pin)  # the api has stated it already
         base.lifeline.hear(self._messages.heard)
         work: dict[str, Callable[[], Awaitable[None]]] = {
             "the reconciliation with the ROS master": parts.reconciler.run,
@@ -153,7 +153,6 @@ class _Control:
             "the check of protection that is off": operators.switched_off.watch,
             "the blocks of hosts": operators.blocks.watch,
             "the storage of parameters": self._save_parameters,
-            "the tunnels": partial(base.tunnels.run, operators.certification.each_hour),
             "the publications of monitors": partial(parts.publisher.run, parts.reconciler.ready),
             **base.features.work(),
         }

@@ -8,7 +8,7 @@ import structlog
 
 from appliance.base.actors import DISK
 from appliance.channel import messages
-from appliance.channel.admin import HostsReload, PolicyReload
+from appliance.channel.admin import PolicyReload
 from appliance.channel.answers.status import ProcessInfo
 from appliance.channel.channel import Channel
 from appliance.control.assembly.assembly import Parts
@@ -120,7 +120,7 @@ class SupervisorMessages:
             except StoreError as error:
                 _log.error("the policy is in force and not stored", reason=str(error))
             try:
-                await self._operators.hosts.reload(HostsReload(), DISK)
+                await self._base.features.hosts().read_again(DISK)
             except HostRefusedError as error:
                 _log.error("hosts.yaml was rejected", reason=str(error))
             except StoreError as error:

@@ -34,23 +34,13 @@ if TYPE_CHECKING:
     from appliance.control.assembly.policies import Policies
     from appliance.control.operators.request_method import RequestMethod
     from appliance.control.operators.sessions import Sessions
+    from appliance.hosts.tunnel_hosts import TunnelHosts
     from appliance.policy.model import Address, Request
     from appliance.policy.policy import Approval
     from appliance.specifications.specification_manager import SpecificationManager
     from appliance.store.state_file import StateStore
     from appliance.supervisor.service_gate import Pairing
     from appliance.telemetry.audit_trail import AuditTrail, RecordDetails
-
-
-class HostDeclarations(Protocol):
-    """The hosts that a bundle declares, in place of the file hosts.yaml."""
-
-    @property
-    def bundled(self) -> str:
-        """Return the text of the bundle in force; empty: the file is in force."""
-
-    async def take_bundle(self, text: str, who: str) -> object:
-        """Bring the hosts of a bundle into force; empty: those of the file. Raises `HostRefusedError`."""
 
 
 class KeptHosts(Protocol):
@@ -91,7 +81,7 @@ class OperatorContext:
     store: "StateStore"
     policies: "Policies"
     monitors: "SpecificationManager"
-    hosts: HostDeclarations
+    hosts: "TunnelHosts"
     processes: "Callable[[], Sequence[ProcessInfo]]"
     received: Callable[[int], None]
     graph: "Callable[[], Graph]"
@@ -110,9 +100,9 @@ class FeaturePart:
     `connected(door, ticket, peer, descriptor)` passes a WebSocket of the api on; it returns an HTTP status and why it
     is refused, or an empty text. `details` returns what it adds to the details of a record (`RecordDetails`). `called`
     answers nodes' calls of its services, by name without the appliance's own name. `sessions` are those of people whom
-    the feature signs in; they count beside tokens. `holders` returns the host that holds each group (`Policy.holders`).
-    `approved` returns the approvals that last (`Policy.approved`), `held` holds a call that needs one, and `approve`
-    decides about a request to a service.
+    the feature signs in; they count beside tokens. `hosts` are those in tunnels. `holders` returns the host that holds
+    each group (`Policy.holders`). `approved` returns the approvals that last (`Policy.approved`), `held` holds a call
+    that needs one, and `approve` decides about a request to a service.
 
     `status_fields()` returns the present states of the feature by their fields in `rosrv status --json`. The feature's
     view defines the fields (`StateView`). A state that is None or missing is null there.
@@ -134,6 +124,7 @@ class FeaturePart:
     work: Mapping[str, Callable[[], Awaitable[None]]] = field(default_factory=dict)
     connected: "Callable[[str, str, str, int], tuple[int, str]] | None" = None
     sessions: "Sessions | None" = None
+    hosts: "TunnelHosts | None" = None
 
 
 class ConsolePart(NamedTuple):
@@ -155,7 +146,8 @@ class Feature:
     """All that a feature adds: a section of `appliance.yaml`, processes, requests, verbs, and a part of control.
 
     `operations` returns the requests of operators' tools; the admin socket, REST and the client follow from their
-    rows. `routes` is the function (`module:function`) that returns further routes of the api for its `Services`.
+    rows. `answers` are the `Answer`s (`module:name`) of operations over REST that are not just control's, by name, and
+    `routes` is the function (`module:function`) that returns further routes of the api for its `Services`.
     `without_token` lists the paths of routes that need no token. `page` returns settings for the console's page.
     `verbs` are commands of `rosrv`.
     `quotas` are rows that the table of quotas lists.
@@ -169,13 +161,13 @@ class Feature:
     a class of `control.assembly.active_role.StartGate`. `keep(sections, store, lifeline)` returns `KeptHosts`, before
     the policy comes into force. `inherit(foundation, parts)` returns a `FeaturePart` once
     control may serve and has its parts, before it serves.
-    a class of `control.assembly.active_role.StartGate`.
     """
 
     name: str
     settings: type[FeatureSection] | None = None
     roles: tuple[Role, ...] = ()
     operations: "Callable[[], tuple[type[AdminRequest[Any]], ...]]" = lambda: ()
+    answers: str | None = None
     routes: str | None = None
     without_token: tuple[str, ...] = ()
     page: Callable[[Sections], Mapping[str, str]] = lambda _sections: {}

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from appliance.features.feature import FeatureContext, FeaturePart, KeptHosts, OperatorContext
 from appliance.features.table import FEATURES
+from appliance.hosts.tunnel_hosts import TunnelHosts
 
 if TYPE_CHECKING:
     from appliance.audit.log.record import Severity
@@ -31,6 +32,7 @@ class FeatureParts:
 
     def __init__(self, core: FeatureContext) -> None:
         self._core = core
+        self._no_hosts = TunnelHosts()
         self.kept: dict[str, KeptHosts] = {}
         self._parts = [feature.make(core) for feature in FEATURES if feature.make is not None]
 
@@ -56,7 +58,7 @@ class FeatureParts:
 
     def operate(self, **later: Any) -> None:
         """Add the parts that need objects of control that exist now: the fields of `OperatorContext`."""
-        context = OperatorContext(self._core, **later, kept=self.kept)
+        context = OperatorContext(self._core, **later, hosts=self.hosts(), kept=self.kept)
         self._parts += [feature.operate(context) for feature in FEATURES if feature.operate is not None]
 
     async def inherit(self, foundation: Any, parts: Any) -> None:
@@ -139,6 +141,10 @@ class FeatureParts:
     def sessions(self) -> "Sessions | None":
         """Return the sessions of people, or None if people sign in with tokens only."""
         return next((part.sessions for part in self._parts if part.sessions is not None), None)
+
+    def hosts(self) -> TunnelHosts:
+        """Return the hosts in tunnels."""
+        return next((part.hosts for part in self._parts if part.hosts is not None), self._no_hosts)
 
     def work(self) -> dict[str, Callable[[], Awaitable[None]]]:
         """Return the work that runs until control ends."""

@@ -43,15 +43,15 @@ ORDERS: tuple[admin.AdminRequest[Any], ...] = (
     admin.AlarmSilence("none"),
     admin.TokenAdd("late", "viewer", 3600.0),
     admin.TokenRotate("guest"),
-    admin.HostToken("laptop", endpoint="192.0.2.1"),
-    admin.HostAdd("laptop", REQUEST),
-    admin.HostEnrol("rosrv-enrol_none", REQUEST, "192.0.2.2"),
-    admin.HostRenew("laptop", REQUEST),
-    admin.HostRenewItself("laptop", REQUEST, b"", "192.0.2.2"),
-    admin.HostRenewed("laptop", "192.0.2.2"),
-    admin.HostPorts("192.0.2.3", "closed"),
-    admin.HostsReload(),
     admin.HostUnblock("192.0.2.66"),
+    *of_feature("host token", name="laptop", endpoint="192.0.2.1"),
+    *of_feature("host add", name="laptop", request=REQUEST),
+    *of_feature("host enrol", token="rosrv-enrol_none", request=REQUEST, peer="192.0.2.2"),
+    *of_feature("host renew", name="laptop", request=REQUEST),
+    *of_feature("host renew itself", name="laptop", request=REQUEST, proof=b"", peer="192.0.2.2"),
+    *of_feature("host renewed", name="laptop", peer="192.0.2.2"),
+    *of_feature("host ports", name="192.0.2.3", state="closed"),
+    *of_feature("hosts reload"),
     *of_feature("door add", name="alice"),
     *of_feature("door ticket", name="alice", seconds=60.0),
     *of_feature("guard new", preset="deadman", topics={"command": "/cmd_vel"}),
@@ -61,9 +61,9 @@ UNSTORED = {
     "host block", "host revoke", "token revoke", "record now", "recording memory", "recording remove",
     "standby promote", "door remove", "drive take", "drive give", "drive ask", "sso end", "sso sign out",
 }  # fmt: skip
-LOOKS = (
-    admin.PolicyRevisions(), admin.MonitorRevisions(), admin.MonitorsWanted(True), admin.TokenList(), admin.HostList(),
-    admin.HostBlocks(),
+LOOKS: tuple[admin.AdminRequest[Any], ...] = (
+    admin.PolicyRevisions(), admin.MonitorRevisions(), admin.MonitorsWanted(True), admin.TokenList(),
+    admin.HostBlocks(), *of_feature("host list"),
 )  # fmt: skip
 
 
@@ -121,11 +121,12 @@ def test_a_change_that_cannot_be_stored_has_no_effect(small: SmallDisk) -> None:
         assert "nothing was changed: free space" in answer.error, order
     assert small.all() == before
     small.filler.unlink()
-    for order in (
+    stored: tuple[admin.AdminRequest[Any], ...] = (
         admin.TokenAdd("late", "viewer", 3600.0),
         admin.PolicyLoad(CLOSED),
-        admin.HostPorts("192.0.2.3", "open"),
-    ):
+        *of_feature("host ports", name="192.0.2.3", state="open"),
+    )
+    for order in stored:
         assert small.ask(order).ok, order
     after = small.all()
     small.appliance.kill("control")

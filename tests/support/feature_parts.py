@@ -9,7 +9,6 @@ from appliance.control.assembly.policies import Policies
 from appliance.features.feature import Feature, FeatureContext
 from appliance.features.parts import FeatureParts
 from appliance.features.table import FEATURES
-from appliance.hosts.enrolment import HostEnrolment
 from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
@@ -18,14 +17,14 @@ from tests.support.idle import idle
 
 def idle_parts() -> FeatureParts:
     """Return the parts of all features, with default settings and a log that records nothing."""
-    store, monitors, hosts = idle(StateStore), idle(SpecificationManager), idle(HostEnrolment)
+    store, monitors = idle(StateStore), idle(SpecificationManager)
     store.settings = dict  # type: ignore[method-assign]  # an idle store has no settings
     early = FeatureContext(
         DEFAULTS, idle(AuditTrail), idle(AuditLog), "", charged_to=lambda host: host, in_force=lambda: (0, 0)
     )
     parts = FeatureParts(early)
     parts.operate(
-        appliance="", store=store, policies=idle(Policies), monitors=monitors, hosts=hosts, processes=tuple,
+        appliance="", store=store, policies=idle(Policies), monitors=monitors, processes=tuple,
         received=lambda _sequence: None, graph=lambda: Graph([], [], []), tokens_changed=lambda: None,
         bearers=frozenset,
     )  # fmt: skip

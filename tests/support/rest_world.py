@@ -24,12 +24,11 @@ from appliance.base.clock import using
 from appliance.channel import admin
 from appliance.channel.admin import AdminRequest, answer_to
 from appliance.channel.answers.graph_answers import Registrations
-from appliance.channel.answers.host_answers import Endpoint, KitParts
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.monitor_answers import Monitors
 from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.channel.messages.api import ApiLink, ClientRequest, RequestMade, TokenKept
-from appliance.channel.operations import CHANGES
+from appliance.channel.operations import CHANGES, request_named
 from appliance.configuration.settings import ApiLimits, Settings
 from appliance.control.assembly.policies import Policies
 from appliance.control.operators.administration import Administration
@@ -41,10 +40,6 @@ from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
-from appliance.hosts.certification import Certification
-from appliance.hosts.checked_ports import PortChecks
-from appliance.hosts.enrolment import HostEnrolment
-from appliance.hosts.self_service import HostSelfService
 from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.access_tokens import TokenRow, make_token
 from tests.support.answers import example
@@ -60,14 +55,20 @@ R = TypeVar("R", bound=AdminRequest[Any])
 ROLES = ("viewer", "investigator", "operator", "admin")
 _NOW = 1_700_000_000.0
 _STATE = Settings().state
+_KIT = {"name": "laptop", "address": "10.9.0.2", "appliance": "10.9.0.1"}
+
+
+def _of_feature(verb: str, **fields: Any) -> dict[type, Any]:
+    request = request_named(verb)
+    return {} if request is None else {request: example(cast(Any, answer_to(request)), **fields)}
+
+
 _ANSWERS: dict[type, Any] = {
     admin.PolicyWanted: example(PolicyKnown, revision=7, text="[Nodes]\n", file="f"),
     admin.RegistrationsWanted: example(Registrations),
-    admin.HostEndpoint: Endpoint("10.0.0.9", "the route"),
-    **dict.fromkeys(
-        (admin.HostAdd, admin.HostRenew),
-        example(KitParts, name="laptop", address="10.9.0.2", appliance="10.9.0.1"),
-    ),
+    **_of_feature("host endpoint", endpoint="10.0.0.9"),
+    **_of_feature("host add", **_KIT),
+    **_of_feature("host renew", **_KIT),
     admin.MonitorsWanted: example(Monitors, files={"safeZone": "text"}),
 }
 
@@ -139,16 +140,13 @@ class RestWorld:
         self._runner.run(self._connect())
 
     async def _connect(self) -> None:
-        queries, hosts = idle(Queries), idle(HostEnrolment)
+        queries = idle(Queries)
         object.__setattr__(queries, "policies", SimpleNamespace(revision=7))
         object.__setattr__(queries, "parts", SimpleNamespace(monitors=SimpleNamespace(revision=3)))
-        hosts.itself, hosts.ports = idle(HostSelfService), idle(PortChecks)
         methods = idle_parts().methods() + request_methods(
             queries=queries,
             policies=idle(Policies),
             monitors=idle(SpecificationManager),
-            hosts=hosts,
-            certification=idle(Certification),
             tokens=idle(TokenOrders),
             blocks=idle(BlockOrders),
             limits=idle(LimitQueries),

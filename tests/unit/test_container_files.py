@@ -6,7 +6,6 @@ from pathlib import Path
 import yaml
 
 from appliance.configuration.config_sources import resolve
-from appliance.hosts.rest_address import rest_address
 from appliance.supervisor.privileges import SUPERVISOR_CAPABILITIES
 from appliance.supervisor.roles import ROLES
 from appliance.supervisor.users import NUMERIC_IDS
@@ -82,22 +81,6 @@ def test_the_endpoint_is_one_line_in_env() -> None:
     """Kits get `ROSRV_ENDPOINT=192.168.1.20` from `.env`; without it the configuration is still valid."""
     assert resolve(None, environment(), {}).ipsec.endpoint is None
     assert resolve(None, environment(ROSRV_ENDPOINT="192.168.1.20"), {}).ipsec.endpoint == "192.168.1.20"
-
-
-def test_no_script_is_written_that_cannot_reach_rest() -> None:
-    """While REST is published on loopback, no host can enrol itself by a token; the error says so and gives advice."""
-    published = [
-        port
-        for port in yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]["ports"]
-        if port.endswith(":8443")
-    ]
-    assert published == ["127.0.0.1:8443:8443"]
-    listens = {"ROSRV_API": "0.0.0.0:8443", "ROSRV_ISOLATION": "container"}  # as in the Dockerfile
-    place = rest_address(resolve(None, listens | environment(), {}))
-    assert place.port is None
-    assert "ROSRV_API_PUBLISHED" in place.trouble
-    override = {"ROSRV_API_PUBLISHED": "true", "ROSRV_API_NETWORKS": "[172.29.76.1/32, 192.168.1.0/24]"}
-    assert rest_address(resolve(None, listens | environment() | override, {})).port == 8443
 
 
 def test_a_flood_ends_in_the_container() -> None:

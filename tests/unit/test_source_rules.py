@@ -294,7 +294,7 @@ WALL_CLOCK = {
         "features/doors/door_node.py", "features/doors/door_table.py", "features/doors/door_tickets.py",
         "features/syslog/log_forwarder.py",
         "features/fleet/segment_pusher.py",
-        "hosts/checked_ports.py", "hosts/host_table.py", "features/standby/shared_authority.py",
+        "features/tunnels/checked_ports.py", "hosts/host_table.py", "features/standby/shared_authority.py",
         "features/recorder/recorder.py", "features/recorder/ring.py", "features/recorder/recorder_ring.py",
         "features/recorder/rings.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",
         "specifications/specification_manager.py", "supervisor/process_handle.py", "supervisor/monitor_memory.py",
@@ -306,13 +306,14 @@ WALL_CLOCK = {
         "features/selftest/file_checks.py",
         "base/deadlines.py", "features/fleet/verified_bundles.py",
         "control/operators/token_orders.py", "features/standby/appliance_table.py",
-        "hosts/certification.py", "hosts/enrolment_tokens.py",
-        "hosts/revoked_certificates.py", "hosts/tunnel_state.py", "hosts/view.py", "ipsec/certificate_authority.py",
+        "features/tunnels/certification.py", "features/tunnels/enrolment_tokens.py",
+        "hosts/revoked_certificates.py", "hosts/tunnel_state.py", "features/tunnels/host_view.py",
+        "ipsec/certificate_authority.py",
         "signing/own_certificate.py",
     ],
     "a span that goes on over restarts of the machine, which has no other clock": [
         "control/operators/alarm_orders.py", "features/standby/stored_times.py",
-        "control/operators/switched_off.py", "hosts/self_service.py", "specifications/timed_switches.py",
+        "control/operators/switched_off.py", "features/tunnels/self_service.py", "specifications/timed_switches.py",
         "store/revisions.py",
     ],
     "whether the wall clock can be believed, and where it is read": [
@@ -321,7 +322,8 @@ WALL_CLOCK = {
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
         "api/front/moments.py", "audit/search/filter_options.py",
         "features/evidence/evidence_verbs.py",
-        "cli/monitor/offline.py", "features/policy_tools/learn_verb.py", "cli/protect_verb.py", "base/ages.py",
+        "cli/monitor/offline.py", "features/policy_tools/learn_verb.py", "features/tunnels/protect_verb.py",
+        "base/ages.py",
         "cli/topic_verbs.py", "features/recorder/recorder_input.py", "features/recorder/record_verbs.py",
     ],
 }  # fmt: skip

@@ -46,15 +46,17 @@ def _carry_out(rest: RestClient, request: AdminRequest[A]) -> A:
     if isinstance(asked, admin.RegistrationsWanted):
         return cast(A, _registrations(_carry_out(rest, admin.GraphWanted())))
     operation = operation_of(request)
-    if operation is None or not operation.path or type(request) in _ONLY_THERE:
-        raise NotRunningError(f"{rest.url}: {_ONLY_THERE.get(type(request), _UNASKED)}")
+    if isinstance(asked, admin.TokenAdd | admin.TokenRotate):
+        raise NotRunningError(f"{rest.url}: {_MACHINE_ONLY}")
+    if operation is None or not operation.path or operation.machine_only:
+        raise NotRunningError(f"{rest.url}: {(operation and operation.machine_only) or _UNASKED}")
     call = call_of(request, operation)
     body = rest.call(call.method, call.target, body=call.body, match=call.match)
+    if operation.answer_field:
+        body = {operation.answer_field: body}
     match asked:
         case admin.MonitorLoad() | admin.MonitorReload() | admin.MonitorRemove() | admin.MonitorRollback():
             body["warnings"] = [_line(line) for line in body["warnings"]]
-        case admin.HostPorts(name):
-            body = {"name": name, "ports": body, "revision": 0}
     try:
         return msgspec.convert(body, admin.answer_to(type(request)))
     except msgspec.ValidationError as error:
@@ -63,21 +65,10 @@ def _carry_out(rest: RestClient, request: AdminRequest[A]) -> A:
         ) from None
 
 
-_KIT = (
-    "a kit is made on the appliance's machine, without --api; over REST take --token, with which no private key"
-    " travels"
-)
 _MACHINE_ONLY = (
     "tokens are made on the appliance's machine only, without --api: a compromised api gains no lasting"
     " access"
 )
-_ONLY_THERE: dict[type, str] = {
-    admin.HostAdd: _KIT,
-    admin.HostRenew: _KIT,
-    admin.HostEndpoint: _KIT,
-    admin.TokenAdd: _MACHINE_ONLY,
-    admin.TokenRotate: _MACHINE_ONLY,
-}
 _UNASKED = "this cannot be asked over REST; run it with --state"
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from appliance.base.withdrawal import WithdrawnError, require_awaited
 from appliance.channel import admin
 from appliance.channel.admin import A
-from appliance.channel.operations import CHANGES
+from appliance.channel.operations import ORDERS
 from appliance.control.assembly.policies import RevisionChangedError
 from appliance.control.assembly.policy_gate import PolicyRefusedError
 from appliance.control.errors import SenselessError, TokenRefusedError, UnavailableError, UnknownThingError
@@ -52,9 +52,7 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
 # Requests that are rejected if the store cannot be written, except rows with `full_disk`: a block or revocation takes
 # effect at once, and its answer reports if it was not stored. The recorder checks its own disk space. A full disk is a
 # reason to switch over.
-KEPT = CHANGES | {
-    admin.TokenAdd, admin.TokenRotate, admin.HostEnrol, admin.HostRenewItself, admin.HostRenewed,
-}  # fmt: skip
+KEPT = ORDERS | {admin.TokenAdd, admin.TokenRotate}
 
 
 class Administration:

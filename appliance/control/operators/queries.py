@@ -37,7 +37,7 @@ from appliance.control.links.supervisor_link import Surroundings
 from appliance.control.operators.measurements import measures_of
 from appliance.control.operators.overview import graph_of
 from appliance.features.views import states_in
-from appliance.hosts.enrolment import HostEnrolment
+from appliance.hosts.tunnel_hosts import TunnelHosts
 from appliance.master.graph.registry import Kind, Life
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.sections import DECIDERS
@@ -66,7 +66,7 @@ class Queries:
     parts: Parts
     trail: AuditTrail
     policies: Policies
-    hosts: HostEnrolment
+    hosts: TunnelHosts
     surroundings: Surroundings
     features: Callable[[], dict[str, Any]]
     audit: Callable[[dict[str, Any]], AuditState]

@@ -10,8 +10,6 @@ from appliance.control.operators.limit_use import LimitQueries
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.token_orders import TokenOrders
-from appliance.hosts.certification import Certification
-from appliance.hosts.enrolment import HostEnrolment
 from appliance.specifications.specification_manager import SpecificationManager
 
 
@@ -20,8 +18,6 @@ def request_methods(
     queries: Queries,
     policies: Policies,
     monitors: SpecificationManager,
-    hosts: HostEnrolment,
-    certification: Certification,
     tokens: TokenOrders,
     blocks: BlockOrders,
     limits: LimitQueries,
@@ -60,23 +56,9 @@ def request_methods(
         RequestMethod(admin.MonitorShadow, monitors.shadow, who=True),
         RequestMethod(admin.MonitorGive, monitors.give, who=True),
         RequestMethod(admin.MonitorResume, monitors.resume, who=True),
-        RequestMethod(admin.HostList, hosts.listed),
-        RequestMethod(admin.HostEndpoint, hosts.endpoint),
-        RequestMethod(admin.HostKit, hosts.kit),
-        RequestMethod(admin.HostAdd, hosts.add, who=True),
-        RequestMethod(admin.HostRenew, hosts.renew, who=True),
-        RequestMethod(admin.HostToken, hosts.token, who=True),
-        RequestMethod(admin.HostRevoke, hosts.revoke, who=True, full_disk=True),
-        RequestMethod(admin.HostsReload, hosts.reload, who=True),
         RequestMethod(admin.HostBlock, blocks.block, who=True, full_disk=True),
         RequestMethod(admin.HostUnblock, blocks.unblock, who=True),
         RequestMethod(admin.HostBlocks, blocks.listed, order=False),
-        RequestMethod(admin.HostEnrol, hosts.itself.enrol),
-        RequestMethod(admin.HostRenewItself, hosts.itself.renew),
-        RequestMethod(admin.HostRenewed, hosts.itself.renewed),
-        RequestMethod(admin.HostPorts, hosts.ports.tell, who=True),
-        RequestMethod(admin.RevocationsWanted, certification.revocations),
-        RequestMethod(admin.AuthorityWanted, certification.authority),
         RequestMethod(admin.TokenList, tokens.listed),
         RequestMethod(admin.TokenAdd, tokens.add, who=True),
         RequestMethod(admin.TokenRotate, tokens.rotate, who=True),

@@ -26,7 +26,6 @@ from appliance.channel import admin
 from appliance.channel.link import Link
 from appliance.control.assembly.policies import Policies, PolicyCases, RevisionChangedError
 from appliance.control.assembly.policy_gate import PolicyRefusedError
-from appliance.features.feature import HostDeclarations
 from appliance.features.fleet.bundle_health import RobotHealth
 from appliance.features.fleet.bundle_link import (
     BundleHealth,
@@ -40,6 +39,7 @@ from appliance.features.fleet.view import BundlesState
 from appliance.formats.bundle_archive import BundleContents
 from appliance.hosts.host_table import HostRefusedError
 from appliance.hosts.hosts_file import IN_BUNDLE, DeclaredHostsError, parse_declared
+from appliance.hosts.tunnel_hosts import TunnelHosts
 from appliance.policy.lost_rights import LostRights
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
@@ -115,7 +115,7 @@ class BundleGate:
         *,
         policies: Policies,
         monitors: SpecificationManager,
-        hosts: HostDeclarations,
+        hosts: TunnelHosts,
         store: StateStore,
         trail: AuditTrail,
         health: Callable[[Callable[[Address], bool]], RobotHealth],

@@ -1,11 +1,23 @@
-"""The feature tunnels: the process that runs charon, and `rosrv host` for hosts that connect through IPsec."""
+"""The feature tunnels: charon, the enrolment of hosts that connect through IPsec, and the ports that nodes close."""
+
+from typing import TYPE_CHECKING, Any
 
 from appliance.cli.verb_table import FIRST, Group, Verb
 from appliance.features.feature import Feature
 from appliance.supervisor.role import Role
 from appliance.supervisor.sandbox.sandbox_plan import ROUTES, SandboxPlan
 
+if TYPE_CHECKING:
+    from appliance.channel.admin import AdminRequest
+
 _PLACE = "appliance.features.tunnels."
+
+
+def _operations() -> "tuple[type[AdminRequest[Any]], ...]":
+    from appliance.features.tunnels.host_requests import REQUESTS  # noqa: PLC0415  few processes need it
+
+    return REQUESTS
+
 
 TUNNELS = Feature(
     "tunnels",
@@ -21,7 +33,16 @@ TUNNELS = Feature(
             ),
         ),
     ),
+    operations=_operations,
+    answers=f"{_PLACE}host_routes:ANSWERS",
+    routes=f"{_PLACE}enrol_routes:routes",
+    inherit=f"{_PLACE}control_part:inherit",
     verbs={
+        "protect": Verb(
+            f"{_PLACE}protect_verb:protect",
+            "Close the ROS ports of this machine to all but the appliance.",
+            after="alarm",
+        ),
         "host": Group(
             "Block hosts; enrol, list and revoke hosts that connect through IPsec tunnels.",
             {

@@ -6,15 +6,22 @@ from typing import Annotated
 import typer
 from msgspec.structs import replace
 
-from appliance.api.routes.kits import KitOptions
 from appliance.base.validation_messages import meant
-from appliance.channel.admin import HostAdd, HostList, HostRenew, HostRevoke, HostsReload, HostToken
 from appliance.channel.answers.host_answers import Host, PortsSeen
 from appliance.cli import completion
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import moment, say_json, say_row
-from appliance.features.tunnels.kit_files import key_and_request, placed, wishes_of, write_kit, write_script
+from appliance.features.tunnels.host_requests import (
+    HostAdd,
+    HostList,
+    HostRenew,
+    HostRevoke,
+    HostsReload,
+    HostToken,
+)
+from appliance.features.tunnels.kit_output import key_and_request, placed, wishes_of, write_kit, write_script
+from appliance.features.tunnels.kits import KitOptions
 from appliance.features.tunnels.private_output import new_output, usage_error
 from rosmop.tool.terminal import printable, say
 

@@ -1,7 +1,5 @@
 """Tests of `appliance.channel.admin`: every request that REST can make has a route and a role."""
 
-from appliance.channel import admin
-from appliance.channel.admin import operation_of
 from appliance.channel.operations import CHANGES, OPERATIONS
 
 
@@ -17,10 +15,3 @@ def test_changes_are_for_operators_and_admins() -> None:
         "recording memory",
         "sso sign out",
     }
-
-
-def test_a_kind_of_request_can_have_several_ways() -> None:
-    """A token can be for a new host or for an enrolled one."""
-    found = [operation_of(admin.HostToken("laptop", new=new)) for new in (True, False)]
-    assert [one.path for one in found if one] == ["/v1/hosts", "/v1/hosts/{name}/token"]
-    assert operation_of(admin.TokenAdd("ci", "viewer", 60)) is None

@@ -96,10 +96,3 @@ def test_requests_that_are_not_orders(change: dict[str, Any]) -> None:
     assert meant(good) == admin.PolicyLoad("[Nodes]\n")
     with pytest.raises(NoOrderError):
         meant(msgspec.structs.replace(good, **change))
-
-
-def test_a_date_is_seconds() -> None:
-    """A field that is not a whole number gets seconds."""
-    body = b'{"state": "open", "checked": "2026-03-01T00:00:00.5Z"}'
-    ports = ClientRequest("10.0.0.1", "PUT", "/v1/hosts/laptop/ports", "*", "application/json", "", body)
-    assert meant(ports) == admin.HostPorts("laptop", "open", checked=1_772_323_200.5)

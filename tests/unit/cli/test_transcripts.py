@@ -56,7 +56,7 @@ def write_log(signed: str | None = None, *, below: list[str]) -> None:
 def set_scan(monkeypatch: pytest.MonkeyPatch, *, below: list[str]) -> None:
     found = yaml.safe_load("\n".join(below))
     result = ScanResult(**found | {"open": tuple(found.get("open", ()))})
-    monkeypatch.setattr("appliance.cli.protect_verb.scan", lambda *_: result)
+    monkeypatch.setattr("appliance.network.scan.scan", lambda *_: result)
 
 
 @pytest.fixture

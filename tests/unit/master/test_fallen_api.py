@@ -26,7 +26,7 @@ from tests.support.memory_channel import memory_link
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
-REVOKE = ClientRequest("10.0.0.1", "DELETE", "/v1/hosts/laptop", '"3"', "", "", b"")
+REMOVE = ClientRequest("10.0.0.1", "DELETE", "/v1/monitors/laptop", '"3"', "", "", b"")
 LOAD = ClientRequest("10.0.0.1", "POST", "/v1/policy", '"3"', "text/plain", "", b"[Nodes]\n")
 
 
@@ -141,7 +141,7 @@ async def test_public_data_of_a_token_opens_nothing(world: World) -> None:
     guesses += [kept.hash.hex(), kept.reading.hex(), f"rosrv-read_{row.id}_{kept.reading.hex()[:43]}"]
     for shown in guesses:
         requests: tuple[tuple[AdminRequest[Any], ClientRequest | None], ...] = (
-            (admin.HostRevoke("laptop", 3), REVOKE),
+            (admin.MonitorRemove(["laptop"], "3"), REMOVE),
             (admin.PolicyWanted(), None),
             (admin.ChallengeWanted(), None),
             (admin.TokenList(), None),
@@ -155,18 +155,20 @@ async def test_public_data_of_a_token_opens_nothing(world: World) -> None:
 
 
 async def test_a_signed_order_is_carried_out_unchanged(world: World, token: str, api: Api) -> None:
-    answer = await api.ask(admin.HostRevoke("laptop", 3), reading_key(token), await api.signed(token, REVOKE))
+    answer = await api.ask(
+        admin.MonitorRemove(["laptop"], "3"), reading_key(token), await api.signed(token, REMOVE)
+    )
     assert answer.ok
-    assert world.done == [(admin.HostRevoke("laptop", 3), "alice")]
+    assert world.done == [(admin.MonitorRemove(["laptop"], "3"), "alice")]
     assert world.refusals == []
 
 
 async def test_a_signed_order_is_valid_once(world: World, token: str) -> None:
     shown = reading_key(token)
     api = Api(world)
-    kept_back = await api.signed(token, REVOKE)
-    seen = await api.signed(token, REVOKE)
-    order = admin.HostRevoke("laptop", 3)
+    kept_back = await api.signed(token, REMOVE)
+    seen = await api.signed(token, REMOVE)
+    order = admin.MonitorRemove(["laptop"], "3")
     assert (await api.ask(order, shown, seen)).ok
     again = await api.ask(order, shown, seen)
     assert "already used" in again.error
@@ -186,15 +188,19 @@ async def test_a_signed_order_is_valid_once(world: World, token: str) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"method": "PUT"}, {"target": "/v1/hosts/laptoq"}, {"target": "/v1/hosts/laptop?x=1"}, {"if_match": "*"},
-        {"if_match": '"4"'}, {"content_type": "text/plain"}, {"body": b"\x00"}, {"target": "/v1/hosts/laptop\n"},
+        {"method": "PUT"}, {"target": "/v1/monitors/laptoq"}, {"target": "/v1/monitors/laptop?x=1"}, {"if_match": "*"},
+        {"if_match": '"4"'}, {"content_type": "text/plain"}, {"body": b"\x00"}, {"target": "/v1/monitors/laptop\n"},
     ],
 )  # fmt: skip
 async def test_no_byte_of_an_order_can_change(
     change: dict[str, Any], world: World, token: str, api: Api
 ) -> None:
-    forged = msgspec.structs.replace(await api.signed(token, REVOKE), **change)
-    for order in (admin.HostRevoke("laptop", 3), admin.HostRevoke("laptoq", 3), admin.HostRevoke("laptop")):
+    forged = msgspec.structs.replace(await api.signed(token, REMOVE), **change)
+    for order in (
+        admin.MonitorRemove(["laptop"], "3"),
+        admin.MonitorRemove(["laptoq"], "3"),
+        admin.MonitorRemove(["laptop"]),
+    ):
         assert (await api.ask(order, reading_key(token), forged)).trouble == "forbidden"
     assert world.done == []
     assert len(world.refusals) == 3
@@ -203,17 +209,17 @@ async def test_no_byte_of_an_order_can_change(
 @pytest.mark.parametrize(
     "order",
     [
-        admin.HostRevoke("robot", 3), admin.HostRevoke("laptop", None), admin.TokenRevoke("bob"),
-        admin.PolicyLoad("[Topics]\n* = *\n"), admin.PolicyRollback(1), admin.MonitorRemove(["safeZone"]),
+        admin.MonitorRemove(["robot"], "3"), admin.MonitorRemove(["laptop"]), admin.TokenRevoke("bob"),
+        admin.PolicyLoad("[Topics]\n* = *\n"), admin.PolicyRollback(1),
     ],
 )  # fmt: skip
 async def test_another_order_under_a_valid_proof_is_an_alarm(
     order: AdminRequest[Any], world: World, token: str, api: Api
 ) -> None:
     """The proof is valid for the request but not for another order; only a compromised api sends such a pair."""
-    signed = await api.signed(token, REVOKE)
+    signed = await api.signed(token, REMOVE)
     assert (await api.ask(order, reading_key(token), signed)).trouble == "forbidden"
-    bare = msgspec.structs.replace(REVOKE, proof="")
+    bare = msgspec.structs.replace(REMOVE, proof="")
     assert (await api.ask(order, token, bare)).trouble == "forbidden"
     assert (await api.ask(order, token, None)).trouble == "forbidden"
     assert world.done == []
@@ -225,8 +231,8 @@ async def test_a_proof_is_valid_for_its_signer_only(world: World) -> None:
     alice = (await world.tokens.add(TokenAdd("alice", "admin", 600))).token
     bob = (await world.tokens.add(TokenAdd("bob", "operator", 600))).token
     api = Api(world)
-    by_bob = await api.signed(bob, REVOKE)
-    order = admin.HostRevoke("laptop", 3)
+    by_bob = await api.signed(bob, REMOVE)
+    order = admin.MonitorRemove(["laptop"], "3")
     assert "another request was signed" in (await api.ask(order, reading_key(alice), by_bob)).error
     assert "this is for admins" in (await api.ask(order, reading_key(bob), by_bob)).error
     assert world.done == []
@@ -234,10 +240,10 @@ async def test_a_proof_is_valid_for_its_signer_only(world: World) -> None:
 
 
 async def test_orders_of_a_revoked_token_are_refused(world: World, token: str, api: Api) -> None:
-    kept_back = await api.signed(token, REVOKE)
+    kept_back = await api.signed(token, REMOVE)
     await world.tokens.revoke(TokenRevoke("alice"))
     for shown in (reading_key(token), token):
-        answer = await api.ask(admin.HostRevoke("laptop", 3), shown, kept_back)
+        answer = await api.ask(admin.MonitorRemove(["laptop"], "3"), shown, kept_back)
         assert (answer.ok, answer.trouble) == (False, "forbidden")
         assert not (await api.ask(admin.PolicyWanted(), shown)).ok
     assert world.done == []

@@ -20,27 +20,13 @@ from appliance.control.operators.limit_use import LimitQueries
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.token_orders import TokenOrders
-from appliance.hosts.certification import Certification
-from appliance.hosts.checked_ports import PortChecks
-from appliance.hosts.enrolment import HostEnrolment
-from appliance.hosts.self_service import HostSelfService
 from appliance.specifications.specification_manager import SpecificationManager
 from tests.support.feature_parts import answered_later, idle_parts
-
-
-class Hosts(HostEnrolment):
-    """The classes of the parts of host enrolment, in place of the parts."""
-
-    itself = cast(HostSelfService, HostSelfService)
-    ports = cast(PortChecks, PortChecks)
-
 
 CLASSES: dict[str, Any] = {
     "queries": Queries,
     "policies": Policies,
     "monitors": SpecificationManager,
-    "hosts": Hosts,
-    "certification": Certification,
     "tokens": TokenOrders,
     "blocks": BlockOrders,
     "limits": LimitQueries,

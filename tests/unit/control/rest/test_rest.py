@@ -11,7 +11,7 @@ import pytest
 from appliance.base import clock
 from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import messages
-from appliance.channel.admin import AdminAnswer, HostEnrol, PolicyLoad, StatusWanted, decode
+from appliance.channel.admin import AdminAnswer, PolicyLoad, StatusWanted, TopicLook, decode
 from appliance.channel.answers.status import Status
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages.api import (
@@ -138,11 +138,11 @@ async def test_tokens_are_sent_at_once_and_after_every_change(link: RestLink, ap
     assert len(await api.until(2)) == 2
 
 
-async def test_enrolments_block_no_other_requests(world: Everything, api: Api) -> None:
+async def test_requests_that_wait_block_no_other_requests(world: Everything, api: Api) -> None:
     world.only_slow = True
     world.go.clear()
     for number in range(20):
-        api.channel.send(RequestMade(number, HostEnrol(f"h{number}", "request", "10.0.0.1")))
+        api.channel.send(RequestMade(number, TopicLook(f"/t{number}"), TOKEN))
     api.channel.send(RequestMade(99, StatusWanted(), TOKEN))
     heard = (await api.until(6))[1:]
     assert [answer_of(one).trouble for one in heard if one.number != 99] == ["busy"] * 4

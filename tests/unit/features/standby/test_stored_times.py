@@ -10,16 +10,15 @@ import pytest
 
 from appliance.base import clock
 from appliance.base.age_clock import AgeClock
-from appliance.base.deadlines import Deadlines
 from appliance.control.assembly.host_blocks import BlockTable
 from appliance.features.standby.lease_client import LeaseClient
 from appliance.features.standby.replication import Pair
 from appliance.features.standby.standby_tunnels import StandbyTunnels
 from appliance.features.standby.stored_times import adopt_times, note_times
-from appliance.hosts.enrolment_tokens import EnrolmentTokens
 from appliance.policy.model import address_of
 from appliance.store import host_tables
 from appliance.store.access_tokens import make_token
+from appliance.store.host_tables import EnrolmentTokenRow
 from appliance.store.revisions import LIMITS
 from appliance.store.state_file import SCHEMA, StateStore
 from tests.support.engines import InlineDatabase
@@ -94,8 +93,8 @@ class Two:
         self.store.save_setting("monitor returns", returns)
         blocks.put(HOST, seconds=HOUR, who="ann", note="")
         self.store.save_tokens(make_token("ci", "viewer", now=now, seconds=HOUR)[0])
-        EnrolmentTokens(self.store.hosts, Deadlines()).add(
-            "ocu", seconds=HOUR, address="10.0.0.9", days=1.0, kit={}, who="ann"
+        self.store.hosts.save_awaited(
+            EnrolmentTokenRow("ocu", "id", b"hash", now, now + HOUR, "10.0.0.9", 1.0, {}, "ann")
         )
 
 

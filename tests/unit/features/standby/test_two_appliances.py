@@ -2,22 +2,18 @@
 
 import asyncio
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 from cryptography import x509
 
 from appliance.base.clock import using
-from appliance.channel.admin import HostRenewItself
 from appliance.features.standby import appliance_table
 from appliance.features.standby.appliance_table import ApplianceTable
 from appliance.features.standby.replication_frames import Introduction
 from appliance.features.standby.shared_authority import SharedAuthority
 from appliance.hosts.appliances import Appliances
 from appliance.hosts.certificate_requests import AuthorityError
-from appliance.hosts.host_table import HostRefusedError
 from appliance.hosts.revoked_certificates import RevokedCertificates
 from appliance.hosts.stored_authority import StoredAuthority
 from appliance.ipsec.requests import fingerprint, make_key, signing_request
@@ -25,7 +21,6 @@ from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase
 from tests.support.near_authority import NearAuthority
 from tests.support.virtual_clock import VirtualClock
-from tests.unit.hosts.test_enrolment import Bench, request_of, run, sign
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
@@ -198,58 +193,3 @@ async def test_each_appliance_knows_its_own_row(tmp_path: Path, store: StateStor
     second.note_own("0" * 64)
     assert second.other is not None
     assert (second.other.endpoint, second.other.pin) == (FIRST, PIN)
-
-
-def run_as(directory: Path, work: Any, endpoint: str) -> None:
-    """Run the work on one of two appliances, which hosts reach at this address."""
-    run(directory, work, kind=SharedAuthority, table=partial(ApplianceTable, endpoint=endpoint))
-
-
-def test_without_the_authoritys_key_changes_wait(tmp_path: Path) -> None:
-    """On the second of two appliances, new certificates wait, and so does the replacement of one; hosts are revoked."""
-    keys, request = [make_key(), make_key()], request_of("b")
-
-    async def first(bench: Bench) -> None:
-        for name, key in zip("ab", keys, strict=True):
-            await bench.add(name, key=key)
-        await bench.renew_itself("a", request_of("a"), keys[0])
-        await bench.shared.revocations([])
-
-    async def second(bench: Bench) -> None:
-        await bench.tunnels.start()
-        elsewhere = NearAuthority(tmp_path / "elsewhere")
-        bench.authority.stated = elsewhere.stated  # type: ignore[method-assign]  # another key than that of the state
-        for order in (
-            bench.add("c"),
-            bench.renewed("a"),
-            bench.hosts.itself.renew(HostRenewItself("b", request, sign(keys[1], request), "10.113.11.3")),
-        ):
-            with pytest.raises(HostRefusedError, match="new certificates wait") as caught:
-                await order
-            assert caught.value.ours
-        assert bench.store.hosts.revoked() == []
-        await bench.revoke("b")
-        assert [row.name for row in bench.table.enrolled()] == ["a"]
-
-    (tmp_path / "elsewhere").mkdir()
-    run_as(tmp_path, first, "192.168.1.20")
-    run_as(tmp_path, second, "192.168.1.21")
-
-
-def test_a_kit_of_two_appliances_has_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its address and pin come from the other one's introduction; until then a warning says what to do."""
-    monkeypatch.setattr("appliance.features.standby.appliance_table._INTRODUCTION_SECONDS", 0.01)
-    pin, key = "sha256//" + 43 * "B" + "=", make_key()
-    other = Introduction(signing_request(key, "rosrv-appliance"), fingerprint(key), "192.168.1.21", pin)
-
-    async def work(bench: Bench) -> None:
-        await bench.add("a")
-        kit = await bench.certification.kit("a", None)
-        assert kit.second == ""
-        assert "later, rosrv host kit a" in (kit.warning or "")
-        assert isinstance(bench.appliances, ApplianceTable)
-        await bench.appliances.introduce(other, bench.shared)
-        kit = await bench.certification.kit("a", None)
-        assert (kit.second, kit.pin, kit.warning) == ("192.168.1.21", f"sha256//pin;{pin}", None)
-
-    run_as(tmp_path, work, "192.168.1.20")

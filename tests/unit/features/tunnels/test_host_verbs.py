@@ -12,9 +12,9 @@ from appliance.channel.admin import (
     AdminAnswer,
     AdminRequest,
 )
-from appliance.channel.answers.host_answers import KitParts
 from appliance.cli.connection.admin_client import AdminSocket
 from appliance.cli.main import app
+from appliance.features.tunnels.host_answers import KitParts
 from tests.support.answers import example
 
 

@@ -16,12 +16,13 @@ from appliance.api.front.problems import ProblemError
 from appliance.api.front.route_roles import Operator, Viewer, ask
 from appliance.api.front.routing import ETAG, Responses, Routes, Tagged, answer, content, tagged
 from appliance.api.front.services import Services
-from appliance.api.routes.kits import KitOptions, kit_of
 from appliance.api.routes.operation_routes import Answer, OperationCall
-from appliance.channel import admin
-from appliance.channel.answers import host_answers as answers
-from appliance.channel.rest_bodies import ENDPOINT, HOST_NAME, KitWishes
-from appliance.ipsec.enrolment_kit import archive
+from appliance.channel.answers.host_answers import Host, PortsSeen
+from appliance.features.tunnels import host_answers as answers
+from appliance.features.tunnels import host_requests
+from appliance.features.tunnels.enrolment_kit import archive
+from appliance.features.tunnels.kits import KitOptions, kit_of
+from appliance.features.tunnels.rest_bodies import ENDPOINT, HOST_NAME, KitWishes
 from appliance.ipsec.requests import make_key, signing_request
 
 _UNKNOWN: Responses = {404: {"description": "There is no such host."}}
@@ -35,21 +36,22 @@ OneName = Annotated[
 ]
 
 
-def routes(services: Services) -> Routes:
-    """Return the routes that are not derived from the table of operations."""
-    router = Routes(prefix="/v1/hosts", tags=["hosts"])
+def add_host_routes(router: Routes, services: Services) -> None:
+    """Add the routes that are not derived from the table of operations."""
     control = services.control
 
-    @router.get("/{name}", responses=_UNKNOWN)
-    async def host(name: OneName, bearer: Viewer) -> Tagged[answers.Host]:
+    @router.get("/v1/hosts/{name}", responses=_UNKNOWN)
+    async def host(name: OneName, bearer: Viewer) -> Tagged[Host]:
         """One host."""
-        found = await ask(control, admin.HostList(), bearer)
+        found = await ask(control, host_requests.HostList(), bearer)
         for host in found.hosts:
             if host.name == name:
                 return Tagged(host, found.revision)
         raise ProblemError(404, "unknown", f"there is no host {name}")
 
-    @router.get("/{name}/kit", operation_id="host_kit", responses=_KIT | _UNKNOWN, response_class=Response)
+    @router.get(
+        "/v1/hosts/{name}/kit", operation_id="host_kit", responses=_KIT | _UNKNOWN, response_class=Response
+    )
     async def kit(
         name: OneName,
         bearer: Operator,
@@ -59,14 +61,12 @@ def routes(services: Services) -> Routes:
         ] = None,
     ) -> Response:
         """Return the kit of an enrolled host as it is now, without its private key, which the host has."""
-        parts = await ask(control, admin.HostKit(name), bearer)
-        wishes = KitOptions(endpoint or (await ask(control, admin.HostEndpoint(), bearer)).endpoint)
+        parts = await ask(control, host_requests.HostKit(name), bearer)
+        wishes = KitOptions(endpoint or (await ask(control, host_requests.HostEndpoint(), bearer)).endpoint)
         return _archive(parts, wishes, None)
 
-    return router
 
-
-async def _token(call: OperationCall[admin.HostToken]) -> Tagged[answers.EnrolmentToken]:
+async def _token(call: OperationCall[host_requests.HostToken]) -> Tagged[answers.EnrolmentToken]:
     _wishes(call.body)  # rejects invalid options
     return tagged(await call.ask(call.order))
 
@@ -89,11 +89,11 @@ async def _kit(call: OperationCall[Any]) -> Response:
         made = await asyncio.to_thread(make_key)
         key, order = made.decode(), structs.replace(order, request=signing_request(made, "host").decode())
     if not wishes.endpoint:
-        wishes = replace(wishes, endpoint=(await call.ask(admin.HostEndpoint())).endpoint)
+        wishes = replace(wishes, endpoint=(await call.ask(host_requests.HostEndpoint())).endpoint)
     return _archive(await call.ask(order), wishes, key, call.operation.status)
 
 
-async def _ports(call: OperationCall[admin.HostPorts]) -> Tagged[answers.PortsSeen]:
+async def _ports(call: OperationCall[host_requests.HostPorts]) -> Tagged[PortsSeen]:
     known = await call.ask(call.order)
     return Tagged(known.ports, known.revision)
 

@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from appliance.channel.answers.host_answers import KitParts
-from appliance.ipsec.enrolment_kit import Kit
+from appliance.features.tunnels.enrolment_kit import Kit
+from appliance.features.tunnels.host_answers import KitParts
 from appliance.network.close_ports import parse_ports, parse_services, protection
 
 

@@ -4,10 +4,10 @@ from typing import Any
 
 import pytest
 
-from appliance.channel.answers.host_answers import Endpoint
 from appliance.channel.messages import EndpointFound
 from appliance.configuration.settings import Ipsec, Settings
-from appliance.hosts.enrolment import find_endpoint
+from appliance.features.tunnels.enrolment import find_endpoint
+from appliance.features.tunnels.host_answers import Endpoint
 from appliance.hosts.host_table import HostRefusedError
 from tests.support import autojump
 

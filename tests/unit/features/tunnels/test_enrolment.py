@@ -16,7 +16,28 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from appliance.base.clock import using
 from appliance.base.deadlines import Deadlines
-from appliance.channel.admin import (
+from appliance.channel.answers.host_answers import PortsSeen
+from appliance.channel.channel import Channel
+from appliance.channel.messages import (
+    CertificateNeeded,
+    Message,
+    TunnelLink,
+    TunnelsEnclosed,
+    TunnelsReported,
+    TunnelsStated,
+    TunnelsWanted,
+)
+from appliance.features.tunnels.certification import Certification
+from appliance.features.tunnels.enrolment import HostEnrolment
+from appliance.features.tunnels.host_answers import (
+    Endpoint,
+    EnrolmentToken,
+    KitParts,
+    NewCertificate,
+    Reloaded,
+    Revoked,
+)
+from appliance.features.tunnels.host_requests import (
     AuthorityWanted,
     HostAdd,
     HostEnrol,
@@ -30,28 +51,8 @@ from appliance.channel.admin import (
     HostToken,
     RevocationsWanted,
 )
-from appliance.channel.answers.host_answers import (
-    Endpoint,
-    EnrolmentToken,
-    KitParts,
-    NewCertificate,
-    PortsSeen,
-    Reloaded,
-    Revoked,
-)
-from appliance.channel.channel import Channel
-from appliance.channel.messages import (
-    CertificateNeeded,
-    Message,
-    TunnelLink,
-    TunnelsEnclosed,
-    TunnelsReported,
-    TunnelsStated,
-    TunnelsWanted,
-)
+from appliance.features.tunnels.rest_address import RestAddress
 from appliance.hosts.appliances import Appliances
-from appliance.hosts.certification import Certification
-from appliance.hosts.enrolment import HostEnrolment
 from appliance.hosts.host_table import (
     HostForbiddenError,
     HostRefusedError,
@@ -59,13 +60,12 @@ from appliance.hosts.host_table import (
     HostTable,
 )
 from appliance.hosts.hosts_file import DeclaredHosts
-from appliance.hosts.rest_address import RestAddress
 from appliance.hosts.revoked_certificates import RevokedCertificates
 from appliance.hosts.stored_authority import StoredAuthority
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.ipsec.requests import fingerprint, make_key, signing_request
 from appliance.policy.model import Address
-from appliance.store.host_tables import HostTables
+from appliance.store.host_tables import ApplianceRow, HostTables
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.audit import RecordingTrail
@@ -742,3 +742,60 @@ def test_a_full_disk_during_enrolment_names_the_way_out(
         await bench.renew("a")
 
     run(tmp_path, work)
+
+
+class Waiting(StoredAuthority):
+    """The authority of the second of two appliances: the other one has its key."""
+
+    async def obstacle(self) -> str:
+        return "new certificates wait"
+
+
+class Two(Appliances):
+    """Two appliances; the other one is `row` once it has introduced itself."""
+
+    paired = True
+    row: ApplianceRow | None = None
+
+    @property
+    def other(self) -> ApplianceRow | None:
+        return self.row
+
+
+def test_without_the_authoritys_key_changes_wait(tmp_path: Path) -> None:
+    """On the second of two appliances, new certificates wait, and so does the replacement of one; hosts are revoked."""
+    key, request = make_key(), request_of("a")
+
+    async def first(bench: Bench) -> None:
+        await bench.add("a", key=key)
+        await bench.add("b")
+        await bench.renew_itself("a", request, key)
+
+    async def second(bench: Bench) -> None:
+        await bench.tunnels.start()
+        for order in (bench.add("c"), bench.renewed("a"), bench.renew("b")):
+            with pytest.raises(HostRefusedError, match="new certificates wait") as caught:
+                await order
+            assert caught.value.ours
+        assert bench.store.hosts.revoked() == []
+        await bench.revoke("b")
+        assert [row.name for row in bench.table.enrolled()] == ["a"]
+
+    run(tmp_path, first)
+    run(tmp_path, second, kind=Waiting)
+
+
+def test_a_kit_of_two_appliances_has_both(tmp_path: Path) -> None:
+    """It has the address and pin of the other one; until that is known, a warning says what to do."""
+
+    async def work(bench: Bench) -> None:
+        await bench.add("a")
+        kit = await bench.certification.kit("a", None)
+        assert kit.second == ""
+        assert "later, rosrv host kit a" in (kit.warning or "")
+        assert isinstance(bench.appliances, Two)
+        bench.appliances.row = ApplianceRow("key", "192.168.1.21", "sha256//B", "", "1f", 1.0)
+        kit = await bench.certification.kit("a", None)
+        assert (kit.second, kit.pin, kit.warning) == ("192.168.1.21", "sha256//pin;sha256//B", None)
+
+    run(tmp_path, work, table=Two)

@@ -5,9 +5,10 @@ from collections.abc import Mapping
 from typing import cast
 
 from appliance.base import clock
-from appliance.channel.answers.host_answers import Host, Machine, PortsSeen, PortsState, State
+from appliance.channel.answers.host_answers import Host, PortsSeen, PortsState, State
 from appliance.channel.answers.status import IpsecState
-from appliance.hosts.enrolment_tokens import EnrolmentTokens
+from appliance.features.tunnels.enrolment_tokens import EnrolmentTokens
+from appliance.features.tunnels.host_answers import Machine
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.store.host_tables import EnrolmentTokenRow, HostRow

@@ -16,26 +16,28 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 
 from appliance.base.withdrawal import take_effect
-from appliance.channel import admin
-from appliance.channel.answers import host_answers as answers
-from appliance.channel.answers.host_answers import Endpoint
+from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.status import IpsecState
 from appliance.channel.messages import EndpointFound
 from appliance.configuration.settings import Settings
-from appliance.hosts.certification import Certification
-from appliance.hosts.checked_ports import PortChecks
-from appliance.hosts.enrolment_tokens import LONGEST_SECONDS, MOST
+from appliance.features.tunnels import host_answers as answers
+from appliance.features.tunnels import host_requests
+from appliance.features.tunnels.certification import Certification
+from appliance.features.tunnels.checked_ports import PortChecks
+from appliance.features.tunnels.enrolment_kit import filled
+from appliance.features.tunnels.enrolment_tokens import LONGEST_SECONDS, MOST
+from appliance.features.tunnels.host_answers import Endpoint
+from appliance.features.tunnels.host_view import HostView
+from appliance.features.tunnels.rest_address import NO_TUNNELS
+from appliance.features.tunnels.self_service import HostSelfService
 from appliance.hosts.host_table import LONGEST_DAYS, HostRefusedError
 from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHostsError
-from appliance.hosts.rest_address import NO_TUNNELS
-from appliance.hosts.self_service import HostSelfService
-from appliance.hosts.view import HostView
-from appliance.ipsec.enrolment_kit import filled
+from appliance.hosts.tunnel_hosts import TunnelHosts
 from appliance.policy.model import Address
 from appliance.store.host_tables import EnrolmentTokenRow
 
 
-class HostEnrolment:
+class HostEnrolment(TunnelHosts):
     """The operators' requests about hosts; `itself` serves the requests of hosts.
 
     `expel(address, reason)` removes a host's registrations and grants and returns their number. `find_endpoint()`
@@ -69,7 +71,7 @@ class HostEnrolment:
 
     # --- queries ---
 
-    async def listed(self, _request: admin.HostList) -> answers.Hosts:
+    async def listed(self, _request: host_requests.HostList) -> answers.Hosts:
         """Return every host and machine, and the state of the tunnels."""
         machines = self.ports.in_clear_text()
         status = self._view.status(machines)
@@ -90,22 +92,26 @@ class HostEnrolment:
         """Return the state of the tunnels for `rosrv status`."""
         return self._view.status(self.ports.in_clear_text())
 
-    def rows(self) -> list[answers.Host]:
+    def rows(self) -> list[Host]:
         """Return every host, enrolled, awaited or declared."""
         return self._view.rows()
 
-    async def endpoint(self, _request: admin.HostEndpoint) -> answers.Endpoint:
+    def served_by(self, pin: str) -> None:
+        """Store the pin by which hosts recognise the api."""
+        self._certification.served_by(pin)
+
+    async def endpoint(self, _request: host_requests.HostEndpoint) -> answers.Endpoint:
         """Return the address at which hosts reach the appliance."""
         return await self._find_endpoint()
 
-    async def kit(self, request: admin.HostKit) -> answers.KitParts:
+    async def kit(self, request: host_requests.HostKit) -> answers.KitParts:
         """Return the parts of an enrolled host's kit. Raises `HostRefusedError`."""
         self._table.enrolled_row(request.name)
         return await self._certification.kit(request.name, None)
 
     # --- changes by operators ---
 
-    async def add(self, request: admin.HostAdd, who: str) -> answers.KitParts:
+    async def add(self, request: host_requests.HostAdd, who: str) -> answers.KitParts:
         """Enrol a host; return its kit's parts. Raises `HostRefusedError`, `HostsChangedError`, `StoreError`."""
         name = request.name
         async with self._certification.changing:
@@ -120,7 +126,7 @@ class HostEnrolment:
             self._certification.enrolled(name, wanted, made, who)
             return await self._certification.finish(name)
 
-    async def renew(self, request: admin.HostRenew, who: str) -> answers.KitParts:
+    async def renew(self, request: host_requests.HostRenew, who: str) -> answers.KitParts:
         """Replace and revoke a host's certificate; return the parts of its kit. Raises as `add`."""
         name = request.name
         async with self._certification.changing:
@@ -134,7 +140,7 @@ class HostEnrolment:
             self._certification.renewed(name, row.serial, made.serial, made.expires, who)
             return await self._certification.finish(name)
 
-    async def token(self, request: admin.HostToken, who: str) -> answers.EnrolmentToken:
+    async def token(self, request: host_requests.HostToken, who: str) -> answers.EnrolmentToken:
         """Return a one-time token for a host. Raises as `add`."""
         name = request.name
         found = answers.Endpoint(request.endpoint, "") if request.endpoint else await self._find_endpoint()
@@ -195,7 +201,7 @@ class HostEnrolment:
                 script=filled("enrol.sh", {"name": name, **known}),
             )
 
-    async def revoke(self, request: admin.HostRevoke, who: str) -> answers.Revoked:
+    async def revoke(self, request: host_requests.HostRevoke, who: str) -> answers.Revoked:
         """Revoke an enrolled host and close its connections, or revoke an awaited host's token. Raises as `add`."""
         name = request.name
         self._table.require(request.expected)
@@ -223,10 +229,13 @@ class HostEnrolment:
         await self._carried_out()
         return answers.Revoked(self._table.revision, name, row.address, row.serial, taken)
 
-    async def reload(self, request: admin.HostsReload, who: str) -> answers.Reloaded:
+    async def reload(self, request: host_requests.HostsReload, who: str) -> answers.Reloaded:
         """Read hosts.yaml again and open or close tunnels. Raises as `add`; an invalid file changes nothing."""
         self._table.require(request.expected)
         return await self._declare(self._table.declared.reload, who)
+
+    async def read_again(self, who: str) -> None:
+        await self.reload(host_requests.HostsReload(), who)
 
     async def take_bundle(self, text: str, who: str) -> answers.Reloaded:
         """Use a bundle's text instead of hosts.yaml (empty: the file again). Raises as `reload`."""

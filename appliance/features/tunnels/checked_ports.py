@@ -5,11 +5,11 @@ from collections.abc import Callable
 
 from appliance.audit.log.record import Severity
 from appliance.base import clock
-from appliance.channel import admin
-from appliance.channel.answers.host_answers import PortsReport
-from appliance.hosts.certification import Certification
+from appliance.features.tunnels import host_requests
+from appliance.features.tunnels.certification import Certification
+from appliance.features.tunnels.host_answers import PortsReport
+from appliance.features.tunnels.host_view import HostView
 from appliance.hosts.host_table import HostRefusedError
-from appliance.hosts.view import HostView
 from appliance.store.host_tables import PortsRow
 
 _CLOCKS_DIFFER = 86_400.0
@@ -29,7 +29,7 @@ class PortChecks:
         self._view = view
         self._machines = machines
 
-    async def tell(self, request: admin.HostPorts, who: str) -> PortsReport:
+    async def tell(self, request: host_requests.HostPorts, who: str) -> PortsReport:
         """Store and record the result of a check. Raises `HostRefusedError`, `HostsChangedError`."""
         self._table.require(request.expected)
         key, state = self._known_machine(request.name), request.state
@@ -50,7 +50,7 @@ class PortChecks:
             who=who,
         )
         await self._certification.store.settled()
-        return PortsReport(self._table.revision, key, self._view.ports(key))
+        return PortsReport(self._view.ports(key), self._table.revision, key)
 
     def in_clear_text(self) -> dict[str, int]:
         """Return the number of nodes on each machine that connects without a tunnel, by address."""

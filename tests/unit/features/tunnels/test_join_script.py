@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from appliance.features.tunnels.enrolment_kit import filled
 from appliance.ipsec.certificate_authority import CertificateAuthority
-from appliance.ipsec.enrolment_kit import filled
 from appliance.ipsec.requests import make_key, signing_request
 
 pytestmark = pytest.mark.nightly

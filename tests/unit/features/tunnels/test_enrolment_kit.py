@@ -9,8 +9,8 @@ from dataclasses import replace
 import pytest
 from msgspec import structs
 
-from appliance.channel.answers.host_answers import KitParts
-from appliance.ipsec.enrolment_kit import Kit, archive, swanctl_conf
+from appliance.features.tunnels.enrolment_kit import Kit, archive, swanctl_conf
+from appliance.features.tunnels.host_answers import KitParts
 from appliance.network.close_ports import protection
 from appliance.network.firewall.firewall_rules import PortRange
 

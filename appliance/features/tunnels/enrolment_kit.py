@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from importlib.resources import files
 from string import Template
 
-from appliance.channel.answers.host_answers import KitParts
 from appliance.channel.messages import APPLIANCE_NAME
+from appliance.features.tunnels.host_answers import KitParts
 from appliance.ipsec.strongswan import CHILD, ESP_PROPOSALS, IKE_PROPOSALS
 
 CONNECTION, SECOND = "rosrv", "rosrv-2"  # the scripts find both by the beginning of these names
@@ -66,7 +66,7 @@ def members(kit: Kit) -> list[tuple[str, str, int]]:
 
 def filled(script: str, values: Mapping[str, str]) -> str:
     """Return a script of `kit_files` with its values filled in; `@stop@` is `stop.inc`."""
-    folder = files("appliance.ipsec").joinpath("kit_files")
+    folder = files("appliance.features.tunnels").joinpath("kit_files")
     text, stop = (folder.joinpath(name).read_text(encoding="utf-8") for name in (script, "stop.inc"))
     return _Template(text.replace("@stop@\n", stop)).substitute(values)
 

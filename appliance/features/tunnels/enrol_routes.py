@@ -24,15 +24,16 @@ from appliance.api.front.route_roles import answered
 from appliance.api.front.routing import Responses, Routes, answer, body, content, file
 from appliance.api.front.services import Services
 from appliance.api.front.streams import peer_of
-from appliance.api.routes.host_routes import OneName
-from appliance.api.routes.kits import KitOptions, kit_of
 from appliance.base import clock
-from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
 from appliance.channel.answers.field_docs import Moment, doc
-from appliance.channel.answers.host_answers import NewCertificate
-from appliance.channel.rest_bodies import WHOLE, SigningRequest
-from appliance.ipsec.enrolment_kit import archive, members
+from appliance.channel.rest_bodies import WHOLE
+from appliance.features.tunnels import host_requests
+from appliance.features.tunnels.enrolment_kit import archive, members
+from appliance.features.tunnels.host_answers import NewCertificate
+from appliance.features.tunnels.host_routes import OneName, add_host_routes
+from appliance.features.tunnels.kits import KitOptions, kit_of
+from appliance.features.tunnels.rest_bodies import SigningRequest
 
 TOKEN = r"^rosrv-enrol_[0-9a-f]{12}_[A-Za-z0-9_-]{43}$"  # noqa: S105  the form of one
 PROOF = r"^[A-Za-z0-9+/]+={0,2}$"
@@ -89,6 +90,7 @@ _PEM: Responses = file("application/x-pem-file", "PEM") | {
 
 def routes(services: Services) -> Routes:
     router = Routes(tags=["hosts"])
+    add_host_routes(router, services)
     _add_enrolment(router, services)
     _add_renewal(router, services)
     return router
@@ -107,7 +109,7 @@ def _add_enrolment(router: Routes, services: Services) -> None:
         peer = peer_of(request)
         patience.require(peer)
         try:
-            parts = await _ask(services, admin.HostEnrol(brought.token, brought.request, peer))
+            parts = await _ask(services, host_requests.HostEnrol(brought.token, brought.request, peer))
         except ProblemError as problem:
             if problem.status == 403:
                 patience.failed(peer)
@@ -129,7 +131,9 @@ def _add_renewal(router: Routes, services: Services) -> None:
             proof = base64.b64decode(renewal.proof, validate=True)
         except binascii.Error as error:
             raise ProblemError(422, "bad-input", f"body.proof: not base64: {error}") from None
-        return await _ask(services, admin.HostRenewItself(name, renewal.request, proof, peer_of(request)))
+        return await _ask(
+            services, host_requests.HostRenewItself(name, renewal.request, proof, peer_of(request))
+        )
 
     @router.post(
         "/v1/hosts/{name}/renewed",
@@ -142,18 +146,18 @@ def _add_renewal(router: Routes, services: Services) -> None:
         """For a host in its tunnel: the new certificate is installed. The one before ends, and the tunnel is built
         again.
         """
-        await _ask(services, admin.HostRenewed(name, peer_of(request)))
+        await _ask(services, host_requests.HostRenewed(name, peer_of(request)))
 
     @router.get("/v1/revocations", responses=_PEM, response_class=Response)
     async def revocations() -> Response:
         """Return the signed list of revoked certificates (CRL)."""
-        listed = await _ask(services, admin.RevocationsWanted())
+        listed = await _ask(services, host_requests.RevocationsWanted())
         return Response(listed.revocations, media_type="application/x-pem-file")
 
     @router.get("/v1/authority", responses=_PEM, response_class=Response)
     async def authority() -> Response:
         """Return the certificate of the appliance's authority."""
-        own = await _ask(services, admin.AuthorityWanted())
+        own = await _ask(services, host_requests.AuthorityWanted())
         return Response(own.authority, media_type="application/x-pem-file")
 
 

@@ -15,12 +15,12 @@ import ipaddress
 
 from appliance.base import clock
 from appliance.base.withdrawal import WithdrawnError, take_effect
-from appliance.channel import admin
-from appliance.channel.answers.host_answers import KitParts, NewCertificate, Renewed
-from appliance.hosts.certification import Certification
-from appliance.hosts.enrolment_tokens import BadEnrolmentTokenError
+from appliance.features.tunnels import host_requests
+from appliance.features.tunnels.certification import Certification
+from appliance.features.tunnels.enrolment_tokens import BadEnrolmentTokenError
+from appliance.features.tunnels.host_answers import KitParts, NewCertificate, Renewed
+from appliance.features.tunnels.host_view import span
 from appliance.hosts.host_table import HostForbiddenError, HostRefusedError
-from appliance.hosts.view import span
 from appliance.store.host_tables import HostRow
 
 _ANSWER_SECONDS = 1.0  # time for the answer to leave through the host's tunnel
@@ -43,7 +43,7 @@ class HostSelfService:
             if name.startswith(_RENEWED)
         }
 
-    async def enrol(self, request: admin.HostEnrol) -> KitParts:
+    async def enrol(self, request: host_requests.HostEnrol) -> KitParts:
         """Enrol a host by its one-time token and a signing request. Raises `HostRefusedError`."""
         async with self._certification.changing:
             try:
@@ -67,7 +67,7 @@ class HostSelfService:
             )
             return await self._certification.finish(name, awaited.kit)
 
-    async def renew(self, request: admin.HostRenewItself) -> NewCertificate:
+    async def renew(self, request: host_requests.HostRenewItself) -> NewCertificate:
         """Issue the next certificate to a host that requests it through its tunnel. Raises `HostRefusedError`."""
         name = request.name
         async with self._certification.changing:
@@ -94,7 +94,7 @@ class HostSelfService:
                 name, made.serial, made.expires, made.certificate.decode(), authority.decode()
             )
 
-    async def renewed(self, request: admin.HostRenewed) -> Renewed:
+    async def renewed(self, request: host_requests.HostRenewed) -> Renewed:
         """Replace a host's certificate by the next one, which the host has installed. Raises `HostRefusedError`."""
         name = request.name
         before = self._in_its_tunnel(name, request.peer).serial

@@ -3,10 +3,12 @@
 from typing import Any
 
 import pytest
+import yaml
 
-from appliance.configuration.config_sources import read
+from appliance.configuration.config_sources import read, resolve
 from appliance.configuration.settings import Settings
-from appliance.hosts.rest_address import rest_address
+from appliance.features.tunnels.rest_address import rest_address
+from tests.unit.test_container_files import ROOT, environment
 
 NET = ["192.168.1.0/24"]
 
@@ -56,3 +58,19 @@ def test_tunnels_reach_an_unpublished_port() -> None:
     """Tunnels end in the container, behind the ports that its engine publishes."""
     settings = {"api": "0.0.0.0:8443", "isolation": "container", "api_networks": NET, "api_published": False}
     assert rest_address(read(settings)).inner_port == 8443
+
+
+def test_no_script_is_written_that_cannot_reach_rest() -> None:
+    """While REST is published on loopback, no host can enrol itself by a token; the error says so and gives advice."""
+    published = [
+        port
+        for port in yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]["ports"]
+        if port.endswith(":8443")
+    ]
+    assert published == ["127.0.0.1:8443:8443"]
+    listens = {"ROSRV_API": "0.0.0.0:8443", "ROSRV_ISOLATION": "container"}  # as in the Dockerfile
+    place = rest_address(resolve(None, listens | environment(), {}))
+    assert place.port is None
+    assert "ROSRV_API_PUBLISHED" in place.trouble
+    override = {"ROSRV_API_PUBLISHED": "true", "ROSRV_API_NETWORKS": "[172.29.76.1/32, 192.168.1.0/24]"}
+    assert rest_address(resolve(None, listens | environment() | override, {})).port == 8443

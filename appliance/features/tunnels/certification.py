@@ -14,17 +14,17 @@ from typing import Any
 
 from appliance.base import clock
 from appliance.base.deadlines import Deadlines
-from appliance.channel import admin
-from appliance.channel.answers.host_answers import AuthorityCertificate, KitParts, RevocationList
 from appliance.channel.messages import CertificateMade
+from appliance.features.tunnels import host_requests
+from appliance.features.tunnels.enrolment_tokens import EnrolmentTokens
+from appliance.features.tunnels.host_answers import AuthorityCertificate, KitParts, RevocationList
+from appliance.features.tunnels.host_view import soon
+from appliance.features.tunnels.rest_address import RestAddress
 from appliance.hosts.appliances import Appliances
 from appliance.hosts.certificate_requests import AuthorityError
-from appliance.hosts.enrolment_tokens import EnrolmentTokens
 from appliance.hosts.host_table import HostForbiddenError, HostRefusedError, HostTable
-from appliance.hosts.rest_address import RestAddress
 from appliance.hosts.stored_authority import StoredAuthority
 from appliance.hosts.tunnel_state import Tunnels
-from appliance.hosts.view import soon
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
@@ -186,7 +186,7 @@ class Certification:
             kept=kept or {},
         )
 
-    async def revocations(self, _request: admin.RevocationsWanted) -> RevocationList:
+    async def revocations(self, _request: host_requests.RevocationsWanted) -> RevocationList:
         """Return the authority's list of revoked certificates, in PEM. Raises `HostRefusedError`."""
         try:
             listed = await self.tunnels.revocations.signed()
@@ -194,7 +194,7 @@ class Certification:
             raise HostRefusedError(str(error), ours=True) from error
         return RevocationList(listed.decode())
 
-    async def authority(self, _request: admin.AuthorityWanted) -> AuthorityCertificate:
+    async def authority(self, _request: host_requests.AuthorityWanted) -> AuthorityCertificate:
         """Return the authority's certificate, in PEM. Raises `HostRefusedError`."""
         return AuthorityCertificate((await self.authority_certificate()).decode())
 

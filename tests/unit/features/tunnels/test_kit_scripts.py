@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-import appliance.ipsec
+import appliance.features.tunnels
 
-FOLDER = Path(appliance.ipsec.__file__).parent / "kit_files"
+FOLDER = Path(appliance.features.tunnels.__file__).parent / "kit_files"
 SCRIPTS = sorted(FOLDER.glob("*.sh"))
 
 

@@ -13,13 +13,15 @@ from urllib.parse import urlsplit
 import typer
 
 from appliance.base import clock
-from appliance.channel.admin import HostPorts, StatusWanted
+from appliance.channel.admin import StatusWanted
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
+from appliance.features.tunnels.host_requests import HostPorts
 from appliance.network import close_ports as protection
+from appliance.network import scan as scanner
 from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.namespaces import Namespace, NetworkError
-from appliance.network.scan import ScanResult, addresses_of, scan
+from appliance.network.scan import ScanResult, addresses_of
 
 OPEN_STATUS, ERROR_STATUS = 1, 2
 _SHOWN = 20  # most open ports listed on a terminal
@@ -160,7 +162,9 @@ class _CheckTarget:
 
 
 def _check(checked: _CheckTarget, running: Appliance) -> None:
-    results = [scan(address, checked.wanted(), checked.seconds) for address in addresses_of(checked.host)]
+    results = [
+        scanner.scan(address, checked.wanted(), checked.seconds) for address in addresses_of(checked.host)
+    ]
     opened = any(result.open for result in results)
     unknown = not all(result.answered and not result.untried for result in results)
     state: Literal["closed", "open", "unknown"] = "open" if opened else "unknown" if unknown else "closed"
@@ -177,7 +181,7 @@ def _check(checked: _CheckTarget, running: Appliance) -> None:
         found = sorted({port for result in results for port in result.open})[:_MOST_TOLD]
         name = checked.name or results[0].address
         body = running.ask_or_exit(HostPorts(name, state, found, clock.wall()))
-        sys.stderr.write(f"rosrv: reported to the appliance: the ports of {body.name} are {state}\n")
+        sys.stderr.write(f"rosrv: reported to the appliance: the ports of {body.name or name} are {state}\n")
     if opened:
         raise typer.Exit(OPEN_STATUS)
     if unknown:

@@ -9,8 +9,8 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
+from appliance.features.tunnels.enrolment_kit import filled
 from appliance.ipsec.certificate_authority import CertificateAuthority
-from appliance.ipsec.enrolment_kit import filled
 from appliance.ipsec.requests import make_key, signing_request
 
 pytestmark = pytest.mark.nightly

@@ -1,0 +1,41 @@
+"""Define what other parts of control need of the hosts in tunnels; this class is for a product without tunnels."""
+
+from appliance.channel.answers.host_answers import Host
+from appliance.channel.answers.status import IpsecState
+from appliance.hosts.host_table import HostRefusedError
+
+
+class TunnelHosts:
+    """The hosts in tunnels."""
+
+    _text = ""
+
+    @property
+    def bundled(self) -> str:
+        """Return the bundle's text that is used instead of hosts.yaml; empty if there is none."""
+        return self._text
+
+    async def take_bundle(self, text: str, who: str) -> object:
+        """Use a bundle's text instead of hosts.yaml (empty: the file again). Raises `HostRefusedError`."""
+        del who
+        if text.strip():
+            raise HostRefusedError("the bundle declares hosts, and this appliance has no tunnels")
+        self._text = text
+        return None
+
+    async def read_again(self, who: str) -> None:
+        """Read hosts.yaml again. Raises `HostRefusedError` and `StoreError`."""
+
+    def status(self) -> IpsecState:
+        """Return the state of the tunnels for `rosrv status`."""
+        return IpsecState(
+            esp=None, key_exchange=[], post_quantum=None, charon=None, pool="", address="", hosts_file="",
+            enrolled=0, awaited=0, up=0, troubles=[], ports={},
+        )  # fmt: skip
+
+    def rows(self) -> list[Host]:
+        """Return every host, enrolled, awaited or declared."""
+        return []
+
+    def served_by(self, pin: str) -> None:
+        """Store the pin by which hosts recognise the api."""
