@@ -17,6 +17,7 @@ Invariants:
 
 import asyncio
 import heapq
+import itertools
 import time
 from collections import deque
 from collections.abc import Callable, Hashable
@@ -43,58 +44,58 @@ class Line(Generic[Key, Item]):
     def __init__(self) -> None:
         self.start = 0.0
         self._used: dict[Key, float] = {}
-        self._items: dict[Key, deque[Item]] = {}
+        self.queues: dict[Key, deque[Item]] = {}  # no queue is empty
         self._order: list[tuple[float, int, Key]] = []  # a heap; the stored use of a key may be too low
-        self._count = 0
+        self._numbers = itertools.count()
 
     def __len__(self) -> int:
-        return sum(map(len, self._items.values()))
-
-    def __bool__(self) -> bool:
-        return bool(self._items)
+        return sum(map(len, self.queues.values()))
 
     def used(self, key: Key) -> float:
         """Return the use of a key, at least `start`."""
-        return max(self._used.get(key, self.start), self.start)
+        used, start = self._used.get(key, self.start), self.start
+        return used if used > start else start
 
     def charge(self, key: Key, seconds: float) -> None:
         """Add to the use of a key."""
-        self._used[key] = self.used(key) + seconds
-        if len(self._used) > _MOST_KEPT:
+        kept, start = self._used, self.start
+        used = kept.get(key, start)
+        kept[key] = (used if used > start else start) + seconds
+        if len(kept) > _MOST_KEPT:
             # Keep only half of them, so that the next removal does not follow soon.
-            largest = heapq.nlargest(_MOST_KEPT // 2, self._used.items(), key=itemgetter(1))
-            self._used = {one: used for one, used in largest if used > self.start}
+            largest = heapq.nlargest(_MOST_KEPT // 2, kept.items(), key=itemgetter(1))
+            self._used = {one: used for one, used in largest if used > start}
 
     def forget(self) -> None:
         """Forget the use of all keys."""
         self._used.clear()
 
     def put(self, key: Key, item: Item) -> None:
-        queue = self._items.get(key)
+        queue = self.queues.get(key)
         if queue is None:
-            self._items[key] = deque([item])
-            heapq.heappush(self._order, self._entry(key))
+            self.queues[key] = deque([item])
+            heapq.heappush(self._order, (self.used(key), next(self._numbers), key))
         else:
             queue.append(item)
 
     def pop(self) -> tuple[Key, Item]:
         """Return the next key and item. Among keys with equal use, the longest waiting one is next."""
-        while self._order[0][0] < self.used(self._order[0][2]):
-            heapq.heapreplace(self._order, self._entry(self._order[0][2]))
-        key = self._order[0][2]
-        self.start = self.used(key)
-        queue = self._items[key]
+        order = self._order
+        while True:
+            stored, _, key = order[0]
+            used = self.used(key)
+            if stored >= used:
+                break
+            heapq.heapreplace(order, (used, next(self._numbers), key))
+        self.start = used
+        queue = self.queues[key]
         item = queue.popleft()
         if queue:
-            heapq.heapreplace(self._order, self._entry(key))
+            heapq.heapreplace(order, (used, next(self._numbers), key))
         else:
-            heapq.heappop(self._order)
-            del self._items[key]
+            heapq.heappop(order)
+            del self.queues[key]
         return key, item
-
-    def _entry(self, key: Key) -> tuple[float, int, Key]:
-        self._count += 1
-        return self.used(key), self._count, key
 
 
 class ProcessorTime:
@@ -119,26 +120,21 @@ class ProcessorTime:
         return len(self._classes)
 
     @property
-    def free(self) -> bool:
-        """Whether work may run at once: no work waits, and this turn has time left."""
-        return not self._classes and self._left > 0
-
-    @property
-    def _left(self) -> float:
-        running = 0.0 if self._since is None else self._clock() - self._since
-        return TURN_SECONDS - self._spent - running
-
-    @property
     def running(self) -> bool:
         """Whether a piece of work is running."""
         return self._since is not None
+
+    @property
+    def _turn_has_time(self) -> bool:
+        running = 0.0 if self._since is None else self._clock() - self._since
+        return self._spent + running < TURN_SECONDS
 
     def run(self, host: Address, work: Work) -> bool:
         """Run short work for a host now and return True, or queue it for the host's turn and return False.
 
         Exceptions of the work are reported to the event loop.
         """
-        if self.free:
+        if not self._classes.queues and self._turn_has_time:
             self._do(host, work)
             return True
         self._queue(host, work)
@@ -199,13 +195,14 @@ class ProcessorTime:
     def _new_turn(self) -> None:
         self._turn_ends = False
         self._spent = 0.0
-        while self._classes and self._left > 0:
-            kind, _ = self._classes.pop()
+        classes = self._classes
+        while classes.queues and self._spent < TURN_SECONDS:
+            kind, _ = classes.pop()
             hosts = self._hosts[kind]
             self._do(*hosts.pop())
-            if not hosts:
+            if not hosts.queues:
                 del self._hosts[kind]
-        if self._classes:
+        if classes.queues:
             self._end_turn_later()
         else:
-            self._classes.forget()
+            classes.forget()

@@ -46,6 +46,7 @@ _MOST_PIPELINED = 512
 _REQUEST_BYTES = 4096
 _OPENING_SECONDS = 50e-6  # the processor time to open and close a transport
 _READ_AT_ONCE = 8192  # the bytes that are read and parsed in one piece
+_LENGTHS = frozenset(map(len, (b"content-length", b"content-encoding", b"expect")))
 _BEGINNING = 4096  # the bytes of a refused body that are read for its audit record
 _BEGINNING_SECONDS = 1.0  # the longest wait for these bytes
 
@@ -297,7 +298,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
 
     def on_header(self, name: bytes, value: bytes) -> None:
         super().on_header(name, value)
-        if self.closing:
+        if self.closing or len(name) not in _LENGTHS:
             return
         lowered = name.lower()
         if lowered == b"content-length" and value.isdigit() and int(value) > self.limits.body_bytes:
