@@ -7,11 +7,12 @@ Invariants:
    An operator's block denies every request of its host, whatever the rules say, also in audit-only mode.
 2. Otherwise one rule decides a request: the rule with the most specific matching key of its section, or `default`.
 3. `Decision.reason` is a sentence shorter than 300 characters.
-4. Memory does not grow with requests: answers are kept for at most `_KEPT_DECISIONS` short resource names.
+4. Memory does not grow with requests: answers are kept for at most `_KEPT_DECISIONS` short resource names, and hosts.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 from appliance.policy import commands
 from appliance.policy.authority import AuthorityGroup
@@ -82,6 +83,14 @@ class RuleTable:
     audit_only: bool = False
 
 
+class HostStanding(NamedTuple):
+    """What a policy says about a host: `Policy.knows`, `names` and `alike`."""
+
+    known: bool
+    named: bool
+    alike: str
+
+
 @dataclass(kw_only=True, eq=False, repr=False)
 class Policy:
     """A compiled policy; only `compile_policy` makes it.
@@ -119,6 +128,8 @@ class Policy:
     _kept_below: dict[tuple[int, int, Category, str, bool], Decision] = field(
         default_factory=dict, init=False
     )
+
+    _standings: dict[Address, HostStanding] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
         self._any_audit_only = any(table.audit_only for table in self.tables.values())
@@ -197,6 +208,16 @@ class Policy:
         """Return the rate limit of a request to publish or subscribe; other requests have no limit."""
         part = _LIMITED.get(request.category)
         return NO_LIMIT if part is None else self.limit(part, request.resource, request.host)
+
+    def standing(self, address: Address) -> HostStanding:
+        """Return what every call of a host asks for. It is kept, because this policy's answer never changes."""
+        standing = self._standings.get(address)
+        if standing is None:
+            if len(self._standings) >= _KEPT_DECISIONS:
+                self._standings.clear()
+            standing = HostStanding(self.knows(address), self.names(address), self.alike(address))
+            self._standings[address] = standing
+        return standing
 
     def knows(self, address: Address) -> bool:
         """Whether any rule includes this address and the host is not blocked. Other hosts are unknown hosts.

@@ -177,8 +177,9 @@ def class_of(policy: Callable[[], Policy], quota_class: ClassOf, host: Address) 
     The class is the address or network that the policy names. A host can have many addresses, so all hosts that only
     `*` names share one class, or a second one if they have a registration.
     """
-    if host.is_loopback or policy().names(host):
-        return policy().alike(host)
+    standing = policy().standing(host)
+    if host.is_loopback or standing.named:
+        return standing.alike
     return _ANYBODY if quota_class(host) is QuotaClass.REGISTERED else _UNKNOWN
 
 
@@ -189,10 +190,9 @@ def connection_class_of(policy: Callable[[], Policy], quota_class: ClassOf, host
     that the policy names. Without a registration, they count as unknown; with a registration, as named. Any of these
     hosts can register a node, so they do not get the part for registered hosts.
     """
-    found = class_of(policy, quota_class, host)
-    if found == _UNKNOWN:
-        return QuotaClass.UNKNOWN
-    return QuotaClass.NAMED if found == _ANYBODY else quota_class(host)
+    if host.is_loopback or policy().standing(host).named:
+        return quota_class(host)
+    return QuotaClass.NAMED if quota_class(host) is QuotaClass.REGISTERED else QuotaClass.UNKNOWN
 
 
 # The bounds for the appliance's own nodes and the ROS master: they share one address, and no other host can reach their

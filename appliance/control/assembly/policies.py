@@ -117,13 +117,13 @@ class Policies(Revisions[RevisionRow]):
 
     @property
     def current(self) -> Policy:
-        if self._current is None:
-            raise RuntimeError("no policy is loaded yet")
-        return self._current
+        return self.policy()
 
     def policy(self) -> Policy:
         """Return the policy in force to the parts that decide by it."""
-        return self.current
+        if self._current is None:
+            raise RuntimeError("no policy is loaded yet")
+        return self._current
 
     def named_as(self, host: Address) -> Network:
         return self.current.named_as(host)

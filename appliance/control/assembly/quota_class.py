@@ -22,7 +22,7 @@ class HostQuotaClass:
     def __call__(self, host: Address) -> QuotaClass:
         """Return the present quota class of a host. In audit-only mode, also an unknown host can have registrations."""
         # The policy need not name loopback, from which the appliance's own nodes call.
-        if not (host.is_loopback or self._policy().knows(host)):
+        if not (host.is_loopback or self._policy().standing(host).known):
             return QuotaClass.UNKNOWN
         return QuotaClass.REGISTERED if self._registrations(host) else QuotaClass.NAMED
 
