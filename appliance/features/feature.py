@@ -113,7 +113,7 @@ class FeaturePart:
     longest: Mapping[str, int] = field(default_factory=dict)
     status_fields: Callable[[], Mapping[str, Any]] = dict
     limits: "Callable[[], tuple[LimitUse, ...]]" = lambda: ()
-    details: "RecordDetails" = lambda *_event: {}
+    details: "RecordDetails | None" = None
     called: "Mapping[str, Callable[[OwnServiceCalled], Awaitable[OwnServiceAnswered]]]" = field(
         default_factory=dict
     )

@@ -103,7 +103,8 @@ class FeatureParts:
         """Return what the features add to the details of a record."""
         details: dict[str, str] = {}
         for part in self._parts:
-            details |= part.details(event, decision, severity, host, now)
+            if part.details is not None:
+                details |= part.details(event, decision, severity, host, now)
         return details
 
     async def called(self, call: "OwnServiceCalled") -> "OwnServiceAnswered":

@@ -101,7 +101,7 @@ class AuditTrail:
             detail["needs"] = decision.needs
         if decision.asks is not None:
             detail["approval"] = f"{decision.asks.category} {decision.asks.resource}"
-        now = clock.wall_ns()
+        now, taken = clock.wall_ns(), clock.now_ns() - asker.arrived
         severity = Severity.INFO if decision.allowed and not decision.would_deny else Severity.WARNING
         detail |= self._details("decision", word, severity, asker.host, now)
         unknown = self._marked(asker.host, word, detail)
@@ -118,13 +118,12 @@ class AuditTrail:
             rule=rule_reference(decision.rule),
             revision=self.revision,
             reason=decision.reason,
-            duration_us=(clock.now_ns() - asker.arrived) // 1000,
+            duration_us=taken // 1000,
             unknown=unknown,
             detail=detail,
             folds=reads and word == "allow",
         )
-        seconds = (clock.now_ns() - asker.arrived) / 1e9
-        self.meter.decided(category, word, seconds, "" if unknown else asker.host)
+        self.meter.decided(category, word, taken / 1e9, "" if unknown else asker.host)
         return self._log.record(record)
 
     def happened(

@@ -33,11 +33,7 @@ def to_columns(record: AuditRecord, sequence: int) -> StoredColumns:
     """Return the columns of a record with this sequence. Never fails, whatever the record contains."""
     try:
         columns = _columns(record, sequence)
-        if (
-            isinstance(record.detail, dict)
-            and len(columns.detail) <= LARGEST_DETAIL
-            and all(map(_storable, columns, _KINDS))
-        ):
+        if isinstance(record.detail, dict) and len(columns.detail) <= LARGEST_DETAIL and _storable(columns):
             return columns
     except (AttributeError, TypeError, ValueError, OverflowError, RecursionError):
         pass
@@ -55,12 +51,19 @@ def _columns(record: AuditRecord, sequence: int) -> StoredColumns:
     )  # fmt: skip
 
 
-def _storable(value: Any, kinds: tuple[type, ...]) -> bool:
-    kind = type(value)
-    if kind is str:
-        short = len(value) <= LONGEST_TEXT and kind in kinds
-        return short and (value.isascii() or not any("\ud800" <= c <= "\udfff" for c in value))
-    return kind in kinds and (kind is not int or -_LARGEST_INTEGER <= value <= _LARGEST_INTEGER)
+def _storable(columns: StoredColumns) -> bool:
+    for value, kinds in zip(columns, _KINDS, strict=True):
+        kind = type(value)
+        if kind not in kinds:
+            return False
+        if kind is str:
+            if len(value) > LONGEST_TEXT:
+                return False
+            if not value.isascii() and any("\ud800" <= c <= "\udfff" for c in value):
+                return False
+        elif kind is int and not -_LARGEST_INTEGER <= value <= _LARGEST_INTEGER:
+            return False
+    return True
 
 
 def from_columns(columns: StoredColumns) -> AuditRecord:

@@ -91,7 +91,7 @@ def new_state(record: AuditRecord, scope: str) -> FoldState:
 
 def subject(record: AuditRecord) -> Key:
     """Return the key of a request; a contrary decision with the same key ends a kind."""
-    about = tuple(str(record.detail.get(name)) for name in ABOUT)
+    about = map(str, map(record.detail.get, ABOUT))
     return (record.host, record.caller_id, record.category, record.resource, *about)
 
 
