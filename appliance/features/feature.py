@@ -98,11 +98,11 @@ class FeaturePart:
     `longest` limits the bytes of a message. `methods` answer the feature's `operations`. `work` runs until control
     ends; its names go into error messages. `limits` returns how much of its resources is used.
     `connected(door, ticket, peer, descriptor)` passes a WebSocket of the api on; it returns an HTTP status and why it
-    is refused, or an empty text. `details` returns what it adds to the details of a record (`RecordDetails`). `called`
-    answers nodes' calls of its services, by name without the appliance's own name. `sessions` are those of people whom
-    the feature signs in; they count beside tokens. `hosts` are those in tunnels. `holders` returns the host that holds
-    each group (`Policy.holders`). `approved` returns the approvals that last (`Policy.approved`), `held` holds a call
-    that needs one, and `approve` decides about a request to a service.
+    is refused, or an empty text. `details` returns what it adds to the details of a record (`RecordDetails`), if it
+    adds anything. `called` answers nodes' calls of its services, by name without the appliance's own name. `sessions`
+    are those of people whom the feature signs in; they count beside tokens. `hosts` are those in tunnels. `holders`
+    returns the host that holds each group (`Policy.holders`). `approved` returns the approvals that last
+    (`Policy.approved`), `held` holds a call that needs one, and `approve` decides about a request to a service.
 
     `status_fields()` returns the present states of the feature by their fields in `rosrv status --json`. The feature's
     view defines the fields (`StateView`). A state that is None or missing is null there.

@@ -84,7 +84,7 @@ class RuleTable:
 
 
 class HostStanding(NamedTuple):
-    """What a policy says about a host: `Policy.knows`, `names` and `alike`."""
+    """The answers of a policy about a host: `Policy.knows`, `names` and `alike`."""
 
     known: bool
     named: bool
@@ -210,7 +210,7 @@ class Policy:
         return NO_LIMIT if part is None else self.limit(part, request.resource, request.host)
 
     def standing(self, address: Address) -> HostStanding:
-        """Return what every call of a host asks for. It is kept, because this policy's answer never changes."""
+        """Return the answers that every call of a host needs. They are kept, because a policy never changes."""
         standing = self._standings.get(address)
         if standing is None:
             if len(self._standings) >= _KEPT_DECISIONS:

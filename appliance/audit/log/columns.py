@@ -53,15 +53,14 @@ def _columns(record: AuditRecord, sequence: int) -> StoredColumns:
 
 def _storable(columns: StoredColumns) -> bool:
     for value, kinds in zip(columns, _KINDS, strict=True):
-        kind = type(value)
-        if kind not in kinds:
+        if type(value) not in kinds:
             return False
-        if kind is str:
+        if isinstance(value, str):
             if len(value) > LONGEST_TEXT:
                 return False
             if not value.isascii() and any("\ud800" <= c <= "\udfff" for c in value):
                 return False
-        elif kind is int and not -_LARGEST_INTEGER <= value <= _LARGEST_INTEGER:
+        elif isinstance(value, int) and not -_LARGEST_INTEGER <= value <= _LARGEST_INTEGER:
             return False
     return True
 

@@ -69,8 +69,8 @@ class Appliance:
         store = StateStore(self.state, failed=fail, kind=InlineDatabase)
         self.records = Records()
         policies = Policies(
-            self.file, store, cast(Any, self.records), robot=(), hosts=hosts, blocks=blocks, holders=dict, approved=frozenset,
-            live=live, changed=changed, carried_out=at_once, site_keys=site_keys,
+            self.file, store, cast(Any, self.records), robot=(), hosts=hosts, blocks=blocks, holders=dict,
+            approved=frozenset, live=live, changed=changed, carried_out=at_once, site_keys=site_keys,
         )  # fmt: skip
         policies.start(restarted=restarted)
         try:
