@@ -77,8 +77,8 @@ class Control(ControlParts):
         self.remotes: dict[str, str] = {}
         self.policies = Policies(
             state / "policy.ini", self.state, cast(Any, self.records), robot=[ipaddress.ip_network(ROBOT)],
-            hosts=dict, blocks=lambda: self.blocks.reasons, holders=dict, approved=frozenset, live=list, changed=self.changed,
-            carried_out=at_once, site_keys=(),
+            hosts=dict, blocks=lambda: self.blocks.reasons, holders=dict, approved=frozenset, live=list,
+            changed=self.changed, carried_out=at_once, site_keys=(),
         )  # fmt: skip
         self.policies.start(restarted=False)
         self.current = self.policies.current
