@@ -53,7 +53,6 @@ MONITORS = Versioned(
 
 _WITHIN = ("confirm_within",)
 _LOADED = (*_WITHIN, "force", "shadow", "hold")
-_NO_REVISION = {404: "There is no such revision."}
 _NO_MONITOR = {404: "There is no such monitor, or revision."}
 
 Revision = Annotated[int, parameter("number of the revision", ge=1, le=bodies.LONGEST_REVISION, examples=[1])]

@@ -85,16 +85,6 @@ VERBS: Verbs = {
             "rvstate": Verb("monitor.in_force:rv_state", hidden=True),
         },
     ),
-    "topic": Group(
-        "Show topics of the running robot.",
-        {
-            "list": Verb("graph_verbs:list_topics"),
-            "echo": Verb("topic_verbs:echo"),
-            "info": Verb("topic_verbs:info"),
-            "publishers": Verb("topic_verbs:publishers"),
-        },
-    ),
-    "node": Group("Show nodes of the running robot.", {"list": Verb("graph_verbs:list_nodes")}),
     "sign": Verb("sign:sign"),
     "version": Verb("version:version"),
     "config": Group(

@@ -25,6 +25,7 @@ from appliance.features.selftest.feature import SELFTEST
 from appliance.features.sso.feature import SSO
 from appliance.features.standby.feature import STANDBY
 from appliance.features.syslog.feature import SYSLOG
+from appliance.features.topics.feature import TOPICS
 from appliance.features.tunnels.feature import TUNNELS
 from appliance.supervisor.role import SharedMemory
 
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from appliance.supervisor.service_gate import Pairing
 
 FEATURES: tuple[Feature, ...] = (
+    TOPICS,
     TUNNELS,
     SYSLOG,
     EVIDENCE,

@@ -324,7 +324,7 @@ WALL_CLOCK = {
         "features/evidence/evidence_verbs.py",
         "cli/monitor/offline.py", "features/policy_tools/learn_verb.py", "features/tunnels/protect_verb.py",
         "base/ages.py",
-        "cli/topic_verbs.py", "features/recorder/recorder_input.py", "features/recorder/record_verbs.py",
+        "features/topics/topic_verbs.py", "features/recorder/recorder_input.py", "features/recorder/record_verbs.py",
     ],
 }  # fmt: skip
 """The files that read the wall clock, by purpose. Add a file only if it has one of these purposes."""

@@ -3,16 +3,11 @@
 from typing import Annotated, Literal
 
 import msgspec
-from fastapi import Path
 
 from appliance.api.front.problems import Finding
 from appliance.channel.answers.field_docs import Moment, doc
-from appliance.channel.rest_bodies import LONGEST_REVISION
 from appliance.policy.model import Category
 
-OneRevision = Annotated[
-    int, Path(ge=1, le=LONGEST_REVISION, description="number of the revision", examples=[1])
-]
 Decided = Literal["allow", "deny", "would deny", "ask"]
 
 

@@ -20,8 +20,8 @@ from appliance.cli import completion
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
+from appliance.cli.message_lines import lines_of
 from appliance.cli.output import say_json, usage_error
-from appliance.cli.topic_verbs import lines_of
 from appliance.features.recorder import recording_requests
 from appliance.features.recorder.bag_reader import MessagePosition
 from appliance.features.recorder.mcap import as_mcap

@@ -10,7 +10,6 @@ import typer
 
 from appliance.api.front.moments import in_full
 from appliance.audit.log.record_format import rfc3339
-from appliance.audit.search.publishers import publishers_at
 from appliance.audit.search.query import Filter
 from appliance.base import clock
 from appliance.base.timestamps import parse_timestamp
@@ -19,7 +18,9 @@ from appliance.channel.answers.graph_answers import Topic, TopicMessage
 from appliance.cli import completion
 from appliance.cli.audit.audit_errors import Errors
 from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.message_lines import lines_of
 from appliance.cli.output import say_json, usage_error
+from appliance.features.topics.publishers import publishers_at
 from rosmop.tool.terminal import printable, refused, say
 from roswire.message_view import CUT
 from roswire.names import is_global_name
@@ -179,33 +180,3 @@ def _left_out(value: Any, name: str) -> str:
     last = value[-1] if isinstance(value, list) and value else value
     numbered = name.isdecimal() or last == CUT
     return CUT + last.partition(CUT)[2] if isinstance(last, str) and CUT in last and numbered else ""
-
-
-def lines_of(value: Any, depth: int) -> Iterator[str]:
-    """Yield a value as rostopic prints it, one field per line, without control characters."""
-    indent = "  " * depth
-    if isinstance(value, Mapping):
-        for name, inner in value.items():
-            if _is_deep(inner):
-                yield f"{indent}{printable(str(name))}:"
-                yield from lines_of(inner, depth + 1)
-            else:
-                yield f"{indent}{printable(str(name))}: {_plain(inner)}"
-    elif _is_deep(value):
-        for row in value:
-            first, *rest = lines_of(row, 0)
-            yield f"{indent}- {first}"
-            yield from (f"{indent}  {line}" for line in rest)
-    else:
-        yield indent + _plain(value)
-
-
-def _is_deep(value: Any) -> bool:
-    """Whether a value has fields, each of which needs its own line."""
-    return isinstance(value, Mapping) or (isinstance(value, list) and any(map(_is_deep, value)))
-
-
-def _plain(value: Any) -> str:
-    if isinstance(value, list):
-        return f"[{', '.join(map(_plain, value))}]"
-    return printable(str(value))

@@ -1,0 +1,36 @@
+"""Print the fields of a message as rostopic does."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from rosmop.tool.terminal import printable
+
+
+def lines_of(value: Any, depth: int) -> Iterator[str]:
+    """Yield a value as rostopic prints it, one field per line, without control characters."""
+    indent = "  " * depth
+    if isinstance(value, Mapping):
+        for name, inner in value.items():
+            if _is_deep(inner):
+                yield f"{indent}{printable(str(name))}:"
+                yield from lines_of(inner, depth + 1)
+            else:
+                yield f"{indent}{printable(str(name))}: {_plain(inner)}"
+    elif _is_deep(value):
+        for row in value:
+            first, *rest = lines_of(row, 0)
+            yield f"{indent}- {first}"
+            yield from (f"{indent}  {line}" for line in rest)
+    else:
+        yield indent + _plain(value)
+
+
+def _is_deep(value: Any) -> bool:
+    """Whether a value has fields, each of which needs its own line."""
+    return isinstance(value, Mapping) or (isinstance(value, list) and any(map(_is_deep, value)))
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_plain, value))}]"
+    return printable(str(value))

@@ -1,0 +1,1 @@
+"""Topics and nodes of the running robot on the command line."""

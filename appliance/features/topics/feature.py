@@ -1,0 +1,27 @@
+"""The feature topics: `rosrv topic` and `rosrv node` show topics and nodes, now and in the past."""
+
+from appliance.cli.verb_table import Group, Verb
+from appliance.features.feature import Feature
+
+_PLACE = "appliance.features.topics."
+
+TOPICS = Feature(
+    "topics",
+    verbs={
+        "topic": Group(
+            "Show topics of the running robot.",
+            {
+                "list": Verb(f"{_PLACE}graph_verbs:list_topics"),
+                "echo": Verb(f"{_PLACE}topic_verbs:echo"),
+                "info": Verb(f"{_PLACE}topic_verbs:info"),
+                "publishers": Verb(f"{_PLACE}topic_verbs:publishers"),
+            },
+            after="monitor",
+        ),
+        "node": Group(
+            "Show nodes of the running robot.",
+            {"list": Verb(f"{_PLACE}graph_verbs:list_nodes")},
+            after="topic",
+        ),
+    },
+)
