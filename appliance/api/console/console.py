@@ -32,7 +32,7 @@ from appliance.configuration.settings import Settings
 from appliance.features.feature import Feature
 from appliance.features.table import FEATURES
 
-_VIEWS = ("now", "graph", "audit", "policy", "monitors", "hosts", "robot")
+_VIEWS = ("now", "graph", "audit", "policy", "monitors", "robot")
 _PREFIX = "/console/static/"
 _SERVED = ("css", "icon.svg", "index.html", "js", "vendor")  # the other files of the folder are Python
 _PAGE, _SCRIPT, _STYLE, _PARTS = "index.html", "js/main.js", "css/main.css", "js/features.js"

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from appliance.cli.verb_table import FIRST, Group, Verb
-from appliance.features.feature import Feature
+from appliance.features.feature import ConsolePart, Feature
 from appliance.supervisor.role import Role
 from appliance.supervisor.sandbox.sandbox_plan import ROUTES, SandboxPlan
 
@@ -36,6 +36,7 @@ TUNNELS = Feature(
     operations=_operations,
     answers=f"{_PLACE}host_routes:ANSWERS",
     routes=f"{_PLACE}enrol_routes:routes",
+    console=(ConsolePart("view", "view.js", "Hosts", "Hosts"),),
     inherit=f"{_PLACE}control_part:inherit",
     verbs={
         "protect": Verb(

@@ -3,13 +3,12 @@
 import { Audit } from "./audit/view.js";
 import { PARTS } from "./features.js";
 import { GraphView } from "./graph/view.js";
-import { Hosts } from "./hosts/view.js";
 import { Monitors } from "./monitors/view.js";
 import { Now } from "./now/view.js";
 import { PolicyView } from "./policy/view.js";
 import { RobotView } from "./robot.js";
 
-const OWN = { Now, Graph: GraphView, Audit, Policy: PolicyView, Monitors, Hosts };
+const OWN = { Now, Graph: GraphView, Audit, Policy: PolicyView, Monitors };
 
 export const VIEWS = [
   ...Object.entries(OWN).map(([title, View]) => ({ title, View })),

@@ -1,13 +1,13 @@
 /** Revoke a host, after confirmation. */
 
-import { html, useState } from "../html.js";
-import { Button } from "../parts/button.js";
-import { Dialog } from "../parts/dialog.js";
-import { Field } from "../parts/field.js";
-import { Given } from "../parts/given.js";
-import { Failure } from "../parts/notice.js";
-import { done } from "../parts/toast.js";
-import { ask } from "../rest.js";
+import { html, useState } from "#console/html.js";
+import { Button } from "#console/parts/button.js";
+import { Dialog } from "#console/parts/dialog.js";
+import { Field } from "#console/parts/field.js";
+import { Given } from "#console/parts/given.js";
+import { Failure } from "#console/parts/notice.js";
+import { done } from "#console/parts/toast.js";
+import { ask } from "#console/rest.js";
 
 /** @param {{host: any, etag: string, close: () => void, after: () => Promise<void>}} given */
 export function Revoke({ host, etag, close, after }) {

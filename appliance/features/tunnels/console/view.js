@@ -1,19 +1,19 @@
 /** Hosts: tunnels, certificates, open ports; enrol and revoke. */
 
-import { html, useEffect, useState } from "../html.js";
-import { live } from "../live.js";
-import { lasting, Moment } from "../moments.js";
-import { bytes, counted } from "../numbers.js";
-import { Badge } from "../parts/badge.js";
-import { Button } from "../parts/button.js";
-import { Given } from "../parts/given.js";
-import { Host } from "../parts/host.js";
-import { Icon } from "../parts/icon.js";
-import { Empty, Failure, Loading, Notice } from "../parts/notice.js";
-import { done, failed } from "../parts/toast.js";
-import { ask } from "../rest.js";
-import { useStore } from "../store.js";
-import { Block, Blocked } from "./block.js";
+import { html, useEffect, useState } from "#console/html.js";
+import { live } from "#console/live.js";
+import { lasting, Moment } from "#console/moments.js";
+import { bytes, counted } from "#console/numbers.js";
+import { Badge } from "#console/parts/badge.js";
+import { Button } from "#console/parts/button.js";
+import { Given } from "#console/parts/given.js";
+import { Host } from "#console/parts/host.js";
+import { Icon } from "#console/parts/icon.js";
+import { Empty, Failure, Loading, Notice } from "#console/parts/notice.js";
+import { done, failed } from "#console/parts/toast.js";
+import { ask } from "#console/rest.js";
+import { useStore } from "#console/store.js";
+import { Block, Blocked } from "#console/hosts/block.js";
 import { Enrol } from "./enrol.js";
 import { Revoke } from "./revoke.js";
 

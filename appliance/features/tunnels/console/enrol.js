@@ -1,16 +1,16 @@
 /** Enrol a host: with a one-time token and its own key, or with a kit. */
 
-import { html, useState } from "../html.js";
-import { save } from "../audit/proof.js";
-import { Moment } from "../moments.js";
-import { Button } from "../parts/button.js";
-import { Dialog } from "../parts/dialog.js";
-import { Field } from "../parts/field.js";
-import { Given } from "../parts/given.js";
-import { Icon } from "../parts/icon.js";
-import { Failure, Notice } from "../parts/notice.js";
-import { done } from "../parts/toast.js";
-import { send } from "../rest.js";
+import { html, useState } from "#console/html.js";
+import { save } from "#console/audit/proof.js";
+import { Moment } from "#console/moments.js";
+import { Button } from "#console/parts/button.js";
+import { Dialog } from "#console/parts/dialog.js";
+import { Field } from "#console/parts/field.js";
+import { Given } from "#console/parts/given.js";
+import { Icon } from "#console/parts/icon.js";
+import { Failure, Notice } from "#console/parts/notice.js";
+import { done } from "#console/parts/toast.js";
+import { send } from "#console/rest.js";
 
 const HOW = /** @type {[string, string][]} */ ([["token", "One-time token: the host creates its own key"], ["kit", "Kit: an archive with a private key, to copy to the host"]]);
 const LASTS = /** @type {[string, string][]} */ ([["900", "15 minutes"], ["3600", "1 hour"], ["86400", "1 day"], ["604800", "7 days"]]);
