@@ -34,13 +34,13 @@ from appliance.features.fleet.bundle_link import (
     BundleStated,
     RefusedBundle,
 )
+from appliance.features.fleet.lost_rights import LostRights
 from appliance.features.fleet.settings import Fleet
 from appliance.features.fleet.view import BundlesState
 from appliance.formats.bundle_archive import BundleContents
 from appliance.hosts.host_table import HostRefusedError
 from appliance.hosts.hosts_file import IN_BUNDLE, DeclaredHostsError, parse_declared
 from appliance.hosts.tunnel_hosts import TunnelHosts
-from appliance.features.fleet.lost_rights import LostRights
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
 from appliance.signing.fingerprints import fingerprint
