@@ -46,7 +46,7 @@ ORDERS: tuple[admin.AdminRequest[Any], ...] = (
     admin.HostUnblock("192.0.2.66"),
     *of_feature("host token", name="laptop", endpoint="192.0.2.1"),
     *of_feature("host add", name="laptop", request=REQUEST),
-    *of_feature("host enrol", token="rosrv-enrol_none", request=REQUEST, peer="192.0.2.2"),  # noqa: S106  not a token
+    *of_feature("host enrol", token="rosrv-enrol_none", request=REQUEST, peer="192.0.2.2"),  # noqa: S106  no token
     *of_feature("host renew", name="laptop", request=REQUEST),
     *of_feature("host renew itself", name="laptop", request=REQUEST, proof=b"", peer="192.0.2.2"),
     *of_feature("host renewed", name="laptop", peer="192.0.2.2"),
