@@ -62,7 +62,6 @@ class Child:
         self._answer(Failed(reason, output))
 
     def close(self) -> None:
-        """Close the link to control."""
         self._control.close()
 
     def _supervisor_said(self, message: Any, descriptors: tuple[int, ...]) -> None:

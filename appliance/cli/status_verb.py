@@ -135,7 +135,6 @@ class StatusScreen:
     attention: list[str]
 
     def __rich_console__(self, _console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield its parts."""
         for trouble in shortened(self.troubles, _MOST_TROUBLES):
             yield Text(f"! {trouble}", style=_RED)
         for line in shortened(self.attention, _MOST_TROUBLES):

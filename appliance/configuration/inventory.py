@@ -56,7 +56,6 @@ def debian_licences(text: str) -> list[str]:
 
 
 def python_licences(fields: Message) -> list[str]:
-    """Return the licences in the metadata of a Python package."""
     classified = [
         str(classifier).rpartition(" :: ")[2]
         for classifier in fields.get_all("Classifier", [])

@@ -462,7 +462,6 @@ class Settings:
                 )
 
     def of(self, kind: type[S]) -> S:
-        """Return a feature's section."""
         value: Any = self
         for name in kind.place.split("."):
             value = getattr(value, name)

@@ -77,7 +77,6 @@ class HostTable:
             raise HostsChangedError(f"the table of hosts has revision {self.revision}, not {expected}")
 
     def changed(self) -> None:
-        """Note a change of the table."""
         self.revision += 1
         self._store.save_setting(_REVISION, str(self.revision))
 

@@ -164,7 +164,6 @@ def _local_route(route: Any, network: str) -> dict[str, Any]:
 
 
 def links(namespace: Namespace) -> list[str]:
-    """Return the names of the interfaces."""
     return _netlink(namespace, "listing interfaces", lambda route: list(_names(route).values()))
 
 

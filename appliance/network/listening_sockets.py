@@ -10,7 +10,6 @@ _TCP_LISTEN = "0A"
 
 
 def listening_addresses(port: int) -> tuple[str, ...]:
-    """Return the addresses with a listener on a TCP port."""
     return tuple(sorted({_address(row.address) for row in _listeners() if row.port == port}))
 
 

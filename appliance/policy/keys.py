@@ -52,7 +52,6 @@ class Key:
         return any(star for _, star in (self.steps if self.subtree else self.steps[:-1]))
 
     def matches(self, name: str) -> bool:
-        """Whether this key matches a resolved ROS name."""
         if self.exact:
             return name == self.text
         parts = levels(name)

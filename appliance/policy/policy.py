@@ -281,7 +281,6 @@ class Policy:
         return self.hosts.names(address) and self.blocked(address) is None
 
     def has_section(self, category: Category) -> bool:
-        """Whether the file has the section that decides this category."""
         return category in self.present
 
     def audit_only(self, category: Category) -> bool:

@@ -20,7 +20,6 @@ class Decider:
 
     @property
     def categories(self) -> tuple[Category, ...]:
-        """Return the categories that the section decides."""
         return tuple(self.phrases)
 
 

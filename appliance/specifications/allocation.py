@@ -74,7 +74,6 @@ class Allocation:
         return self._of(self._plan.resources, (kind, name))
 
     def of_file(self, file: str) -> int:
-        """Return the relay of a file of specifications."""
         return self._plan.files.get(file, 0)
 
     @property

@@ -78,7 +78,6 @@ class Tables:
                 self._columns.setdefault(table, {})[column] = _Column(_TYPES[kind], bool(nullable))
 
     def __iter__(self) -> Iterator[str]:
-        """Yield the names of the tables."""
         return iter(self._columns)
 
     def check(self, change: Change) -> None:

@@ -58,13 +58,11 @@ class DoorTables:
         return [DoorRow(*row) for row in self._database.query("SELECT * FROM door ORDER BY added, name")]
 
     def save_tickets(self, *rows: TicketRow) -> None:
-        """Store tickets."""
         with self._database.together():
             for row in rows:
                 self._database.put("door_ticket", *row)
 
     def forget_ticket(self, ticket: str) -> None:
-        """Remove a ticket."""
         self._database.delete("door_ticket", id=ticket)
 
     def tickets(self) -> list[TicketRow]:

@@ -187,11 +187,9 @@ class StateStore:
     # --- grants ---
 
     def save_permission(self, row: PermissionRow) -> None:
-        """Keep a grant."""
         self.database.put("permission", *row)
 
     def remove_permission(self, row: PermissionRow) -> None:
-        """Drop a grant."""
         self.database.delete("permission", **row._asdict())
 
     def permissions(self) -> list[PermissionRow]:

@@ -230,7 +230,6 @@ class Listener:
         task.add_done_callback(self._tasks.discard)
 
     async def start(self, sock: socket.socket, context: ssl.SSLContext | None) -> None:
-        """Begin to accept."""
         self._acceptor = Acceptor(sock, self._time, partial(self._accepted, context))
         self._begin(self.connection_table.sweep())
 

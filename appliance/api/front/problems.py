@@ -76,7 +76,6 @@ class ProblemError(Exception):
         self.column = findings[0].column if findings else column
 
     def response(self) -> Response:
-        """Return the problem as an answer."""
         problem = Problem(
             f"urn:rosrv:problem:{self.kind}",
             http.HTTPStatus(self.status).phrase,

@@ -93,7 +93,6 @@ class RequestGate:
         self._page_rate = Buckets(limits.requests_per_second * _PAGE_SHARE, limits.burst * _PAGE_SHARE)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request."""
         if scope["type"] != "http":
             return
         answer = _Answer(scope, send, self._journal)

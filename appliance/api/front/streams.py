@@ -26,7 +26,6 @@ A = TypeVar("A", str, bytes)
 
 
 def peer_of(request: Request) -> str:
-    """Return the address that a request comes from."""
     return request.client.host if request.client is not None else ""
 
 

@@ -288,8 +288,6 @@ def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
 
 
 def _add_one(router: Routes, services: Services, desk: LogReader) -> None:
-    """Add the routes of one record."""
-
     @router.get("/{record_id}", responses=_json(_ONE) | _UNKNOWN)
     async def audit_record(
         bearer: Viewer, record_id: OneRecord, neighbours: Annotated[int, Query(ge=0, le=_MOST_NEIGHBOURS)] = 5

@@ -18,7 +18,6 @@ _Json = Mapping[str, Any]
 
 
 def page_of(document: _Json) -> str:
-    """Return the page of an OpenAPI document."""
     return "".join(_lines(document))
 
 

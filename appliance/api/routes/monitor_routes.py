@@ -64,7 +64,6 @@ def unknown_monitor(name: str, loaded: Monitors) -> ProblemError:
 
 
 def routes(services: Services) -> Routes:
-    """Return the routes."""
     router = Routes(prefix="/v1/monitors", tags=["monitors"])
     looking = _Looking(services)
 

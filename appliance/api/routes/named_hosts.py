@@ -34,7 +34,6 @@ def names_of(known: PolicyInForce) -> HostNames:
 
 
 def labels_of(known: PolicyInForce) -> HostLabels:
-    """Return the labels of addresses."""
     return HostLabels([HostLabel(str(network), name) for network, name in names_of(known).labels()])
 
 

@@ -62,7 +62,6 @@ class Tested(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def routes(services: Services) -> Routes:
-    """Return the routes."""
     router = Routes(prefix="/v1/policy", tags=["policy"])
     control = services.control
 

@@ -79,7 +79,6 @@ class FoldState(msgspec.Struct, kw_only=True):
 
 
 def new_state(record: AuditRecord, scope: str) -> FoldState:
-    """Return the state of a kind that begins with this record."""
     known = {name: record.detail.get(name) for name in ABOUT}
     about = {name: str(value)[:_LONGEST_KEY] for name, value in known.items() if value is not None}
     return FoldState(

@@ -35,7 +35,6 @@ class EqualKey(NamedTuple):
     reason: str
 
     def equals(self, other: "EqualKey") -> bool:
-        """Whether two records are equal."""
         same_reason = self.reason == other.reason or not (self.reason and other.reason)
         return self.fields == other.fields and same_reason
 

@@ -39,7 +39,6 @@ class FileLog:
 
     @property
     def path(self) -> Path:
-        """Return the path of the log's file."""
         if not self._state.is_dir():
             raise LogUnreadableError(
                 f"{self._state}: no such directory; give the appliance's state directory with --state"

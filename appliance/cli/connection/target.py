@@ -110,7 +110,6 @@ class Appliance(typer.Context):
 
     @property
     def as_json(self) -> bool:
-        """Whether to print answers as JSON."""
         return bool(self.params["as_json"])
 
     @property

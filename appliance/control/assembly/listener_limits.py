@@ -106,7 +106,6 @@ class ListenerLimits:
         )
 
     def close(self) -> None:
-        """Stop serving."""
         for server in self._servers:
             server.close()
 

@@ -130,7 +130,6 @@ class Policies(Revisions[RevisionRow]):
 
     @property
     def differs_from_file(self) -> bool:
-        """Whether the policy in force differs from the file."""
         try:
             return read_policy(self.file) != (self.current.text, self.in_force.signature)
         except PolicyRefusedError:

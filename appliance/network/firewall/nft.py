@@ -57,7 +57,6 @@ class NftBackend:
         self._nft(["-f", "-"], json.dumps({"nftables": [*_delete_table(), _table("add"), *render(rules)]}))
 
     def remove(self) -> None:
-        """Delete the table."""
         self._nft(["-f", "-"], json.dumps({"nftables": _delete_table()}))
 
     def counters(self) -> tuple[RuleCounter, ...]:
