@@ -32,7 +32,7 @@ from appliance.store.change_feed import ChangeFeed
 from appliance.store.changes import Change, ChangeError, Condition, Delete, Put, Tables, Value, joined
 
 _GROUP = 2_000
-_GATHER_SECONDS = 0.02  # time to gather changes that are not awaited: they are safe in `ahead`
+_GATHER_SECONDS = 0.2  # time to gather changes that are not awaited: they are safe in `ahead`
 
 _RETRY_SECONDS = 0.5
 _CATCH_UP_SECONDS = 1.0
