@@ -72,6 +72,7 @@ class RosMaster:
             NodeUri("http", "127.0.0.1", port, "/"),
             timeout=timeout,
             pool=32,
+            bare=True,
             limits=limits,
             disconnected=self._lost,
         )

@@ -47,7 +47,7 @@ class Post:
             quota_class=lambda _host: QuotaClass.REGISTERED,
             **bounds,
         )
-        cast(Any, self.world.nodes).client = lambda _incarnation: self.node
+        cast(Any, self.world.nodes).call = lambda _incarnation, *call: self.node.call(*call)
         self.incarnation = self.world.node("/n")
 
     def _troubled(self, incarnation: Incarnation, call: NodeCall, _why: str) -> None:
@@ -138,9 +138,9 @@ async def test_silent_nodes_delay_no_call_to_other_hosts() -> None:
     post = Post()
     robot = Node()
     robot.answers.set()
-    cast(Any, post.world.nodes).client = lambda incarnation: (
+    cast(Any, post.world.nodes).call = lambda incarnation, *call: (
         robot if incarnation.name == "/robot" else post.node
-    )
+    ).call(*call)
     for number in range(2 * NODE_CALLS_UNDER_WAY.bounds.whole):
         guest = post.node_on("10.0.0.66", f"/guest_{number}")
         post.delivery.push(guest, NodeCall("publisherUpdate", ("/t", [])))

@@ -1,5 +1,6 @@
 """A process that reuses the port of a killed node is not mistaken for that node."""
 
+import asyncio
 from typing import Any, cast
 
 import pytest
@@ -20,7 +21,7 @@ class Street(ControlParts):
     def surround(self) -> None:
         self.heard: list[tuple[int, str]] = []
         self.process = 1
-        cast(Any, self.nodes).client = lambda node: _Door(self, node)
+        cast(Any, self.nodes).client = lambda node, **_: _Door(self, node)
         self.delivery = Delivery(
             self.nodes,
             troubled=self.watchlist.could_not_tell,
@@ -42,6 +43,9 @@ class Street(ControlParts):
 class _Door:
     def __init__(self, street: Street, node: Incarnation) -> None:
         self._street, self._port = street, node.api.port
+
+    def close(self) -> None:
+        """Close nothing."""
 
     async def call(self, method: str, *_params: Value) -> Value:
         self._street.heard.append((self._port, method))
@@ -108,3 +112,30 @@ async def test_programs_that_serve_two_nodes_with_one_api(telling: NodeCall) -> 
         street.delivery.push(node, telling)
         await street.settle()
     assert street.heard == [(4001, telling.method)] * 2
+
+
+async def test_a_connection_is_kept_for_the_next_call_but_not_to_find_out_whether_a_node_is_there() -> None:
+    """A process that is gone, or whose machine is off, must not be taken for a silent one on its old connection."""
+    street = Street()
+    made: list[tuple[str, int]] = []
+    closed: list[str] = []
+
+    class Recorded(_Door):
+        def __init__(self, node: Incarnation, pool: int) -> None:
+            super().__init__(street, node)
+            made.append((node.name, pool))
+            self.close = lambda: closed.append(node.name)  # type: ignore[method-assign]
+
+    cast(Any, street.nodes).client = lambda node, *, pool=0: Recorded(node, pool)
+    first, second = street.node("/first", 1), street.node("/second", 2)
+    for method in ("requestTopic", "publisherUpdate", "getPid", "paramUpdate", "shutdown"):
+        await street.nodes.call(first, method)
+    await street.nodes.call(second, "requestTopic")
+    assert made == [("/first", 1), ("/first", 0), ("/first", 0), ("/second", 1)]
+    await asyncio.sleep(1.5)
+    await street.nodes.call(second, "requestTopic")
+    assert (len(made), closed) == (4, [])
+    await asyncio.sleep(1)
+    assert closed == ["/first"]
+    await asyncio.sleep(2)
+    assert closed == ["/first", "/second"]
