@@ -159,20 +159,20 @@ def package(folder: Path, nodes: int, port: int, *, rospy: bool) -> Path:
     return file
 
 
-def start(session: RosSession, master: int, nodes: int, *, rospy: bool) -> Start:
-    """Launch the robot at a master whose processes are `master` and its descendants, and measure."""
+def start(session: RosSession, masters: list[int], nodes: int, *, rospy: bool) -> Start:
+    """Launch the robot at a master whose processes are `masters` and their descendants, and measure."""
     reports, measured = Reports(), Start()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         file = package(folder, nodes, reports.port, rospy=rospy)
         path = {"ROS_PACKAGE_PATH": f"{folder}:/usr/share"}
-        used = {pid: processor_seconds([pid]) for pid in descendants(master)}
+        used = _used(masters)
         with OtherClient(session.master_uri) as other:
             began = time.monotonic()
             launch = session.start(["/usr/bin/roslaunch", "--disable-title", str(file)], **path)
             last = reports.wait(set(range(nodes)))
         measured.figures["last node is up"] = last - began
-        now = {pid: processor_seconds([pid]) for pid in descendants(master)}
+        now = _used(masters)
         measured.figures["processor time"] = sum(now[pid] - used.get(pid, 0.0) for pid in now)
         for method, delays in other.delays.items():
             measured.figures[f"one {method}"] = statistics.median(delays)
@@ -184,6 +184,11 @@ def start(session: RosSession, master: int, nodes: int, *, rospy: bool) -> Start
         launch.stop(with_signal=signal.SIGINT, timeout=60)
     reports.close()
     return measured
+
+
+def _used(masters: list[int]) -> dict[int, float]:
+    pids = {pid for master in masters for pid in descendants(master)}
+    return {pid: processor_seconds([pid]) for pid in pids}
 
 
 def killed(session: RosSession, folder: Path, reports: Reports, nodes: int, path: dict[str, str]) -> float:
@@ -210,24 +215,24 @@ def _is_first(entry: Path, folder: str) -> bool:
 
 
 @contextlib.contextmanager
-def plain() -> Iterator[tuple[RosSession, int]]:
-    """Run rosmaster with rosout."""
+def plain() -> Iterator[tuple[RosSession, list[int]]]:
+    """Run rosmaster with rosout; yield a session and both processes."""
     with (
         tempfile.TemporaryDirectory() as home,
         PlainMaster(Path(home)) as master,
         RosSession(master.master_uri, Path(home)) as session,
     ):
-        yield session, master.processes[0].pid
+        yield session, [process.pid for process in master.processes]
 
 
 @contextlib.contextmanager
-def deployed() -> Iterator[tuple[RosSession, int]]:
-    """Run the appliance as `rosrv up` does."""
+def deployed() -> Iterator[tuple[RosSession, list[int]]]:
+    """Run the appliance as `rosrv up` does; yield a session and its supervisor."""
     options = ("--api", "off", "--listen", f"127.0.0.1:{free_port()}")
     with Appliance(options=options) as appliance, tempfile.TemporaryDirectory() as home:
         assert appliance.process is not None
         with RosSession(appliance.master_uri, Path(home)) as session:
-            yield session, appliance.process.pid
+            yield session, [appliance.process.pid]
 
 
 def main() -> None:
@@ -249,8 +254,8 @@ def main() -> None:
         for number in range(given.rounds):
             found: dict[str, Start] = {}
             for side in (plain, deployed) if number % 2 else (deployed, plain):
-                with side() as (session, pid):
-                    found[side.__name__] = start(session, pid, given.nodes, rospy=given.rospy)
+                with side() as (session, masters):
+                    found[side.__name__] = start(session, masters, given.nodes, rospy=given.rospy)
             runs.append((found["plain"], found["deployed"]))
     finally:
         for program in programs:
