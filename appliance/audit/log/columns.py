@@ -52,6 +52,7 @@ def _columns(record: AuditRecord, sequence: int) -> StoredColumns:
 
 
 def _storable(columns: StoredColumns) -> bool:
+    value: Any
     for value, kinds in zip(columns, _KINDS, strict=True):
         if type(value) not in kinds:
             return False
