@@ -438,11 +438,15 @@ class OwnServiceCalled(Message):
 
 
 class OwnServiceAnswered(Message):
-    """Control answers a call of the appliance's own service, with a text."""
+    """Control answers a call of the appliance's own service, with a text.
+
+    `repeats`: calls of the same host in the next second get this answer too.
+    """
 
     number: int
     success: bool
     text: str
+    repeats: bool = True
 
 
 class ApprovalWanted(Message):

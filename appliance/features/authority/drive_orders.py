@@ -81,7 +81,7 @@ class DriveOrders:
         async with self._turn:
             if self._groups.holder(group.name) is None and to is None:
                 raise SenselessError(f"no host holds {group.name}: `rosrv drive status` lists all groups")
-            await self._hand_over(group, to or self._next(group), f"given by {who}", who)
+            await self._hand_over(group, to, f"given by {who}", who)
         return self._state(group)
 
     async def ask(self, request: requests.DriveAsk, who: str) -> requests.GroupState:
@@ -113,7 +113,7 @@ class DriveOrders:
         if not done and not refused:
             refused.append(f"{host} has no claim to a group of [Authority]")
         text = "; ".join([*([f"{host} holds {', '.join(done)}"] if done else []), *refused])
-        return OwnServiceAnswered(call.number, bool(done) and not refused, text)
+        return OwnServiceAnswered(call.number, bool(done) and not refused, text, repeats=False)
 
     async def give_called(self, call: OwnServiceCalled) -> OwnServiceAnswered:
         """End the authority of the caller's host over all groups."""
@@ -122,12 +122,10 @@ class DriveOrders:
             async with self._turn:
                 holding = self._groups.holder(group.name)
                 if holding is not None and holding.host == host:
-                    await self._hand_over(
-                        group, self._next(group), f"given by {call.caller_id}", call.caller_id
-                    )
+                    await self._hand_over(group, None, f"given by {call.caller_id}", call.caller_id)
                     done.append(group.name)
         text = f"{host} gave {', '.join(done)}" if done else f"{host} holds no group"
-        return OwnServiceAnswered(call.number, bool(done), text)
+        return OwnServiceAnswered(call.number, bool(done), text, repeats=False)
 
     # --- the end of a lease ---
 
@@ -148,11 +146,13 @@ class DriveOrders:
             async with self._turn:
                 held = self._groups.holder(group.name)
                 if held is None:
+                    if self._next(group) is not None:
+                        await self._hand_over(group, None, "it waited for the group", "")
                     continue
                 live, moved = self._signs.live(held.host), self._signs.moved(held.host, group.names)
                 loss = self._groups.loss(group, clock.now(), moved=moved, live=live)
                 if loss:
-                    await self._hand_over(group, self._next(group), loss, "", stop=True)
+                    await self._hand_over(group, None, loss, "", stop=True)
 
     # --- inside; the caller has the turn ---
 
@@ -183,12 +183,11 @@ class DriveOrders:
     ) -> None:
         """Cut the holder off on all relays, then let the next host hold the group. This is one audit record.
 
+        Without `to`, the next host is the first one that waits, if all relays are ready; the group is freed anyway.
         `stop`: the guards of the group stop the robot in between.
         """
         if to is not None and not self._relays_ready():
-            if who:
-                raise UnavailableError(f"a relay starts, so {group.name} cannot be handed over: try again")
-            to = None
+            raise UnavailableError(f"a relay starts, so {group.name} cannot be handed over: try again")
         take_effect()
         before = self._groups.free(group.name)
         try:
@@ -197,12 +196,20 @@ class DriveOrders:
                 await self._carried_out()
                 if stop:
                     await self._stop.after(str(before.host), group.names, f"{group.name}: {reason}")
-            if to is not None and self._claim(group, to) is not None:
-                self._groups.hold(group.name, to, clock.now())
+            heir = to or self._next(group)
+            # A relay whose link was lost meanwhile may still let the earlier holder through.
+            if heir is not None and self._relays_ready() and self._claim(group, heir) is not None:
+                self._groups.hold(group.name, heir, clock.now())
                 self._decide_again()
                 await self._carried_out()
         finally:
-            self._record(group.name, before, self._groups.holder(group.name), reason, who)
+            now = self._groups.holder(group.name)
+            if (before, now) != (None, None):
+                self._record(group.name, before, now, reason, who)
+        if to is not None and now is None:
+            raise UnavailableError(
+                f"{group.name} is free: a relay or the policy changed while it was handed over: try again"
+            )
 
     def _record(self, group: str, before: Holding | None, now: Holding | None, reason: str, who: str) -> None:
         earlier, later = (("nobody" if one is None else str(one.host)) for one in (before, now))

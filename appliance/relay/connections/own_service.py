@@ -3,8 +3,9 @@
 `OwnServer` replaces the connection to a node, so grants, headers, monitors and limits apply as for any other service.
 
 Invariants:
-- Control gets at most one call of a service from a host at a time, and at most one a second. Further calls of that host
-  get the same answer, so a single host cannot keep control busy.
+- Control gets at most one call of a service from a host at a time, and at most one a second, so a single host cannot
+  keep control busy. Further calls of that host get the same answer if it `repeats`. An answer about the holder of a
+  group may be outdated by then, so they wait for the end of the second, and get the answer to one new call.
 - Every call is answered. If control ends first, the answer reports that control is not running.
 """
 
@@ -28,9 +29,12 @@ _SECOND = 1.0
 
 @dataclass(slots=True)
 class _Call:
-    """A host's last call of a service: the clients that wait for the answer, or the answer and when it expires."""
+    """A host's last call of a service: the clients that wait, and when the second of its answer ends (0: not answered).
 
-    number: int
+    `reply` is the answer if it repeats.
+    """
+
+    asked: OwnServiceCalled
     waiting: list["OwnServer"] = field(default_factory=list)
     reply: bytes = b""
     until: float = 0.0
@@ -46,16 +50,20 @@ class OwnService:
         self._number = 0
 
     def call(self, service: str, host: str, caller_id: str, server: "OwnServer") -> None:
-        """Ask control, or repeat the answer to this host's last call if that answer is less than a second old."""
+        """Ask control, or repeat or await the answer to this host's call of the last second."""
         last = self._calls.get((service, host))
-        if last is not None and not last.until:
-            last.waiting.append(server)
-        elif last is not None and self._loop.clock() < last.until:
+        if last is None or 0 < last.until <= self._loop.clock():
+            self._ask(service, host, caller_id, [*([] if last is None else last.waiting), server])
+        elif last.reply:
             server.answered(last.reply)
         else:
-            self._number += 1
-            self._calls[service, host] = _Call(self._number, [server])
-            self._send(OwnServiceCalled(self._number, service, host, caller_id))
+            last.waiting.append(server)
+
+    def _ask(self, service: str, host: str, caller_id: str, waiting: list["OwnServer"]) -> None:
+        self._number += 1
+        asked = OwnServiceCalled(self._number, service, host, caller_id)
+        self._calls[service, host] = _Call(asked, waiting)
+        self._send(asked)
 
     def forget(self, service: str, host: str, server: "OwnServer") -> None:
         """Drop a client that has disconnected."""
@@ -65,8 +73,8 @@ class OwnService:
 
     def answered(self, answer: OwnServiceAnswered) -> None:
         """Give control's answer to the clients that wait for it."""
-        for call in [call for call in self._calls.values() if call.number == answer.number]:
-            self._settle(call, answer.success, answer.text)
+        for call in [call for call in self._calls.values() if call.asked.number == answer.number]:
+            self._settle(call, answer.success, answer.text, repeats=answer.repeats)
 
     def control_gone(self) -> None:
         """Answer all open calls: control has gone."""
@@ -77,15 +85,29 @@ class OwnService:
     def tidy(self) -> None:
         """Forget answers that are older than a second."""
         now = self._loop.clock()
-        self._calls = {key: call for key, call in self._calls.items() if not call.until or now < call.until}
+        self._calls = {
+            key: call
+            for key, call in self._calls.items()
+            if call.waiting or not call.until or now < call.until
+        }
 
-    def _settle(self, call: _Call, success: bool, text: str) -> None:
+    def _settle(self, call: _Call, success: bool, text: str, *, repeats: bool = True) -> None:
         data = text.encode()
-        call.reply = encode_service_reply(bytes([success]) + len(data).to_bytes(4, "little") + data)
+        reply = encode_service_reply(bytes([success]) + len(data).to_bytes(4, "little") + data)
         call.until = self._loop.clock() + _SECOND
         waiting, call.waiting = call.waiting, []
         for server in waiting:
-            server.answered(call.reply)
+            server.answered(reply)
+        if repeats:
+            call.reply = reply
+        else:
+            self._loop.after(_SECOND, lambda: self._ask_again(call))
+
+    def _ask_again(self, call: _Call) -> None:
+        """Ask control for the clients that called in the second after an answer."""
+        asked = call.asked
+        if call.waiting and self._calls.get((asked.service, asked.host)) is call:
+            self._ask(asked.service, asked.host, asked.caller_id, call.waiting)
 
 
 class OwnServer:

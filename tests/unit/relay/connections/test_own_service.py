@@ -106,6 +106,28 @@ def test_a_flood_of_one_host_is_one_call_to_control(scene: Scene) -> None:
     assert scene.called() == []
 
 
+def test_an_answer_that_does_not_repeat_is_asked_for_again(scene: Scene) -> None:
+    """Calls in the second after it wait, and get the answer to one new call: a host that lost a group learns it."""
+    first, second, gone = (scene.client(persistent="1") for _one in range(3))
+    first.send(encode_frame(b""))
+    asked = scene.hears(OwnServiceCalled)
+    now = scene.loop.clock()
+    scene.loop.clock = lambda: now
+    scene.state(OwnServiceAnswered(asked.number, True, "holds base", repeats=False))
+    scene.gets(first, reply(True, "holds base"))
+    for client in (gone, first, second):
+        client.send(encode_frame(b""))
+        scene.loop.turn(0.01)
+    gone.sock.close()
+    scene.hears(ConnectionClosed)
+    assert scene.called() == []
+    scene.loop.clock = lambda: now + 1.1
+    asked = scene.hears(OwnServiceCalled)
+    scene.state(OwnServiceAnswered(asked.number, False, "another host holds base", repeats=False))
+    for client in (first, second):
+        scene.gets(client, reply(False, "another host holds base"))
+
+
 def test_a_call_is_answered_when_control_ends(scene: Scene) -> None:
     """The answer is false with the reason; a call that the next control receives gets that control's answer."""
     client = scene.client()
