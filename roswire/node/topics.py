@@ -218,8 +218,11 @@ class NodePublication:
             "latching": str(int(latched)),
         }
         self._queue = queue
-        self._replay_until = asyncio.get_running_loop().time() + replay
-        self._kept: deque[bytes] = deque(maxlen=1 if latched else queue)  # for subscribers that connect later
+        loop = asyncio.get_running_loop()
+        self._replay_until = loop.time() + replay
+        self._kept = _SendQueue("", 1 if latched else queue, link.limits.queue_bytes)  # for later subscribers
+        if not latched:
+            loop.call_later(replay, self._kept.clear)
         self._served: set[_SendQueue] = set()
         self._tasks = OwnedTasks()
 
@@ -231,9 +234,7 @@ class NodePublication:
     def publish(self, body: bytes) -> None:
         """Send a serialised message to all subscribers."""
         if self.latched or self._replays():
-            self._kept.append(body)
-        else:
-            self._kept.clear()
+            self._kept.put(encode_frame(body))
         frame = encode_frame(body) if self._served else b""
         for one in self._served:
             self.dropped += one.put(frame)
@@ -243,8 +244,8 @@ class NodePublication:
     def repeat(self, received: Received) -> None:
         """Give `received` the last message, if the publication is latched."""
         if self.latched:
-            for body in self._kept:
-                received(body, self._header)
+            for frame in self._kept.frames:
+                received(frame[4:], self._header)  # without its length
 
     def _replays(self) -> bool:
         return asyncio.get_running_loop().time() < self._replay_until
@@ -263,8 +264,8 @@ class NodePublication:
         writer.write(encode_header(self._header))
         queue = _SendQueue(header.get("callerid", "")[:200], self._queue, self._link.limits.queue_bytes)
         if self.latched or self._replays():
-            for body in self._kept:
-                queue.put(encode_frame(body))
+            for frame in self._kept.frames:
+                queue.put(frame)
         self._served.add(queue)
         sending = self._tasks.start(queue.send_to(writer))
         try:
@@ -287,20 +288,25 @@ class _SendQueue:
     def __init__(self, name: str, most: int, most_bytes: int) -> None:
         self.name = name
         self._most, self._most_bytes = most, most_bytes
-        self._frames: deque[bytes] = deque()
+        self.frames: deque[bytes] = deque()
         self._bytes = 0
         self._ready = asyncio.Event()
 
     def put(self, frame: bytes) -> int:
         """Add a frame; return how many older ones were dropped for it."""
         dropped = 0
-        self._frames.append(frame)
+        self.frames.append(frame)
         self._bytes += len(frame)
-        while len(self._frames) > 1 and (len(self._frames) > self._most or self._bytes > self._most_bytes):
-            self._bytes -= len(self._frames.popleft())
+        while len(self.frames) > 1 and (len(self.frames) > self._most or self._bytes > self._most_bytes):
+            self._bytes -= len(self.frames.popleft())
             dropped += 1
         self._ready.set()
         return dropped
+
+    def clear(self) -> None:
+        """Drop all frames."""
+        self.frames.clear()
+        self._bytes = 0
 
     async def send_to(self, writer: ByteWriter) -> None:
         """Send what is added, until the connection ends."""
@@ -308,8 +314,8 @@ class _SendQueue:
             while True:
                 await self._ready.wait()
                 self._ready.clear()
-                while self._frames:
-                    frame = self._frames.popleft()
+                while self.frames:
+                    frame = self.frames.popleft()
                     self._bytes -= len(frame)
                     writer.write(frame)
                     await writer.drain()

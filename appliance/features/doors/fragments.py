@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 from appliance.features.doors.requests import ClientId
 from appliance.features.doors.rosbridge_frames import FragmentOp, OperationError
 
-_OVERHEAD = 64  # bytes that a fragment takes besides its text
+_OVERHEAD = 200  # bytes that a fragment takes besides its text
+_FRAME_OVERHEAD = 600  # bytes that a frame takes besides its id and its fragments
 
 
 @dataclass(slots=True)
@@ -25,16 +26,17 @@ class FragmentStore:
 
     def add(self, fragment: FragmentOp) -> bytes | None:
         """Add a fragment; return the frame once it is complete. Raises `OperationError`, and drops the frame."""
-        frame = self._frames.setdefault(fragment.id, _Incomplete(fragment.total))
+        frame = self._frames.get(fragment.id)
+        if frame is None:
+            frame = self._frames[fragment.id] = _Incomplete(fragment.total)
+            self._charge(frame, _FRAME_OVERHEAD + len(str(fragment.id)))
         if fragment.total != frame.total or fragment.num >= frame.total or fragment.num in frame.parts:
             self._remove(fragment.id)
             raise OperationError(
                 f"fragment {fragment.num} of {fragment.total} does not fit its frame of {frame.total}; send it again"
             )
-        size = len(fragment.data) + _OVERHEAD
         frame.parts[fragment.num] = fragment.data
-        frame.bytes += size
-        self._bytes += size
+        self._charge(frame, len(fragment.data) + _OVERHEAD)
         if self._bytes > self._most_bytes:
             self._frames.clear()
             self._bytes = 0
@@ -45,6 +47,10 @@ class FragmentStore:
             return None
         self._remove(fragment.id)
         return "".join(frame.parts[number] for number in range(frame.total)).encode()
+
+    def _charge(self, frame: _Incomplete, size: int) -> None:
+        frame.bytes += size
+        self._bytes += size
 
     def _remove(self, key: ClientId) -> None:
         self._bytes -= self._frames.pop(key).bytes

@@ -344,7 +344,7 @@ def test_everything_that_a_client_can_make_grow_has_a_limit() -> None:
         "publish": lambda number: {"topic": f"/t{number}"},
         "advertise": lambda number: {"topic": "/t1", "type": "a/B", "id": number},
         "advertise_service": lambda number: {"service": f"/s{number}", "type": "a/B"},
-        "fragment": lambda number: {"id": number, "num": 0, "total": 9, "data": "x" * 100},
+        "fragment": lambda number: {"id": "x" * 900 + str(number), "num": 0, "total": 9, "data": ""},
     }
     for operation, fields in made.items():
         refused = 0

@@ -1,6 +1,7 @@
 """A node in virtual time: two nodes, a scripted master and peers that break the rules, on a network in memory."""
 
 import asyncio
+import tracemalloc
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -145,6 +146,20 @@ async def test_early_messages_are_replayed_only_for_a_while(wait: float, heard: 
         await listener.subscribe("/cmd_vel", lambda body, _header: got.append(body))
         await later()
         assert got == heard
+
+
+async def test_early_messages_take_no_memory_after_the_replay() -> None:
+    async with nodes() as world:
+        talker = await world.node("10.0.0.2")
+        publisher = await talker.advertise("/image", STRING, latched=False, queue=100, replay=1)
+        tracemalloc.start()
+        for _ in range(9):
+            publisher.publish(bytes(100_000))
+        await later(1.5)
+        taken, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert taken < 300_000
+        assert peak > 900_000
 
 
 async def test_a_slow_subscriber_loses_the_oldest_messages() -> None:
