@@ -197,7 +197,7 @@ class DriveOrders:
                 if stop:
                     await self._stop.after(str(before.host), group.names, f"{group.name}: {reason}")
             heir = to or self._next(group)
-            # A relay whose link was lost meanwhile may still let the earlier holder through.
+            # A relay whose link was lost in the meantime may still let the earlier holder through.
             if heir is not None and self._relays_ready() and self._claim(group, heir) is not None:
                 self._groups.hold(group.name, heir, clock.now())
                 self._decide_again()
