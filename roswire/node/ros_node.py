@@ -186,6 +186,10 @@ class RosNode:
                 raise
             return publisher
 
+    async def advertise_again(self, topic: str) -> None:
+        """Register a publication again, which shows whether the master still grants it. Raises `RosError`."""
+        await self.master("registerPublisher", topic, self.publishers[topic].type.name, self._uri)
+
     async def unadvertise(self, topic: str) -> None:
         """End a publication, if there is one."""
         async with self._lock("publisher", topic):

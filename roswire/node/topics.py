@@ -218,11 +218,10 @@ class NodePublication:
             "latching": str(int(latched)),
         }
         self._queue = queue
-        loop = asyncio.get_running_loop()
-        self._replay_until = loop.time() + replay
+        self._replay = replay
         self._kept = _SendQueue("", 1 if latched else queue, link.limits.queue_bytes)  # for later subscribers
-        if not latched:
-            loop.call_later(replay, self._kept.clear)
+        self._forget: asyncio.TimerHandle | None = None
+        self.replay_from_now()
         self._served: set[_SendQueue] = set()
         self._tasks = OwnedTasks()
 
@@ -246,6 +245,15 @@ class NodePublication:
         if self.latched:
             for frame in self._kept.frames:
                 received(frame[4:], self._header)  # without its length
+
+    def replay_from_now(self) -> None:
+        """Keep the next messages for subscribers that connect within `replay` seconds from now; forget earlier ones."""
+        loop = asyncio.get_running_loop()
+        self._kept.clear()
+        self._replay_until = loop.time() + self._replay
+        if self._forget is not None:
+            self._forget.cancel()
+        self._forget = None if self.latched else loop.call_later(self._replay, self._kept.clear)
 
     def _replays(self) -> bool:
         return asyncio.get_running_loop().time() < self._replay_until

@@ -48,6 +48,7 @@ from roswire.node.tcpros_streams import ANY
 _LINGER_SECONDS = 10.0
 _REPLAY_SECONDS = 1.0  # not longer: an old command must not reach a robot
 _LEARN_SECONDS = 1.0
+_ASK_SECONDS, _ASK_AGAIN_SECONDS = 1.0, 10.0
 _MOST_PARAMETERS = 1000  # of one request
 _ANSWER_SECONDS = 60.0  # for a client that answers a call of its service
 
@@ -88,6 +89,11 @@ class DoorClient(_Subscriber, Protocol):
 class _Publication:
     publication: NodePublication
     codec: MessageCodec
+    asked: float
+    """When the master was last asked whether it grants the publication."""
+    doubtful: bool = False
+    """Whether its subscribers have left since then, or the master refused it."""
+    refusal: RosError | None = None
     clients: set[DoorClient] = field(default_factory=set)
 
 
@@ -128,7 +134,7 @@ class DoorNode:
             case UnadvertiseTopic(topic):
                 self._unadvertise(topic, client)
             case PublishMessage():
-                self._publish(request)
+                await self._publish(request)
             case SubscribeTopic():
                 await self._subscribe(request, client)
             case UnsubscribeTopic(topic):
@@ -171,7 +177,7 @@ class DoorNode:
                     queue=request.queue,
                     replay=_REPLAY_SECONDS,
                 )
-                known = self._publications[request.topic] = _Publication(publication, codec)
+                known = self._publications[request.topic] = _Publication(publication, codec, clock.now())
             elif request.type not in (None, known.publication.type.name):
                 raise ProtocolError(
                     f"{request.topic} is advertised as {known.publication.type.name}, not {request.type}"
@@ -206,14 +212,34 @@ class DoorNode:
                 del self._publications[topic]
                 await self.node.unadvertise(topic)
 
-    def _publish(self, request: PublishMessage) -> None:
+    async def _publish(self, request: PublishMessage) -> None:
         known = self._publications.get(request.topic)
         if known is None:
             raise ProtocolError(f"{request.topic} is not advertised by this client")
+        await self._check_granted(known)
         values = request.values
         known.publication.publish(
             known.codec.writer.from_json(values, present_time()) if isinstance(values, Raw) else values
         )
+
+    async def _check_granted(self, known: _Publication) -> None:
+        """Raise the master's refusal if the publication is no longer granted, such as after the end of an approval.
+
+        The master tells no publisher. So ask it again while no subscriber is connected: soon after they left.
+        """
+        if known.publication.subscribers:
+            known.doubtful, known.refusal = True, None
+        elif clock.now() - known.asked >= (_ASK_SECONDS if known.doubtful else _ASK_AGAIN_SECONDS):
+            known.asked, before = clock.now(), known.refusal
+            try:
+                await self.node.advertise_again(known.publication.topic)
+                known.doubtful, known.refusal = False, None
+            except MasterDenialError as denial:
+                known.doubtful, known.refusal = True, denial
+            if before is not None and known.refusal is None:
+                known.publication.replay_from_now()
+        if known.refusal is not None:
+            raise known.refusal
 
     # --- subscriptions ---
 

@@ -1,0 +1,202 @@
+"""An agent is held, approved, and held again; a lease on a motion ends by silence, with the guard's stop."""
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.sync.client import connect
+
+from examples.landshark.lab import Host, Lab
+from tests.integration.features.doors.test_running_doors import frame
+from tests.support.appliance import Appliance
+from tests.support.nodes import RosSession
+from tests.support.waiting import eventually
+
+AGENT = "ws://10.77.0.2:9091"
+TWIST = {"linear": {"x": 0.5}}
+DRIVES, STOPS = ",0.5,0.0,0.0,0.0,0.0,0.0", ",0.0,0.0,0.0,0.0,0.0,0.0"
+POLICY = """
+[Groups]
+site = 10.77.0.0/24
+agent = door:agent-1
+[Nodes]
+default = site agent
+[Publishers]
+default = site
+/cmd_vel = site, ask agent
+[Subscribers]
+default = site agent
+[Services]
+default = site
+[Clients]
+default = site
+/brake = site, ask agent
+[Commands]
+default = site agent
+[Parameters]
+read default = site agent
+write default = site
+write /agent/** = site, ask agent
+"""
+
+
+@pytest.fixture
+def appliance(lab: Lab) -> Iterator[Appliance]:
+    """An appliance with the door of an agent on the robot."""
+    with Appliance(lab.host("appliance", "10.77.0.2/24"), policy=POLICY) as running:
+        running.rosrv("door", "add", "agent-1", "--port", "9091", "--from", "10.77.0.10")
+        eventually(lambda: not running.row("door", "list")["trouble"], "the door serves")
+        yield running
+
+
+def agent(robot: Host, *frames: dict[str, Any], answer: str) -> dict[str, Any]:
+    """Send frames on a connection of their own, as ros-mcp does; return the first frame of this operation."""
+
+    def work() -> dict[str, Any]:
+        with connect(AGENT) as client:
+            for one in frames:
+                client.send(json.dumps(one))
+            found: dict[str, Any] = frame(client, op=answer)
+            return found
+
+    return robot.run(work)  # type: ignore[no-any-return]  # of the robot's process
+
+
+def number_in(text: str) -> str:
+    """Return the number of the approval in a refusal."""
+    found = re.search(r"held for approval ([0-9]+); ask the operator, then repeat; expires in [0-9]+ s", text)
+    assert found, text
+    return found[1]
+
+
+def test_a_call_is_held_approved_used_once_and_held_again(
+    appliance: Appliance, robot: Host, tmp_path: Path
+) -> None:
+    """The same number while it waits; other arguments are another call; a lease is for all of them."""
+    brake = {"op": "call_service", "service": "/brake"}
+
+    def call(on: bool) -> dict[str, Any]:
+        return agent(robot, {**brake, "args": [on]}, answer="service_response")
+
+    with RosSession(appliance.master_uri, tmp_path, robot) as ros:
+        ros.service_server("roscpp", "/brake")
+        held = number_in(call(True)["values"]["message"])
+        assert number_in(call(True)["values"]["message"]) == held
+        assert number_in(call(False)["values"]["message"]) != held
+        assert "{'data': True}: waits" in appliance.rosrv("approve").stdout
+        assert "approved by" in appliance.rosrv("approve", held).stdout
+        assert call(True)["result"] is True
+        again = number_in(call(True)["values"]["message"])
+        assert again != held
+        appliance.rosrv("approve", again, "--refuse")
+        assert "an operator refused approval" in call(True)["values"]["message"]
+        other = number_in(call(False)["values"]["message"])
+        appliance.rosrv("approve", other, "--for", "30s")
+        assert call(True)["result"] is True and call(False)["result"] is True
+        appliance.rosrv("approve", other, "--refuse")
+        assert "refused approval" in call(True)["values"]["message"]
+        number_in(call(False)["values"]["message"])
+        appliance.kill("control")
+        eventually(
+            lambda: "no call waits" in appliance.rosrv("approve", check=False).stdout, "nothing is kept"
+        )
+        number_in(call(False)["values"]["message"])
+    assert appliance.recorded("--event", "approval used")
+    assert appliance.recorded("--event", "approval given", count=2)
+
+
+def test_a_publication_lasts_for_its_lease(appliance: Appliance, robot: Host, tmp_path: Path) -> None:
+    """The door tells its client in words that the lease is over, on a connection that stays open."""
+    advertise = {"op": "advertise", "topic": "/cmd_vel", "type": "geometry_msgs/Twist", "id": "a"}
+    publish = {"op": "publish", "topic": "/cmd_vel", "msg": TWIST, "id": "p"}
+    with RosSession(appliance.master_uri, tmp_path, robot) as ros:
+        echo = ros.start(["/usr/bin/rostopic", "echo", "-p", "/cmd_vel"])
+        held = number_in(agent(robot, advertise, answer="status")["msg"])
+        appliance.rosrv("approve", held, "--for", "5s")
+
+        def work() -> str:
+            with connect(AGENT) as client:
+                client.send(json.dumps(advertise))
+                for _ in range(100):
+                    client.send(json.dumps(publish))
+                    try:
+                        return str(json.loads(client.recv(0.1))["msg"])
+                    except TimeoutError:
+                        continue
+            return "no refusal"
+
+        again = number_in(robot.run(work))
+        echo.wait_for_text(DRIVES)
+        mark = echo.mark()
+        appliance.rosrv("approve", again)
+        eventually(lambda: robot.run(lambda: published(publish)) or None, "it is heard again")
+        echo.wait_for_text(DRIVES, since=mark)
+        appliance.kill("control")
+        eventually(
+            lambda: "no call waits" in appliance.rosrv("approve", check=False).stdout, "nothing is kept"
+        )
+        eventually(lambda: "held for" in robot.run(lambda: refused(publish)), "the lease is over")
+
+
+def published(publish: dict[str, Any]) -> bool:
+    """Advertise and publish on a connection; return whether nothing was refused."""
+    return not refused(publish)
+
+
+def refused(publish: dict[str, Any]) -> str:
+    """Advertise and publish on a connection for two seconds; return the last refusal."""
+    text = ""
+    with connect(AGENT) as client:
+        client.send(json.dumps({"op": "advertise", "topic": "/cmd_vel", "type": "geometry_msgs/Twist"}))
+        for _ in range(20):
+            client.send(json.dumps(publish))
+            try:
+                text = str(json.loads(client.recv(0.1)).get("msg", ""))
+            except TimeoutError:
+                continue
+    return text
+
+
+def test_a_parameter_is_written_while_a_lease_lasts(appliance: Appliance, robot: Host) -> None:
+    write = {
+        "op": "call_service",
+        "service": "/rosapi/set_param",
+        "args": {"name": "/agent/speed", "value": "1"},
+    }
+    held = number_in(agent(robot, write, answer="service_response")["values"]["message"])
+    appliance.rosrv("approve", held, "--for", "20s")
+    assert agent(robot, write, answer="service_response")["result"] is True
+
+
+MOTION = POLICY + "[Authority]\nbase = /cmd_vel\ntake base = site agent\nlease base = 2s\n"
+
+
+def test_a_lease_on_a_motion_ends_by_silence_and_the_guard_stops_the_robot(
+    appliance: Appliance, robot: Host, tmp_path: Path
+) -> None:
+    """Without a guard, a record says that nothing stops the robot."""
+    appliance.reload(MOTION)
+    publish = {"op": "publish", "topic": "/cmd_vel", "msg": TWIST, "id": "p"}
+    advertise = {"op": "advertise", "topic": "/cmd_vel", "type": "geometry_msgs/Twist", "id": "a"}
+    with RosSession(appliance.master_uri, tmp_path, robot) as ros:
+        echo = ros.start(["/usr/bin/rostopic", "echo", "-p", "/cmd_vel"])
+
+        def drive() -> None:
+            held = number_in(agent(robot, advertise, answer="status")["msg"])
+            appliance.rosrv("approve", held, "--for", "60s")
+            appliance.rosrv("drive", "take", "base", "--host", "door:agent-1")
+            robot.run(lambda: refused(publish))
+            echo.wait_for_text(DRIVES)
+
+        drive()
+        [record] = appliance.recorded("--event", "motion not stopped", count=1)[:1]
+        assert "nothing stops the robot" in record["reason"]
+        appliance.rosrv("guard", "new", "speed", "/cmd_vel", "--type", "command=geometry_msgs/Twist")
+        mark = echo.mark()
+        drive()
+        stops = appliance.recorded("--event", "motion stopped", count=1)
+        assert "speed on /cmd_vel" in stops[0]["reason"], stops
+        echo.wait_for_text(STOPS, since=mark)
