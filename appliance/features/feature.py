@@ -102,7 +102,7 @@ class FeaturePart:
     adds anything. `called` answers nodes' calls of its services, by name without the appliance's own name. `sessions`
     are those of people whom the feature signs in; they count beside tokens. `hosts` are those in tunnels. `holders`
     returns the host that holds each group (`Policy.holders`). `approved` returns the approvals that last
-    (`Policy.approved`), `held` holds a call that needs one, and `approve` decides about a request to a service.
+    (`Policy.approved`), `hold_call` holds a call that needs one, and `approve` decides about a request to a service.
 
     `status_fields()` returns the present states of the feature by their fields in `rosrv status --json`. The feature's
     view defines the fields (`StateView`). A state that is None or missing is null there.
@@ -119,7 +119,7 @@ class FeaturePart:
     )
     holders: "Callable[[], Mapping[str, Address]]" = dict
     approved: "Callable[[], frozenset[Approval]]" = frozenset
-    held: "Callable[[Request], str] | None" = None
+    hold_call: "Callable[[Request], str] | None" = None
     approve: "Callable[[ApprovalWanted], Awaitable[ApprovalAnswered]] | None" = None
     work: Mapping[str, Callable[[], Awaitable[None]]] = field(default_factory=dict)
     connected: "Callable[[str, str, str, int], tuple[int, str]] | None" = None

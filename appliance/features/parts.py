@@ -27,6 +27,9 @@ LONGEST = 64 << 20
 """The most bytes of a message on a link of a feature, unless its part has a smaller limit."""
 
 
+_NO_APPROVALS = "no operator can approve calls on this appliance"
+
+
 class FeatureParts:
     """The parts of all features in control."""
 
@@ -125,10 +128,10 @@ class FeatureParts:
         """Return the approvals that last."""
         return frozenset(approval for part in self._parts for approval in part.approved())
 
-    def held(self, request: "Request") -> str:
-        """Hold a request that needs an approval; return what its host is told."""
-        held = next((part.held for part in self._parts if part.held is not None), None)
-        return "no operator can approve calls on this appliance" if held is None else held(request)
+    def hold_call(self, request: "Request") -> str:
+        """Hold a call that needs an approval; return the answer to its host."""
+        hold = next((part.hold_call for part in self._parts if part.hold_call is not None), None)
+        return _NO_APPROVALS if hold is None else hold(request)
 
     async def approve(self, wanted: "ApprovalWanted") -> "ApprovalAnswered":
         """Decide about one request of a client to a service."""
@@ -137,7 +140,7 @@ class FeatureParts:
             return await approve(wanted)
         from appliance.channel.messages import ApprovalAnswered  # noqa: PLC0415  few processes need it
 
-        return ApprovalAnswered(wanted.number, "no operator can approve calls on this appliance")
+        return ApprovalAnswered(wanted.number, _NO_APPROVALS)
 
     def sessions(self) -> "Sessions | None":
         """Return the sessions of people, or None if people sign in with tokens only."""

@@ -58,7 +58,7 @@ def serving(
         liveness=liveness,
         parameters=parameters,
         redecide_for=redecide_for,
-        held=lambda request: f"held: {request.resource}",
+        hold_call=lambda request: f"held: {request.resource}",
         large=offload,
         large_writes=LargeWrites(offload, lambda _host: QuotaClass.REGISTERED),
     )

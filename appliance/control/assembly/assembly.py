@@ -191,7 +191,7 @@ def _make_calls(
         liveness=ends.liveness,
         parameters=registration.parameters,
         redecide_for=ends.enforcement.redecide_for,
-        held=base.features.held,
+        hold_call=base.features.hold_call,
         large=offload,
         large_writes=LargeWrites(offload, base.quota_class, base.role.before_answer),
     )

@@ -71,8 +71,8 @@ class ApprovalOrders:
 
     # --- calls ---
 
-    def held(self, request: Request) -> str:
-        """Hold a publication or a write; return what its host is told."""
+    def hold_call(self, request: Request) -> str:
+        """Hold a publication or a write; return the answer to its host."""
         call = HeldCall(request.host, request.category, request.resource)
         return self._held(call, request.caller_id, "", b"")
 
@@ -130,6 +130,10 @@ class ApprovalOrders:
         async with self._turn:
             entry = self._entry(request.number)
             seconds = request.seconds
+            if seconds is None and entry.lease and entry.call.category is Category.CALL:
+                raise SenselessError(
+                    f"approval {entry.number} is a lease: give its new time with --for, or --refuse it"
+                )
             if seconds is None and entry.call.category is not Category.CALL:
                 seconds = LEASE_SECONDS  # a publisher registers once, so only a lease bounds its messages
             if seconds is not None and not requests.SHORTEST_LEASE <= seconds <= requests.LONGEST_LEASE:

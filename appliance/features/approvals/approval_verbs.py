@@ -2,6 +2,7 @@
 
 from typing import Annotated, Any
 
+import msgspec
 import typer
 
 from appliance.cli.connection.target import Appliance, speaks
@@ -58,7 +59,7 @@ def _list(appliance: Appliance) -> None:
 
 def _say(appliance: Appliance, one: Approval) -> None:
     if appliance.as_json:
-        say_json({field: getattr(one, field) for field in one.__struct_fields__})
+        say_json(msgspec.structs.asdict(one))
         return
     who = f" by {one.who}" if one.who else ""
     what = f"{one.number}: {one.host} {one.category} {one.resource}{_arguments(one)}"

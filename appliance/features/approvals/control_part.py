@@ -39,7 +39,7 @@ async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
         status_fields=lambda: {"approvals": orders.state()},
         limits=orders.limits,
         approved=orders.approved,
-        held=orders.held,
+        hold_call=orders.hold_call,
         approve=orders.approve_call,
         work={"the end of approvals": orders.watch},
     )

@@ -164,9 +164,7 @@ def explain_request(
     robot: Robot = None,
     enrolled: Enrolled = None,
 ) -> None:
-    """Explain whether a request is allowed, by which rule, and which rules were overridden.
-
-    Exit status 1 if it is denied or needs an approval.
+    """Explain whether a request is allowed, by which rule, and the overridden rules. Exit status 1 unless allowed.
 
     Without a file, explain the decision of the policy in force.
 

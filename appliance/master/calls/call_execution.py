@@ -67,7 +67,7 @@ class ServedRequest(NamedTuple):
 class Execution:
     """Carry out calls. A write of at least `large` bytes waits for other large writes.
 
-    `held(request)` holds a request that needs an approval, and returns what its host is told.
+    `hold_call(request)` holds a call that needs an approval, and returns the answer to its host.
     `redecide_for(host, caller_id)` revokes the rights of a caller that the policy in force does not allow.
     """
 
@@ -79,7 +79,7 @@ class Execution:
     liveness: Liveness
     parameters: ParameterCalls
     redecide_for: Callable[[Address, str], None]
-    held: Callable[[Request], str]
+    hold_call: Callable[[Request], str]
     large: int
     large_writes: LargeWrites
     _names: KeyTurns = field(default_factory=KeyTurns, init=False)
@@ -227,7 +227,7 @@ class Execution:
         """Record a decision; return the answer of a denial, or None if the call is allowed."""
         request, call = attempt.request, attempt.call
         if decision.asks is not None and not decision.allowed:
-            decision = replace(decision, reason=self.held(decision.asks))
+            decision = replace(decision, reason=f"{self.hold_call(decision.asks)}: {decision.reason}")
         record = self.trail.decided(
             attempt.caller.asker,
             call.name,

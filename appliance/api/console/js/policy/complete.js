@@ -8,12 +8,12 @@ const SECTIONS = /** @type {Record<string, {keys?: string[], names?: "nodes" | "
   Ports: { keys: ["range"] },
   Monitor: { keys: ["topic", "service"] },
   Nodes: { keys: ["default"], names: "nodes" },
-  Publishers: { keys: ["default"], names: "topics" },
+  Publishers: { keys: ["default"], names: "topics", values: ["ask"] },
   Subscribers: { keys: ["default"], names: "topics" },
   Commands: { keys: ["default"] },
   Services: { keys: ["default"], names: "services" },
-  Clients: { keys: ["default"], names: "services" },
-  Parameters: { keys: ["read default", "write default"] },
+  Clients: { keys: ["default"], names: "services", values: ["ask"] },
+  Parameters: { keys: ["read default", "write default"], values: ["ask"] },
   Limits: { names: "topics", values: ["publisher", "subscriber", "topic"] },
   Authority: {},
   Options: { keys: ["takeover", "audit-only", "tell"] },
@@ -58,7 +58,7 @@ async function valuesOf(/** @type {string} */ section, /** @type {{values?: stri
   if (section === "Options") return [...named(OPTIONS[key] ?? [], "option"), ...named(key === "audit-only" ? Object.keys(SECTIONS) : [], "section")];
   if (section === "Monitor") return key === "topic" ? named((await live()).topics, "topic") : named((await live()).services, "service");
   if (section === "Ports") return [];
-  return [...named(values ?? [], "limit"), ...named(["robot", ...groupsOf(text)], "group"), ...named((await live()).hosts, "host")];
+  return [...named(values ?? [], section === "Limits" ? "limit" : "option"), ...named(["robot", ...groupsOf(text)], "group"), ...named((await live()).hosts, "host")];
 }
 
 /** The section at the end of a text, as `SECTIONS` spells it. */

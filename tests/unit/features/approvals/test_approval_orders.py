@@ -1,0 +1,280 @@
+"""Held calls and approvals: random histories, the orders of operators, and the end of each."""
+
+import hashlib
+import random
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from appliance.base import clock
+from appliance.channel.messages import ApprovalWanted
+from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.features.approvals.approval_orders import CHECK_SECONDS, LEASE_SECONDS, ApprovalOrders
+from appliance.features.approvals.approval_requests import Approval, ApprovalsWanted, ApproveCall, RefuseCall
+from appliance.features.approvals.approval_table import WAIT_SECONDS
+from appliance.features.approvals.view import APPROVALS_VIEW
+from appliance.master.endpoints.host_signs import HostSigns
+from appliance.policy.model import Address, Category, Request, address_of
+from appliance.policy.policy import Policy
+from appliance.policy.policy_compiler import compile_policy
+from tests.support.virtual_clock import VirtualClock
+
+pytestmark = pytest.mark.anyio
+AGENT, OTHER = address_of("10.0.0.7"), address_of("10.0.0.8")
+TEXT = f"""
+[Publishers]
+default = ask {AGENT} {OTHER}
+[Clients]
+default = ask {AGENT} {OTHER}
+[Parameters]
+write default = ask {AGENT}
+[Authority]
+base = /cmd_vel
+take base = {AGENT}
+lease base = 5s
+"""
+NUMBER = re.compile(r"held for approval ([0-9]+); ask the operator, then repeat; expires in ([0-9]+) s")
+
+
+class Site:
+    """Control without nodes: what is approved passes at once."""
+
+    def __init__(self, time: VirtualClock) -> None:
+        self.time = time
+        self.text = compile_policy(TEXT, file="site.ini")
+        self.policy: Policy
+        self.records: list[dict[str, Any]] = []
+        self.decisions: list[str] = []
+        self.stops: list[tuple[str, set[str]]] = []
+        self.moved = 0.0
+        self.obstacle, self.strict = None, False
+        self.orders = ApprovalOrders(
+            lambda: self.policy,
+            cast(Any, self),
+            HostSigns(lambda _host: True, lambda _host, _names: self.moved),
+            cast(Any, SimpleNamespace(after=self.stop)),
+            first=17,
+            decide_again=self.decide_again,
+            carried_out=self.carried_out,
+        )
+        self.decide_again()
+
+    def decide_again(self) -> int:
+        self.policy = replace(self.text, approved=self.orders.approved())
+        return 0
+
+    async def carried_out(self) -> None:
+        assert self.policy.approved == self.orders.approved()
+
+    async def stop(self, host: str, topics: set[str], _why: str) -> None:
+        """The guards stop what a host published; its messages already no longer pass."""
+        assert not any(
+            (address_of(host), Category.PUBLISH, topic) in self.orders.approved() for topic in topics
+        )
+        self.stops.append((host, topics))
+
+    def happened(self, event: str, reason: str, **detail: Any) -> None:
+        self.records.append({"event": event, "reason": reason, **detail})
+
+    def decided(self, *asked: Any) -> str:
+        self.decisions.append(asked[-1].word)
+        return "id"
+
+    def shut_out(self, _host: str) -> str:
+        return ""
+
+    def events(self) -> list[str]:
+        return [one["event"].removeprefix("approval ") for one in self.records]
+
+    async def pass_time(self, seconds: float) -> None:
+        """Let time pass, in steps of the watch."""
+        for _ in range(round(seconds / CHECK_SECONDS)):
+            self.time.advance(CHECK_SECONDS)
+            await self.orders.check()
+
+    async def call(self, body: bytes = b"", host: Address = AGENT, service: str = "/home") -> str:
+        """Make a request to a service; return its refusal."""
+        digest = hashlib.sha256(body).hexdigest()
+        wanted = ApprovalWanted(1, service, str(host), "/it", "std_srvs/SetBool", digest, body)
+        return (await self.orders.approve_call(wanted)).refused
+
+    def publish(self, topic: str, category: Category = Category.PUBLISH) -> str:
+        """Publish a topic, or write a parameter; return the refusal."""
+        decision = self.policy.decide(Request(AGENT, "/it", category, topic))
+        return (
+            ""
+            if decision.allowed
+            else self.orders.hold_call(decision.asks or Request(AGENT, "", category, ""))
+        )
+
+    async def held(self) -> list[Approval]:
+        return (await self.orders.listed(ApprovalsWanted())).approvals
+
+
+@pytest.fixture
+def site() -> Any:
+    with clock.using(time := VirtualClock()):
+        yield Site(time)
+
+
+def number_in(text: str) -> int:
+    found = NUMBER.search(text)
+    assert found, text
+    return int(found[1])
+
+
+async def test_an_approval_of_one_call_is_used_once(site: Site) -> None:
+    """By the same host, for the same service and arguments; a repetition of a call that waits keeps its number."""
+    first = number_in(await site.call(b"1"))
+    assert first == number_in(await site.call(b"1")) == 17
+    assert number_in(await site.call(b"2")) != first
+    shown = await site.orders.approve(ApproveCall(first), "ann")
+    assert (shown.state, shown.who, shown.left_seconds) == ("approved", "ann", WAIT_SECONDS)
+    for refusal in (
+        await site.call(b"2"),
+        await site.call(b"1", OTHER),
+        await site.call(b"1", service="/other"),
+    ):
+        assert number_in(refusal) != first
+    assert await site.call(b"1") == ""
+    assert number_in(await site.call(b"1")) != first
+    assert site.decisions.count("allow") == 1
+    assert site.events().count("used") == 1
+
+
+async def test_a_lease_of_a_service_is_for_any_arguments_until_its_time(site: Site) -> None:
+    number = number_in(await site.call(b"1"))
+    await site.orders.approve(ApproveCall(number, 10.0), "ann")
+    assert [await site.call(body) for body in (b"1", b"2", b"1")] == ["", "", ""]
+    assert number_in(await site.call(b"1", OTHER)) != number
+    await site.pass_time(10)
+    assert number_in(await site.call(b"1")) != number
+
+
+async def leased_call(site: Site) -> int:
+    """Return the number of a lease on a service, which cannot become an approval of one call with any arguments."""
+    number = number_in(await site.call(b"1"))
+    await site.orders.approve(ApproveCall(number, 10.0), "ann")
+    return number
+
+
+@pytest.mark.parametrize("category", [Category.PUBLISH, Category.WRITE])
+async def test_a_topic_and_a_parameter_are_approved_for_some_time(site: Site, category: Category) -> None:
+    number = number_in(site.publish("/x", category))
+    assert number_in(site.publish("/x", category)) == number
+    assert number_in(site.publish("/y", category)) != number
+    assert (await site.orders.approve(ApproveCall(number), "ann")).left_seconds == LEASE_SECONDS
+    assert site.publish("/x", category) == ""
+    await site.pass_time(LEASE_SECONDS - 1)
+    assert site.publish("/x", category) == ""
+    await site.pass_time(1)
+    assert number_in(site.publish("/x", category)) != number
+    with pytest.raises(SenselessError, match="is a lease"):
+        await site.orders.approve(ApproveCall(await leased_call(site)), "ann")
+    for seconds in (0.5, 3601.0, float("nan")):
+        with pytest.raises(SenselessError, match="is not a lease"):
+            await site.orders.approve(ApproveCall(number_in(site.publish("/x", category)), seconds), "ann")
+
+
+async def test_a_lease_on_a_motion_ends_by_silence_and_the_guards_stop_the_robot(site: Site) -> None:
+    """Silence counts from the first message on; a topic without a group keeps its lease."""
+    for topic in ("/cmd_vel", "/other"):
+        await site.orders.approve(ApproveCall(number_in(site.publish(topic)), 60.0), "ann")
+    await site.pass_time(20)
+    assert site.publish("/cmd_vel") == ""
+    site.moved = clock.now()
+    await site.pass_time(4.5)
+    assert site.publish("/cmd_vel") == "" and not site.stops
+    await site.pass_time(0.5)
+    assert site.publish("/cmd_vel")
+    assert site.publish("/other") == ""
+    assert site.stops == [(str(AGENT), {"/cmd_vel"})]
+    await site.pass_time(60)
+    assert site.stops[1:] == [(str(AGENT), {"/other"})], "its guards stop it too, if there are any"
+
+
+async def test_an_operator_refuses_a_call_and_ends_an_approval(site: Site) -> None:
+    number = number_in(await site.call())
+    await site.orders.refuse(RefuseCall(number), "ann")
+    assert await site.call() == await site.call()
+    assert f"an operator refused approval {number}" in await site.call()
+    await site.pass_time(WAIT_SECONDS)
+    lease = number_in(site.publish("/x"))
+    await site.orders.approve(ApproveCall(lease), "ann")
+    await site.orders.refuse(RefuseCall(lease), "ann")
+    assert number_in(site.publish("/x")) != lease
+    for order in (
+        site.orders.approve(ApproveCall(lease), "ann"),
+        site.orders.refuse(RefuseCall(number), "ann"),
+    ):
+        with pytest.raises(UnknownThingError, match="rosrv approve lists all"):
+            await order
+
+
+async def test_a_call_that_nobody_answers_ends_with_an_alarm(site: Site) -> None:
+    [view] = APPROVALS_VIEW.states
+    number = number_in(await site.call())
+    assert not [*view.alarms(site.orders.state())]
+    await site.pass_time(WAIT_SECONDS)
+    [alarm] = view.alarms(site.orders.state())
+    assert alarm.kind == "approval-unanswered"
+    assert number_in(await site.call()) != number
+    await site.pass_time(1)
+    site.time.advance(600)
+    assert not [*view.alarms(site.orders.state())]
+
+
+async def test_an_approval_ends_when_the_policy_no_longer_asks(site: Site) -> None:
+    """A block and a denial end it for good: a later policy does not bring it back."""
+    for change in ("[Publishers]\n", "block"):
+        number = number_in(site.publish("/x"))
+        await site.orders.approve(ApproveCall(number, 3600.0), "ann")
+        before = site.text
+        site.text = compile_policy("[Publishers]\n", file="site.ini")
+        if change == "block":
+            site.text = replace(before, blocks={AGENT: "blocked by ann"})
+        site.decide_again()
+        await site.pass_time(CHECK_SECONDS)
+        site.text = before
+        site.decide_again()
+        assert number_in(site.publish("/x")) != number
+
+
+async def test_a_host_has_a_quota_of_waiting_calls(site: Site) -> None:
+    for body in range(20):
+        await site.call(bytes([body]))
+    assert len(await site.held()) == 8
+    assert "8 calls of a host may wait" in await site.call(b"more")
+    assert number_in(await site.call(b"1", OTHER))
+    [use] = site.orders.limits()
+    assert (use.used, use.host, use.host_used) == (9, str(AGENT), 8)
+    await site.pass_time(WAIT_SECONDS)
+    assert await site.held() == []
+    assert number_in(await site.call(b"more"))
+
+
+async def test_no_call_passes_without_an_approval_of_its_own(site: Site) -> None:
+    """In random histories, each allowed call uses up one approval, or falls into a lease."""
+    chance = random.Random(11)  # noqa: S311  a history by seed
+    once: list[tuple[Address, bytes]] = []
+    leases: dict[Address, float] = {}
+    for _ in range(2000):
+        host, body = chance.choice((AGENT, OTHER)), chance.choice((b"1", b"2", b"3"))
+        match chance.randrange(4):
+            case 0:
+                if waiting := [one for one in await site.held() if one.state == "waits"]:
+                    one, seconds = chance.choice(waiting), chance.choice((None, 3.0))
+                    await site.orders.approve(ApproveCall(one.number, seconds), "ann")
+                    if seconds is None:
+                        once.append((address_of(one.host), bytes.fromhex(one.arguments)))
+                    else:
+                        leases[address_of(one.host)] = clock.now() + seconds
+            case 1:
+                await site.pass_time(chance.choice((0.25, 1, 2)))
+            case _:
+                leased = leases.get(host, 0.0) > clock.now()
+                if not await site.call(body, host) and not leased:
+                    once.remove((host, body))

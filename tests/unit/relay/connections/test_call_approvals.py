@@ -1,0 +1,100 @@
+"""Requests to services that need an approval, without sockets."""
+
+from typing import Any, cast
+
+import pytest
+
+from appliance.channel.messages import ApprovalAnswered
+from appliance.relay.connections.call_approvals import AWAY, CallApprovals
+from appliance.relay.connections.exchange import ServiceExchange
+from roswire.errors import ProtocolError
+from roswire.tcpros import encode_frame, encode_service_error, encode_service_reply
+
+
+class Relay:
+    """One client of a service, and control's end of the link."""
+
+    def __init__(self, *, asks: bool = True) -> None:
+        self.asks = asks
+        self.later: list[Any] = []
+        self.asked: list[Any] = []
+        self.service, self.client = bytearray(), bytearray()
+        self.approvals = CallApprovals(cast(Any, self), self.asked.append)
+        self.exchange = ServiceExchange(
+            1000,
+            persistent=True,
+            to_service=self.service.extend,
+            to_client=self.client.extend,
+            count=lambda _size: None,
+            asks=self.ask,
+        )
+        self.approvals.attach(True)
+
+    def after(self, _seconds: float, work: Any) -> None:
+        self.later.append(work)
+
+    def ask(self, body: bytes) -> bool:
+        if self.asks:
+            self.approvals.ask(("/home", "10.0.0.7", "/it"), "std_srvs/SetBool", body, self.exchange.settle)
+        return self.asks
+
+    def request(self, *bodies: bytes) -> None:
+        self.exchange.from_client(b"".join(map(encode_frame, bodies)))
+        self.exchange.advance()
+
+
+def test_a_held_request_reaches_the_service_only_when_approved() -> None:
+    """The next request of the connection waits, and is asked about on its own."""
+    relay = Relay()
+    relay.request(b"\x01", b"\x02")
+    assert not relay.service and not relay.exchange.may_read
+    relay.exchange.advance()
+    [wanted] = relay.asked
+    assert (wanted.service, wanted.host, wanted.caller_id, wanted.shown) == (
+        "/home",
+        "10.0.0.7",
+        "/it",
+        b"\x01",
+    )
+    relay.approvals.answered(ApprovalAnswered(wanted.number + 1, ""))
+    assert not relay.service, "the answer to another request"
+    relay.approvals.answered(ApprovalAnswered(wanted.number, ""))
+    relay.approvals.answered(ApprovalAnswered(wanted.number, ""))
+    assert relay.service == encode_frame(b"\x01")
+    relay.exchange.from_service(encode_service_reply(b"done"))
+    relay.exchange.advance()
+    assert relay.asked[1].digest != wanted.digest
+    relay.approvals.answered(ApprovalAnswered(relay.asked[1].number, "held for approval 17"))
+    assert relay.service == encode_frame(b"\x01")
+    assert relay.client.endswith(encode_service_error("held for approval 17"))
+
+
+def test_a_reply_without_a_request_is_an_error_while_one_is_held() -> None:
+    relay = Relay()
+    relay.request(b"\x01")
+    with pytest.raises(ProtocolError, match="without a request"):
+        relay.exchange.from_service(encode_service_reply(b"mine"))
+
+
+def test_requests_are_refused_without_control() -> None:
+    """Also those that wait when control ends. Each answer comes in a later turn, so that no flood nests."""
+    relay = Relay()
+    relay.request(b"\x01")
+    relay.approvals.attach(False)
+    relay.request(b"\x02")
+    assert len(relay.asked) == 1 and relay.client.count(AWAY.encode()) == 1
+    for work in relay.later:
+        work()
+    assert relay.client.count(AWAY.encode()) == 2 and not relay.service
+
+
+def test_a_client_that_asks_no_longer_is_not_held() -> None:
+    """The grant decides at each request, so a change of the policy also counts for open connections."""
+    relay = Relay()
+    relay.asks = False
+    relay.request(b"\x01")
+    assert relay.service == encode_frame(b"\x01")
+    relay.exchange.from_service(encode_service_reply(b"done"))
+    relay.asks = True
+    relay.request(b"\x01")
+    assert relay.service == encode_frame(b"\x01") and len(relay.asked) == 1
