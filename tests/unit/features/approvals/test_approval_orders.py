@@ -214,7 +214,7 @@ async def test_an_operator_refuses_a_call_and_ends_an_approval(site: Site) -> No
             await order
 
 
-async def test_a_call_that_nobody_answers_ends_with_an_alarm(site: Site) -> None:
+async def test_a_call_without_an_answer_ends_with_an_alarm(site: Site) -> None:
     [view] = APPROVALS_VIEW.states
     number = number_in(await site.call())
     assert not [*view.alarms(site.orders.state())]
