@@ -21,6 +21,13 @@ def test_no_answer_for_other_hosts_if_the_networks_are_all() -> None:
     assert [answer.hosts for answer in who_may(policy, Category.NODE, "/n")] == ["0.0.0.0/0", "::/0"]
 
 
+def test_hosts_that_need_an_approval_are_listed() -> None:
+    text = "[Nodes]\ndefault = *\n[Publishers]\n/cmd_vel = 10.0.0.1 ask 10.0.0.7\n"
+    policy = compile_policy(text, file="p.ini")
+    verdicts = [answer.decision.verdict for answer in who_may(policy, Category.PUBLISH, "/cmd_vel")]
+    assert verdicts == ["allow", "ask", "deny"]
+
+
 _NEAR = st.builds(
     lambda last, prefix: str(ipaddress.ip_network((10 << 24 | last, prefix), strict=False)),
     st.integers(0, 7),
