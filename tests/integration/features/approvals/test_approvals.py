@@ -63,7 +63,7 @@ def agent(robot: Host, *frames: dict[str, Any], answer: str) -> dict[str, Any]:
                 if found["op"] == answer:
                     return found
 
-    return robot.run(work)  # type: ignore[no-any-return]  # of the robot's process
+    return robot.run(work)
 
 
 def number_in(text: str) -> str:
