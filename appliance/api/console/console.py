@@ -9,7 +9,8 @@ Invariants:
 3. The headers restrict the page to this origin, for loading and for connections, and to its own scripts. A string never
    becomes markup (Trusted Types).
 4. The page names its files by addresses that contain a hash of their content, so browsers keep them without asking. All
-   modules are one script, all style sheets one, both made here: a missing file or name ends the start of the API.
+   modules are one script, all style sheets one, both made here: a missing file or name ends the start of the API. A
+   script of a feature that `import()` names is a file of its own, which a browser loads when the page needs it.
 """
 
 import gzip
@@ -26,7 +27,7 @@ from typing import NamedTuple
 from fastapi import APIRouter, Request
 from starlette.responses import Response
 
-from appliance.api.console.console_bundle import ModuleError, join_modules, join_styles
+from appliance.api.console.console_bundle import ModuleError, join_late_modules, join_modules, join_styles
 from appliance.api.front.problems import ProblemError
 from appliance.configuration.settings import Settings
 from appliance.features.feature import Feature
@@ -88,6 +89,8 @@ def routes(settings: Settings) -> APIRouter:
         if name not in served:
             raise ModuleError(f"the console names {_PREFIX}{name}, which does not exist")
         if name not in addresses:
+            if name.startswith("features/") and name.endswith(".js"):
+                joined[name] = join_late_modules(texts, name)
             body = _ADDRESS.sub(named, joined[name]).encode() if name in joined else served[name].body
             lasting = _file(body, served[name].media_type, lasting=True)
             stem, _, ending = name.rpartition(".")

@@ -66,6 +66,18 @@ def join_modules(sources: Mapping[str, str], entry: str) -> str:
     return joining.script()
 
 
+def join_late_modules(sources: Mapping[str, str], entry: str) -> str:
+    """Return one module with the entry and all that it imports from its folder, with the exports of the entry.
+
+    A page loads it by `import()` at its address. Modules of other folders are in the page's script, with their state,
+    so the entry gets them as arguments. Raise `ModuleError`.
+    """
+    folder = f"{posixpath.dirname(entry)}/"
+    joining = _Joining({name: text for name, text in sources.items() if name.startswith(folder)})
+    joining.include(entry)
+    return f"{joining.script()}{joining.exports(entry)}"
+
+
 def join_styles(sources: Mapping[str, str], entry: str, within: tuple[str, ...] = ()) -> str:
     """Return one style sheet: the entry with the files that it imports, without comments and indentation.
 
@@ -101,6 +113,9 @@ class _Joining:
             heads.setdefault(address, []).append(f"{name} as {alias}")
         imports = [f'import {{{",".join(names)}}} from "{address}";\n' for address, names in heads.items()]
         return "".join(imports + self._scopes)
+
+    def exports(self, path: str) -> str:
+        return f"export const {{{','.join(sorted(self._exports[path]))}}}={self._constants[path]};\n"
 
     def include(self, path: str) -> None:
         if path in self._open:

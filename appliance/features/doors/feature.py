@@ -40,7 +40,7 @@ DOORS = Feature(
         ),
     ),
     operations=_operations,
-    console=(ConsolePart("robot", "panel.js", "Doors"),),
+    console=(ConsolePart("robot", "own.js", "OwnDoor"), ConsolePart("robot", "panel.js", "Doors")),
     verbs={
         "door": Group(
             "Let browsers, viewers and agents in, each with its own rights.",

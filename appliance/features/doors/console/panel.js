@@ -56,13 +56,20 @@ function DoorRow(/** @type {{door: any, again: () => void}} */ { door, again }) 
     <td data-label="Opened by"><div>${door.port && html`<div>port ${door.port} from <${Given} value=${door.source || "anywhere"} mono />${!door.source && html` <${Badge} word="every host" tone="warn" />`}</div>`}
       ${door.tickets.map((/** @type {any} */ one) => html`<div key=${one.id} class="small">ticket <${Given} value=${one.id} mono /> until <${Moment} at=${one.expires} />, by <${Given} value=${one.who} most=${40} /></div>`)}
       ${!door.port && !door.tickets.length && html`<span class="muted small">no valid ticket</span>`}</div></td>
-    <td class="number" data-label="Connected">${door.connections ? html`<${Badge} word=${String(door.connections)} tone="allow" />` : "0"}</td>
+    <td class="number" data-label="Connected">${door.connections ? html`<${Clients} door=${door} />` : "0"}</td>
     <td class="number" data-label="Received">${count(door.received)}</td><td class="number" data-label="Sent">${count(door.sent)}</td>
     <td class="number" data-label="Dropped"><div>${count(door.dropped)}${door.refused > 0 && html`<div class="small muted">${counted(door.refused, "connection")} refused</div>`}</div></td>
     <td><div class="row row-end door-verbs"><${Link} class="button small" to=${rights}>Rights</${Link}><${Button} small role="operator" onClick=${() => setOpen("ticket")}>Ticket…</${Button}><${Button} small role="admin" tone="danger" onClick=${() => setOpen("remove")}>Remove</${Button}></div>
       ${open === "ticket" && html`<${Ticket} door=${door} again=${again} close=${close} />`}
       ${open === "remove" && html`<${Dialog} title=${`Remove ${door.name}?`} close=${close} foot=${html`<button class="button" onClick=${close}>Keep it</button><${Button} role="admin" tone="danger" onClick=${remove}>Remove</${Button}>`}>
         <p>Its ${counted(door.connections, "connection")} and ${counted(door.tickets.length, "ticket")} end at once. Its address stays reserved for its name.</p></${Dialog}>`}</td></tr>`;
+}
+
+/** The connections of a door, and what each did in the last minute. */
+function Clients(/** @type {{door: any}} */ { door }) {
+  const more = door.connections - door.clients.length;
+  return html`<details class="door-clients"><summary><${Badge} word=${String(door.connections)} tone="allow" /><span class="sr-only"> connected: show them</span></summary><ul class="small">${door.clients.map((/** @type {any} */ one, /** @type {number} */ index) => html`<li key=${index}><${Given} value=${one.address} mono />${one.who && html` by <${Given} value=${one.who} most=${40} />`}
+      <div class="muted">${one.protocol} since <${Moment} at=${one.since} /></div><div class="muted">in the last minute ${count(one.received)} received, ${count(one.sent)} sent${one.refused > 0 && `, ${counted(one.refused, "refusal")}`}</div></li>`)}${more > 0 && door.clients.length > 0 && html`<li class="muted">and ${more} more</li>`}</ul></details>`;
 }
 
 /** Make a ticket, and show it once. */

@@ -22,7 +22,8 @@ from tests.support.asgi import requested
 FILES = Path(appliance.api.__file__).parent / "console"
 VENDOR = FILES / "vendor"
 OF_FEATURES = FILES.parents[1] / "features"
-SOURCES = sorted([*(FILES / "js").rglob("*.js"), *OF_FEATURES.glob("*/console/*.js")])
+LATE = sorted(OF_FEATURES.glob("*/console/*/*.js"))  # loaded when a page needs them
+SOURCES = sorted([*(FILES / "js").rglob("*.js"), *OF_FEATURES.glob("*/console/*.js"), *LATE])
 IMPORT = re.compile(r"""(?:from|import)\s+"([^"]+)"|import\("([^"]+)"\)""")
 # Names of XML vocabularies; nothing is fetched from them.
 NAMESPACES = re.compile(
@@ -107,17 +108,21 @@ def test_the_files_of_the_page_are_cached_for_good_and_compressed(client: Client
             assert plain.content == answer.content
             assert plain.headers["etag"] != answer.headers["etag"] or not address.endswith((".js", ".css"))
     assert {Path(address).name.partition(".")[0] for address in seen} == {
-        "console", "early", "main", "preact", "dagre", "codemirror", "inter", "jetbrains-mono", "icon"
+        "console", "early", "main", "preact", "dagre", "codemirror", "inter", "jetbrains-mono", "icon", "view"
     }  # fmt: skip
 
 
 def test_every_module_is_included_once(client: Client) -> None:
-    """The script has each module of the console and of the features, and imports vendored files only."""
+    """The scripts have each module of the console and of the features, and import vendored files only."""
     [name] = re.findall(r"/console/static/js/main\.\w+\.js", client.get("/console").text)
     script = client.get(name).text
-    assert script.count("=(()=>{") == len(SOURCES) - len({"early.js"})
-    assert "@param" not in script
-    assert [one for one in script.splitlines() if one.startswith("import ") and "/vendor/" not in one] == []
+    [late] = re.findall(r"/console/static/features/[\w./-]+", script)
+    assert script.count("=(()=>{") == len(SOURCES) - len({"early.js"}) - len(LATE)
+    assert client.get(late).text.count("=(()=>{") == len(LATE)
+    for one in (script, client.get(late).text):
+        assert "@param" not in one
+        imports = [line for line in one.splitlines() if line.startswith("import ")]
+        assert [line for line in imports if "/vendor/" not in line] == []
     assert script.count("function GraphView(") == script.count("function OnTimeline(") == 1
 
 

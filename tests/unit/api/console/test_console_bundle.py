@@ -2,7 +2,7 @@
 
 import pytest
 
-from appliance.api.console.console_bundle import ModuleError, join_modules, join_styles
+from appliance.api.console.console_bundle import ModuleError, join_late_modules, join_modules, join_styles
 
 
 def test_only_comments_and_indentation_are_removed() -> None:
@@ -78,3 +78,17 @@ def test_styles_are_joined_in_the_order_of_their_imports() -> None:
         join_styles({"c/a.css": "@import url(./b.css);"}, "c/a.css")
     with pytest.raises(ModuleError, match=r"import each other: c/a\.css, c/b\.css, c/a\.css"):
         join_styles(sources | {"c/b.css": '@import "./a.css";'}, "c/a.css")
+
+
+def test_a_late_module_has_its_folder_and_exports_its_entry() -> None:
+    """It cannot include a module of the page, which would have a second state."""
+    sources = {
+        "features/x/late/view.js": 'import { a } from "./a.js";\nexport const view = a;\n',
+        "features/x/late/a.js": "export const a = 1;\n",
+        "js/state.js": "export const state = {};\n",
+    }
+    script = join_late_modules(sources, "features/x/late/view.js")
+    assert script.splitlines()[-1] == "export const {view}=$m1;"
+    sources["features/x/late/a.js"] = 'import { state } from "#console/state.js";\nexport const a = state;\n'
+    with pytest.raises(ModuleError, match=r"there is no file js/state.js, imported by features/x/late/a.js"):
+        join_late_modules(sources, "features/x/late/view.js")

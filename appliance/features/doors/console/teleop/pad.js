@@ -1,0 +1,147 @@
+/** The pad: a finger, the mouse or the arrow keys drive the base. Whatever ends the hold stops it. */
+
+import { html, useEffect, useId, useMemo, useRef, useState } from "/console/static/vendor/preact.js";
+import { COMMANDS, Drive } from "./drive.js";
+
+const SPEEDS = /** @type {[string, string, number, number][]} */ ([["slow", "slow: 0.1 m/s", 0.1, 0.3], ["medium", "medium: 0.3 m/s", 0.3, 0.6], ["fast", "fast: 0.8 m/s", 0.8, 1.2]]);
+const ARROWS = { ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [-1, 0], ArrowRight: [1, 0] };
+const DEAD = 0.12; // fraction of the radius that means zero
+
+export function Pad(/** @type {import("./picture.js").Given & {name: string, address: string}} */ { parts, door, topics, name, address }) {
+  const bases = topics.filter(({ type }) => type in COMMANDS);
+  const [chosen, setChosen] = useState(/** @type {string | null} */ (null));
+  const topic = chosen ?? bases[0]?.name ?? "";
+  const type = bases.find((one) => one.name === topic)?.type ?? "geometry_msgs/Twist";
+  const [speed, setSpeed] = useState("slow");
+  const list = useId();
+  const { group, groups, guards, error, again } = useMotion(parts, topic);
+  const listed = bases.some((one) => one.name === topic);
+  const fastest = SPEEDS.find(([word]) => word === speed) ?? SPEEDS[0];
+  const held = !group || group.holder === address;
+  const why = !topic ? "Name a topic" : !guards && !error ? "Looking who drives" : error ? "It is not known who drives" : held ? "" : `Take ${group.group} first`;
+  return html`<section class="stack-tight" aria-label="Pad"><h3>Pad</h3>
+    <div class="form-grid"><${parts.Field} label="Commands" mono value=${topic} set=${setChosen} list=${list} placeholder="/cmd_vel" hint=${listed ? type : topic ? "not listed by the door: sent as geometry_msgs/Twist" : "no topic of velocities is listed: name one"} />
+      <${parts.Field} label="Speed" value=${speed} set=${setSpeed} options=${SPEEDS.map(([word, shown]) => [word, shown])} hint=${`turns with ${fastest[3]} rad/s`} /></div>
+    <datalist id=${list}>${[...new Set([...bases.map((one) => one.name), ...groups])].map((one) => html`<option key=${one} value=${one}></option>`)}</datalist>
+    ${error ? html`<${parts.Failure} error=${error} retry=${again} />` : null}
+    ${group && html`<${Authority} parts=${parts} group=${group} held=${held} name=${name} again=${again} />`}
+    ${topic && guards && !guards.includes("deadman") && html`<${parts.Notice} tone="warn" title="No deadman guards this topic">If the connection breaks, the robot keeps its last command: <code>rosrv guard new deadman <${parts.Given} value=${topic} most=${80} /></code></${parts.Notice}>`}
+    ${guards?.length ? html`<span class="muted small">Guards: ${guards.join(", ")}</span>` : null}
+    <${Plate} key=${`${topic} ${type}`} parts=${parts} door=${door} topic=${topic} type=${type} speed=${fastest} why=${why} /></section>`;
+}
+
+/** The holder of the group, and the buttons that hand it over. */
+function Authority(/** @type {{parts: any, group: any, held: boolean, name: string, again: () => void}} */ { parts, group, held, name, again }) {
+  const order = async (/** @type {string} */ verb, /** @type {any} */ json) => {
+    try {
+      await parts.ask("POST", `/v1/drive/${encodeURIComponent(group.group)}/${verb}`, { json, match: "*" });
+    } catch (failure) {
+      parts.failed(failure);
+    }
+    await again();
+  };
+  const holder = group.holder ? html`<${parts.Given} value=${group.holder} mono /> holds` : "Nobody holds";
+  return html`<div class="row small"><span>${held ? "You hold" : holder} <strong><${parts.Given} value=${group.group} most=${64} /></strong>.</span>
+    ${held ? html`<${parts.Button} small role="operator" onClick=${() => order("give", { to: "" })}>Give it up</${parts.Button}>` : html`<${parts.Button} small role="operator" tone="primary" onClick=${() => order("take", { host: `door:${name}` })}>Take it</${parts.Button}>`}</div>`;
+}
+
+/** Who may drive on a topic, and the guards in force on it, every two seconds. */
+function useMotion(/** @type {any} */ parts, /** @type {string} */ topic) {
+  const [state, setState] = useState(/** @type {{group: any, groups: string[], guards: string[] | null, error: unknown}} */ ({ group: null, groups: [], guards: null, error: null }));
+  const look = async () => {
+    try {
+      const [drive, guarded] = await Promise.all([parts.optional("/v1/drive"), parts.optional("/v1/guards")]);
+      const all = drive?.groups ?? [];
+      const group = all.find((/** @type {any} */ one) => one.names.includes(topic)) ?? null;
+      const acting = (guarded?.guards ?? []).filter((/** @type {any} */ one) => one.topics.command === topic && !["shadow", "off"].includes(one.state));
+      setState({ group, groups: all.flatMap((/** @type {any} */ one) => one.names), guards: acting.map((/** @type {any} */ one) => one.preset), error: null });
+    } catch (error) {
+      setState((known) => ({ ...known, error }));
+    }
+  };
+  useEffect(() => {
+    setState((known) => ({ ...known, group: null, guards: null, error: null }));
+    look();
+    const timer = setInterval(look, 2000);
+    return () => clearInterval(timer);
+  }, [topic]);
+  return { ...state, again: look };
+}
+
+function Plate(/** @type {{parts: any, door: import("./connection.js").DoorConnection, topic: string, type: string, speed: any, why: string}} */ { parts, door, topic, type, speed, why }) {
+  const [driving, setDriving] = useState(false);
+  const [said, setSaid] = useState("");
+  const [at, setAt] = useState({ x: 0, y: 0 });
+  const keys = useRef(/** @type {Set<string>} */ (new Set()));
+  const pointer = useRef(/** @type {number | null} */ (null));
+  const drive = useMemo(() => new Drive(door, topic, type, (on, text) => {
+    setDriving(on);
+    setSaid(text);
+  }), []);
+  const release = (/** @type {string} */ text = "") => {
+    keys.current.clear();
+    pointer.current = null;
+    setAt({ x: 0, y: 0 });
+    drive.stop(text);
+  };
+  const hold = (/** @type {number} */ x, /** @type {number} */ y) => {
+    const length = Math.hypot(x, y);
+    const scale = length < DEAD ? 0 : 1 / Math.max(1, length);
+    const [, , fastest, turn] = speed;
+    setAt({ x: x * scale, y: y * scale });
+    drive.go(y * scale * fastest, -x * scale * turn);
+  };
+  useEffect(() => {
+    const away = () => release();
+    const hidden = () => document.hidden && release();
+    addEventListener("blur", away);
+    addEventListener("pagehide", away);
+    document.addEventListener("visibilitychange", hidden);
+    return () => {
+      removeEventListener("blur", away);
+      removeEventListener("pagehide", away);
+      document.removeEventListener("visibilitychange", hidden);
+      drive.stop();
+    };
+  }, []);
+  useEffect(() => {
+    if (why) release();
+  }, [why]);
+  const point = (/** @type {PointerEvent} */ event) => {
+    const box = /** @type {Element} */ (event.currentTarget).getBoundingClientRect();
+    hold(((event.clientX - box.left) / box.width) * 2 - 1, 1 - ((event.clientY - box.top) / box.height) * 2);
+  };
+  const down = (/** @type {PointerEvent} */ event) => {
+    if (why || pointer.current !== null || event.button !== 0) return;
+    pointer.current = event.pointerId;
+    /** @type {Element} */ (event.currentTarget).setPointerCapture(event.pointerId);
+    point(event);
+  };
+  const move = (/** @type {PointerEvent} */ event) => {
+    if (event.pointerId === pointer.current) point(event);
+  };
+  const up = (/** @type {PointerEvent} */ event) => {
+    if (event.pointerId === pointer.current) release();
+  };
+  const press = (/** @type {KeyboardEvent} */ event) => {
+    if (!(event.key in ARROWS) || event.ctrlKey || event.altKey || event.metaKey) return;
+    event.preventDefault();
+    if (why || event.repeat) return;
+    keys.current.add(event.key);
+    steer();
+  };
+  const let_go = (/** @type {KeyboardEvent} */ event) => {
+    if (!keys.current.delete(event.key)) return;
+    if (keys.current.size) steer();
+    else release();
+  };
+  const steer = () => {
+    const sides = [...keys.current].map((key) => ARROWS[/** @type {keyof typeof ARROWS} */ (key)]);
+    hold(sides.reduce((sum, [x]) => sum + x, 0), sides.reduce((sum, [, y]) => sum + y, 0));
+  };
+  return html`${said && html`<${parts.Notice} tone="deny" title="The pad has stopped" role="alert"><${parts.Given} value=${said} most=${600} /></${parts.Notice}>`}
+    <div class=${`door-pad${driving ? " driving" : ""}`} tabindex="0" role="application" aria-label="Pad: hold it, or the arrow keys, to drive" aria-disabled=${why ? "true" : undefined} title=${why || undefined}
+      onPointerDown=${down} onPointerMove=${move} onPointerUp=${up} onPointerCancel=${up} onLostPointerCapture=${up} onKeyDown=${press} onKeyUp=${let_go} onBlur=${() => release()} onContextMenu=${(/** @type {Event} */ event) => event.preventDefault()}>
+      <span class="door-knob" style=${{ left: `${50 + at.x * 50}%`, top: `${50 - at.y * 50}%` }}></span></div>
+    <span class="muted small" role="status">${why || (driving ? "Driving: let go to stop." : "Stopped. Hold the pad, or focus it and hold the arrow keys.")}</span>`;
+}

@@ -1,0 +1,132 @@
+"""The person's own door in the console: a camera's picture, a plot, and a pad that stops the robot."""
+
+import re
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from examples.landshark.doorway import Doorway
+from examples.landshark.lab import Host, Lab
+from tests.support.appliance import Appliance
+from tests.support.nodes import RosSession
+from tests.support.processes import Process
+from tests.support.waiting import eventually
+from tests.system.console.reader import Reader
+
+POLICY = """
+[Groups]
+site = 10.77.0.0/24
+mine = door:first
+[Nodes]
+default = site mine
+[Publishers]
+default = site
+/cmd_vel = site mine
+[Subscribers]
+default = site mine
+[Commands]
+default = site mine
+[Authority]
+base = /cmd_vel
+take base = site mine
+lease base = 60s
+"""
+CONSOLE = "127.0.0.1", 8443
+SECONDS_TO_A_PICTURE = 60
+# 3 x 2 pixels, red.
+PNG = bytes.fromhex(
+    "89504e470d0a1a0a0000000d49484452000000030000000208020000001216f14d0000001049444154789c63f8cfc000410c"
+    "70160041d205fb87f0b9480000000049454e44ae426082"
+)
+
+
+@pytest.fixture(scope="module")
+def appliance(common_lab: Lab) -> Iterator[Appliance]:
+    host = common_lab.host("appliance", "10.77.0.2/24")
+    with Appliance(host, policy=POLICY, options=("--api", f"{CONSOLE[0]}:{CONSOLE[1]}")) as running:
+        yield running
+
+
+@pytest.fixture
+def reader(browser: object, appliance: Appliance) -> Iterator[Callable[..., Reader]]:
+    assert isinstance(appliance.host, Host)
+    with Doorway(appliance.host, CONSOLE) as door:
+        url = f"https://127.0.0.1:{door.port}"
+        yield lambda **look: Reader(browser, url, str(appliance.ready["token"]), **look)  # type: ignore[arg-type]
+
+
+def test_a_person_sees_and_drives_the_robot_through_their_own_door(
+    appliance: Appliance, common_robot: Host, reader: Callable[..., Reader], tmp_path: Path
+) -> None:
+    """Add the door, see its picture within a minute, plot a field, drive; whatever ends the hold stops the robot."""
+    with RosSession(appliance.master_uri, tmp_path, common_robot) as ros, reader() as console:
+        image = f"{{format: png, data: {[*PNG]}}}"
+        ros.start(["rostopic", "pub", "-r", "5", "/camera/compressed", "sensor_msgs/CompressedImage", image])
+        ros.start(["rostopic", "pub", "-r", "10", "/battery", "std_msgs/Float64", "data: 12.5"])
+        base = ros.start(["rostopic", "echo", "-p", "/cmd_vel"])
+        appliance.recorded("--category", "publish", resource="/camera/compressed")
+        began = time.monotonic()
+        page = console.go("robot")
+        own = page.get_by_role("region", name="Your door")
+        expect(own).to_contain_text("there is no door first: rosrv door add first")
+        own.get_by_role("button", name="Add door first").click()
+        own.get_by_role("button", name="Open").click()
+        expect(own.get_by_role("img", name="Picture of /camera/compressed")).to_have_attribute("width", "3")
+        assert time.monotonic() - began < SECONDS_TO_A_PICTURE
+        own.get_by_label("Topic").select_option("/battery")
+        expect(own.get_by_role("img", name="data of /battery: 12.5")).to_be_visible()
+        assert console.axe() == []
+        drive(page, base)
+        own.get_by_label("Commands").fill("/other")
+        own.get_by_role("application").press("ArrowUp")
+        expect(own.get_by_role("alert")).to_contain_text(re.compile(r"\[Publishers\].*policy\.ini:8"))
+        [client] = appliance.row("door", "list")["clients"]
+        assert (client["address"], client["protocol"], client["who"]) == ("127.0.0.1", "rosbridge", "first")
+        eventually(
+            lambda: appliance.row("door", "list")["clients"][0]["refused"] > 0, "the refusal is counted"
+        )
+        appliance.rosrv("door", "remove", "first")
+        expect(own).to_contain_text("there is no door first: rosrv door add first")
+
+
+def drive(page: Page, base: Process) -> None:
+    """Take the group, drive with the keys and the mouse, and require that each end of a hold stops the robot."""
+    own = page.get_by_role("region", name="Your door")
+    pad = own.get_by_role("application")
+    own.get_by_label("Commands").fill("/cmd_vel")
+    expect(own).to_contain_text("Take base first")
+    own.get_by_role("button", name="Take it").click()
+    expect(own).to_contain_text("You hold base")
+    expect(own).to_contain_text("No deadman guards this topic")
+    pad.focus()
+    page.keyboard.down("ArrowUp")
+    eventually(lambda: moving(base), "the robot drives")
+    page.keyboard.up("ArrowUp")
+    eventually(lambda: stopped(base), "the robot stops when the key is released")
+    box = pad.bounding_box()
+    assert box is not None
+    for event in ("window.dispatchEvent(new Event('blur'))", "window.dispatchEvent(new Event('pagehide'))"):
+        page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] * 0.1)
+        page.mouse.down()
+        eventually(lambda: moving(base), "the robot drives again")
+        page.evaluate(event)
+        eventually(lambda: stopped(base), f"the robot stops at {event}")
+        page.mouse.up()
+
+
+def moving(base: Process) -> bool:
+    return _last(base)[0] > 0
+
+
+def stopped(base: Process) -> bool:
+    return _last(base) == [0.0] * 6
+
+
+def _last(base: Process) -> list[float]:
+    """Return the last command that the robot heard, as `rostopic echo -p` prints it: after its time."""
+    texts = [str(event.get("text", "")) for event in base.events]
+    lines = [text for text in texts if re.fullmatch(r"\d+(,-?[\d.e-]+){6}", text)]
+    return [float(number) for number in lines[-1].split(",")[1:]] if lines else [0.0]
