@@ -291,6 +291,7 @@ WALL_CLOCK = {
         "control/assembly/policies.py", "control/operators/queries.py", "features/standby/replication.py",
         "features/recorder/recording_orders.py",
         "features/evidence/bundle.py",
+        "features/doors/client_counts.py",
         "features/doors/door_node.py", "features/doors/door_table.py", "features/doors/door_tickets.py",
         "features/syslog/log_forwarder.py",
         "features/fleet/segment_pusher.py",

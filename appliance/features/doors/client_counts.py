@@ -19,7 +19,7 @@ class _Counts(NamedTuple):
     refusals: int
 
 
-class DoorClient:
+class CountedClient:
     """A connection with its counts; `queues` are those of its protocol, once it has one."""
 
     def __init__(self, session: DoorSession, peer: str, ticket: str, queues: list[ViewerQueue[Any]]) -> None:
@@ -47,7 +47,7 @@ class DoorClient:
         return ClientShown(self._peer, self.ticket, self.session.protocol_name, self._since, *lately)
 
 
-def shown(clients: Iterable[DoorClient]) -> Iterator[ClientShown]:
+def shown(clients: Iterable[CountedClient]) -> Iterator[ClientShown]:
     """Yield the connections, the oldest first, at most `MOST_SHOWN`."""
     oldest_first = sorted((one.shown() for one in clients), key=lambda one: one.since)
     yield from oldest_first[:MOST_SHOWN]

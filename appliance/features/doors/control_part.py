@@ -284,12 +284,12 @@ class DoorOrders:
             clients=self._clients(row),
         )
 
-    def _clients(self, row: DoorRow) -> list[door_requests.DoorClient]:
+    def _clients(self, row: DoorRow) -> list[door_requests.ConnectedClient]:
         makers = {
             one.id: one.who for one in (*self._tickets.valid(row.name), *self._visits.present(row.name))
         }
         return [
-            door_requests.DoorClient(
+            door_requests.ConnectedClient(
                 address=one.peer[:64],
                 since=one.since,
                 protocol=one.protocol[:32],

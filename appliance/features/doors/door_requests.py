@@ -24,7 +24,7 @@ class Ticket(msgspec.Struct, frozen=True):
     who: Annotated[str, doc("who made it")]
 
 
-class DoorClient(msgspec.Struct, frozen=True, kw_only=True):
+class ConnectedClient(msgspec.Struct, frozen=True, kw_only=True):
     """A connection to a door. The counts are of the last minute."""
 
     address: Annotated[str, doc("of the client")]
@@ -53,7 +53,7 @@ class DoorState(msgspec.Struct, frozen=True, kw_only=True):
     dropped: Annotated[int, doc("messages for clients that read too slowly")]
     refused: Annotated[int, doc("connections in excess of the limits")]
     tickets: Annotated[list[Ticket], doc("that can be used now")]
-    clients: Annotated[list[DoorClient], doc("that are connected, the oldest first, at most 50")]
+    clients: Annotated[list[ConnectedClient], doc("that are connected, the oldest first, at most 50")]
 
 
 class OwnDoor(msgspec.Struct, frozen=True, kw_only=True):

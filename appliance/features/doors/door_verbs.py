@@ -8,8 +8,8 @@ from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import moment, say_json
 from appliance.features.doors.door_requests import (
+    ConnectedClient,
     DoorAdd,
-    DoorClient,
     DoorRemove,
     DoorState,
     DoorsWanted,
@@ -121,7 +121,7 @@ def remove(appliance: Appliance, name: _Name) -> None:
     say(f"{body.name} ({body.address}) is removed")
 
 
-def _client(one: DoorClient) -> str:
+def _client(one: ConnectedClient) -> str:
     origin = f" by {one.who}" if one.who else ""
     refused = f", {counted(one.refused, 'refusal')}" if one.refused else ""
     return (

@@ -13,7 +13,7 @@ from appliance.features.doors.door_table import DoorTable, is_door_name
 from appliance.store.door_tables import DoorRow
 
 
-class OwnDoor(NamedTuple):
+class CallerDoor(NamedTuple):
     """The door of a caller; without a `row`, `reason` says why there is none and what to do.
 
     `name` is that of the door, also if it does not exist. It is empty if the caller can have none.
@@ -31,21 +31,21 @@ class OwnDoors:
         self._table = table
         self._sessions = sessions
 
-    def of(self, who: str) -> OwnDoor:
+    def of(self, who: str) -> CallerDoor:
         """Return the door of the token or person with this name."""
         groups = self._groups(who)
         names = [name for name in ([who] if groups is None else groups) if is_door_name(name)]
         live = {row.name: row for row in self._table.live()}
         found = next((name for name in names if name in live), None)
         if found is not None:
-            return OwnDoor(found, live[found], "")
+            return CallerDoor(found, live[found], "")
         if names:
-            return OwnDoor(names[0], None, f"there is no door {names[0]}: rosrv door add {names[0]}")
+            return CallerDoor(names[0], None, f"there is no door {names[0]}: rosrv door add {names[0]}")
         if groups is None:
             text = f"no door can have the name {who[:80]}: use a token with the name of a door (a-z, 0-9, _ and -)"
         else:
             text = f"no group of {who[:140]} has the name of a door: name one in sso.doors of appliance.yaml"
-        return OwnDoor("", None, text)
+        return CallerDoor("", None, text)
 
     def _groups(self, who: str) -> list[str] | None:
         """Return the groups of doors of a person; None for a token."""

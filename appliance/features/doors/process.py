@@ -19,7 +19,7 @@ from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 from appliance.features.doors import door_link
-from appliance.features.doors.client_counts import SAMPLE_SECONDS, DoorClient, shown
+from appliance.features.doors.client_counts import SAMPLE_SECONDS, CountedClient, shown
 from appliance.features.doors.connections import ConnectionLimits, DoorConnections
 from appliance.features.doors.door_link import node_name
 from appliance.features.doors.door_node import DoorNode, present_time
@@ -68,7 +68,7 @@ class _Totals:
     sent_bytes: int = 0
     refusals: int = 0
 
-    def add(self, client: DoorClient) -> None:
+    def add(self, client: CountedClient) -> None:
         session = client.session
         self.received += session.received
         self.sent += session.sent
@@ -107,7 +107,7 @@ class _Process:
         self._over = asyncio.Event()
         self._failure = ""
         self._listens = False
-        self._clients: set[DoorClient] = set()
+        self._clients: set[CountedClient] = set()
         self._tickets: set[str] = set()  # of connections that control passed on, until they end
         self._shown: list[door_link.ClientShown] = []
         self._changes: dict[tuple[str, str], _Change] = {}
@@ -254,7 +254,7 @@ class _Process:
             subprotocols=SUBPROTOCOLS,
             options=SessionOptions(origins=tuple(given.origins)),
         )
-        client = DoorClient(session, peer, ticket, queues)
+        client = CountedClient(session, peer, ticket, queues)
         self._clients.add(client)
         self._changed(peer, ticket, began=1)
         try:

@@ -91,9 +91,9 @@ def _listed(names: list[str]) -> str:
 
 
 def _samples(state: DoorsState) -> dict[str, Samples]:
+    doors = [msgspec.structs.asdict(one) for one in state.doors]
     return {
-        metric.name: [((one.name,), getattr(one, field)) for one in state.doors]
-        for field, metric in _METRICS.items()
+        metric.name: [((one["name"],), one[field]) for one in doors] for field, metric in _METRICS.items()
     }
 
 
