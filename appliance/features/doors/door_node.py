@@ -95,6 +95,12 @@ class _Publication:
     """Whether its subscribers have left since then, or the master refused it."""
     refusal: RosError | None = None
     clients: set[DoorClient] = field(default_factory=set)
+    wills: dict[DoorClient, Raw] = field(default_factory=dict)
+
+    def publish(self, values: Raw | bytes) -> None:
+        """Publish a message. Raises `PeerError` if the values do not fit."""
+        raw = isinstance(values, Raw)
+        self.publication.publish(self.codec.writer.from_json(values, present_time()) if raw else values)
 
 
 @dataclass(slots=True)
@@ -153,8 +159,12 @@ class DoorNode:
                 await self._write_parameter(request)
 
     async def forget(self, client: DoorClient) -> None:
-        """Release all that a connection used."""
-        for topic in [topic for topic, one in self._publications.items() if client in one.clients]:
+        """Release all that a connection used, and publish its wills."""
+        for topic, known in [
+            (topic, one) for topic, one in self._publications.items() if client in one.clients
+        ]:
+            if client in known.wills:
+                known.publish(known.wills[client])
             self._unadvertise(topic, client)
         for topic in [topic for topic, clients in self._heard.items() if client in clients]:
             self._unsubscribe(topic, client)
@@ -182,6 +192,9 @@ class DoorNode:
                 raise ProtocolError(
                     f"{request.topic} is advertised as {known.publication.type.name}, not {request.type}"
                 )
+            if request.will is not None:
+                known.codec.writer.from_json(request.will, present_time())  # raises if it does not fit
+                known.wills[client] = request.will
             known.clients.add(client)
 
     async def _type_of(self, topic: str) -> str:
@@ -201,6 +214,7 @@ class DoorNode:
         known = self._publications.get(topic)
         if known is not None:
             known.clients.discard(client)
+            known.wills.pop(client, None)
             if not known.clients:
                 self._tasks.start(self._end_publication(topic))
 
@@ -217,10 +231,7 @@ class DoorNode:
         if known is None:
             raise ProtocolError(f"{request.topic} is not advertised by this client")
         await self._check_granted(known)
-        values = request.values
-        known.publication.publish(
-            known.codec.writer.from_json(values, present_time()) if isinstance(values, Raw) else values
-        )
+        known.publish(request.values)
 
     async def _check_granted(self, known: _Publication) -> None:
         """Raise the master's refusal if the publication is no longer granted, such as after the end of an approval.

@@ -15,13 +15,17 @@ ClientId: TypeAlias = str | int | float | None
 
 @dataclass(frozen=True, slots=True)
 class AdvertiseTopic:
-    """Advertise a topic. Without a type, the topic has the type that its other publishers and subscribers use."""
+    """Advertise a topic. Without a type, the topic has the type that its other publishers and subscribers use.
+
+    `will` is published if the connection ends while the topic is advertised.
+    """
 
     topic: str
     type: str | None
     latched: bool = False
     queue: int = 100
     reply_to: ClientId = None
+    will: msgspec.Raw | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -139,9 +139,8 @@ class Rosbridge:
     def _advertise(self, operation: AdvertiseOp) -> list[DoorRequest]:
         topic = self._resolved(operation.topic)
         self._add_advertisement(topic, operation.id)
-        return [
-            AdvertiseTopic(topic, operation.type, operation.latch, operation.queue_size or 1, operation.id)
-        ]
+        queue, will = operation.queue_size or 1, operation.will if bytes(operation.will) else None
+        return [AdvertiseTopic(topic, operation.type, operation.latch, queue, operation.id, will)]
 
     def _add_advertisement(self, topic: str, client: ClientId) -> None:
         _check_room(self._advertised, topic, self._limits.topics, "topics are advertised")

@@ -35,12 +35,13 @@ class _Operation(Struct, tag_field="op", kw_only=True):
 
 
 class AdvertiseOp(_Operation, tag="advertise"):
-    """Advertise a topic."""
+    """Advertise a topic. `will` is a message that the door publishes if the connection ends before `unadvertise`."""
 
     topic: Name
     type: Name
     latch: bool = False
     queue_size: _Count = 100
+    will: Raw = Raw()
 
 
 class UnadvertiseOp(_Operation, tag="unadvertise"):

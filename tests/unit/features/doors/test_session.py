@@ -66,6 +66,26 @@ async def test_each_new_client_of_a_topic_gets_the_last_message_of_latched_publi
             assert client.frames.empty()
 
 
+@pytest.mark.parametrize("left", [True, False])
+async def test_a_will_is_published_if_the_client_leaves_first(left: bool) -> None:
+    """As the stop of a base; a client that ends its publication has stopped it itself."""
+    async with door_world() as world:
+        robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
+        heard: list[bytes] = []
+        await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
+        wrong = {"op": "advertise", "topic": "/cmd", "type": "std_msgs/String", "will": {"datum": 1}}
+        client.send(wrong)
+        assert "unknown field `datum`" in (await client.next())["msg"]
+        client.send(wrong | {"will": {"data": "stop"}})
+        client.send({"op": "publish", "topic": "/cmd", "msg": {"data": "go"}})
+        if not left:
+            client.send({"op": "unadvertise", "topic": "/cmd"})
+        await asyncio.sleep(1)
+        client.writer.close()
+        await asyncio.sleep(1)
+        assert heard == [string("go"), *([string("stop")] if left else [])]
+
+
 @pytest.mark.parametrize("deflate", [False, True])
 async def test_a_denial_of_the_master_is_words_with_the_id(deflate: bool) -> None:
     async with door_world() as world:

@@ -44,14 +44,15 @@ export class DoorConnection {
   }
 
   /**
-   * Hear a topic; returns the function that ends it. @param {string} topic @param {number} interval least milliseconds between two messages
+   * Hear a topic; returns the function that ends it. @param {string} topic @param {{interval: number, newest?: boolean}} rate `interval`: least
+   * milliseconds between two messages; `newest`: to a slow network, the door sends only the newest message
    * @param {(message: any) => void} heard @param {Refused} refused
    */
-  subscribe(topic, interval, heard, refused) {
+  subscribe(topic, { interval, newest = false }, heard, refused) {
     const id = this.#begin(refused);
     const all = this.#heard.get(topic) ?? new Set();
     this.#heard.set(topic, all.add(heard));
-    this.#send({ op: "subscribe", id, topic, throttle_rate: interval, queue_length: 1 });
+    this.#send({ op: "subscribe", id, topic, throttle_rate: interval, queue_length: newest ? 1 : 0 });
     return () => {
       all.delete(heard);
       this.#refused.delete(id);
@@ -59,10 +60,13 @@ export class DoorConnection {
     };
   }
 
-  /** Publish on a topic. @param {string} topic @param {string} type @param {Refused} refused */
-  advertise(topic, type, refused) {
+  /**
+   * Publish on a topic. The door publishes `will` if the connection ends before the publication.
+   * @param {string} topic @param {string} type @param {any} will @param {Refused} refused
+   */
+  advertise(topic, type, will, refused) {
     const id = this.#begin(refused);
-    this.#send({ op: "advertise", id, topic, type, queue_size: 1 });
+    this.#send({ op: "advertise", id, topic, type, will, queue_size: 1 });
     return {
       publish: (/** @type {any} */ msg) => this.#send({ op: "publish", id, topic, msg }),
       end: () => this.#send({ op: "unadvertise", id, topic }),

@@ -2,7 +2,8 @@
  * Drive a base through a door: publish a velocity while the pad is held, and stop it in every other case.
  *
  * 1. `stop` sends zeros at once, and ends the publication. Nothing is published after it.
- * 2. While it drives, the door must answer within `SILENT`. Otherwise the connection ends with what it has not sent, so
+ * 2. If the connection ends while it drives, the door publishes the zeros.
+ * 3. While it drives, the door must answer within `SILENT`. Otherwise the connection ends with what it has not sent, so
  *    that no late command reaches the robot.
  */
 
@@ -36,7 +37,7 @@ export class Drive {
     this.#wanted = { forward, left };
     if (this.#publication) return;
     let refused = false;
-    this.#publication = this.#door.advertise(this.#topic, this.#type, (why) => {
+    this.#publication = this.#door.advertise(this.#topic, this.#type, this.#command(0, 0), (why) => {
       if (refused) return; // of the commands behind the first refusal
       refused = true;
       this.stop();
@@ -53,15 +54,14 @@ export class Drive {
     if (!publication) return;
     this.#publication = null;
     this.#timers.forEach(clearInterval);
-    this.#wanted = { forward: 0, left: 0 };
-    publication.publish(this.#command());
+    publication.publish(this.#command(0, 0));
     publication.end();
     this.#told(false, why);
   }
 
   #publish() {
     if (this.#door.unsent > MOST_UNSENT) this.#give("The network is too slow for commands: the robot was stopped.");
-    else this.#publication?.publish(this.#command());
+    else this.#publication?.publish(this.#command(this.#wanted.forward, this.#wanted.left));
   }
 
   async #probe() {
@@ -79,8 +79,7 @@ export class Drive {
     this.#door.close(why);
   }
 
-  #command() {
-    const { forward, left } = this.#wanted;
+  #command(/** @type {number} */ forward, /** @type {number} */ left) {
     return COMMANDS[this.#type]({ linear: { x: forward, y: 0, z: 0 }, angular: { x: 0, y: 0, z: left } });
   }
 }
