@@ -20,8 +20,8 @@ export function Pad(/** @type {import("./picture.js").Given & {name: string, add
   const held = !group || group.holder === address;
   const why = !topic ? "Name a topic" : !guards && !error ? "Looking who drives" : error ? "It is not known who drives" : held ? "" : `Take ${group.group} first`;
   return html`<section class="stack-tight" aria-label="Pad"><h3>Pad</h3>
-    <div class="form-grid"><${parts.Field} label="Commands" mono value=${topic} set=${setChosen} list=${list} placeholder="/cmd_vel" hint=${listed ? type : topic ? "not listed by the door: sent as geometry_msgs/Twist" : "no topic of velocities is listed: name one"} />
-      <${parts.Field} label="Speed" value=${speed} set=${setSpeed} options=${SPEEDS.map(([word, shown]) => [word, shown])} hint=${`turns with ${fastest[3]} rad/s`} /></div>
+    <${parts.Field} label="Commands" mono value=${topic} set=${setChosen} list=${list} placeholder="/cmd_vel" hint=${listed ? type : topic ? "not listed by the door: sent as geometry_msgs/Twist" : "no topic of velocities is listed: name one"} />
+    <${parts.Field} label="Speed" value=${speed} set=${setSpeed} options=${SPEEDS.map(([word, shown]) => [word, shown])} hint=${`turns with ${fastest[3]} rad/s`} />
     <datalist id=${list}>${[...new Set([...bases.map((one) => one.name), ...groups])].map((one) => html`<option key=${one} value=${one}></option>`)}</datalist>
     ${error ? html`<${parts.Failure} error=${error} retry=${again} />` : null}
     ${group && html`<${Authority} parts=${parts} group=${group} held=${held} name=${name} again=${again} />`}
@@ -142,6 +142,6 @@ function Plate(/** @type {{parts: any, door: import("./connection.js").DoorConne
   return html`${said && html`<${parts.Notice} tone="deny" title="The pad has stopped" role="alert"><${parts.Given} value=${said} most=${600} /></${parts.Notice}>`}
     <div class=${`door-pad${driving ? " driving" : ""}`} tabindex="0" role="application" aria-label="Pad: hold it, or the arrow keys, to drive" aria-disabled=${why ? "true" : undefined} title=${why || undefined}
       onPointerDown=${down} onPointerMove=${move} onPointerUp=${up} onPointerCancel=${up} onLostPointerCapture=${up} onKeyDown=${press} onKeyUp=${let_go} onBlur=${() => release()} onContextMenu=${(/** @type {Event} */ event) => event.preventDefault()}>
-      <span class="door-knob" style=${{ left: `${50 + at.x * 50}%`, top: `${50 - at.y * 50}%` }}></span></div>
+      <span class="door-knob" style=${{ left: `${50 + at.x * 37}%`, top: `${50 - at.y * 37}%` }}></span></div>
     <span class="muted small" role="status">${why || (driving ? "Driving: let go to stop." : "Stopped. Hold the pad, or focus it and hold the arrow keys.")}</span>`;
 }

@@ -4,7 +4,7 @@ import { html, useEffect, useRef, useState } from "/console/static/vendor/preact
 import { decoded } from "./pixels.js";
 
 const TYPES = { "sensor_msgs/CompressedImage": 100, "sensor_msgs/Image": 250 }; // least milliseconds between two images
-const SHOWN = 1000; // milliseconds between two changes of the text
+const SHOWN = 2000; // milliseconds between two changes of the text
 
 /** @typedef {{parts: any, door: import("./connection.js").DoorConnection, topics: {name: string, type: string}[]}} Given */
 
@@ -24,7 +24,7 @@ export function Picture(/** @type {Given} */ { parts, door, topics }) {
       draw(canvas.current, picture);
       setWrong("");
     }, (error) => setWrong(error.message));
-    const leave = door.subscribe(topic, TYPES[/** @type {keyof typeof TYPES} */ (type)], drawing.give, setWrong);
+    const leave = door.subscribe(topic, { interval: TYPES[/** @type {keyof typeof TYPES} */ (type)], newest: true }, drawing.give, setWrong);
     const timer = setInterval(() => setAbout(drawing.about(SHOWN)), SHOWN);
     return () => {
       clearInterval(timer);
@@ -69,7 +69,7 @@ function newestOnly(/** @type {(message: any) => Promise<ImageBitmap>} */ decode
     about: (/** @type {number} */ milliseconds) => {
       const rate = (drawn * 1000) / milliseconds;
       drawn = 0;
-      return size && `${size}, ${rate} a second`;
+      return size && `${size}, ${Number(rate.toFixed(1))} a second`;
     },
   };
 }

@@ -39,7 +39,7 @@ export function FieldPlot(/** @type {import("./picture.js").Given} */ { parts, d
       points.current.push({ time, value: valueOf(message, shown.current) });
       while (points.current[0].time < time - SPAN) points.current.shift();
     };
-    const leave = door.subscribe(topic, INTERVAL, heard, setWrong);
+    const leave = door.subscribe(topic, { interval: INTERVAL }, heard, setWrong);
     const timer = setInterval(() => {
       draw(canvas.current, points.current);
       setLatest(points.current.at(-1)?.value);
