@@ -1,10 +1,12 @@
 """The state of doors, with its alarms, metrics and line of `rosrv status`."""
 
 from collections.abc import Iterator, Mapping
+from typing import Annotated
 
 import msgspec
 
 from appliance.base.metric import Metric, counter, gauge
+from appliance.channel.answers.field_docs import doc
 from appliance.features.view import FeatureView, Samples, StateView, Trouble
 
 LATELY_SECONDS = 600.0
@@ -16,27 +18,27 @@ _MOST_NAMED = 5
 class DoorHealth(msgspec.Struct, frozen=True, kw_only=True):
     """A door's counts since the start of its process; `restarts` counts its processes since the start of RVMaster."""
 
-    name: str
-    up: bool
-    trouble: str
-    connections: int
-    limit: int
-    full_seconds: float
-    received: int
-    sent: int
-    received_bytes: int
-    sent_bytes: int
-    dropped: int
-    refusals: int
-    refused_connections: int
-    restarts: int
-    restarts_lately: int
+    name: Annotated[str, doc("`door:NAME` in the policy")]
+    up: Annotated[bool, doc("whether it serves")]
+    trouble: Annotated[str, doc("why it does not serve; empty: it serves, or starts")]
+    connections: Annotated[int, doc("at present")]
+    limit: Annotated[int, doc("the most connections, `doors.connections`")]
+    full_seconds: Annotated[float, doc("how long it has been at its limit of connections; 0: it is not")]
+    received: Annotated[int, doc("frames from clients")]
+    sent: Annotated[int, doc("frames to clients")]
+    received_bytes: Annotated[int, doc("bytes from clients, as on the wire")]
+    sent_bytes: Annotated[int, doc("bytes to clients, as on the wire")]
+    dropped: Annotated[int, doc("messages for clients that read too slowly")]
+    refusals: Annotated[int, doc("requests of clients that were refused")]
+    refused_connections: Annotated[int, doc("connections in excess of the limits")]
+    restarts: Annotated[int, doc("times its process ended by itself")]
+    restarts_lately: Annotated[int, doc("the same in the last ten minutes")]
 
 
 class DoorsState(msgspec.Struct, frozen=True):
     """The doors: of each its connections, counts and restarts."""
 
-    doors: list[DoorHealth]
+    doors: Annotated[list[DoorHealth], doc("the oldest first")]
 
 
 _METRICS: Mapping[str, Metric] = {
