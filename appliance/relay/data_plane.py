@@ -246,6 +246,7 @@ class DataPlane:
             )
             relayed.upstream = publisher
             self._attach_monitors(relayed)
+        relayed.withhold(self.interceptor.mask(topic))
         self.topics[key, topic] = (relayed, publisher)
         waiting = self._servers.add(key, topic, name)
         for other, _publisher in self.topics.values() if waiting else ():
@@ -308,6 +309,7 @@ class DataPlane:
         self._context.scratch.move(None if monitors is None else monitors.area)
         for relayed, publisher in list(self.topics.values()):
             publisher.recheck()
+            relayed.withhold(self.interceptor.mask(relayed.topic))
             if isinstance(publisher, PublisherConnection):
                 self._attach_monitors(relayed)
         for client in list(self.clients):

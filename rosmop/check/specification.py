@@ -38,6 +38,7 @@ from rosmop.check.scope import CompilationContext, SpecificationNames
 from rosmop.check.slicing import check_parameters, declare_parameters, slicing_of, unsliceable
 from rosmop.check.specification_lint import kept_slices, lint_property, lint_statements, unused_events
 from rosmop.check.traps import rival_changes, traps
+from rosmop.check.withholdings import withholdings
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled, PropertyCode, SpecificationCode
 from rosmop.form.findings import Diagnostic, SpecificationError
@@ -212,6 +213,7 @@ def _compile(
     _check_head(shared, specification)
     declare_safes(shared, names, specification)
     shared.findings += read_at_start(shared, names, specification)
+    withheld = withholdings(shared, names, specification)
     start = _noted(shared, partial(compile_start, shared, names, specification))
     for function in names.functions.values():
         _noted(shared, partial(compile_function, shared, names, function))
@@ -252,6 +254,7 @@ def _compile(
         any(modifier.parts == ("begin",) for modifier in specification.modifiers),
         tuple(names.safes.values()),
         tuple(names.givens.values()),
+        withholdings=withheld,
     )
 
 

@@ -108,6 +108,7 @@ class ModuleState:
         self._senders, self._turn = senders, interpreter.turn
         variables = dict(sorted(cells.variables.items(), key=lambda item: item[1][0]))
         self._names = [*variables]
+        self._addresses = {name: address for name, (address, _kind) in variables.items()}
         self._cells = struct.Struct(
             "<" + "q" * len(running) + "".join(_cell(kind) for _, kind in variables.values())
         )
@@ -211,6 +212,12 @@ class ModuleState:
             self.show()
             self._inside, self.left = False, True
             self._unprepare()
+
+    def is_true(self, name: str) -> bool:
+        """Return the value of a `bool`."""
+        if self._inside and name in self._addresses:
+            return self._memory[self._addresses[name]] != 0
+        return bool(self._values[name])
 
     def show(self) -> None:
         """Copy the state from the module's memory to Python."""

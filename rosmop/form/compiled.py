@@ -67,6 +67,15 @@ class Comparison:
 
 
 @dataclass(frozen=True)
+class Withholding:
+    """A topic that hosts in `networks` do not get while a variable, named as in the code, is true."""
+
+    topic: str
+    networks: tuple[str, ...]
+    condition: str
+
+
+@dataclass(frozen=True)
 class Publication:
     """A topic that a specification publishes or a service that it calls, and the position of the statement.
 
@@ -176,6 +185,7 @@ class SpecificationCode:
     given_topics: tuple[GivenTopic, ...] = ()
     ordered: bool = False
     """Whether an `order` statement names it."""
+    withholdings: tuple[Withholding, ...] = ()
 
 
 @dataclass(eq=False)

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from rosmop.form.compiled import Compiled, EventCode, SpecificationCode
+from rosmop.form.compiled import Compiled, EventCode, SpecificationCode, Withholding
 from rosmop.form.connected_groups import channel_of
 from rosmop.form.findings import Diagnostic
 from rosmop.form.specification_groups import groups
@@ -199,6 +199,7 @@ class MonitorSet:
         self._places: dict[str, list[int]] = {}
         """The places of the specifications of `steps`, in the order of all specifications."""
         self._contexts: dict[str, tuple[Context, ...]] = {}
+        self._withheld: dict[str, list[tuple[MonitorInstance, Withholding]]] = {}
         self._silent: dict[str, BatchOptions] = {}
         """The options for `judge`, by topic and source."""
         self._execution = MonitorExecution(self.interpreter, on_fault, self._guards.judging)
@@ -333,6 +334,31 @@ class MonitorSet:
     def taps(self, topic: str) -> bool:
         """Return whether messages on this topic may be copied into `tapped`."""
         return topic in self._tapped_ways
+
+    def may_withhold(self, topic: str) -> bool:
+        """Return whether an enabled monitor in force may withhold messages of a topic from hosts."""
+        return topic in self._withheld
+
+    def withheld_from(self, topic: str) -> tuple[str, ...]:
+        """Return the networks whose hosts get no message of a topic now."""
+        return tuple(
+            network
+            for monitor, one in self._withheld.get(topic, ())
+            if self._is_true(monitor, one.condition)
+            for network in one.networks
+        )
+
+    def withholds(self, monitor: MonitorInstance) -> bool:
+        """Return whether a monitor withholds a topic from hosts now."""
+        return monitor.enabled and any(
+            self._is_true(monitor, one.condition) for one in monitor.code.withholdings
+        )
+
+    def _is_true(self, monitor: MonitorInstance, variable: str) -> bool:
+        """Return the value of a variable, without moving the state of its monitor."""
+        if monitor.home is not None:
+            return monitor.home.is_true(variable)
+        return bool(self.interpreter.variables[variable])
 
     def type_of(self, topic: str, *, shadowed: bool = False) -> str | None:
         """Return the message type of a topic with enabled events, or None. Shadow mode counts only if `shadowed`."""
@@ -844,6 +870,10 @@ class MonitorSet:
             channel for channel, found in steps.items() if any(isinstance(step, _Tap) for step in found)
         )
         self.steps = {channel: tuple(found) for channel, found in steps.items()}
+        self._withheld = {}
+        for monitor in self._monitors if self._holds else ():
+            for one in monitor.code.withholdings if monitor.enabled else ():
+                self._withheld.setdefault(one.topic, []).append((monitor, one))
         self._contexts = {
             channel: tuple(step.monitor.context for step in found if step.first)
             for channel, found in self.steps.items()

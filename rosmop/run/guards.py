@@ -1,7 +1,7 @@
 """Find the specifications whose actions depend on a state, and the events whose faults leave that state out of date.
 
-A *guard* can drop, change or publish a message, depending on variables (its own, or those of specifications that it
-uses) or properties. If the state is lost, or an event that keeps it up to date faults, the guard cannot judge.
+A *guard* can drop, change, publish or withhold a message, depending on variables (its own, or those of specifications
+that it uses) or properties. If the state is lost, or an event that keeps it up to date faults, the guard cannot judge.
 """
 
 from collections.abc import Iterator, Mapping
@@ -35,7 +35,7 @@ def guards_of(compiled: Compiled) -> Guards:
     names = [
         name
         for name, code in codes.items()
-        if code.context in acting
+        if (code.context in acting or code.withholdings)
         and (
             code.properties
             or code.slicing is not None
@@ -71,10 +71,11 @@ def _places(code: SpecificationCode, compiled: Compiled, acts: set[str]) -> set[
     """
     mine = {name for name in acts if compiled.functions[name].context == code.context}
     events = {event.function: event.channel for event in code.events}
+    withheld = {one.topic for one in code.withholdings}
     if mine <= events.keys():
-        return {events[name] for name in mine}
+        return {events[name] for name in mine} | withheld
     timed = any(one.property.timed for one in code.properties)
-    return {*events.values(), *([None] if timed else [])}
+    return {*events.values(), *withheld, *([None] if timed else [])}
 
 
 def _acts(function: nodes.Function) -> bool:

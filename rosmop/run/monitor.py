@@ -47,6 +47,9 @@ class StateHolder(Protocol):
     def show(self) -> None:
         """Copy the state to Python."""
 
+    def is_true(self, name: str) -> bool:
+        """Return the value of a `bool`."""
+
     size: int
     """Size of `cells` in bytes; 0 if the state does not consist only of numbers."""
 

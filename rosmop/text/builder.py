@@ -130,6 +130,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
             items(tree.Property),
             items(tree.SafeDeclaration),
             tuple(givens),
+            items(tree.WithholdDeclaration),
         )
 
     def function(
@@ -226,6 +227,12 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
         place = self.at(kind)
         return tree.SafeDeclaration(
             self.at(meta), name, place, tuple(fields or ()), str(topic), self._period_ns(period)
+        )
+
+    def withhold(self, meta: Meta, _: Any, topic: Any, _from: Any, *rest: Any) -> tree.WithholdDeclaration:
+        *networks, _while, condition = rest
+        return tree.WithholdDeclaration(
+            self.at(meta), str(topic), tuple(networks), tree.Name(self.at(condition), (str(condition),))
         )
 
     def pattern(self, _: Meta, _open: Any, fields: Any, _close: Any) -> tuple[tree.Binding, ...]:

@@ -83,6 +83,10 @@ _FORMS = tuple(
             r"\bsafe\s[^;{}]*(?:\{[^{}]*\}[^;{}]*)?\Z",
             "a safe message is `safe package/Type { field:5 } on /topic every 100ms;`",
         ),
+        (
+            r"\bwithhold\s[^;{}]*\Z",
+            'a topic is withheld by `withhold /topic from "10.0.0.7", "10.8.0.0/16" while variable;`',
+        ),
         (r"\binit\s*\Z", "write `init() { … }`"),
         (r"\b(?:if|while|switch|for|when)\s*\Z", "a condition is written in parentheses"),
     )
@@ -136,6 +140,8 @@ _WORDS = {
     "GIVEN_VALUE": "a value such as `0.22 m/s in 0..2`",
     "TOPIC_WORD": "`topic`",
     "SAFE": "`safe`",
+    "WITHHOLD": "`withhold`",
+    "FROM": "`from`",
     "STOP": "`STOP;`",
     "EQUAL": "`=`",
     "$END": "the end of the file",

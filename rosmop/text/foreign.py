@@ -261,7 +261,7 @@ _SHAPES = (
         2,
     ),
     _shape(
-        r"\b(?:import|from|include|package)\s[^;{}()\n]*;?",
+        r"\b(?:import|from(?!\s*\")|include|package)\s[^;{}()\n]*;?",
         "types and functions are known by their names; leave this line out",
         0,
         1,

@@ -1,8 +1,9 @@
 """The grammar of ``.rv`` files, for lark's LALR(1) parser with its contextual lexer.
 
 The lexer knows which tokens may follow, so `/landshark/scan` is a topic where a topic is allowed and two divisions
-elsewhere. Inside an action, variables can have the names `event`, `service`, `safe` and `STOP`. A C++ parser needs the
-declared types to distinguish a declaration from an expression. In this grammar, two names in a row are a declaration.
+elsewhere. Inside an action, variables can have the names `event`, `service`, `safe`, `withhold` and `STOP`. A C++
+parser needs the declared types to distinguish a declaration from an expression. In this grammar, two names in a row are
+a declaration.
 """
 
 from rosmop.logics.catalogue import LOGICS
@@ -28,7 +29,7 @@ specification: NAME+ ["(" [parameters] ")" [given]] "{" item* "}"
 given: GIVEN "{" (given_value | given_topic)* "}"
 given_value: BUILTIN+ NAME "=" GIVEN_VALUE ";"
 given_topic: TOPIC_WORD NAME "=" TOPIC ";"
-?item: shared ";" | function | prototype | init | event | property | safe | ";" -> nothing
+?item: shared ";" | function | prototype | init | event | property | safe | withhold | ";" -> nothing
 
 function: type NAME "(" [parameters] ")" block
         | NAME "(" [parameters] ")" block         -> procedure
@@ -61,6 +62,7 @@ path_step: NAME ["[" NUMBER "]"]
          | NAME ("::" NAME)+                      -> name
 
 safe: SAFE MESSAGE_TYPE "{" [fields] "}" ON TOPIC EVERY DURATION ";"
+withhold: WITHHOLD TOPIC FROM string ("," string)* WHILE NAME ";"
 
 property: NAME ":" FORMULA handler*
 handler: AT CATEGORY block
@@ -206,6 +208,8 @@ TOPIC_WORD.5: /topic(?!\w)/
 GIVEN_VALUE.9: /[^;={}]+/
 SAFE.5: /safe(?=<GAP>+[A-Za-z]\w*(\/|::)[A-Za-z]\w*<GAP>*\{)/
 ON.5: /on(?!\w)/
+WITHHOLD.5: /withhold(?=<GAP>+[~\/A-Za-z_][\w\/]*<GAP>+from<GAP>*")/
+FROM.5: /from(?=<GAP>*")/
 CALL.3: /CALL(?=<GAP>*\(<GAP>*["\/~])/
 SERVICE.5: /service(?!\w)/
 EVERY.5: /every(?!\w)/

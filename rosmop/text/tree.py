@@ -482,6 +482,15 @@ class SafeDeclaration(SyntaxNode):
 
 
 @dataclass(frozen=True)
+class WithholdDeclaration(SyntaxNode):
+    """`withhold topic from "network", … while condition;`."""
+
+    topic: str
+    networks: tuple[StringLiteral, ...]
+    condition: Name
+
+
+@dataclass(frozen=True)
 class Specification(SyntaxNode):
     """One `name() { … }`."""
 
@@ -495,6 +504,7 @@ class Specification(SyntaxNode):
     properties: tuple[Property, ...]
     safes: tuple[SafeDeclaration, ...] = ()
     givens: tuple[GivenValue | TopicDeclaration, ...] = ()
+    withholds: tuple[WithholdDeclaration, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -543,7 +543,7 @@ class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
 
     A monitor in shadow mode (`shadow`) counts the drops and changes that it would have made. `missed` counts the
     messages that it would have received if it were in force. A parametric specification has `slices` slices now, and at
-    most `slice_limit`.
+    most `slice_limit`. `withholds`: it withholds a topic from hosts now.
     """
 
     name: str
@@ -560,6 +560,7 @@ class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
     missed: int = 0
     slices: int = 0
     slice_limit: int = 0
+    withholds: bool = False
 
 
 class MonitorsCounted(Message):

@@ -12,7 +12,7 @@ class PresetParameter(msgspec.Struct, frozen=True):
     """A parameter of a preset. `least` and `most` are empty for values that are not numbers."""
 
     name: Annotated[str, doc("its name in the text")]
-    kind: Annotated[str, doc("`int`, `double`, `bool`, `corners`, `joints` or `time`")]
+    kind: Annotated[str, doc("`int`, `double`, `bool`, `corners`, `joints`, `time` or `hosts`")]
     default: Annotated[str, doc("the value in the preset")]
     unit: Annotated[str, doc("the unit of its values; empty: none")]
     least: Annotated[str, doc("the least value; empty: not a number")]
@@ -41,14 +41,17 @@ class GuardRow(msgspec.Struct, frozen=True):
     state: Annotated[
         str,
         doc(
-            "`free`: it changed nothing in the last 2 seconds; `stopping`: it did; `holding`: it cannot judge, and"
-            " waits for an operator; `shadow`: it only records; `off`: it is disabled"
+            "`free`: it changed nothing in the last 2 seconds; `stopping`: it did; `withholding`: it withholds its"
+            " topic from hosts; `holding`: it cannot judge, and waits for an operator; `shadow`: it only records;"
+            " `off`: it is disabled"
         ),
     ]
     topics: Annotated[dict[str, str], doc("the topics that are given to it, by name")]
     types: Annotated[dict[str, str], doc("their message types, where the preset has several")]
     given: Annotated[list[GivenState], doc("constants and topics that are given to it")]
-    loads: Annotated[dict[str, str], doc("values in its text: a polygon, limits of joints, a deadline")]
+    loads: Annotated[
+        dict[str, str], doc("values in its text: a polygon, limits of joints, a deadline, hosts")
+    ]
     stops: Annotated[int, doc("messages that it changed or dropped; in shadow mode: that it would have")]
     why_held: Annotated[str, doc("why it holds its topics, if it does")] = ""
     confirm_by: Annotated[

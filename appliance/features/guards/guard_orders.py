@@ -166,6 +166,9 @@ class GuardOrders:
             return "shadow"
         if not monitors.switches.enabled(name):
             return "off"
+        row = monitors.rollout.rows.get(name)
+        if row is not None and row.withholds:
+            return "withholding"
         acted = self._acted_at.get(name)
         return "free" if acted is None or clock.now() - acted > STOPPING_SECONDS else "stopping"
 

@@ -68,7 +68,7 @@ class GuardNew(AdminRequest[Replacement], frozen=True, tag="guard new"):
     problems=_NO_GUARD,
 )  # fmt: skip
 class GuardSet(AdminRequest[GuardList], frozen=True, tag="guard set"):
-    """Set parameters of a guard. Its state stays, except for a polygon, limits of joints or a deadline.
+    """Set parameters of a guard. Its state stays, except for a polygon, limits of joints, a deadline or hosts.
 
     Operators set constants with `PATCH /v1/monitors/{name}/given`.
     """

@@ -103,6 +103,18 @@ _SCAN = {
 SCANS = {"sensor_msgs/LaserScan": TypeRow(_SCAN)}
 BATTERIES = {"sensor_msgs/BatteryState": TypeRow({"percentage": "percentage"})}
 
+SWITCHES = {"std_msgs/Bool": TypeRow({"on": "data"})}
+PRIVATE = {
+    kind: TypeRow()
+    for kind in (
+        "sensor_msgs/Image", "sensor_msgs/CompressedImage", "sensor_msgs/PointCloud2", "sensor_msgs/LaserScan",
+        "sensor_msgs/NavSatFix", "sensor_msgs/JointState", "nav_msgs/Odometry", "nav_msgs/OccupancyGrid",
+        "geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped", "tf2_msgs/TFMessage",
+        "std_msgs/String",
+    )
+}  # fmt: skip
+"""Messages that a preset does not read."""
+
 _EVENT = re.compile(
     r"event (?P<name>\w+)\((?P<parameters>[^)]*)\) (?P<topic>\w+)\s+(?P<type>\w+/\w+)\s+'\{(?P<pattern>[^}]*)\}' \{"
 )

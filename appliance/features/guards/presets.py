@@ -7,6 +7,7 @@ import functools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from ipaddress import ip_network
 from pathlib import Path
 
 from appliance.base.shipped import SHIPPED
@@ -33,6 +34,7 @@ _DECIMAL = re.compile(_NUMBER)
 _CORNERS = re.compile(rf"\s*{_NUMBER}\s*,\s*{_NUMBER}(?:\s+{_NUMBER}\s*,\s*{_NUMBER}){{2,99}}\s*")
 _JOINTS = re.compile(rf"\s*[\w/]+:{_NUMBER}\.\.{_NUMBER}(?:\s+[\w/]+:{_NUMBER}\.\.{_NUMBER})*\s*")
 _TIMEOUT = re.compile(r"(timeout )(\d+(?:\.\d+)?m?s)")
+_HOSTS = re.compile(r"(\bwithhold \w+ from )([^;]+?)(?= while )")
 _SPAN = re.compile(r"(\d+(?:\.\d+)?)(ms|s)")
 
 
@@ -59,6 +61,8 @@ class Parameter:
             if value not in {"true", "false"}:
                 raise GuardError(f"{self.name}={value}: write {self.name}=true or {self.name}=false")
             return value
+        if self.kind == "hosts":
+            return " ".join(_network(self.name, one) for one in value.split() or [value])
         form = _TABLES.get(self.kind)
         if form is not None:
             if not form.fullmatch(value):
@@ -75,6 +79,15 @@ class Parameter:
         return value
 
 
+def _network(name: str, value: str) -> str:
+    try:
+        return str(ip_network(value))
+    except ValueError as error:
+        raise GuardError(
+            f"{name}={value}: {error}; write it like {name}='10.0.0.7 10.8.0.0/16' (rosrv host list)"
+        ) from error
+
+
 _TABLES = {"corners": _CORNERS, "joints": _JOINTS, "time": _SPAN}
 _POLYGON = Parameter(
     "polygon", "corners", "-2,-2 2,-2 2,2 -2,2", "m", what="x and y of each corner", loads=True
@@ -88,6 +101,9 @@ _LIMITS = Parameter(
     loads=True,
 )
 _DEADLINE = Parameter("limit", "time", "120s", what="from a goal to its result", loads=True)
+_FROM = Parameter(
+    "hosts", "hosts", "0.0.0.0/0 ::/0", what="addresses or networks of hosts; default: all hosts", loads=True
+)
 
 
 @dataclass(frozen=True)
@@ -162,6 +178,7 @@ PRESETS = {
         Preset("rate", _MOVES),
         Preset("agree", {**_MOVES, "by": types.SPEEDS, "other": types.SPEEDS}),
         Preset("sane", _MOVES),
+        Preset("withhold", {"command": types.PRIVATE, "by": types.SWITCHES}, (_FROM,)),
     )
 }
 
@@ -225,7 +242,7 @@ def types_in(text: str) -> dict[str, str]:
 
 
 def loaded_values(text: str) -> dict[str, str]:
-    """Return the values of a guard that are in its text, not given: a polygon, limits of joints, a deadline."""
+    """Return the values of a guard that are in its text, not given: a polygon, limits, a deadline, hosts."""
     preset = preset_of(text)
     return {one.name: _in_text(text, one) for one in (preset.parameters if preset else ()) if one.loads}
 
@@ -241,6 +258,9 @@ def _in_text(text: str, parameter: Parameter) -> str:
             return " ".join(
                 f"{joint.strip(chr(34))}:{low}..{high}" for joint, low, high in rows if joint != '""'
             )
+        case "hosts":
+            hosts = _HOSTS.search(text)
+            return hosts[2].replace('"', "").replace(",", "") if hosts else parameter.default
     found = _TIMEOUT.search(text)
     return found[2] if found else parameter.default
 
@@ -279,6 +299,9 @@ def _with_value(text: str, parameter: Parameter, value: str) -> str:
     match parameter.kind:
         case "corners":
             return _with_table(text, "POLYGON", re.split("[ ,]+", value))
+        case "hosts":
+            networks = ", ".join(f'"{one}"' for one in value.split())
+            return _HOSTS.sub(lambda found: found[1] + networks, text)
         case "time":
             return _TIMEOUT.sub(rf"\g<1>{value}", text)
         case "joints":

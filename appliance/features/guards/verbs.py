@@ -163,7 +163,7 @@ def set_values(
     since: Annotated[str, typer.Option("--since", help="With --dry-run: from this time on")] = "1h",
     hold: _Hold = False,
 ) -> None:
-    """Set parameters of a guard while it runs. Its state stays, except for a polygon, limits of joints or a deadline.
+    """Set parameters of a guard while it runs. Its state stays, except for a polygon, limits, a deadline or hosts.
 
     Example: rosrv guard set fence margin=0.5
     """
@@ -321,4 +321,4 @@ def _state(row: GuardRow) -> str:
         if row.confirm_by is None
         else f", until {moment(row.confirm_by)} unless you run: rosrv monitor confirm"
     )
-    return f"in force, {'stopping' if row.state == 'stopping' else 'free'}, {acts}{end}"
+    return f"in force, {row.state}{'' if row.preset == 'withhold' else f', {acts}'}{end}"

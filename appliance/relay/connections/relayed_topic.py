@@ -222,6 +222,8 @@ class RelayedTopic:
         """
         if self._latch.is_latching or self._taps or self.flow.limits or len(self._served) > SUBSCRIBERS:
             return None
+        if self._served.mask is not None:
+            return None
         if self._stream is not None or self._startup_replay is not None or self._served.undelivered:
             return None
         call = None
@@ -269,6 +271,14 @@ class RelayedTopic:
         if wanted:
             self.upstream.connect()
         self._spare_unwanted()
+
+    def withhold(self, mask: Callable[[str], bool] | None) -> None:
+        """Withhold messages from each host for which `mask` is true at their delivery (None: from no host).
+
+        The latched message is the present value of the topic: a host gets it once the topic is withheld no longer.
+        """
+        self._served.mask = mask
+        self.differs()
 
     def upstream_opened(self, header: Mapping[str, str]) -> None:
         """Begin to serve, because the publisher has answered with its header."""
@@ -366,6 +376,11 @@ class RelayedTopic:
 
     def _admit(self, batch: Batch, since: float, *, divided: bool = True) -> Batch | None:
         """Give a batch to monitors and subscribers; return the part that monitors had no time for."""
+        if self._served.mask is not None and batch.messages > 1:  # a message may withhold the next one
+            first, rest = batch.head(1), batch.tail(batch.messages - 1)
+            self._admit(first, since, divided=False)
+            batch.judged = first.judged
+            return rest
         through = self._monitoring.through
         left = batch if through is None else through(batch)
         rest = batch.tail(batch.left) if batch.left else None
@@ -395,7 +410,7 @@ class RelayedTopic:
             now = self._clock()
             if self._startup_replay.over(now) or not self._startup_replay.add(batch, now):
                 self._forget_startup_replay()
-        if self._served.send(batch, divided=divided):
+        if self._served.send(batch, divided=divided and self._served.mask is None):
             self._pause_or_trim()
 
     @property
@@ -424,7 +439,8 @@ class RelayedTopic:
     def tidy(self) -> None:
         """Free temporary data, and trim queues to their bounds; called once a second.
 
-        Also pass on a latched message that a rate limit delayed, as soon as the limit permits it.
+        Also pass on a latched message that a rate limit delayed, as soon as the limit permits it, and one that was
+        withheld.
         """
         now = self._clock()
         waiting = self.flow.later(now)

@@ -22,7 +22,7 @@ class TopicSubscriber(Protocol):
     """The caller id that it claims."""
 
     missed: bool
-    """Whether its rate limit dropped the last message for it."""
+    """Whether it did not get the last message, because of its rate limit or because the topic is withheld from it."""
 
     behind_since: float | None
     """When its queue first became so long that it is behind; None once it has caught up completely."""
@@ -67,6 +67,8 @@ class ServedSubscribers:
         self._members: dict[TopicSubscriber, None] = {}
         self._row: tuple[TopicSubscriber, ...] | None = None
         self._waits: tuple[Batch, tuple[TopicSubscriber, ...]] | None = None
+        self.mask: Callable[[str], bool] | None = None
+        """Whether a host gets no message now; None: each host gets all."""
         self._dropped = 0
 
     def __len__(self) -> int:
@@ -97,7 +99,10 @@ class ServedSubscribers:
         return 0 if self._waits is None else len(self._waits[0].view)
 
     def deliver(self, batch: Batch, member: TopicSubscriber) -> None:
-        self._dropped += member.deliver(batch)
+        """Send a subscriber a batch, unless the topic is withheld from its host."""
+        member.missed = self.mask is not None and self.mask(member.host)
+        if not member.missed:
+            self._dropped += member.deliver(batch)
 
     def send(self, batch: Batch, *, divided: bool) -> bool:
         """Send all of them a batch, after the previous one; return whether a subscriber is behind."""
@@ -127,7 +132,7 @@ class ServedSubscribers:
                 self._waits = kept, members[number:]
                 break
             if member in self._members:
-                self._dropped += member.deliver(batch)
+                self.deliver(batch, member)
                 behind = behind or member.behind_since is not None
         return behind
 

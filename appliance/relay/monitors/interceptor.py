@@ -35,6 +35,7 @@ from appliance.channel.messages import (
 )
 from appliance.relay.loop import EventLoop, LoopTimer
 from appliance.relay.monitors.holds import hold_begun, taken
+from appliance.relay.monitors.host_mask import HostMask
 from appliance.relay.monitors.loader import Loader, Result
 from appliance.relay.monitors.observation_points import NOWHERE, ObservationPoint, Senders
 from appliance.relay.monitors.observations import SHOWN, Observations
@@ -275,6 +276,13 @@ class Interceptor:
     def wants(self, topic: str) -> bool:
         """Whether a monitor wants a topic's messages even without a subscriber."""
         return self.monitors is not None and self.monitors.wants(topic)
+
+    def mask(self, topic: str) -> Callable[[str], bool] | None:
+        """Return which hosts get no message of a topic at present; None if no monitor may withhold it."""
+        monitors = self.monitors
+        if monitors is None or not monitors.may_withhold(topic):
+            return None
+        return HostMask(lambda: monitors.withheld_from(topic)).hides
 
     def objection(self, topic: str, header: Mapping[str, str]) -> str:
         """Return why the monitors of a topic cannot read a publisher's messages; empty if they can."""

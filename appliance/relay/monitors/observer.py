@@ -355,6 +355,7 @@ class Observer:
                 counters.missed,
                 monitor.slices.live if monitor.slices is not None else 0,
                 monitor.slices.limit if monitor.slices is not None else 0,
+                not self._prefix and monitors.withholds(monitor),
             )
             for monitor in (monitors.shadowed if self._prefix else monitors.monitors)
         ]

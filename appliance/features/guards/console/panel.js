@@ -20,7 +20,7 @@ import { useGuards } from "./state.js";
 import { Suggest } from "./suggest.js";
 import { SetValues } from "./values.js";
 
-const TONES = { free: "allow", stopping: "warn", holding: "deny", shadow: "note", off: "" };
+const TONES = { free: "allow", stopping: "warn", withholding: "warn", holding: "deny", shadow: "note", off: "" };
 const WITHIN = /** @type {[string, string][]} */ ([["60", "unless confirmed within 1 minute"], ["300", "unless confirmed within 5 minutes"], ["3600", "unless confirmed within an hour"], ["", "never"]]);
 const WATCHED = 6; // topics that are watched at once: control answers eight queries at a time
 

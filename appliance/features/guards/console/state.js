@@ -6,12 +6,12 @@ import { ask, get } from "#console/rest.js";
 import { useStore } from "#console/store.js";
 import { done, failed } from "#console/parts/toast.js";
 
-const PASSING = ["stopping", "shadow"]; // states whose counts change without a change of the specifications
+const PASSING = ["stopping", "withholding", "shadow"]; // states whose counts change without a change of the specifications
 
 /** @returns {{body: any, error: unknown, again: () => Promise<void>, order: (said: string, more: string, method: string, path: string, options?: any) => Promise<boolean>}} */
 export function useGuards() {
   const [state, setState] = useState({ body: /** @type {any} */ (null), error: /** @type {unknown} */ (null) });
-  const passing = state.body?.guards.some((/** @type {any} */ row) => PASSING.includes(row.state));
+  const passing = state.body?.guards.some((/** @type {any} */ row) => PASSING.includes(row.state) || row.preset === "withhold");
   const mark = useStore(live, (one) => JSON.stringify([one.status?.monitors ?? null, one.samples.at(-1)?.monitors ?? null, passing && one.samples.at(-1)?.time]));
   const again = async () => {
     try {

@@ -28,7 +28,7 @@ class Manager:
         self.orders: list[Any] = []
         self.sources = SimpleNamespace(files={"fence.rv": text_of(FENCE), "other.rv": "other() { }"})
         self.checked = SimpleNamespace(monitors={"fence": "fence.rv", "other": "other.rv"})
-        self.rollout = SimpleNamespace(held=set(), why_held={})
+        self.rollout = SimpleNamespace(held=set(), why_held={}, rows={})
         self.switches = SimpleNamespace(
             in_shadow=lambda _name: self.shadow, enabled=lambda _name: not self.shadow
         )
@@ -76,6 +76,11 @@ async def test_a_guard_is_stopping_while_it_acts(manager: Manager, orders: Guard
     assert ((await row(orders)).state, (await row(orders)).stops) == ("shadow", 0)
     manager.rollout.held.add("fence")
     assert (await row(orders)).state == "holding"
+
+
+async def test_a_guard_is_withholding_while_its_relay_says_so(manager: Manager, orders: GuardOrders) -> None:
+    manager.rollout.rows["fence"] = SimpleNamespace(withholds=True)
+    assert (await row(orders)).state == "withholding"
 
 
 async def test_a_guard_is_shown_with_the_values_in_its_text(orders: GuardOrders) -> None:

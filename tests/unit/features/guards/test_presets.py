@@ -90,6 +90,7 @@ WRONG = [
     ("fence", "base", {}, {}, {"polygon": "0,0 1,1 nan,2"}, "write it like polygon="),
     ("joints", "base", {}, {}, {"limits": 'a":1..2'}, "write it like limits="),
     ("answer", "base", {}, {}, {"limit": "5"}, "write it like limit="),
+    ("withhold", "base", {}, {}, {"hosts": "tablet"}, "write it like hosts="),
     ("speed", "a b", {}, {}, {}, "not a name of a monitor"),
     ("speed", "base", {"command": "cmd"}, {}, {}, "not the name of a topic"),
     ("speed", "base", {"by": "/odom"}, {}, {}, "no topic 'by' is given to speed"),

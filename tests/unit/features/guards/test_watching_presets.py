@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from appliance.features.guards.message_types import GOAL
-from appliance.features.guards.presets import PRESETS
+from appliance.features.guards.presets import PRESETS, loaded_values
 from rosmop.tests.acting import STORE, fields, message
 from rosmop.tests.examples import examples
 from tests.unit.features.guards.guarding import Guarded, legs_of, seeded, twist
@@ -272,6 +272,18 @@ def test_a_goal_without_a_result_is_cancelled() -> None:
     guard.got.clear()
     guard.advance(10_000)
     assert [(at, fields("actionlib_msgs/GoalID", data).id) for at, data in guard.got] == [(2001, "a")]
+
+
+def test_a_topic_is_withheld_until_the_switch_is_off_and_speaks() -> None:
+    types, hosts = {"command": "std_msgs/String", "by": "std_msgs/Bool"}, ("10.0.0.7/32", "10.8.0.0/16")
+    guard = Guarded("withhold", types, hosts="10.0.0.7 10.8.0.0/16", silent=1)
+    assert guard.monitors.withheld_from("/camera/image_raw") == hosts
+    for at, on, withheld in ((1, False, ()), (900, True, hosts), (1000, False, ())):
+        guard.tell("by", button(on), at)
+        assert guard.monitors.withheld_from("/camera/image_raw") == withheld
+    guard.advance(2100)
+    assert guard.monitors.withheld_from("/camera/image_raw") == hosts
+    assert loaded_values(guard.text) == {"hosts": " ".join(hosts)}
 
 
 def test_for_an_action_a_stop_drops_goals_and_cancels_all() -> None:

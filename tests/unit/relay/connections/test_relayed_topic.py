@@ -209,6 +209,46 @@ def test_a_subscriber_whose_limit_kept_the_latched_message_from_it_gets_it_later
     assert member.received == bytes(batch(b"1", b"1").view)
 
 
+def test_a_withheld_topic_reaches_only_other_hosts() -> None:
+    """Each message by itself, also of one batch; the pump leaves the topic to Python."""
+    story, hidden, judged = Story(), [False], []
+
+    def through(one: Batch) -> Batch:
+        judged.append(one.messages)
+        hidden[0] = bytes(one.view).endswith(b"private")
+        return one
+
+    tablet, robot = story.join(), RecordedMember(host="10.0.0.3")
+    story.topic.join(robot)
+    story.topic.monitor(through, wanted=True)
+    story.topic.withhold(lambda host: hidden[0] and host == tablet.host)
+    story.topic.upstream_opened(HEADER)
+    rest: Batch | None = batch(b"1", b"private", b"2")
+    while rest is not None:
+        rest = story.topic.received(rest, story.now)
+    assert tablet.received == bytes(batch(b"1", b"2").view)
+    assert robot.received == bytes(batch(b"1", b"private", b"2").view)
+    assert (judged, story.topic.simple()) == ([1, 1, 1], None)
+
+
+def test_a_withheld_latched_message_is_given_when_the_topic_is_free() -> None:
+    """Also to a subscriber that came meanwhile; other hosts get it at once, and each host once."""
+    story, hidden = Story(), [True]
+    story.topic.withhold(lambda host: hidden[0] and host == "10.0.0.2")
+    early = story.join()
+    story.topic.upstream_opened(HEADER | {"latching": "1"})
+    story.receive(batch(b"map"))
+    late, other = story.join("/late"), RecordedMember(host="10.0.0.3")
+    story.topic.join(other)
+    story.topic.tidy()
+    assert (early.received, late.received, other.received) == (b"", b"", bytes(batch(b"map").view))
+    hidden[0] = False
+    for _ in range(2):
+        story.topic.tidy()
+        story.topic.withhold(None)
+    assert early.received == late.received == other.received == bytes(batch(b"map").view)
+
+
 def test_messages_are_numbered_as_they_come() -> None:
     """Numbers continue over batches and connections: a record names a message by its number in the publication."""
     story = Story()
