@@ -447,21 +447,27 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         into force, and for a monitor that would cut a topic.
         """
         async with self._changing(request.expected):
-            self._all_known(request.names)
-            disabled = [name for name in request.names if self.switches.states[name] is False]
-            if disabled and not request.shadow:
-                text = f"{', '.join(disabled)} is disabled, not in shadow mode: rosrv monitor enable"
-                raise SpecificationsRefusedError([text])
-            if not request.shadow:
-                others = set(self.switches.shadowed()) - set(request.names)
-                self._judged(self.checked, others, _Consent(request.force), promoted=request.names)
-            self._check_limit(request)
+            self.judge_shadow(request)
             names = await self._switch(
                 request.names, SHADOW if request.shadow else True, who, request.confirm_within
             )
             return self._switched(
                 names, self.rollout.began(names), confirm_by=self.returns.confirm_by(request.names[0])
             )
+
+    def judge_shadow(self, request: admin.MonitorShadow) -> list[str]:
+        """Return warnings about topics; nothing changes. Raises the errors of `shadow`."""
+        self._all_known(request.names)
+        disabled = [name for name in request.names if self.switches.states[name] is False]
+        if disabled and not request.shadow:
+            text = f"{', '.join(disabled)} is disabled, not in shadow mode: rosrv monitor enable"
+            raise SpecificationsRefusedError([text])
+        warnings = []
+        if not request.shadow:
+            others = set(self.switches.shadowed()) - set(request.names)
+            warnings = self._judged(self.checked, others, _Consent(request.force), promoted=request.names)
+        self._check_limit(request)
+        return warnings
 
     def _check_limit(self, request: admin.MonitorShadow) -> None:
         """Raise `SpecificationsRefusedError` if a monitor would have no shadow mode to return to."""

@@ -69,6 +69,25 @@ class GuardList(msgspec.Struct, frozen=True):
     guards: Annotated[list[GuardRow], doc("the loaded guards, in the order in which they see messages")]
 
 
+class GuardPlan(msgspec.Struct, frozen=True):
+    """What a new guard, new values or `enforce` would do; nothing has changed."""
+
+    revision: int
+    tag: Tag
+    name: Annotated[str, doc("the guard")]
+    file: Annotated[str, doc("the specification file that would be loaded; empty: none")]
+    text: Annotated[str, doc("its text")]
+    begins: Annotated[bool, doc("the guard would begin in its initial state")]
+    shadow: Annotated[bool, doc("it would be in shadow mode")]
+    changed: Annotated[dict[str, list[str]], doc("values before and after, by parameter")]
+    acts: Annotated[dict[str, str], doc("the topics on which it would act or look, by name")]
+    stops: Annotated[int, doc("messages that it has stopped, or in shadow mode would have stopped, so far")]
+    warnings: Annotated[list[str], doc("warnings that the change would give")]
+    refused: Annotated[
+        list[str], doc("why the change would be refused, for example because topics would be held")
+    ]
+
+
 class Suggestion(msgspec.Struct, frozen=True):
     """A guard that fits the graph. `measured` are values from present rates; check all others."""
 

@@ -17,6 +17,7 @@ from appliance.control.operators.request_method import RequestMethod
 from appliance.features.guards import guard_requests
 from appliance.features.guards.guard_answers import (
     GuardList,
+    GuardPlan,
     GuardRow,
     Suggestion,
     Suggestions,
@@ -32,16 +33,31 @@ from appliance.features.guards.presets import (
     preset_named,
     preset_of,
     text_of,
+    topics_in,
     types_in,
     with_values,
 )
 from appliance.features.guards.suggestions import proposals
+from appliance.specifications.specification_files import SpecificationsRefusedError
 from appliance.specifications.specification_manager import SpecificationManager
 
 STOPPING_SECONDS = 2.0
 """A guard is stopping if it acted in these last seconds; relays report once a second."""
 _LOOK_SECONDS = 0.5
 _ACTS = ("drop", "change", "publish", "call")
+
+
+def _written(value: bool | int | float | str) -> str:
+    """Return a value in force as operators write it."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _same(one: str, other: str) -> bool:
+    """Whether two values of a parameter are equal, as numbers if they are numbers."""
+    try:
+        return float(one) == float(other)
+    except ValueError:
+        return one == other
 
 
 def _suggestions_of(graph: Graph) -> list[Suggestion]:
@@ -68,6 +84,7 @@ class GuardOrders:
             RequestMethod(guard_requests.GuardSuggestionsWanted, self.suggestions, order=False),
             RequestMethod(guard_requests.GuardNew, self.new, who=True),
             RequestMethod(guard_requests.GuardSet, self.set, who=True),
+            RequestMethod(guard_requests.GuardTry, self.plan, order=False, who=True),
         )
 
     async def watch(self) -> None:
@@ -100,18 +117,7 @@ class GuardOrders:
 
     async def new(self, request: guard_requests.GuardNew, who: str) -> Replacement:
         """Make a guard and load it. Raises `SenselessError`, and the errors of a load."""
-        try:
-            if "command" not in request.topics:
-                raise GuardError("topics has no `command`: name the topic to guard, such as /cmd_vel")
-            name, graph = request.name or request.preset, facts_of(self._graph())
-            preset = preset_named(request.preset)
-            guard = planned(preset, name, request.topics, graph, request.values, request.types)
-            text = text_of(guard)
-            file = f"{name}.rv"
-            if name in self._monitors.checked.monitors or file in self._monitors.sources.files:
-                raise GuardError(f"a monitor {name} is loaded: give another name, or set its values")
-        except GuardError as error:
-            raise SenselessError(str(error)) from error
+        file, text = self._made(request)
         order = admin.MonitorLoad(
             {file: text}, note=described(text), expected=request.expected, confirm_within=request.confirm_within,
             shadow=request.shadow, hold=request.hold,
@@ -121,14 +127,7 @@ class GuardOrders:
     async def set(self, request: guard_requests.GuardSet, who: str) -> GuardList:
         """Set values of a guard. Raises `UnknownThingError`, `SenselessError`, and the errors of monitors."""
         monitors, name = self._monitors, request.name
-        preset, text = self._guard(name)
-        try:
-            checked = {each: preset.parameter(each).checked(value) for each, value in request.values.items()}
-            in_text = {each: value for each, value in checked.items() if preset.parameter(each).loads}
-            changed = with_values(text, in_text)
-        except GuardError as error:
-            raise SenselessError(str(error)) from error
-        constants = {each: value for each, value in checked.items() if each not in in_text}
+        text, changed, constants = self._changed(name, request.values)
         given: dict[str, dict[str, GivenValue]] = {name: dict(constants)} if constants else {}
         if changed != text:  # one change of both, so that none of them is in force without the other
             order = admin.MonitorLoad(
@@ -139,6 +138,73 @@ class GuardOrders:
         elif constants:
             await monitors.give(admin.MonitorGive(name, dict(constants), request.expected), who)
         return await self.guards(guard_requests.GuardsWanted())
+
+    async def plan(self, request: guard_requests.GuardTry, who: str) -> GuardPlan:
+        """Return what a change would do; nothing changes. Raises `UnknownThingError` and `SenselessError`."""
+        monitors, name = self._monitors, request.name or request.preset
+        changed: dict[str, list[str]] = {}
+        if request.preset:
+            file, text = self._made(request)
+            shadow, topics, stops = request.shadow, topics_in(text), 0
+            changed = {each: ["", value] for each, value in request.values.items()}
+        else:
+            present, text, _constants = self._changed(name, request.values)
+            file = "" if text == present else monitors.checked.monitors[name]
+            row = self._row(name, self._guards()[name])
+            shadow = monitors.switches.in_shadow(name) and not request.enforce
+            topics, stops = row.topics, row.stops
+            before = row.loads | {one.name: _written(one.value) for one in row.given if one.kind != "topic"}
+            after = {
+                each: self._guards()[name].parameter(each).checked(to) for each, to in request.values.items()
+            }
+            changed = {each: [before[each], to] for each, to in after.items() if not _same(before[each], to)}
+        warnings, refused = await self._judged(request, file, text, who, shadow=shadow)
+        return GuardPlan(
+            monitors.revision, monitors.tag, name, file, text if file else "", bool(file), shadow, changed, topics,
+            stops, warnings, refused,
+        )  # fmt: skip
+
+    async def _judged(
+        self, request: guard_requests.GuardTry, file: str, text: str, who: str, *, shadow: bool
+    ) -> tuple[list[str], list[str]]:
+        """Return the warnings of a change, and why it would be refused."""
+        warnings: list[str] = []
+        try:
+            if file:
+                load = admin.MonitorTry({file: text}, shadow=shadow, hold=request.hold)
+                warnings += (await self._monitors.attempt(load, who)).warnings
+            if request.enforce:
+                order = admin.MonitorShadow([request.name], False)
+                warnings += self._monitors.judge_shadow(order)
+        except SpecificationsRefusedError as error:
+            return warnings, error.findings
+        return warnings, []
+
+    def _made(self, request: guard_requests.GuardNew | guard_requests.GuardTry) -> tuple[str, str]:
+        """Return the file and the text of a new guard. Raises `SenselessError`."""
+        try:
+            if "command" not in request.topics:
+                raise GuardError("topics has no `command`: name the topic to guard, such as /cmd_vel")
+            name, graph = request.name or request.preset, facts_of(self._graph())
+            preset = preset_named(request.preset)
+            text = text_of(planned(preset, name, request.topics, graph, request.values, request.types))
+            file = f"{name}.rv"
+            if name in self._monitors.checked.monitors or file in self._monitors.sources.files:
+                raise GuardError(f"a monitor {name} is loaded: give another name, or set its values")
+        except GuardError as error:
+            raise SenselessError(str(error)) from error
+        return file, text
+
+    def _changed(self, name: str, values: Mapping[str, str]) -> tuple[str, str, dict[str, str]]:
+        """Return the text of a guard, the text with new values, and new constants. Raises `SenselessError`."""
+        preset, text = self._guard(name)
+        try:
+            checked = {each: preset.parameter(each).checked(value) for each, value in values.items()}
+            in_text = {each: value for each, value in checked.items() if preset.parameter(each).loads}
+            changed = with_values(text, in_text)
+        except GuardError as error:
+            raise SenselessError(str(error)) from error
+        return text, changed, {each: value for each, value in checked.items() if each not in in_text}
 
     def _guards(self) -> Mapping[str, Preset]:
         files = self._monitors.sources.files

@@ -11,7 +11,7 @@ from appliance.channel.admin import MONITORS, AdminRequest, Confirm, Hold, OneMo
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.monitor_answers import Replacement
 from appliance.channel.rest_operation import rest
-from appliance.features.guards.guard_answers import GuardList, Suggestions
+from appliance.features.guards.guard_answers import GuardList, GuardPlan, Suggestions
 
 _NO_GUARD = {404: "There is no such guard."}
 _Text = Annotated[str, msgspec.Meta(max_length=4096)]
@@ -34,6 +34,18 @@ class GuardValues(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """New values of a guard's parameters, as text."""
 
     values: Annotated[_Values, doc("by parameter")]
+
+
+class GuardDraft(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A change of a guard to try: with `preset` a new guard, else new values of the guard `name`."""
+
+    preset: Annotated[_Name, doc("the preset of a new guard; empty: a guard that is loaded")] = ""
+    topics: Annotated[_Values, doc("of a new guard, as in a new guard")] = {}
+    types: Annotated[_Values, doc("of a new guard, as in a new guard")] = {}
+    name: Annotated[_Name, doc("the guard; empty: named as the preset")] = ""
+    values: Annotated[_Values, doc("by parameter, as text")] = {}
+    shadow: Annotated[bool, doc("a new guard only records what it would have done")] = False
+    enforce: Annotated[bool, doc("bring the guard from shadow mode into force")] = False
 
 
 @rest("viewer", "GET", "/v1/guards", name="guards")
@@ -79,4 +91,20 @@ class GuardSet(AdminRequest[GuardList], frozen=True, tag="guard set"):
     hold: Hold = False
 
 
-REQUESTS = (GuardsWanted, GuardSuggestionsWanted, GuardNew, GuardSet)
+@rest(
+    "operator", "POST", "/v1/guards/plan", ("hold",), name="plan_guard", body=GuardDraft, problems=_NO_GUARD,
+)  # fmt: skip
+class GuardTry(WaitingRequest[GuardPlan], frozen=True, tag="guard try"):
+    """Report what a new guard, new values or `enforce` would load, change and hold; nothing changes."""
+
+    preset: str = ""
+    topics: dict[str, str] = msgspec.field(default_factory=dict)
+    types: dict[str, str] = msgspec.field(default_factory=dict)
+    name: str = ""
+    values: dict[str, str] = msgspec.field(default_factory=dict)
+    shadow: bool = False
+    enforce: bool = False
+    hold: Hold = False
+
+
+REQUESTS = (GuardsWanted, GuardSuggestionsWanted, GuardNew, GuardSet, GuardTry)

@@ -235,6 +235,12 @@ def described(text: str) -> str:
     return text.split("\n", 1)[0].removeprefix("// ")
 
 
+def topics_in(text: str) -> dict[str, str]:
+    """Return the topics that a guard was made for, by the names that its preset has for them."""
+    topics = described(text).partition(": ")[2].split(", ")
+    return {one.split("=", 1)[0]: one.split("=", 1)[1].split(" ")[0] for one in topics}
+
+
 def types_in(text: str) -> dict[str, str]:
     """Return the message types that a guard was made for, by the names of its topics."""
     topics = described(text).partition(": ")[2].split(", ")

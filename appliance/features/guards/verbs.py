@@ -17,7 +17,7 @@ from appliance.cli.monitor.in_force import say_replaced, say_shadow_deadline
 from appliance.cli.output import moment, say_json
 from appliance.features.guards.guard_answers import GuardRow
 from appliance.features.guards.guard_facts import facts_of, preset_row
-from appliance.features.guards.guard_requests import GuardsWanted
+from appliance.features.guards.guard_requests import GuardsWanted, GuardTry
 from appliance.features.guards.plans import planned
 from appliance.features.guards.presets import (
     PRESETS,
@@ -38,6 +38,7 @@ _Name = Annotated[
     str, typer.Argument(metavar="GUARD", autocompletion=completion.monitors, show_default=False)
 ]
 _Values = Annotated[list[str] | None, typer.Argument(metavar="PARAMETER=VALUE…", show_default=False)]
+_DryRun = Annotated[bool, typer.Option("--dry-run", help="Only say what would be loaded, changed and held")]
 _Hold = Annotated[
     bool,
     typer.Option("--hold", help="Load even if monitors then hold topics with traffic until they are resumed"),
@@ -124,6 +125,7 @@ def new(
     ] = False,
     confirm_within: ConfirmWithin = None,
     hold: _Hold = False,
+    dry_run: _DryRun = False,
 ) -> None:
     """Make a guard from a preset and load it. Its text is also written into the folder of specifications.
 
@@ -134,6 +136,10 @@ def new(
     """
     chosen = preset_named(preset)
     topics = {"command": topic, **({} if by is None else {"by": by}), **_pairs(further, "--topic NAME=TOPIC")}
+    if dry_run:
+        _plan(appliance, GuardTry(preset, topics, _pairs(kinds, "--type NAME=TYPE"), name or preset,
+                                  _pairs(values, "PARAMETER=VALUE"), shadow, hold=hold))  # fmt: skip
+        return
     graph = facts_of(appliance.ask_or_exit(admin.GraphWanted()))
     guard = planned(chosen, name or preset, topics, graph, _pairs(values, "PARAMETER=VALUE"),
                     _pairs(kinds, "--type NAME=TYPE"))  # fmt: skip
@@ -158,7 +164,12 @@ def set_values(
     values: Annotated[list[str], typer.Argument(metavar="PARAMETER=VALUE…", show_default=False)],
     *,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Only list what it would have stopped, from the flight recorder")
+        bool,
+        typer.Option(
+            "--dry-run",
+            help="Only say what would be loaded, changed and held, and what it would have stopped, from the flight"
+            " recorder",
+        ),
     ] = False,
     since: Annotated[str, typer.Option("--since", help="With --dry-run: from this time on")] = "1h",
     hold: _Hold = False,
@@ -173,6 +184,7 @@ def set_values(
     assert preset is not None  # noqa: S101  `_guard` checks it
     checked = {each: preset.parameter(each).checked(value) for each, value in wanted.items()}
     if dry_run:
+        _plan(appliance, GuardTry(name=name, values=wanted, hold=hold))
         _replay(appliance, row, with_values(text, _in_force(row, preset) | checked), since)
         return
     in_text = {each: value for each, value in checked.items() if preset.parameter(each).loads}
@@ -189,13 +201,18 @@ def set_values(
 
 
 @speaks
-def enforce(appliance: Appliance, name: _Name, confirm_within: ConfirmWithin = None) -> None:
+def enforce(
+    appliance: Appliance, name: _Name, *, confirm_within: ConfirmWithin = None, dry_run: _DryRun = False
+) -> None:
     """Bring a guard from shadow mode into force. It keeps its state.
 
     With --confirm-within it returns to shadow mode after this time unless you run `rosrv monitor confirm`.
 
     Example: rosrv guard enforce fence --confirm-within 5m
     """
+    if dry_run:
+        _plan(appliance, GuardTry(name=name, enforce=True))
+        return
     _guard(appliance, name)
     order = admin.MonitorShadow([name], False, confirm_within=seconds_within(confirm_within, "guard"))
     body = appliance.answer_or_exit(order)
@@ -283,6 +300,34 @@ def _write(loaded: Monitors, file: str, text: str, *, temporary: bool = False) -
                 f"the appliance keeps the text, but {loaded.folder}/{file} is not written: {error.strerror}",
                 "yellow",
             )
+
+
+def _plan(appliance: Appliance, request: GuardTry) -> None:
+    """Print what a change would do. Exit status 1 if it would be refused."""
+    plan = appliance.answer_or_exit(request)
+    if appliance.as_json:
+        say_json(plan)
+    else:
+        how = "in shadow mode" if plan.shadow else "in force"
+        if plan.file:
+            say(f"would load {plan.file}; {plan.name} would begin in its initial state, {how}")
+        elif plan.changed:
+            say(f"would load nothing; {plan.name} would keep its state, {how}")
+        elif request.enforce:
+            say(
+                f"would load nothing; {plan.name} would be {how}; it would have acted {plan.stops} times before"
+            )
+        else:
+            say("would change nothing")
+        for name, (before, after) in plan.changed.items():
+            say(f"would set {name}={after}{f', now {before}' if before else ''}")
+        say(f"topics: {', '.join(f'{name}={topic}' for name, topic in plan.acts.items())}")
+        for line in plan.warnings:
+            say(line, "yellow")
+        for line in plan.refused:
+            say(f"would be refused: {line}", "red")
+    if plan.refused:
+        raise typer.Exit(1)
 
 
 def _replay(appliance: Appliance, row: MonitorState, text: str, since: str) -> None:

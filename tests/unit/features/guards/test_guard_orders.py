@@ -12,6 +12,7 @@ from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.guards import guard_requests
 from appliance.features.guards.guard_orders import GuardOrders
 from appliance.features.guards.presets import PRESETS, Guard, text_of
+from appliance.specifications.specification_files import SpecificationsRefusedError
 from tests.support.virtual_clock import let_time_pass
 
 pytestmark = pytest.mark.anyio
@@ -26,6 +27,7 @@ class Manager:
 
     def __init__(self) -> None:
         self.orders: list[Any] = []
+        self.objection: list[str] = []
         self.sources = SimpleNamespace(files={"fence.rv": text_of(FENCE), "other.rv": "other() { }"})
         self.checked = SimpleNamespace(monitors={"fence": "fence.rv", "other": "other.rv"})
         self.rollout = SimpleNamespace(held=set(), why_held={}, rows={})
@@ -41,6 +43,14 @@ class Manager:
         return request
 
     give = load
+
+    async def attempt(self, _request: Any, _who: str) -> Any:
+        return SimpleNamespace(warnings=self.judge_shadow(_request))
+
+    def judge_shadow(self, _request: Any) -> list[str]:
+        if self.objection:
+            raise SpecificationsRefusedError(self.objection)
+        return []
 
 
 @pytest.fixture
@@ -87,6 +97,32 @@ async def test_a_guard_is_shown_with_the_values_in_its_text(orders: GuardOrders)
     """And with the types that it was made for."""
     found = await row(orders)
     assert (found.loads, found.types) == ({"polygon": "0,0 1,0 1,1"}, TYPES)
+
+
+@pytest.mark.parametrize(
+    ("request_", "loads", "changed"),
+    [
+        ({"values": {"margin": "0.5"}}, "", {"margin": ["0.2", "0.5"]}),
+        ({"values": {"margin": "0.20"}}, "", {}),
+        ({"values": {"polygon": "0,0 2,0 2,2"}}, "fence.rv", {"polygon": ["0,0 1,0 1,1", "0,0 2,0 2,2"]}),
+        ({"enforce": True}, "", {}),
+        ({"name": "yard", "preset": "fence", "topics": {"command": "/c", "by": "/o"}, "types": TYPES}, "yard.rv", {}),
+    ],
+)  # fmt: skip
+async def test_a_plan_says_what_a_change_would_do(
+    manager: Manager, orders: GuardOrders, request_: Any, loads: str, changed: Any
+) -> None:
+    """Nothing is loaded or set; a refusal is part of the plan."""
+    manager.givens.states = lambda _checked, _name: [SimpleNamespace(name="margin", value=0.2, kind="double")]
+    manager.shadow = True
+    plan = await orders.plan(guard_requests.GuardTry(**{"name": "fence", **request_}), "eve")
+    assert (plan.file, plan.begins, plan.changed) == (loads, bool(loads), changed)
+    assert plan.shadow is not (request_.keys() > {"topics"} or "enforce" in request_)
+    assert plan.acts.keys() == ({"command", "by"} if loads == "yard.rv" else set())
+    manager.objection = ["fence would hold /cmd_vel"]
+    plan = await orders.plan(guard_requests.GuardTry(**{"name": "fence", **request_}), "eve")
+    assert plan.refused == ([] if not loads and "enforce" not in request_ else manager.objection)
+    assert manager.orders == []
 
 
 async def test_values_are_set_in_one_change(manager: Manager, orders: GuardOrders) -> None:

@@ -5,11 +5,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import typer
 
 from appliance.channel import admin
 from appliance.features.guards import verbs
-from appliance.features.guards.guard_answers import GuardRow
-from appliance.features.guards.guard_requests import GuardsWanted
+from appliance.features.guards.guard_answers import GuardPlan, GuardRow
+from appliance.features.guards.guard_requests import GuardsWanted, GuardTry
 from appliance.features.guards.presets import PRESETS, Guard, GuardError, text_of
 from tests.unit.features.guards.test_suggestions import graph_of
 
@@ -45,6 +46,10 @@ class Robot:
                     for one in ("fence",)
                 ]
                 return SimpleNamespace(guards=rows)
+            case GuardTry():
+                assert request.values == {"margin": "0.5"} and not request.enforce
+                return GuardPlan(2, "2", "fence", "", "", False, False, {"margin": ["0.2", "0.5"]},
+                                 {"command": "/c"}, 3, [], ["it would hold /c"])  # fmt: skip
             case admin.MonitorsWanted():
                 return SimpleNamespace(monitors=self.rows, files=self.files, folder=self.folder)
         self.orders.append(request)
@@ -81,6 +86,24 @@ def test_a_new_guard_is_loaded_and_written(tmp_path: Path, capsys: pytest.Captur
     assert (tmp_path / "fence.rv").read_text() == order.files["fence.rv"]
     assert "double margin = 0.5 m" in order.files["fence.rv"]
     assert "rosrv guard enforce fence" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("new", [True, False])
+def test_a_dry_run_prints_the_plan_and_changes_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], new: bool
+) -> None:
+    """The exit status is 1 if the change would be refused."""
+    robot = Robot(tmp_path, FENCE)
+    with pytest.raises(typer.Exit):
+        if new:
+            run(verbs.new, robot, "fence", "/cmd_vel", ["margin=0.5"], dry_run=True)
+        else:
+            run(verbs.set_values, robot, "fence", ["margin=0.5"], dry_run=True)
+    assert capsys.readouterr().out.splitlines() == [
+        "would load nothing; fence would keep its state, in force", "would set margin=0.5, now 0.2",
+        "topics: command=/c", "would be refused: it would hold /c",
+    ]  # fmt: skip
+    assert (robot.orders, [*tmp_path.iterdir()]) == ([], [])
 
 
 def test_a_guard_that_may_roll_back_is_not_written(tmp_path: Path) -> None:
