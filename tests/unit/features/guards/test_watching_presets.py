@@ -122,6 +122,32 @@ def test_a_scan_that_is_too_large_to_judge_stops_the_base(preset: str) -> None:
     assert runs(guard, 6)
 
 
+ODOM = "nav_msgs/Odometry"
+BLIND = {
+    "fence": (message(ODOM), message(ODOM, pose__pose__position__x=math.nan)),
+    "arm": tuple(message("sensor_msgs/BatteryState", percentage=charge) for charge in (1.0, math.nan)),
+    "sensor": tuple(message("sensor_msgs/LaserScan", ranges=[r]) for r in (4.0, math.nan)),
+    "separation": tuple(
+        message("sensor_msgs/LaserScan", ranges=[r], range_max=30.0) for r in (4.0, math.nan)
+    ),
+}
+
+
+@pytest.mark.parametrize("preset", BLIND)
+@pytest.mark.parametrize("fault", ["NaN", "cut short"])
+def test_a_faulty_sensor_never_releases_the_base(preset: str, fault: str) -> None:
+    """NaN stops it at once, and bytes that are not a message count as silence."""
+    guard, (good, bad) = Guarded(preset), BLIND[preset]
+    guard.tell("by", good, 1)
+    assert runs(guard, 2)
+    if fault == "NaN":
+        guard.tell("by", bad, 3)
+        assert not runs(guard, 4)
+    else:
+        guard.tell("by", good[:20], 3, faults=True)
+        assert not runs(guard, 15_000)
+
+
 def test_many_values_are_compared_by_their_sum() -> None:
     """A repeated scan is always found, and on the module."""
     guard = Guarded("sensor", frozen=2)
