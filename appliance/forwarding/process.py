@@ -60,7 +60,8 @@ class ForwardingProcess:
         while not self._child.ended.is_set():
             self._reports.tell(self._forwarder.progress)
             try:
-                await asyncio.wait_for(self._child.ended.wait(), _REPORT_SECONDS)
+                async with asyncio.timeout(_REPORT_SECONDS):
+                    await self._child.ended.wait()
             except TimeoutError:
                 if not thread.is_alive():
                     break  # the exception is a logged defect; the supervisor restarts the process

@@ -153,7 +153,8 @@ class Tunnels:
             self._answered.clear()
             self._say(messages.TunnelsWanted(str(self._table.pool), own))
             try:
-                await asyncio.wait_for(self._answered.wait(), _OPEN_SECONDS)
+                async with asyncio.timeout(_OPEN_SECONDS):
+                    await self._answered.wait()
             except TimeoutError:
                 raise HostRefusedError("the supervisor did not answer: try again", ours=True) from None
             if not self.enclosed:
@@ -180,7 +181,8 @@ class Tunnels:
         """
         while True:
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._dirty.wait(), self._until_it_changes())
+                async with asyncio.timeout(self._until_it_changes()):
+                    await self._dirty.wait()
             each_hour()
             self._dirty.clear()
             try:
@@ -203,7 +205,8 @@ class Tunnels:
         while self._taken_changes < wanted:
             self._wake.clear()
             try:
-                await asyncio.wait_for(self._wake.wait(), deadline - clock.now())
+                async with asyncio.timeout(deadline - clock.now()):
+                    await self._wake.wait()
             except TimeoutError:
                 return False
         return True

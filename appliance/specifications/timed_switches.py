@@ -131,7 +131,8 @@ class TimedSwitches:
             self._changed.clear()
             left = min(seconds for name, seconds in self._ends.left().items() if name in self._kept)
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._changed.wait(), left)
+                async with asyncio.timeout(left):
+                    await self._changed.wait()
 
     async def _bring_back(self, due: Mapping[str, Switch]) -> None:
         try:

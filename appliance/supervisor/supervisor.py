@@ -211,7 +211,8 @@ class Supervisor:
                 process.note_answer()
                 return
             with suppress(TimeoutError):
-                await asyncio.wait_for(self.stopping.wait(), 0.05)
+                async with asyncio.timeout(0.05):
+                    await self.stopping.wait()
         self.stop(f"rosmaster does not answer on 127.0.0.1:{self._facts.rosmaster_port}; check the log")
 
     async def until_ready(self) -> None:
@@ -219,7 +220,8 @@ class Supervisor:
         began = clock.now()
         while not self.is_ready and not self.stopping.is_set():
             with suppress(TimeoutError):
-                await asyncio.wait_for(self.stopping.wait(), _LOOK_SECONDS)
+                async with asyncio.timeout(_LOOK_SECONDS):
+                    await self.stopping.wait()
             late = [slot for slot in self.slots if slot.is_late]
             words = ", ".join(slot.role.name for slot in late) or "the firewall around control's ports"
             waited = round(clock.now() - began)

@@ -386,6 +386,13 @@ def forged_signatures(source: Source) -> Iterator[tuple[int, str]]:
 # --- pages and prose ---
 
 
+def lost_cancellations(source: Source) -> Iterator[tuple[int, str]]:
+    """Yield uses of `asyncio.wait_for`, which in Python 3.11 loses a cancellation that comes with the event."""
+    for node in source.nodes:
+        if isinstance(node, ast.Attribute) and ast.unparse(node) == "asyncio.wait_for":
+            yield node.lineno, ast.unparse(node)
+
+
 def printed(source: Source) -> Iterator[tuple[int, str]]:
     """Yield all strings; an f-string has a gap for each value."""
     for node in source.nodes:
@@ -477,6 +484,10 @@ RULES = {
     "clocks": Rule(
         ("appliance/", "fleet/rosrv_fleet/"), direct_clocks, exactly(DIRECT, "read it with appliance/base/clock.py"),
         ["time.monotonic_ns()", "datetime.datetime.now()", "from time import time", "date.today()"],
+    ),
+    "cancellations": Rule(
+        WITH_FLEET, lost_cancellations, forbid("use asyncio.timeout: a task that is cancelled must end"),
+        ["await asyncio.wait_for(event.wait(), 1.0)"], ["await condition.wait_for(ready)"],
     ),
     "signatures": Rule(
         (*WITH_FLEET, "distribution/"), forged_signatures,

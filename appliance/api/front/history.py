@@ -94,7 +94,8 @@ class SampleHistory:
         """
         self._sooner.set()
         with contextlib.suppress(TimeoutError):
-            return await asyncio.wait_for(self.after(self.seen.number), seconds)
+            async with asyncio.timeout(seconds):
+                return await self.after(self.seen.number)
         return self.seen
 
     async def run(self) -> None:
@@ -106,7 +107,8 @@ class SampleHistory:
             least = min(LEAST_SECONDS, until)
             await asyncio.sleep(least)
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._sooner.wait(), until - least)
+                async with asyncio.timeout(until - least):
+                    await self._sooner.wait()
 
     async def look(self) -> None:
         """Ask control for the present state, and keep it as the newest sample."""

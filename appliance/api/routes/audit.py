@@ -353,7 +353,8 @@ async def _follow(
             )
         if not entries:
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(services.stopping.wait(), _POLL_SECONDS)
+                async with asyncio.timeout(_POLL_SECONDS):
+                    await services.stopping.wait()
 
 
 def _exported(path: pathlib.Path, wanted: Filter, bearer: Bearer, robot: str) -> Iterator[str]:

@@ -161,9 +161,8 @@ class BlockOrders:
             self._end_due()
             left = self._blocks.seconds_left()
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(
-                    self._changed.wait(), None if left is None else min(left, _LOOK_SECONDS)
-                )
+                async with asyncio.timeout(None if left is None else min(left, _LOOK_SECONDS)):
+                    await self._changed.wait()
 
     def _end_due(self) -> None:
         rows, due = self._blocks.rows(), self._blocks.due()

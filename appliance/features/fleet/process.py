@@ -119,7 +119,8 @@ class _Process:
         while not self._child.ended.is_set():
             self._tell()
             try:
-                await asyncio.wait_for(self._child.ended.wait(), _TICK_SECONDS)
+                async with asyncio.timeout(_TICK_SECONDS):
+                    await self._child.ended.wait()
             except TimeoutError:
                 if not self._loop.alive:
                     break  # the supervisor restarts the process

@@ -53,7 +53,8 @@ class ApplianceTable(Appliances):
         """Wait a moment for the other appliance of two: with the first host, it begins to prepare its tunnels."""
         if self.other is None:
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._introduced.wait(), _INTRODUCTION_SECONDS)
+                async with asyncio.timeout(_INTRODUCTION_SECONDS):
+                    await self._introduced.wait()
 
     def certificate(self, key: str) -> bytes:
         """Return the valid certificate for an appliance's tunnel key, in PEM; empty if there is none."""

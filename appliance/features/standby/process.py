@@ -105,7 +105,8 @@ class LeaseProcess:
             delay = max(0.005, min(self._lease.next_event(now) - now, _CONTROL_SECONDS))
             self._wake.clear()
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._wake.wait(), delay)
+                async with asyncio.timeout(delay):
+                    await self._wake.wait()
         for one in (self.peers, self.asking):
             loop.remove_reader(one)
             one.close()

@@ -295,7 +295,8 @@ class ReplicationSender:
                 self._changed.clear()
                 if self._feed.after(position, 0) == []:
                     with contextlib.suppress(TimeoutError):
-                        await asyncio.wait_for(self._changed.wait(), _HEARTBEAT_SECONDS)
+                        async with asyncio.timeout(_HEARTBEAT_SECONDS):
+                            await self._changed.wait()
 
     async def _send_snapshot(self, link: ReplicationLink[FromStandby]) -> int:
         """Send a copy of the database; return the number of its last change."""

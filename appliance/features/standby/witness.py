@@ -926,8 +926,8 @@ class IdleConnections:
     def reset(self, admitted: str, connecting: Iterable[Ends] = ()) -> None:
         """Begin to reset all present connections with other appliances, and with the fixed address.
 
-        Of those that wait for a first answer, only `connecting` are reset: they began before the rules changed, so the
-        connection tracker leads their first packet to the earlier appliance for good.
+        `connecting` wait for a first answer since before the rules changed, so the connection tracker leads their first
+        packet to the earlier appliance for good.
         """
         addresses = self._addresses(admitted)
         self._left = sockets_with(addresses, _socket_tables())

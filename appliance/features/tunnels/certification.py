@@ -208,7 +208,8 @@ class Certification:
     async def until_served(self) -> bool:
         """Wait for the api, which starts after control; return False if it does not connect in time."""
         try:
-            await asyncio.wait_for(self._served.wait(), _SERVED_SECONDS)
+            async with asyncio.timeout(_SERVED_SECONDS):
+                await self._served.wait()
         except TimeoutError:
             return False
         return True

@@ -332,7 +332,8 @@ async def find_endpoint(settings: Settings, look: Callable[[], Awaitable[Endpoin
     if configured is not None:
         return Endpoint(configured, "ipsec.endpoint of the configuration")
     try:
-        found = await asyncio.wait_for(look(), _ENDPOINT_SECONDS)
+        async with asyncio.timeout(_ENDPOINT_SECONDS):
+            found = await look()
     except TimeoutError:
         raise HostRefusedError("the supervisor did not answer: try again", ours=True) from None
     if found.address is None:
