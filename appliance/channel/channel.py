@@ -209,6 +209,13 @@ class Channel:
         loop.add_reader(self.fileno(), readable)
         self._watch_writable()
 
+    def detach(self) -> None:
+        """Leave all further messages in the socket, until the next `attach`."""
+        if self._loop is not None:
+            self._loop.remove_reader(self.fileno())
+            self._loop.remove_writer(self.fileno())
+            self._loop, self._writing = None, False
+
     def _watch_writable(self) -> None:
         if self._loop is None or self._writing == self.pending:
             return

@@ -88,6 +88,13 @@ class Link:
         if future is not None and not future.done():
             future.set_result(answer)
 
+    def release(self) -> Channel | None:
+        """Return the channel for another link, which gets all further messages; None: not connected."""
+        channel, self.channel = self.channel, None
+        if channel is not None:
+            channel.detach()
+        return channel
+
     def close(self) -> None:
         """Close the channel. Open questions fail."""
         if self.channel is None:

@@ -12,7 +12,15 @@ from appliance.base.deadlines import Deadlines
 from appliance.channel.admin import AdminAnswer, encode
 from appliance.channel.channel import Channel, ChannelFullError
 from appliance.channel.link import Link
-from appliance.channel.messages.api import RequestAnswered, RequestMade, RestServed, TokenKept, TokensStated
+from appliance.channel.messages.api import (
+    ConnectionAnswered,
+    ConnectionPassed,
+    RequestAnswered,
+    RequestMade,
+    RestServed,
+    TokenKept,
+    TokensStated,
+)
 from appliance.control.operators.admin_socket import RequestHandler
 from appliance.control.operators.token_orders import kept_by_api
 from appliance.control.rest.rest_proof import RequestAuthenticator, UnprovenError
@@ -21,6 +29,8 @@ from appliance.store.access_tokens import TokenRow
 
 _MOST_WAITING = 64
 _READ_SECONDS = 2.0
+_TAKING_OVER = "the appliance is taking over: try again"
+_NO_DOORS = "this appliance is the standby: open the door at the active appliance (rosrv standby status)"
 
 _log = structlog.get_logger()
 
@@ -70,7 +80,7 @@ class PassiveRest:
         self._askers = RequestAuthenticator(tokens, require_proof=False)
         self._link = Link(self._received)
         self.pin = ""
-        self._serving: set[asyncio.Task[None]] = set()
+        self._serving: dict[int, asyncio.Task[None]] = {}
 
     def attach(self, channel: Channel) -> None:
         """Serve a new api process. Until the tokens can be read, it answers 503: the appliance is starting."""
@@ -80,11 +90,11 @@ class PassiveRest:
             self._state_tokens()
 
     def release(self) -> Channel | None:
-        """Stop serving; return the channel to the api for the active control."""
-        for task in self._serving:
+        """Stop serving; return the channel to the api for the active control, which gets all further requests."""
+        for number, task in self._serving.items():
             task.cancel()
-        channel, self._link.channel = self._link.channel, None
-        return channel
+            self._answer(number, AdminAnswer(False, error=_TAKING_OVER, trouble="busy"))
+        return self._link.release()
 
     async def run(self) -> None:
         """Send the api the tokens whenever they change, until cancelled."""
@@ -96,6 +106,8 @@ class PassiveRest:
     def _received(self, message: Any) -> None:
         if isinstance(message, RestServed):
             self.pin = message.pin
+        if isinstance(message, ConnectionPassed):
+            self._send(ConnectionAnswered(message.number, 503, _NO_DOORS))
         if not isinstance(message, RequestMade):
             return  # the standby records no calls: the active appliance records its own
         if len(self._serving) >= _MOST_WAITING:
@@ -103,8 +115,8 @@ class PassiveRest:
             self._answer(message.number, AdminAnswer(False, error=text, trouble="busy"))
             return
         task = asyncio.get_running_loop().create_task(self._serve(message))
-        self._serving.add(task)
-        task.add_done_callback(self._serving.discard)
+        self._serving[message.number] = task
+        task.add_done_callback(lambda _task: self._serving.pop(message.number, None))
 
     async def _serve(self, made: RequestMade) -> None:
         try:

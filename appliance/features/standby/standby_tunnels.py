@@ -40,7 +40,7 @@ class StandbyTunnels:
 
     def hand_to(self, tunnels: Tunnels) -> None:
         """Give the link and the request to the tunnels of the active appliance."""
-        channel, self._link.channel = self._link.channel, None
+        channel = self._link.release()
         if channel is not None:
             tunnels.attach(channel, self._needed)
 

@@ -12,7 +12,14 @@ import pytest
 from appliance.base.clock import wall
 from appliance.channel import admin
 from appliance.channel.channel import Channel
-from appliance.channel.messages.api import ApiLink, RequestAnswered, RequestMade, TokensStated
+from appliance.channel.link import Link
+from appliance.channel.messages.api import (
+    ApiLink,
+    ConnectionPassed,
+    RequestAnswered,
+    RequestMade,
+    TokensStated,
+)
 from appliance.features.standby import passive_rest
 from appliance.features.standby.lease_client import HandOverError
 from appliance.features.standby.passive_rest import PassiveRest, ReplicatedTokens
@@ -82,6 +89,28 @@ async def test_a_new_api_learns_the_tokens_at_once(tmp_path: Path) -> None:
         answer = await heard.get()
     assert isinstance(answer, RequestAnswered)
     assert admin.decode(answer.answer, admin.StatusWanted()).active == "10.0.0.1"
+    api.close()
+
+
+@pytest.mark.nightly
+async def test_a_door_is_refused_at_once_and_no_request_is_lost_in_a_takeover(tmp_path: Path) -> None:
+    """A request that arrives while the active control starts waits for it."""
+    row, token = made("alice")
+    save(tmp_path, row)
+    rest = rest_of(tmp_path)
+    api, heard = attached(rest)
+    async with asyncio.timeout(20):
+        await heard.get()
+        with socket.socket() as viewer:
+            api.send(ConnectionPassed(3, "viewer", "ticket", "10.0.0.7"), (viewer.fileno(),))
+            assert (await heard.get()).status == 503
+        channel = rest.release()
+        api.send(RequestMade(7, admin.StatusWanted(), token))
+        await asyncio.sleep(0)
+        assert channel is not None
+        later: asyncio.Queue[Any] = asyncio.Queue()
+        Link(later.put_nowait).attach(channel)
+        assert (await later.get()).number == 7
     api.close()
 
 
