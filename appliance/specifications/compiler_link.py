@@ -5,6 +5,9 @@ process; the specifications in force stay in force.
 
 Orders take precedence over dry runs. A dry run begins only while no order is compiled and no other dry run is under
 way; a new order ends it.
+
+The last answer for a start is kept, and the last parts. So a standby that has checked whether it could start compiles
+nothing when it takes over: the robot would wait for that.
 """
 
 import asyncio
@@ -45,6 +48,9 @@ class SpecificationCompiler:
         self._no_order.set()
         self._one_dry_run = asyncio.Lock()
         self._dry_run = False  # whether a dry run is being compiled
+        self._kept: dict[
+            type, tuple[messages.Message, Any]
+        ] = {}  # the last question of each kind, and its answer
 
     def call(self) -> None:
         """Start the compiler early, because a compilation will soon be requested."""
@@ -76,12 +82,12 @@ class SpecificationCompiler:
         if not sources.files:
             return CheckedSpecifications()
         require_bounded(sources)
-        with self._order():
-            answer = await self._asked(
-                lambda number: messages.ContentsWanted(
-                    number, sources.files, sources.definitions, at_start=at_start, topics=sources.topics
-                )
+        ask = self._asked_once if at_start else self._ordered
+        answer = await ask(
+            lambda number: messages.ContentsWanted(
+                number, sources.files, sources.definitions, at_start=at_start, topics=sources.topics
             )
+        )
         return checked(answer.contents, sources, site_keys)
 
     async def try_out(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
@@ -105,11 +111,23 @@ class SpecificationCompiler:
 
     async def parts(self, compiled: bytes, wanted: list[messages.PartNames]) -> list[bytes]:
         """Compile the relays' parts. Raises `SpecificationsRefusedError`, also if the compiler does not answer."""
+        answer = await self._asked_once(lambda number: messages.PartsWanted(number, compiled, wanted))
+        parts: list[bytes] = answer.parts
+        return parts
+
+    async def _asked_once(self, question: Callable[[int], messages.Message]) -> Any:
+        """Return the answer for an order; to the same question as the last one, the same. Raises as `_asked` does."""
+        wanted = question(0)
+        last, answer = self._kept.get(type(wanted), (None, None))
+        if last != wanted:
+            answer = await self._ordered(question)
+            self._kept[type(wanted)] = wanted, answer
+        return answer
+
+    async def _ordered(self, question: Callable[[int], messages.Message]) -> Any:
+        """Return the answer for an order. Raises as `_asked` does."""
         with self._order():
-            answer: messages.PartsMade = await self._asked(
-                lambda number: messages.PartsWanted(number, compiled, wanted)
-            )
-        return answer.parts
+            return await self._asked(question)
 
     @contextlib.contextmanager
     def _order(self) -> Iterator[None]:

@@ -287,7 +287,8 @@ class Rollout:
 
     async def _findings(self, answers: list[asyncio.Future[list[str]]]) -> list[str]:
         try:
-            said = await asyncio.wait_for(asyncio.gather(*answers), _RELAY_SECONDS)
+            async with asyncio.timeout(_RELAY_SECONDS):
+                said = await asyncio.gather(*answers)
         except TimeoutError:
             return [f"{_SILENT}; try again"]
         return [finding for findings in said for finding in findings]
@@ -343,10 +344,8 @@ class Rollout:
     async def _make(self, revision: Revision, of_file: Callable[[str], int]) -> None:
         """Let the compiler make the parts of these specifications that are still missing for the relays."""
         compiled = revision.checked.compiled
-        wanted = {_names(revision, relay, of_file) for relay in range(self.allocation.relays)}
-        missing = [
-            names for names in wanted if names.monitors and (compiled, names) not in self.compiled_parts
-        ]
+        wanted = parts_wanted(revision, self.allocation.relays, of_file)
+        missing = [names for names in wanted if (compiled, names) not in self.compiled_parts]
         made = await self.parts(compiled, missing) if missing else []
         for names, part in zip(missing, made, strict=True):
             self.compiled_parts[compiled, names] = part
@@ -472,6 +471,16 @@ class Rollout:
 def _names(revision: Revision, relay: int, of_file: Callable[[str], int]) -> messages.PartNames:
     mine = tuple(name for name, file in revision.checked.monitors.items() if of_file(file) == relay)
     return messages.PartNames(mine, tuple(name for name in mine if name in revision.shadows))
+
+
+def parts_wanted(
+    revision: Revision, relays: int, of_file: Callable[[str], int] | None = None
+) -> list[messages.PartNames]:
+    """Return the parts that the relays run; without `of_file`, those of a start on another appliance."""
+    if of_file is None:
+        of_file = _of(Allocation(relays).plan(revision.checked))
+    names = dict.fromkeys(_names(revision, relay, of_file) for relay in range(relays))
+    return [one for one in names if one.monitors]
 
 
 def _of(plan: AllocationPlan) -> Callable[[str], int]:

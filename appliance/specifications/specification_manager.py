@@ -58,14 +58,13 @@ from appliance.specifications.specification_revisions import (
     text_of,
     unknown_monitors,
 )
-from appliance.specifications.switches import Switches, require_whole
+from appliance.specifications.switches import SWITCHES, Switches, require_whole
 from appliance.specifications.timed_switches import LONGEST, TimedSwitches
 from appliance.store.revisions import LIMITS, Revisions, reloaded_by
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
 _log = structlog.get_logger()
-_SWITCHES = "monitor switches"
 _ACTS = "monitor acts"
 _GIVEN = "monitor given"
 ALLOCATION = "relays"
@@ -181,7 +180,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         two appliances (`taken_over`) uses those that were in force on the active one.
         """
         settings = self.store.settings()
-        self.switches.said = json.loads(settings.get(_SWITCHES, "{}"))
+        self.switches.restore(settings.get(SWITCHES, "{}"))
         self.givens.said = json.loads(settings.get(_GIVEN, "{}"))
         self._acts = int(settings.get(_ACTS, "0"))
         last = self.in_force if self._find_last(restarted=restarted or taken_over) else None
@@ -529,11 +528,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 raise
         # Killed between the two, control leaves a limit without its switch, never the reverse.
         if seconds is None:
-            self.store.save_setting(_SWITCHES, json.dumps(switches.said))
+            self.store.save_setting(SWITCHES, json.dumps(switches.said))
             self.returns.end(changed)
         else:
             self.returns.begin({name: switches.states[name] or True for name in changed}, seconds, to)
-            self.store.save_setting(_SWITCHES, json.dumps(switches.said))
+            self.store.save_setting(SWITCHES, json.dumps(switches.said))
         for name in changed:
             switches.states[name] = to
             if not switched_shadow:
@@ -672,9 +671,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     # --- internals ---
 
     def _revision(self, number: int, sources: Sources, checked: CheckedSpecifications) -> Revision:
-        states = self.switches.states_of(checked)
-        shadows = frozenset(name for name, state in states.items() if state == SHADOW)
-        return Revision(number, sources, checked, shadows)
+        return Revision(number, sources, checked, self.switches.shadows_of(checked))
 
     async def _kept(self) -> list[MonitorRevisionRow]:
         await self.store.settled()
@@ -901,7 +898,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 resource="",
                 who=self.in_force.who,
             )
-        self.store.save_setting(_SWITCHES, json.dumps(self.switches.said))
+        self.store.save_setting(SWITCHES, json.dumps(self.switches.said))
         self.store.save_setting(_GIVEN, json.dumps(self.givens.said))
 
 

@@ -6,10 +6,14 @@ later under the same name starts without a switch. Monitors that share variables
 disabled ones).
 """
 
+import json
 from collections.abc import Mapping
 
 from appliance.specifications.rollout import SHADOW, Switch
 from appliance.specifications.specification_files import CheckedSpecifications, SpecificationsRefusedError
+
+SWITCHES = "monitor switches"
+"""The setting with the switches of operators."""
 
 
 class Switches:
@@ -21,6 +25,10 @@ class Switches:
         self.named = set() if enable in words else {name.strip() for name in enable.split(",")}
         self.said: dict[str, Switch] = {}
         self.states: dict[str, Switch] = {}
+
+    def restore(self, text: str) -> None:
+        """Take the operators' switches from the setting `SWITCHES`."""
+        self.said = json.loads(text)
 
     def enabled(self, name: str) -> bool:
         """Whether a monitor is enabled, so that its actions take effect."""
@@ -46,6 +54,10 @@ class Switches:
                 if any(states[name] == SHADOW for name in group):
                     states |= {name: SHADOW for name in group if states[name] is True}
         return states
+
+    def shadows_of(self, checked: CheckedSpecifications) -> frozenset[str]:
+        """Return those of these monitors that are in shadow mode."""
+        return frozenset(name for name, state in self.states_of(checked).items() if state == SHADOW)
 
     def _own(self, name: str) -> Switch:
         """Return a monitor's own switch, ignoring the monitors with which it shares variables."""

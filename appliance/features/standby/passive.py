@@ -71,13 +71,13 @@ class PassiveControl:
         self.tunnels = StandbyTunnels()
         endpoint = host_endpoint(settings, membership)
         self._replica_sync = ReplicaSync(self._replica, self._folder)
-        self._check = TakeoverCheck(settings, membership, compiler.check_at_start)
+        self._check = TakeoverCheck(settings, membership, compiler.check_at_start, compiler.parts)
         self._complete = False  # whether no acknowledged change is missing
         self._receiver = ReplicationReceiver(
             self._replica,
             self._accepts,
             lambda: self.tunnels.introduction(endpoint, self._rest.pin),
-            lambda: self._check.obstacle or "",
+            lambda: self._check.obstacle,
             self._check.news.set,
         )
         self.copies = CopyAge(self._replica.setting)
@@ -185,7 +185,7 @@ class PassiveControl:
             since=self._since,
             wait=wait,
             other=other,
-            obstacle=self._check.obstacle or "",
+            obstacle=self._check.obstacle,
         )
 
     async def hand_over(self) -> None:

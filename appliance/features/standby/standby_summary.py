@@ -12,8 +12,12 @@ SILENT_SECONDS = 5.0
 """From this age of its last answer on, the witness is silent. It is asked every 0.3 s."""
 
 
+UNCHECKED = "it has just started, and still checks whether it could serve"
+"""The obstacle of a standby before the end of its first check, which takes as long as its specifications need."""
+
+
 def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Trouble]:
-    """Yield what is wrong, the most urgent first; `patience`: seconds that the other may be away or behind."""
+    """Yield what is wrong, the most urgent first; `patience`: seconds for which the other may be away or start."""
     other = state.other
     if both_active(state):
         holder = state.witness.holder
@@ -22,7 +26,7 @@ def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Tro
             f" only {holder}; stop this appliance, then start it again"
         )
         yield Trouble("alarm", "both-active", text)
-    if state.obstacle:
+    if state.obstacle and not (patience and state.obstacle == UNCHECKED):
         yield _unready(state)
     lasting = other.trouble_seconds
     if lasting is not None and lasting >= patience:
@@ -81,10 +85,10 @@ def _away(state: StandbyState, seconds: float) -> Trouble:
 def _unready(state: StandbyState) -> Trouble:
     active = state.role == "active"
     name, address = (state.other.name, state.other.address) if active else (state.name, state.address)
-    text = (
-        f"the standby {name} ({address}) cannot take over: {state.obstacle}; once this is corrected, {name} notices it"
-        " within seconds"
-    )
+    text = f"the standby {name} ({address}) cannot take over: {state.obstacle}"
+    if state.obstacle == UNCHECKED:
+        return Trouble("warning", "standby-unchecked", text)
+    text += f"; once this is corrected, {name} notices it within seconds"
     return Trouble("alarm", "standby-unready", text)
 
 

@@ -1,7 +1,8 @@
 """Check on a standby that control could start if this appliance took over now.
 
 The check calls the functions by which the start of control reads the stored policy, specifications, hosts and nodes,
-makes the certificate of the link and opens the port of the ROS master. It also writes to the disk of the state. It runs
+makes the certificate of the link and opens the port of the ROS master. It also writes to the disk of the state, and
+compiles the specifications for the relays, so that a takeover need not (`SpecificationCompiler`). It runs
 at the start, when the active appliance brings another policy or other specifications into force, and every
 `_AGAIN_SECONDS`, because the appliance's own files, disk and ports may change.
 
@@ -28,16 +29,14 @@ from appliance.control.assembly.policy_gate import policy_at_start
 from appliance.control.assembly.robot import robot_addresses
 from appliance.features.standby.link_certificates import replication_context
 from appliance.features.standby.membership import Membership
+from appliance.features.standby.standby_summary import UNCHECKED
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.enactor import restore
 from appliance.policy.judgement import PolicyContext
-from appliance.specifications.specification_files import (
-    CheckedSpecifications,
-    Sources,
-    SpecificationFolder,
-)
+from appliance.specifications.rollout import Parts, Revision, parts_wanted
+from appliance.specifications.specification_files import SpecificationFolder
 from appliance.specifications.specification_revisions import Check, specifications_at_start
-from appliance.specifications.switches import Switches
+from appliance.specifications.switches import SWITCHES, Switches
 from appliance.store.changes import Change, Value
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.store.writer_thread import Database, StoreError
@@ -73,7 +72,7 @@ _log = structlog.get_logger()
 class TakeoverCheck:
     """The check; set `news` when the policy or the specifications of the active appliance have changed.
 
-    `obstacle` is why this appliance could not serve after a takeover, in a line; empty: it could, None: not known yet.
+    `obstacle` is why this appliance could not serve after a takeover, in a line; empty: it could.
     """
 
     def __init__(
@@ -81,6 +80,7 @@ class TakeoverCheck:
         settings: Settings,
         membership: Membership,
         compile_specifications: Check,
+        parts: Parts,
         *,
         again: float = _AGAIN_SECONDS,
     ) -> None:
@@ -88,10 +88,10 @@ class TakeoverCheck:
         self._settings = settings
         self._membership = membership
         self._compile = compile_specifications
+        self._parts = parts
         self._again = again
         self._folder = settings.state / "control"
-        self._compiled: tuple[Sources, CheckedSpecifications] | None = None
-        self.obstacle: str | None = None
+        self.obstacle = UNCHECKED
         self.news = asyncio.Event()
 
     async def run(self, changed: Callable[[], None]) -> None:
@@ -100,12 +100,13 @@ class TakeoverCheck:
             self.news.clear()
             obstacle = await self._find_obstacle()
             if obstacle != self.obstacle:
-                if self.obstacle:
+                if self.obstacle not in ("", UNCHECKED):
                     _log.info("the reason why this appliance cannot take over is gone", reason=self.obstacle)
                 self.obstacle = obstacle
                 changed()
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self.news.wait(), self._again)
+                async with asyncio.timeout(self._again):
+                    await self.news.wait()
 
     async def _find_obstacle(self) -> str:
         try:
@@ -125,20 +126,26 @@ class TakeoverCheck:
         """Read what a takeover reads. Raises any error that would end it."""
         settings = self._settings
         await asyncio.to_thread(_require_room, self._folder)
-        last = await asyncio.to_thread(self._load_state)
-        await specifications_at_start(
+        last, said = await asyncio.to_thread(self._load_state)
+        switches = Switches(settings.enable)
+        switches.restore(said)
+        found = await specifications_at_start(
             last,
             SpecificationFolder(settings.monitors),
-            self._compile_once,
+            self._compile,
             settings.site_keys,
-            named=Switches(settings.enable).named,
+            named=switches.named,
         )
+        revision = Revision(0, found.sources, found.checked, switches.shadows_of(found.checked))
+        wanted = parts_wanted(revision, settings.relays)
+        if wanted:
+            await self._parts(found.checked.compiled, wanted)
         if self.obstacle != "":  # the membership stays the same, and each call writes files
             replication_context(self._membership, self._folder, server=True)
         open_listener(*settings.listen_address).close()
 
-    def _load_state(self) -> MonitorRevisionRow | None:
-        """Read the state and the policy; return the stored specifications, if there are any."""
+    def _load_state(self) -> tuple[MonitorRevisionRow | None, str]:
+        """Read the state and the policy; return the stored specifications, if there are any, and their switches."""
         settings = self._settings
         store = StateStore(self._folder, failed=_log.error, kind=ReadOnlyDatabase)
         known = PolicyContext(
@@ -150,13 +157,7 @@ class TakeoverCheck:
         kept = None if last is None else kept_policy(last)
         policy_at_start(kept, settings.policy, known, kept_first=True)
         restore(Registry(), store)
-        return next(iter(store.monitor_revisions(1)), None)
-
-    async def _compile_once(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-        """Compile specifications that differ from the last ones; the compiler takes seconds for large ones."""
-        if self._compiled is None or self._compiled[0] != sources:
-            self._compiled = (sources, await self._compile(sources, site_keys))
-        return self._compiled[1]
+        return next(iter(store.monitor_revisions(1)), None), store.settings().get(SWITCHES, "{}")
 
 
 def _require_room(folder: Path) -> None:

@@ -31,6 +31,7 @@ from appliance.channel.answers.monitor_answers import Replacement
 from appliance.specifications.allocation import Allocation, Move, Resource
 from appliance.specifications.checking import check, contents_at_start
 from appliance.specifications.live_topics import LiveType, Published
+from appliance.specifications.rollout import Parts
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
     Sources,
@@ -88,6 +89,9 @@ class Desk:
         self.limit_ends.set()
         self.try_out: Check = here
         self.check: Check = here
+        self.check_at_start: Check = here_at_start
+        self.parts: Parts = parts_here
+        self.relays = 1
         self.live: Published = {}
 
     async def monitors(
@@ -95,6 +99,7 @@ class Desk:
         enable: str = "all",
         *,
         restarted: bool = False,
+        taken_over: bool = False,
         folder: bool = True,
         site_keys: Sequence[str] = (),
     ) -> SpecificationManager:
@@ -106,19 +111,19 @@ class Desk:
             self.trail,
             on_fault="drop",
             slices=1000,
-            allocation=Allocation(1),
+            allocation=Allocation(self.relays),
             relays=relay,
             published=lambda: None,
             told=[],
             site_keys=site_keys,
             check=lambda sources, keys: self.check(sources, keys),  # noqa: PLW0108  of whatever it is then
-            check_at_start=here_at_start,
+            check_at_start=self.check_at_start,
             try_out=self.try_out,
-            parts=parts_here,
+            parts=self.parts,
             live=lambda: self.live,
         )
         relay.monitors.desk = self
-        await relay.monitors.start(restarted=restarted)
+        await relay.monitors.start(restarted=restarted, taken_over=taken_over)
         return relay.monitors
 
     def close(self) -> None:

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 
 from appliance.channel.alarms import open_alarms
+from appliance.features.standby.standby_summary import UNCHECKED
 from tests.unit.channel.test_alarms import changed
 
 PAIR: dict[str, Any] = {
@@ -36,7 +37,12 @@ def test_each_condition_of_a_pair_is_an_alarm(more: dict[str, Any], kind: str, s
 
 @pytest.mark.parametrize(
     "more",
-    [{}, {"other": {"trouble_seconds": 59.0}}, {"witness": {"answered_seconds": 4.9, "holder": ""}}],
+    [
+        {},
+        {"other": {"trouble_seconds": 59.0}},
+        {"witness": {"answered_seconds": 4.9, "holder": ""}},
+        {"obstacle": UNCHECKED},
+    ],
 )
 def test_two_appliances_that_work_have_no_alarm(more: dict[str, Any]) -> None:
     assert open_alarms(changed("standby", PAIR | more)) == []

@@ -2,8 +2,9 @@
 
 import asyncio
 import contextlib
+import json
 import socket
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +12,23 @@ import msgspec
 import pytest
 
 from appliance.base.actors import DISK
+from appliance.channel import messages
 from appliance.configuration.settings import Settings
 from appliance.features.standby.membership import Membership
+from appliance.features.standby.standby_summary import UNCHECKED
 from appliance.features.standby.takeover_check import TakeoverCheck
+from appliance.specifications.checking import contents_at_start
+from appliance.specifications.compiler_link import SpecificationCompiler
 from appliance.specifications.specification_files import Sources
 from appliance.specifications.specification_revisions import text_of
+from appliance.specifications.switches import SWITCHES
 from appliance.store.state_file import IncarnationRow, MonitorRevisionRow, RevisionRow, StateStore
 from tests.support.appliance import OPEN_POLICY
 from tests.support.engines import InlineDatabase
 from tests.support.features.standby.standby_site import memberships
 from tests.support.site_key import LINE, signed
-from tests.unit.specifications.monitor_desk import TEXTS, here
+from tests.support.stated import parts_here
+from tests.unit.specifications.monitor_desk import TEXTS, Desk, here
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 SECONDS = 60
@@ -39,7 +46,6 @@ class Standby:
         self.policy.write_text(OPEN_POLICY)
         self.store = StateStore(home / "control", failed=pytest.fail, kind=InlineDatabase)
         self.membership = memberships(home)[0]["b"]
-        self.compilations = 0
         self.store.save_revision(self.revision(OPEN_POLICY))
 
     def revision(self, text: str, signature: str = "") -> RevisionRow:
@@ -51,13 +57,14 @@ class Standby:
         sources = text_of(Sources({"one.rv": text}))
         self.store.save_monitor_revision(MonitorRevisionRow(number, sources, 0.0, who, ""))
 
-    async def compiled(self, sources: Sources, site_keys: Any) -> Any:
-        self.compilations += 1
-        return await here(sources, site_keys)
-
     @contextlib.asynccontextmanager
     async def checked(
-        self, *, again: float = 3600.0, membership: Membership | None = None, **settings: Any
+        self,
+        *,
+        again: float = 3600.0,
+        membership: Membership | None = None,
+        compiler: SpecificationCompiler | None = None,
+        **settings: Any,
     ) -> AsyncIterator["Checked"]:
         """Run the check; it repeats itself after `again` seconds."""
         await self.store.settled()
@@ -67,8 +74,9 @@ class Standby:
             "monitors": self.monitors,
         } | settings
         whole = Settings(state=self.home, policy=self.policy, **given)
+        compiling = (here, parts_here) if compiler is None else (compiler.check_at_start, compiler.parts)
         checked = Checked(
-            TakeoverCheck(whole, membership or self.membership, self.compiled, again=again), self.store
+            TakeoverCheck(whole, membership or self.membership, *compiling, again=again), self.store
         )
         task = asyncio.create_task(checked.check.run(checked.changed.set))
         try:
@@ -90,7 +98,7 @@ class Checked:
     async def next_obstacle(self) -> str:
         await self.changed.wait()
         self.changed.clear()
-        assert self.check.obstacle is not None
+        assert self.check.obstacle != UNCHECKED
         return self.check.obstacle
 
     async def replicate(self) -> None:
@@ -109,7 +117,7 @@ async def test_a_standby_without_obstacles(standby: Standby) -> None:
     """The result is empty; before the first check it is not known."""
     standby.save_specification(TEXTS["a"])
     async with standby.checked() as checked:
-        assert checked.check.obstacle is None
+        assert checked.check.obstacle == UNCHECKED
         assert await checked.next_obstacle() == ""
 
 
@@ -201,17 +209,46 @@ async def test_a_damaged_certificate(standby: Standby) -> None:
         assert "the certificates of the two appliances cannot be used" in await checked.next_obstacle()
 
 
-async def test_the_same_specifications_are_compiled_once(standby: Standby) -> None:
-    standby.save_specification(TEXTS["a"])
-    async with standby.checked() as checked:
-        assert await checked.next_obstacle() == ""
-        standby.store.save_revision(standby.revision(f"{OPEN_POLICY}[Tomorrow]\n"))
-        await checked.replicate()
-        await checked.next_obstacle()
-        standby.store.save_revision(standby.revision(OPEN_POLICY))
-        await checked.replicate()
-        assert await checked.next_obstacle() == ""
-    assert standby.compilations == 1
+class OwnCompiler(SpecificationCompiler):
+    """A compiler in this process, which counts the questions."""
+
+    questions = 0
+
+    async def _asked(self, question: Callable[[int], Any], **_: Any) -> Any:
+        self.questions += 1
+        wanted = question(0)
+        if isinstance(wanted, messages.PartsWanted):
+            return messages.PartsMade(0, await parts_here(wanted.compiled, wanted.parts))
+        return messages.ContentsFound(0, contents_at_start(wanted.files, wanted.definitions, wanted.topics))
+
+
+async def test_a_takeover_compiles_nothing(standby: Standby) -> None:
+    """The check has compiled the specifications, for each relay and with their switches."""
+    files = {f"{name}.rv": TEXTS[name] for name in ("a", "b", "c")}
+    standby.store.save_monitor_revision(MonitorRevisionRow(1, text_of(Sources(files)), 0.0, "alice", ""))
+    standby.store.save_setting(SWITCHES, json.dumps({"b": "shadow"}))
+    compiler = OwnCompiler(lambda: None)
+    async with standby.checked(relays=2, compiler=compiler) as checked:
+        for _ in range(2):
+            assert await checked.next_obstacle() == ""
+            standby.store.save_revision(standby.revision(f"{OPEN_POLICY}[Tomorrow]\n"))
+            await checked.replicate()
+            assert await checked.next_obstacle() != ""
+            standby.store.save_revision(standby.revision(OPEN_POLICY))
+            await checked.replicate()
+    assert compiler.questions == 2
+
+    home = standby.home / "desk"
+    home.mkdir()
+    other = Desk(home)
+    other.store.close()
+    other.store, other.relays = standby.store, 2
+    other.check_at_start, other.parts = compiler.check_at_start, compiler.parts
+    manager = await other.monitors(taken_over=True)
+    assert manager.rollout.allocation.of_file("a.rv") != manager.rollout.allocation.of_file("b.rv")
+    assert manager.switches.shadowed() == ["b"]
+    assert compiler.questions == 2
+    other.log.close()
 
 
 async def test_the_check_changes_nothing(standby: Standby) -> None:
