@@ -71,6 +71,7 @@ class Noticed:
     orders: list[str] = field(default_factory=list)
     two: int = 0
     broken: list[str] = field(default_factory=list)
+    whole: bool = True
     story: str = ""
 
 
@@ -206,14 +207,16 @@ def until_whole(site: StandbySite, robot: StandbyRobot) -> None:
 def one(
     site: StandbySite, robot: StandbyRobot, probe: Process, row: Noticed, fault: Fault, *, limit: float
 ) -> None:
-    """Let a fault happen, and judge it; the `story` of the row says that the site did not recover."""
+    """Let a fault happen, and judge it; a row with a broken promise has the output of all programs as its `story`."""
     try:
         _start_again(robot, suffer(site, robot, probe, row, fault))
         judge(row, fault, limit)
         until_whole(site, robot)
     except (AssertionError, OSError, NotRunningError) as error:
         row.broken.append(f"not whole again: {(str(error).splitlines() or [repr(error)])[0]}")
-        row.story = "\n".join([str(error), site.story(), robot.ros.story()])
+        row.whole, row.story = False, f"{error}\n"
+    if row.broken:
+        row.story += "\n".join([site.story(), robot.ros.story()])
 
 
 def run(faults: Sequence[tuple[Fault, float]], *, done: int, load: int, limit: float) -> Iterator[Noticed]:
@@ -225,7 +228,7 @@ def run(faults: Sequence[tuple[Fault, float]], *, done: int, load: int, limit: f
                 row = Noticed(done, fault.name, round(seconds, 2))
                 one(site, robot, probe, row, fault, limit=limit)
                 yield row
-                if row.story:
+                if not row.whole:
                     break
 
 

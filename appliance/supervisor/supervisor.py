@@ -457,13 +457,16 @@ class Supervisor:
                 slot.process.kill()
 
     def _suspend(self) -> bool:
-        """Stop everything that serves the robot; return False if something is only starting."""
-        serving = [slot for slot in self.slots if slot.role.serves_robot]
-        if any(slot.is_starting for slot in serving):
+        """Stop everything that serves the robot; return False if a process is only starting.
+
+        A control that stood by is not: soon after the activation, too, a lapse must not end the appliance.
+        """
+        serving = [(slot, slot.process) for slot in self.slots if slot.role.serves_robot]
+        if any(slot.is_starting for slot, process in serving if process is not None):
             return False
-        for slot in serving:
-            if slot.process is not None:
-                slot.process.kill(signal.SIGSTOP)
+        for _slot, process in serving:
+            if process is not None:
+                process.kill(signal.SIGSTOP)
         self._suspended_at = clock.now()
         self._answer_for_control(self._gate.paused)
         self._tell("api", messages.ServicePaused(self._gate.paused))
@@ -496,6 +499,8 @@ class Supervisor:
     async def control_ready(self, process: ProcessHandle, said: ControlReady) -> None:
         """Close control's inner ports to other users, and announce that the appliance serves."""
         reason = await self._watchdog.control_ready(said.inner_port, said.own_port)
+        while self._gate.suspended and process.alive:
+            await asyncio.sleep(_SUSPENDED_SECONDS)
         if reason is not None and not self.is_ready:
             self.stop(reason)
         if self.stopping.is_set() or not process.alive or not self._gate.active:

@@ -32,12 +32,13 @@ async def test_a_lapse_of_the_lease_stops_what_serves_the_robot(
         Role("relay", "u", "p", "m:f"),
         Role("lease", "u", "p", "m:f", outlives_takeover=True),
         Role("api", "u", "p", "m:f", stands_by=True),
+        Role("rosout", "u", "p", "m:f", after="control"),  # not started yet, as soon after an activation
     )
     admin = socket.create_server(("127.0.0.1", 0))
     facts = Facts(state=tmp_path, config=tmp_path / "config.json", rosmaster_port=1)
     supervisor = Supervisor(roles, facts, admin=admin, ready=lambda _said: None, gate=LeaseWatch)
-    control, relay, lease, api = stand_ins = [StandIn() for _ in roles]
-    for slot, process in zip(supervisor.slots, stand_ins, strict=True):
+    control, relay, lease, api = stand_ins = [StandIn() for _ in roles[:-1]]
+    for slot, process in zip(supervisor.slots[:-1], stand_ins, strict=True):
         slot.process, process.ready, process.role = cast(ProcessHandle, process), True, slot.role.name
 
     def report(message: object) -> None:
