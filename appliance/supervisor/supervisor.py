@@ -459,7 +459,7 @@ class Supervisor:
     def _suspend(self) -> bool:
         """Stop everything that serves the robot; return False if a process is only starting.
 
-        A control that stood by is not: soon after the activation, too, a lapse must not end the appliance.
+        A control that stood by is not, so a lapse soon after the activation does not end the appliance either.
         """
         serving = [(slot, slot.process) for slot in self.slots if slot.role.serves_robot]
         if any(slot.is_starting for slot, process in serving if process is not None):

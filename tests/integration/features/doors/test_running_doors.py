@@ -80,7 +80,7 @@ def test_an_agent_hears_publishes_and_calls_within_its_rights(
             with connect(AGENT) as client:
                 client.send(json.dumps({"op": "subscribe", "topic": "/chatter", "type": "std_msgs/String"}))
                 assert frame(client, op="publish")["msg"]["data"].startswith("hello ")
-                assert appliance.status()["ipsec"]["ports"].keys() == {"10.77.0.10"}  # a door is no machine
+                assert appliance.status()["ipsec"]["ports"].keys() == {"10.77.0.10"}  # no door
                 client.send(json.dumps({"op": "advertise", "topic": "/answer", "type": "std_msgs/String"}))
                 client.send(json.dumps({"op": "publish", "topic": "/answer", "msg": {"data": "first"}}))
                 client.send(json.dumps({"op": "call_service", "service": "/brake", "args": [True], "id": 1}))
