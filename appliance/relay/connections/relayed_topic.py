@@ -377,10 +377,10 @@ class RelayedTopic:
     def _admit(self, batch: Batch, since: float, *, divided: bool = True) -> Batch | None:
         """Give a batch to monitors and subscribers; return the part that monitors had no time for."""
         if self._served.mask is not None and batch.messages > 1:  # a message may withhold the next one
-            first, rest = batch.head(1), batch.tail(batch.messages - 1)
+            first = batch.head(1)
             self._admit(first, since, divided=False)
             batch.judged = first.judged
-            return rest
+            return batch.tail(batch.messages - 1)
         through = self._monitoring.through
         left = batch if through is None else through(batch)
         rest = batch.tail(batch.left) if batch.left else None

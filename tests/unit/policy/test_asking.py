@@ -10,7 +10,6 @@ from appliance.policy.diff import diff
 from appliance.policy.grant import DecidedRequest, grant
 from appliance.policy.judgement import PolicyContext, approvals_of
 from appliance.policy.learn import Observation, learn
-from appliance.policy.lost_rights import LostRights
 from appliance.policy.model import Category, Request, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
@@ -89,7 +88,6 @@ def test_every_reader_of_a_policy_knows_ask() -> None:
     assert [*render(explain(asked, request))][-1] == "together: needs an approval"
     assert [one.word for one in diff(plain, asked, [request])] == ["needs approval"]
     assert not diff(asked, asked, [request])
-    assert LostRights(plain, asked).took_from(AGENT)
     granted = grant(TEXT, "site.ini", PolicyContext(), DecidedRequest(request, rights_of(request)))
     assert "/cmd_vel = operator agent-1, ask agent-1" in granted.text
     learned = learn([Observation(request, "registerPublisher", asked=True)]).text

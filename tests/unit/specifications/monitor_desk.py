@@ -227,7 +227,7 @@ class Dialogue:
         match said:
             case ["start", *how]:
                 await desk.store.settled()
-                given = dict(word.split("=") for word in how if "=" in word)
+                given: dict[str, Any] = dict(word.split("=") for word in how if "=" in word)
                 start = desk.monitors(restarted="restarted" in how, folder="no-folder" not in how, **given)
                 try:
                     self._monitors, self._last = await start, ""

@@ -73,3 +73,11 @@ def test_denials_that_the_new_policy_causes_do_not_count() -> None:
         "a wider policy causes no denial"
     )
     assert counted_denials({ROBOT: 11} | denied, narrower, LostRights(_POLICY, narrower).took_from) == 11
+
+
+def test_a_right_that_now_needs_an_approval_is_lost() -> None:
+    plain, asked = (
+        compile_policy(f"[Publishers]\n/cmd_vel = {hosts}\n", file="policy.ini")
+        for hosts in (ROBOT, f"ask {ROBOT}")
+    )
+    assert LostRights(plain, asked).took_from(ipaddress.ip_address(ROBOT))
