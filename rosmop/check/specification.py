@@ -36,7 +36,13 @@ from rosmop.check.reachable_types import identity, reached
 from rosmop.check.safe_messages import declare_safes
 from rosmop.check.scope import CompilationContext, SpecificationNames
 from rosmop.check.slicing import check_parameters, declare_parameters, slicing_of, unsliceable
-from rosmop.check.specification_lint import kept_slices, lint_property, lint_statements, unused_events
+from rosmop.check.specification_lint import (
+    kept_slices,
+    lint_property,
+    lint_size,
+    lint_statements,
+    unused_events,
+)
 from rosmop.check.traps import rival_changes, traps
 from rosmop.check.withholdings import withholdings
 from rosmop.form import nodes
@@ -44,8 +50,6 @@ from rosmop.form.compiled import Compiled, PropertyCode, SpecificationCode
 from rosmop.form.findings import Diagnostic, SpecificationError
 from rosmop.logics.catalogue import compile_property
 from rosmop.logics.interface import CompiledProperty, FormulaError
-from rosmop.run.state import MOST_BYTES
-from rosmop.runtime.action_context import MAX_BYTES
 from rosmop.text import tree
 from rosmop.types.messages import MessageTypes, nearest, shown
 from roswire.definitions import Definitions
@@ -155,18 +159,7 @@ def _declare(shared: CompilationContext, specification: tree.Specification) -> S
     declare_functions(shared, names, specification)
     declare_facts(shared, names, specification)
     size = sum(shared.values.width(variable.type) for variable in names.variables.values())
-    if MOST_BYTES < size <= MAX_BYTES:
-        text = f"the variables take {size} bytes; a state of more than {MOST_BYTES >> 10} KiB is not kept, so"
-        text += " a restart of the relay loses it"
-        shared.findings.append(Diagnostic(specification.position, "warning", text))
-    if size > MAX_BYTES:
-        shared.findings.append(
-            Diagnostic(
-                specification.position,
-                "error",
-                f"the variables take {size} bytes; a specification may hold {MAX_BYTES >> 20} MiB",
-            )
-        )
+    shared.findings += lint_size(size, specification.position)
     return names
 
 

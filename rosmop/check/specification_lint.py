@@ -7,10 +7,12 @@ from typing import Protocol
 
 from rosmop.check.call_expressions import stream_of
 from rosmop.form.compiled import EventCode, PropertyCode
-from rosmop.form.findings import Diagnostic
+from rosmop.form.findings import Diagnostic, Position
 from rosmop.logics.catalogue import LOGICS
 from rosmop.logics.interface import Categories, ClockedProperty, CompiledProperty, FiniteProperty
 from rosmop.logics.property_lint import analyse
+from rosmop.run.state import MOST_BYTES
+from rosmop.runtime.action_context import MAX_BYTES
 from rosmop.text import tree
 from rosmop.types.messages import shown
 
@@ -26,6 +28,16 @@ _WORD = re.compile(r"[A-Za-z_][A-Za-z_0-9]*+")
 class _HasProperty(Protocol):
     @property
     def property(self) -> CompiledProperty: ...
+
+
+def lint_size(size: int, position: Position) -> Iterator[Diagnostic]:
+    """Report variables of `size` bytes that are not kept, or that no specification may have."""
+    if size > MAX_BYTES:
+        text = f"the variables take {size} bytes; a specification may hold {MAX_BYTES >> 20} MiB"
+        yield Diagnostic(position, "error", text)
+    elif size > MOST_BYTES:
+        text = f"the variables take {size} bytes; a state of more than {MOST_BYTES >> 10} KiB is not kept, so"
+        yield Diagnostic(position, "warning", f"{text} a restart of the relay loses it")
 
 
 def lint_property(compiled: CompiledProperty, node: tree.Property) -> list[Diagnostic]:

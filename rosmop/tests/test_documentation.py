@@ -19,7 +19,7 @@ from rosmop.tests.acting import definitions, load
 from rosmop.text.parser import MAX_CHARACTERS, MAX_DEPTH
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "rv-language.md").read_text()
-EXAMPLE, GIVEN, ORDER, SAFE, CALLS, VARIABLES, FUNCTIONS, PROPERTY, SLICED = re.findall(
+EXAMPLE, GIVEN, ORDER, SAFE, WITHHELD, CALLS, VARIABLES, FUNCTIONS, PROPERTY, SLICED = re.findall(
     r"```cpp\n(.*?)```", PAGE, re.DOTALL
 )
 

@@ -41,7 +41,7 @@ def test_hosts_get_messages_exactly_while_the_variable_is_false(
         hidden = hidden if data is FRAME else data is not SHOW
         assert bool(outcome.faults) is (data is SHORT)
         assert monitors.withheld_from("/image") == (NETWORKS if hidden else ())
-        assert monitors.withholds(monitors._monitors[0]) is hidden
+        assert monitors.withholds(monitors.monitor("w")) is hidden
     assert monitors.withheld_from("/pose") == ()
 
 

@@ -125,7 +125,8 @@ CALLS = {
     "metrics_v1": of(), "history": of(points=2), "whoami": of(), "challenge": of(), "live_state": of(graph=False),
     "graph": of(), "topic_messages": of(topic="/odom", messages=1, seconds=10.0), "tokens": of(),
     "alarms": of(), "limits": of(), "host_names": of(),
-    "guards": of(), "guard_suggestions": of(), "doors": of(), "drive": of(), "sso_sessions": of(),
+    "guards": of(), "guard_suggestions": of(), "doors": of(), "own_door": of(),
+    "drive": of(), "approvals": of(), "sso_sessions": of(),
     "revoke_token": of(name="shift"),
     "record_now": of(),
     "recording_of_memory": Call(body=lambda _done: {"since": 0}),
@@ -162,9 +163,10 @@ REFUSED: dict[str, dict[str, Any]] = {
     "standby": {}, "promote_standby": {}, "acknowledge_alarm": {}, "silence_alarm": {},
     "drive_take": {"group": "base"}, "drive_give": {"group": "base"}, "drive_ask": {"group": "base"},
     "remove_door": {"door_name": "alice"}, "make_door_ticket": {"door_name": "alice"},
+    "make_own_ticket": {}, "plan_guard": {}, "approve": {"number": 48213}, "approval_refuse": {"number": 48213},
     "end_sessions": {"name": "alice"}, "sign_out": {"session": "0" * 12},
 }  # fmt: skip
-"""Operations on what is not there: a second appliance, an alarm, a group, a door, a person's session.
+"""Operations on what is not there: a second appliance, an alarm, a group, a guard, a door, a held call, a person's session.
 
 They return the promised problem.
 """

@@ -78,8 +78,8 @@ def _arguments(one: Approval) -> str:
 
 def _fields(service: str, data: bytes) -> dict[str, Any] | None:
     from roswire.errors import DefinitionError  # noqa: PLC0415  few calls need the definitions
-    from roswire.message_view import read_fields  # noqa: PLC0415
-    from roswire.standard import standard_definitions  # noqa: PLC0415
+    from roswire.message_view import read_fields  # noqa: PLC0415  as above
+    from roswire.standard import standard_definitions  # noqa: PLC0415  as above
 
     try:
         definitions = standard_definitions()

@@ -31,7 +31,7 @@ class ConnectedClient(msgspec.Struct, frozen=True, kw_only=True):
     since: Moment
     protocol: Annotated[str, doc("`rosbridge`, or the subprotocol of Foxglove")]
     ticket: Annotated[str, doc("id of its ticket; empty: it came to an agent's port")]
-    who: Annotated[str, doc("who made the ticket; empty: nobody, or the ticket is over")]
+    who: Annotated[str, doc("who made the ticket; empty: no ticket, or it is over")]
     received: Annotated[int, doc("frames from the client")]
     sent: Annotated[int, doc("frames to the client")]
     refused: Annotated[int, doc("requests of the client that were refused")]

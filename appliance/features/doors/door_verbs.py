@@ -81,7 +81,7 @@ def list_doors(appliance: Appliance) -> None:
     if appliance.as_json:
         return
     if doors:
-        say("What one may do: rosrv policy explain --host door:NAME")
+        say("Rights of a door: rosrv policy explain --host door:NAME")
     else:
         say("no doors; add one: rosrv door add NAME")
 

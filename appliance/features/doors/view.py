@@ -31,7 +31,7 @@ class DoorHealth(msgspec.Struct, frozen=True, kw_only=True):
     dropped: Annotated[int, doc("messages for clients that read too slowly")]
     refusals: Annotated[int, doc("requests of clients that were refused")]
     refused_connections: Annotated[int, doc("connections in excess of the limits")]
-    restarts: Annotated[int, doc("times its process ended by itself")]
+    restarts: Annotated[int, doc("unexpected ends of its process")]
     restarts_lately: Annotated[int, doc("the same in the last ten minutes")]
 
 
@@ -54,7 +54,7 @@ _METRICS: Mapping[str, Metric] = {
     "refused_connections": counter(
         "rosrv_door_connections_refused_total", "connections in excess of the limits", "door"
     ),
-    "restarts": counter("rosrv_door_restarts_total", "times the process of the door ended by itself", "door"),
+    "restarts": counter("rosrv_door_restarts_total", "unexpected ends of the process of the door", "door"),
 }  # fmt: skip
 """The metrics by the fields of `DoorHealth`. All but the restarts begin at zero when the door's process starts."""
 

@@ -70,7 +70,7 @@ class GuardList(msgspec.Struct, frozen=True):
 
 
 class GuardPlan(msgspec.Struct, frozen=True):
-    """What a new guard, new values or `enforce` would do; nothing has changed."""
+    """The effects of a new guard, of new values or of `enforce`; nothing has changed."""
 
     revision: int
     tag: Tag

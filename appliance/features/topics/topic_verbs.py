@@ -126,7 +126,7 @@ def publishers(
 
 def _to_seconds(text: str) -> str:
     """Leave out the fractions of a second of the times in a text."""
-    return re.sub(r"(T\d\d:\d\d:\d\d)\.\d+Z", r"\1Z", text)
+    return re.sub(r"(T\d\d:\d\d:\d\d)\.\d++Z", r"\1Z", text)
 
 
 def _described(topic: Topic) -> Iterator[str]:

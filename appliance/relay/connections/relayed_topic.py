@@ -222,7 +222,7 @@ class RelayedTopic:
         """
         if self._latch.is_latching or self._taps or self.flow.limits or len(self._served) > SUBSCRIBERS:
             return None
-        if self._served.mask is not None:
+        if self._served.masked:
             return None
         if self._stream is not None or self._startup_replay is not None or self._served.undelivered:
             return None
@@ -277,7 +277,7 @@ class RelayedTopic:
 
         The latched message is the present value of the topic: a host gets it once the topic is withheld no longer.
         """
-        self._served.mask = mask
+        self._served.withhold(mask)
         self.differs()
 
     def upstream_opened(self, header: Mapping[str, str]) -> None:
@@ -376,7 +376,7 @@ class RelayedTopic:
 
     def _admit(self, batch: Batch, since: float, *, divided: bool = True) -> Batch | None:
         """Give a batch to monitors and subscribers; return the part that monitors had no time for."""
-        if self._served.mask is not None and batch.messages > 1:  # a message may withhold the next one
+        if self._served.masked and batch.messages > 1:  # a message may withhold the next one
             first = batch.head(1)
             self._admit(first, since, divided=False)
             batch.judged = first.judged
@@ -410,7 +410,7 @@ class RelayedTopic:
             now = self._clock()
             if self._startup_replay.over(now) or not self._startup_replay.add(batch, now):
                 self._forget_startup_replay()
-        if self._served.send(batch, divided=divided and self._served.mask is None):
+        if self._served.send(batch, divided=divided and not self._served.masked):
             self._pause_or_trim()
 
     @property

@@ -67,9 +67,17 @@ class ServedSubscribers:
         self._members: dict[TopicSubscriber, None] = {}
         self._row: tuple[TopicSubscriber, ...] | None = None
         self._waits: tuple[Batch, tuple[TopicSubscriber, ...]] | None = None
-        self.mask: Callable[[str], bool] | None = None
-        """Whether a host gets no message now; None: each host gets all."""
+        self._mask: Callable[[str], bool] | None = None
         self._dropped = 0
+
+    @property
+    def masked(self) -> bool:
+        """Return whether messages are withheld from hosts."""
+        return self._mask is not None
+
+    def withhold(self, mask: Callable[[str], bool] | None) -> None:
+        """Send nothing to each host for which `mask` is true at the time (None: send to all)."""
+        self._mask = mask
 
     def __len__(self) -> int:
         return len(self._members)
@@ -100,7 +108,7 @@ class ServedSubscribers:
 
     def deliver(self, batch: Batch, member: TopicSubscriber) -> None:
         """Send a subscriber a batch, unless the topic is withheld from its host."""
-        member.missed = self.mask is not None and self.mask(member.host)
+        member.missed = self._mask is not None and self._mask(member.host)
         if not member.missed:
             self._dropped += member.deliver(batch)
 

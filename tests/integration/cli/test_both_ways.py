@@ -85,7 +85,8 @@ LOOKING = [
     ("guard", "list"), ("guard", "suggest"), ("guard", "new", "nothing", "/cmd_vel"),
     ("door", "list"), ("door", "ticket", "nobody"), ("door", "remove", "nobody"), ("drive", "status"),
     ("drive", "take", "base", "--host", "robot"), ("drive", "give", "base"),
-    ("drive", "ask", "base", "--host", "robot"), ("sso", "list"), ("sso", "end", "nobody"),
+    ("drive", "ask", "base", "--host", "robot"), ("approve",),
+    ("approve", "48213"), ("sso", "list"), ("sso", "end", "nobody"),
     ("guard", "set", "nobody", "vMax=1"), ("guard", "enforce", "nobody"), ("guard", "remove", "nobody"),
 ]  # fmt: skip
 

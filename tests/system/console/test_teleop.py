@@ -55,7 +55,7 @@ def reader(browser: object, appliance: Appliance) -> Iterator[Callable[..., Read
     assert isinstance(appliance.host, Host)
     with Doorway(appliance.host, CONSOLE) as door:
         url = f"https://127.0.0.1:{door.port}"
-        yield lambda **look: Reader(browser, url, str(appliance.ready["token"]), **look)  # type: ignore[arg-type]
+        yield lambda **look: Reader(browser, url, str(appliance.ready["token"]), **look)  # type: ignore[arg-type]  # options of `Reader`
 
 
 def test_a_person_sees_and_drives_the_robot_through_their_own_door(

@@ -4,7 +4,7 @@ from appliance.channel.operations import CHANGES, OPERATIONS
 
 
 def test_changes_are_for_operators_and_admins() -> None:
-    """Each change requires one of these roles, or makes messages that only investigators may fetch.
+    """Each change requires one of these roles, or makes messages that only investigators may fetch, or opens the own door.
 
     Some requests for these roles change nothing: the lists of tokens and sessions, a kit, a query, a check.
     """
@@ -13,5 +13,6 @@ def test_changes_are_for_operators_and_admins() -> None:
     assert reads - {"sso list", "host kit"} == {"token list", "topic look", "monitor try"}
     assert {str(request.__struct_config__.tag) for request in CHANGES - listed} <= {
         "recording memory",
+        "door visit",
         "sso sign out",
     }

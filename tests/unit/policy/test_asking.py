@@ -45,7 +45,7 @@ def policy(text: str = TEXT, *approved: tuple[str, str, str]) -> Policy:
 
 
 def verdict(policy: Policy, category: Category, name: str, host: object = AGENT) -> tuple[str, bool]:
-    decision = decide(policy, rights_of(Request(host, "/it", category, name)))  # type: ignore[arg-type]
+    decision = decide(policy, rights_of(Request(host, "/it", category, name)))  # type: ignore[arg-type]  # any host
     return decision.verdict, decision.allowed
 
 

@@ -27,7 +27,7 @@ def test_first_policy_of_the_page_loads() -> None:
 
 
 def test_cases_of_the_page_are_well_formed() -> None:
-    assert len(run_cases(compile_policy(block("ini"), file="p.ini"), block("yaml"), "docs/policy.md")) == 4
+    assert len(run_cases(compile_policy(block("ini"), file="p.ini"), block("yaml"), "docs/policy.md")) == 5
 
 
 @pytest.mark.parametrize("word", sorted([*COMMANDS, *VERBS, *(f"[{name}]" for name in NAMES)]))

@@ -10,7 +10,6 @@ import pytest
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
-from appliance.features.authority.drive_requests import DriveStatus
 from examples.landshark.lab import Lab
 from tests.support.features.standby.standby_site import ADDRESSES, OCU, ROBOT, StandbySite
 from tests.support.nodes import has_ros
@@ -88,7 +87,7 @@ def test_a_door_a_held_group_and_guards(site: StandbySite) -> None:
         site.cut("a")
         site.until_taken_over("b")
         assert tablet.run(lambda: eventually(lambda: watched("b", path), site.story))
-        assert not b.ask(DriveStatus()).groups[0].holder
+        assert not b.row("drive", "status")["holder"]
         assert {name: row["shadow"] for name, row in guards(site, "b").items()} == {
             "speed": False,
             "deadman": True,

@@ -29,6 +29,7 @@ def known(text: str = CLOSED) -> PolicyKnown:
     unknown = dict.fromkeys(get_type_hints(PolicyKnown))
     given = {
         "text": text, "file": "p.ini", "revision": 3, "hosts": {}, "robot": [], "site_keys": [], "blocks": {},
+        "approved": [],
     }  # fmt: skip
     return PolicyKnown(**(unknown | given | {"cases_file": ""}))  # type: ignore[arg-type]  # what it is judged by
 

@@ -124,7 +124,7 @@ async def test_a_connection_is_kept_for_the_next_call_but_not_to_find_out_whethe
         def __init__(self, node: Incarnation, pool: int) -> None:
             super().__init__(street, node)
             made.append((node.name, pool))
-            self.close = lambda: closed.append(node.name)  # type: ignore[method-assign]
+            self.close = lambda: closed.append(node.name)  # type: ignore[method-assign]  # to see the end of the connection
 
     cast(Any, street.nodes).client = lambda node, *, pool=0: Recorded(node, pool)
     first, second = street.node("/first", 1), street.node("/second", 2)

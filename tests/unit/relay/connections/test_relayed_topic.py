@@ -210,7 +210,7 @@ def test_a_subscriber_whose_limit_kept_the_latched_message_from_it_gets_it_later
 
 
 def test_a_withheld_topic_reaches_only_other_hosts() -> None:
-    """Each message by itself, also of one batch; the pump leaves the topic to Python."""
+    """Each message alone, also of one batch; the pump leaves the topic to Python."""
     story, hidden, judged = Story(), [False], []
 
     def through(one: Batch) -> Batch:
@@ -232,7 +232,7 @@ def test_a_withheld_topic_reaches_only_other_hosts() -> None:
 
 
 def test_a_withheld_latched_message_is_given_when_the_topic_is_free() -> None:
-    """Also to a subscriber that came meanwhile; other hosts get it at once, and each host once."""
+    """Also to a subscriber that came in the meantime; other hosts get it at once, and each host once."""
     story, hidden = Story(), [True]
     story.topic.withhold(lambda host: hidden[0] and host == "10.0.0.2")
     early = story.join()
