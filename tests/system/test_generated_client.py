@@ -166,7 +166,7 @@ REFUSED: dict[str, dict[str, Any]] = {
     "make_own_ticket": {}, "plan_guard": {}, "approve": {"number": 48213}, "approval_refuse": {"number": 48213},
     "end_sessions": {"name": "alice"}, "sign_out": {"session": "0" * 12},
 }  # fmt: skip
-"""Operations on what is not there: a second appliance, an alarm, a group, a guard, a door, a held call, a person's session.
+"""Operations on a second appliance, an alarm, a group, a guard, a door, a call or a session that does not exist.
 
 They return the promised problem.
 """

@@ -4,7 +4,7 @@ from appliance.channel.operations import CHANGES, OPERATIONS
 
 
 def test_changes_are_for_operators_and_admins() -> None:
-    """Each change requires one of these roles, or makes messages that only investigators may fetch, or opens the own door.
+    """Each change requires one of these roles, makes messages that only investigators may fetch, or opens one's own door.
 
     Some requests for these roles change nothing: the lists of tokens and sessions, a kit, a query, a check.
     """
