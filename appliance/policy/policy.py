@@ -172,7 +172,7 @@ class Policy:
         return kept
 
     def _decide_below(self, request: Request, namespace: bool) -> Decision | None:
-        """Return the denial because of a key below the resource, or None if no such key denies the host."""
+        """Return the decision by a key below the resource that does not grant the host; None: all of them do."""
         table = self.tables[request.category]
         atoms = self.hosts.atoms_of(request.host)
         deciding = table.tree.below(request.resource)
@@ -189,8 +189,7 @@ class Policy:
             if not rule.asks(atoms):
                 what = f"{_what(request, 'may not')} with what is below it"
                 return _by_rule(what, rule, table.audit_only)
-            if not self._is_approved(request):
-                return self._asking(request, rule, table.audit_only)
+            return self._asking(request, rule, table.audit_only)
         return None
 
     def limit_rule(self, topic: str) -> LimitRule | None:

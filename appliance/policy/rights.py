@@ -108,7 +108,10 @@ def needs_node(request: Request) -> bool:
 
 
 def decide(policy: Policy, rights: Iterable[Right]) -> Decision:
-    """Return one decision on all rights: the first of the lowest rank, so a denial before a missing approval."""
+    """Return one decision on all rights: the first of the lowest rank, so a denial before a missing approval.
+
+    A missing approval goes before one that lasts, because each right that asks needs its own.
+    """
     first, *others = rights
     verdict = decide_right(policy, first)
     for right in others:
@@ -118,7 +121,7 @@ def decide(policy: Policy, rights: Iterable[Right]) -> Decision:
         if category in PARAMETERS and not policy.has_section(category):
             continue  # without the section, all access to parameters is allowed
         decision = decide_right(policy, right)
-        if decision.rank < verdict.rank:
+        if (decision.allowed, decision.rank) < (verdict.allowed, verdict.rank):
             verdict = replace(decision, needs=str(right))
     return verdict
 

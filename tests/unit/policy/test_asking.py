@@ -1,6 +1,7 @@
 """`ask` in a value: the hosts after it need an operator's approval, and every reader of a policy says so."""
 
 from dataclasses import replace
+from typing import cast
 
 import pytest
 
@@ -14,7 +15,7 @@ from appliance.policy.model import Category, Request, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
-from appliance.policy.rights import Right, decide, rights_of
+from appliance.policy.rights import Right, decide, rights_of, rights_of_call
 
 TEXT = """
 [Groups]
@@ -73,6 +74,19 @@ def test_a_denial_goes_before_a_missing_approval() -> None:
     assert decide(policy(TEXT, ("10.0.0.7", "write", "/arm")), [below]).verdict == "deny"
     open_below = policy(TEXT.replace("secret = operator", "secret = * "), ("10.0.0.7", "write", "/arm"))
     assert decide(open_below, [below]).allowed, "an approval of a namespace covers what asks below it"
+    plain = policy(open_below.text + "write /arm = agent-1\n", ("10.0.0.7", "write", "/arm"))
+    assert decide(plain, [below]).asks is not None, "it asks also while it is approved"
+
+
+def test_each_right_that_asks_needs_its_own_approval() -> None:
+    """A write of `/arm/x` also replaces the value of `/arm`, so an approval of one of them is not enough."""
+    text = TEXT.replace("write /arm/**", "write /arm = ask agent-1\nwrite /arm/**")
+    request = Request(AGENT, "/it", Category.COMMAND, "setParam")
+    rights = rights_of_call(request, "setParam", "/arm/x", value=1, tree={"arm": 5})
+    one, other = ("10.0.0.7", "write", "/arm/x"), ("10.0.0.7", "write", "/arm")
+    for approved, missing in (((one,), "/arm"), ((other,), "/arm/x"), ((one, other), None)):
+        decision = decide(policy(text, *approved), rights)
+        assert (None if decision.allowed else cast(Request, decision.asks).resource) == missing
 
 
 def test_a_blocked_host_and_a_group_without_a_claim_are_not_asked_for() -> None:
