@@ -96,7 +96,7 @@ class ApprovalOrders:
     def _decided(self, decision: Decision, wanted: ApprovalWanted, host: Address) -> Decision:
         call = HeldCall(host, Category.CALL, wanted.service, wanted.digest)
         entry = self._table.find(call)
-        if entry is None or entry.state is not ApprovalState.APPROVED:
+        if entry is None or entry.state is not ApprovalState.APPROVED or entry.until <= clock.now():
             told = self._held(call, wanted.caller_id, wanted.type, wanted.shown)
             return replace(decision, allowed=False, reason=f"{told}: {decision.reason}")
         if entry.once:
@@ -191,10 +191,9 @@ class ApprovalOrders:
                 if entry.state is ApprovalState.APPROVED
                 else "no operator answered in time"
             )
-        asking = decide_right(
-            policy, Right(Request(call.host, entry.caller_id, call.category, call.resource))
-        )
-        if asking.asks is None:
+        request = Request(call.host, entry.caller_id, call.category, call.resource)
+        asking = (decide_right(policy, Right(request, below)).asks for below in (False, True))
+        if not any(asking):  # a parameter may be held because of a rule for what is below it
             return "the policy no longer asks"
         group = policy.commanded(call.resource) if call.category is Category.PUBLISH else None
         if not entry.lease or group is None:
@@ -204,16 +203,18 @@ class ApprovalOrders:
         return f"its host was silent for {group.lease:g} s" if silent else ""
 
     async def _end(self, entry: ApprovalEntry, reason: str, who: str = "") -> None:
-        """End an entry. The end of a lease cuts its host off on all relays; then the guards stop the robot."""
-        moved = self._signs.moved(entry.call.host, frozenset({entry.call.resource})) if entry.lease else 0.0
+        """End an entry. The end of a lease cuts its host off on all relays; then the guards stop the robot.
+
+        They also stop it if no message was reported, because a report may be missing: relays report once a second, and
+        the traffic of a node that has ended is forgotten.
+        """
         self._table.end(entry)
         self._record("approval ended", entry, f"approval {entry.number} ended: {reason}", who=who)
         if entry.lease:
             await self._enforce()
-            if entry.call.category is Category.PUBLISH and moved > entry.since:
-                await self._stop.after(
-                    str(entry.call.host), {entry.call.resource}, f"approval {entry.number} ended"
-                )
+            call = entry.call
+            if call.category is Category.PUBLISH and self._policy().may_command(call.resource, call.host):
+                await self._stop.after(str(call.host), {call.resource}, f"approval {entry.number} ended")
 
     async def _enforce(self) -> None:
         """Decide all rights again if the leases differ from those in force."""

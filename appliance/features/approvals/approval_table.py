@@ -117,7 +117,7 @@ class ApprovalTable:
             replace(
                 entry,
                 call=call,
-                since=now,
+                since=entry.since if entry.lease else now,
                 until=until,
                 state=ApprovalState.APPROVED,
                 once=seconds is None,

@@ -20,6 +20,7 @@ from appliance.master.endpoints.host_signs import HostSigns
 from appliance.policy.model import Address, Category, Request, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
+from appliance.policy.rights import Right, decide_right
 from tests.support.virtual_clock import VirtualClock
 
 pytestmark = pytest.mark.anyio
@@ -150,7 +151,9 @@ async def test_a_lease_of_a_service_is_for_any_arguments_until_its_time(site: Si
     await site.orders.approve(ApproveCall(number, 10.0), "ann")
     assert [await site.call(body) for body in (b"1", b"2", b"1")] == ["", "", ""]
     assert number_in(await site.call(b"1", OTHER)) != number
-    await site.pass_time(10)
+    site.time.advance(10)
+    assert await site.call(b"1"), "also before the watch has ended it"
+    await site.pass_time(CHECK_SECONDS)
     assert number_in(await site.call(b"1")) != number
 
 
@@ -194,6 +197,41 @@ async def test_a_lease_on_a_motion_ends_by_silence_and_the_guards_stop_the_robot
     assert site.stops == [(str(AGENT), {"/cmd_vel"})]
     await site.pass_time(60)
     assert site.stops[1:] == [(str(AGENT), {"/other"})], "its guards stop it too, if there are any"
+
+
+async def test_a_lease_that_is_extended_still_ends_by_silence(site: Site) -> None:
+    number = number_in(site.publish("/cmd_vel"))
+    await site.orders.approve(ApproveCall(number, 60.0), "ann")
+    await site.pass_time(1)
+    site.moved = clock.now()
+    await site.pass_time(1)
+    await site.orders.approve(ApproveCall(number, 60.0), "ann")
+    await site.pass_time(4)
+    assert site.publish("/cmd_vel")
+    assert site.stops
+
+
+async def test_the_end_of_a_lease_stops_the_robot_without_a_report_of_a_message(site: Site) -> None:
+    """Relays report once a second, and nothing of a node that has ended. A host without the group moved nothing."""
+    for holder in (AGENT, OTHER):
+        site.text = replace(site.text, holders={"base": holder})
+        site.decide_again()
+        await site.orders.approve(ApproveCall(number_in(site.publish("/cmd_vel")), 1.0), "ann")
+        await site.pass_time(1)
+    assert site.stops == [(str(AGENT), {"/cmd_vel"})]
+
+
+async def test_a_namespace_is_approved_although_only_what_is_below_it_asks(site: Site) -> None:
+    site.text = compile_policy(
+        f"[Parameters]\nwrite /arm = {AGENT}\nwrite default = ask {AGENT}", file="site.ini"
+    )
+    site.decide_again()
+    below = Right(Request(AGENT, "/it", Category.WRITE, "/arm"), namespace=True)
+    asked = decide_right(site.policy, below).asks
+    assert asked is not None
+    await site.orders.approve(ApproveCall(number_in(site.orders.hold_call(asked)), 10.0), "ann")
+    await site.pass_time(9)
+    assert decide_right(site.policy, below).allowed
 
 
 async def test_an_operator_refuses_a_call_and_ends_an_approval(site: Site) -> None:
