@@ -5,8 +5,9 @@ The front process identifies the client, and passes its connection here as a str
 1. A frame is at most `frame_bytes` long, also after inflation. A browser's Origin must be listed.
 2. The session carries out the requests of the client in order. While it does so, it does not read; calls of services
    do not hold up later requests.
-3. Frames are sent only as fast as the client reads. In the meantime, its queue keeps the newest messages of each topic.
-4. A client that sends nothing, and does not answer pings, is disconnected.
+3. Frames are sent only as fast as the client reads. In the meantime, its queue keeps the newest messages of each topic,
+   and its requests are carried out: a stop does not wait for pictures.
+4. A client that sends nothing, and does not answer pings, is disconnected: within seconds if it has a will.
 5. Once the session disconnects a client, it carries out no further request, and ends even if the client does not read.
 """
 
@@ -31,7 +32,7 @@ from appliance.features.doors.door_node import DoorNode
 from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.lookout import Lookout
 from appliance.features.doors.origins import rejection
-from appliance.features.doors.requests import DoorRequest, Frame
+from appliance.features.doors.requests import AdvertiseTopic, DoorRequest, Frame, UnadvertiseTopic
 from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerStalledError
 from roswire.errors import RosError
@@ -42,6 +43,7 @@ _READ_DEFLATED_BYTES = 1 << 12  # the frames that are read at once take up to 10
 _BATCH_BYTES = 1 << 15
 _CLOSING_SECONDS = 2.0
 _WATCH_SECONDS = 2.0  # between two looks at the surroundings
+_MOST_PINGS = 100  # of the client that wait for their answers
 _WINDOW_BITS = 12  # with this and the level, a connection takes about 40 KB for compression
 
 
@@ -54,6 +56,8 @@ class SessionOptions:
     handshake_seconds: float = 10.0
     ping_seconds: float = 20.0
     silent_seconds: float = 60.0
+    will_ping_seconds: float = 1.0  # of a client with a will
+    will_silent_seconds: float = 3.0
 
 
 class ClientProtocol(Protocol):
@@ -122,6 +126,8 @@ class DoorSession:
         self._subprotocols = subprotocols
         self._options = options
         self._protocol: ClientProtocol
+        self._wills: set[str] = set()  # the topics on which the client has a will
+        self._pings = 0
         self._frame = bytearray()  # the fragments that have come; empty ones take nothing
         self._is_text = False
         self._wake = asyncio.Event()
@@ -224,7 +230,9 @@ class DoorSession:
     async def _receive(self) -> None:
         size = _READ_DEFLATED_BYTES if self._socket.extensions else _READ_BYTES
         while not self._socket.close_expected():
-            async with asyncio.timeout(self._options.silent_seconds):
+            options = self._options
+            silent = options.will_silent_seconds if self._wills else options.silent_seconds
+            async with asyncio.timeout(silent):
                 data = await self._reader.read(size)
             if not data:
                 self._socket.receive_eof()
@@ -234,10 +242,13 @@ class DoorSession:
             for event in self._socket.events_received():
                 if isinstance(event, WebSocketFrame):
                     await self._take(event)
-            await self._flush()
+            self._wake.set()  # for the answer to a ping
+            if self._pings > _MOST_PINGS:
+                await self._flush()
         self.end = self.end or f"the client ended the connection{_reason(self._socket)}"
 
     async def _take(self, frame: WebSocketFrame) -> None:
+        self._pings += frame.opcode is Opcode.PING
         if frame.opcode not in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT) or self._over.is_set():
             return
         if frame.opcode is not Opcode.CONT:
@@ -266,25 +277,34 @@ class DoorSession:
                 return
             try:
                 await self._door.carry_out(request, self)
+                self._note_will(request)
             except RosError as error:
                 self.refusals += 1
                 self._protocol.failed(request, str(error))
                 self._wake.set()
                 return
 
+    def _note_will(self, request: DoorRequest) -> None:
+        match request:
+            case AdvertiseTopic(topic, will=will) if will is not None:
+                self._wills.add(topic)
+            case UnadvertiseTopic(topic):
+                self._wills.discard(topic)
+
     # --- frames for the client ---
 
     async def _send(self) -> None:
-        loop = asyncio.get_running_loop()
-        next_ping = loop.time() + self._options.ping_seconds
+        loop, options = asyncio.get_running_loop(), self._options
+        last_ping = loop.time()
         while self._socket.state is State.OPEN:
             if self._take_frames(loop.time()):
                 await self._flush()
                 continue
+            next_ping = last_ping + (options.will_ping_seconds if self._wills else options.ping_seconds)
             if loop.time() >= next_ping:
-                next_ping = loop.time() + self._options.ping_seconds
+                last_ping = loop.time()
                 self._socket.send_ping(b"")
-                await self._flush()
+            await self._flush()
             due = self._protocol.next_time()
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout_at(next_ping if due is None else min(due, next_ping)):
@@ -305,6 +325,7 @@ class DoorSession:
         return size
 
     async def _flush(self) -> None:
+        self._pings = 0
         pieces = self._socket.data_to_send()
         if sum(map(len, pieces)) <= 2 * _BATCH_BYTES:
             pieces = [b"".join(pieces)]

@@ -86,6 +86,51 @@ async def test_a_will_is_published_if_the_client_leaves_first(left: bool) -> Non
         assert heard == [string("go"), *([string("stop")] if left else [])]
 
 
+async def test_a_will_is_published_within_seconds_after_the_network_is_cut() -> None:
+    async with door_world() as world:
+        robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
+        heard: list[bytes] = []
+        await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
+        client.send({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String", "will": {"data": "stop"}})
+        await asyncio.sleep(60)
+        assert client.is_open and not heard
+        client.stop_reading()
+        await asyncio.sleep(4)
+        assert heard == [string("stop")]
+
+
+async def test_a_client_that_does_not_read_pictures_is_heard_at_once() -> None:
+    """Its stop does not wait until the network has taken the pictures."""
+    async with door_world() as world:
+        robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
+        heard: list[bytes] = []
+        await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
+        publication = await talks(robot, "/image")
+        client.send({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String"})
+        client.send({"op": "subscribe", "topic": "/image"})
+        await asyncio.sleep(1)
+        client.stop_reading()
+        for _ in range(9):
+            publication.publish(string("x" * 100_000))
+        for word in ("go", "on", "stop"):
+            client.send({"op": "publish", "topic": "/cmd", "msg": {"data": word}})
+            await asyncio.sleep(1)
+        assert heard == [string("go"), string("on"), string("stop")]
+
+
+async def test_pings_without_reading_their_answers_stop_the_reading() -> None:
+    async with door_world() as world:
+        client = await world.client()
+        client.stop_reading()
+        for _ in range(50):
+            for _number in range(1000):
+                client.socket.send_ping(b"x" * 125)
+            client.flush()
+            await asyncio.sleep(0.1)
+        [session] = world.sessions
+        assert session.received_bytes < 50 * 125_000 / 2
+
+
 @pytest.mark.parametrize("deflate", [False, True])
 async def test_a_denial_of_the_master_is_words_with_the_id(deflate: bool) -> None:
     async with door_world() as world:
