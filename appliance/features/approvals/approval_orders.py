@@ -36,6 +36,8 @@ from appliance.telemetry.audit_trail import NOT_RECORDED, Asker, AuditTrail
 CHECK_SECONDS = 0.25
 LEASE_SECONDS = 60.0
 """The lease of a topic or a parameter, if the operator names none."""
+SILENT_SECONDS = 5.0
+"""The silence that ends a lease on a motion outside the groups of `[Authority]`."""
 UNANSWERED_SECONDS = 600.0
 """How long the alarm about an unanswered call lasts."""
 
@@ -67,6 +69,8 @@ class ApprovalOrders:
         self._table = ApprovalTable(first)
         self._turn = asyncio.Lock()
         self._unanswered: list[float] = []
+        self._moved: dict[int, float] = {}  # of leases: the last message, also after its publisher ended
+        self._still: dict[int, float] = {}  # of leases: the last message before a silence that needs no stop
         self.approved = self._table.approved
 
     # --- calls ---
@@ -176,7 +180,9 @@ class ApprovalOrders:
         """End the calls and approvals that are over now, and leases of hosts that stopped publishing a motion."""
         for entry in self._table.entries():
             async with self._turn:
-                reason = self._table.entry(entry.number) is entry and self._ended(entry)
+                reason = self._table.entry(entry.number) is entry and (
+                    self._ended(entry) or await self._silent(entry)
+                )
                 if reason:
                     if entry.state is ApprovalState.WAITS and entry.until <= clock.now():
                         self._unanswered.append(clock.now())
@@ -184,7 +190,7 @@ class ApprovalOrders:
 
     def _ended(self, entry: ApprovalEntry) -> str:
         """Return why an entry ends now; empty: it goes on."""
-        now, policy, call = clock.now(), self._policy(), entry.call
+        now, call = clock.now(), entry.call
         if entry.until <= now:
             return (
                 "its time is over"
@@ -192,15 +198,33 @@ class ApprovalOrders:
                 else "no operator answered in time"
             )
         request = Request(call.host, entry.caller_id, call.category, call.resource)
-        asking = (decide_right(policy, Right(request, below)).asks for below in (False, True))
-        if not any(asking):  # a parameter may be held because of a rule for what is below it
-            return "the policy no longer asks"
-        group = policy.commanded(call.resource) if call.category is Category.PUBLISH else None
-        if not entry.lease or group is None:
+        asking = (decide_right(self._policy(), Right(request, below)).asks for below in (False, True))
+        # A parameter may be held because of a rule for what is below it.
+        return "" if any(asking) else "the policy no longer asks"
+
+    async def _silent(self, entry: ApprovalEntry) -> str:
+        """Return why silence ends a lease on a motion now; empty: it goes on.
+
+        A topic is a motion if it is in a group of `[Authority]`, or if an enabled guard has a safe message for it. The
+        answer to the latter is the stop itself, so the guards are asked once in each silence.
+        """
+        moved, topic = self._last_message(entry), entry.call.resource
+        group = self._policy().commanded(topic)
+        seconds = SILENT_SECONDS if group is None else group.lease
+        if moved <= entry.since or clock.now() - moved < seconds or self._still.get(entry.number) == moved:
             return ""
-        moved = self._signs.moved(call.host, frozenset({call.resource}))
-        silent = moved > entry.since and now - moved >= group.lease
-        return f"its host was silent for {group.lease:g} s" if silent else ""
+        if group is None and not await self._stop.stop(topic):
+            self._still[entry.number] = moved
+            return ""
+        return f"its host was silent for {seconds:g} s"
+
+    def _last_message(self, entry: ApprovalEntry) -> float:
+        """Return the time of the last message under a lease on a topic; 0: none."""
+        if not entry.lease or entry.call.category is not Category.PUBLISH:
+            return 0.0
+        moved = self._signs.moved(entry.call.host, frozenset({entry.call.resource}))
+        self._moved[entry.number] = max(moved, self._moved.get(entry.number, 0.0))
+        return self._moved[entry.number]
 
     async def _end(self, entry: ApprovalEntry, reason: str, who: str = "") -> None:
         """End an entry. The end of a lease cuts its host off on all relays; then the guards stop the robot.
@@ -209,6 +233,8 @@ class ApprovalOrders:
         the traffic of a node that has ended is forgotten.
         """
         self._table.end(entry)
+        self._moved.pop(entry.number, None)
+        self._still.pop(entry.number, None)
         self._record("approval ended", entry, f"approval {entry.number} ended: {reason}", who=who)
         if entry.lease:
             await self._enforce()

@@ -51,12 +51,14 @@ class Site:
         self.decisions: list[str] = []
         self.stops: list[tuple[str, set[str]]] = []
         self.moved = 0.0
+        self.guarded: list[str] = []
+        self.asked: list[str] = []
         self.obstacle, self.strict = None, False
         self.orders = ApprovalOrders(
             lambda: self.policy,
             cast(Any, self),
             HostSigns(lambda _host: True, lambda _host, _names: self.moved),
-            cast(Any, SimpleNamespace(after=self.stop)),
+            cast(Any, SimpleNamespace(after=self.stop, stop=self.guards)),
             first=17,
             decide_again=self.decide_again,
             carried_out=self.carried_out,
@@ -76,6 +78,10 @@ class Site:
             (address_of(host), Category.PUBLISH, topic) in self.orders.approved() for topic in topics
         )
         self.stops.append((host, topics))
+
+    async def guards(self, topic: str) -> list[str]:
+        self.asked.append(topic)
+        return ["deadman"] if topic in self.guarded else []
 
     def happened(self, event: str, reason: str, **detail: Any) -> None:
         self.records.append({"event": event, "reason": reason, **detail})
@@ -183,20 +189,25 @@ async def test_a_topic_and_a_parameter_are_approved_for_some_time(site: Site, ca
 
 
 async def test_a_lease_on_a_motion_ends_by_silence_and_the_guards_stop_the_robot(site: Site) -> None:
-    """Silence counts from the first message on; a topic without a group keeps its lease."""
-    for topic in ("/cmd_vel", "/other"):
+    """A motion is in a group, or has a guard. Silence counts from the first message on."""
+    site.guarded = ["/arm"]
+    for topic in ("/cmd_vel", "/arm", "/other"):
         await site.orders.approve(ApproveCall(number_in(site.publish(topic)), 60.0), "ann")
     await site.pass_time(20)
-    assert site.publish("/cmd_vel") == ""
+    assert site.publish("/cmd_vel") == "" and not site.asked
     site.moved = clock.now()
     await site.pass_time(4.5)
-    assert site.publish("/cmd_vel") == "" and not site.stops
+    assert site.publish("/cmd_vel") == site.publish("/arm") == "" and not site.stops
     await site.pass_time(0.5)
-    assert site.publish("/cmd_vel")
-    assert site.publish("/other") == ""
-    assert site.stops == [(str(AGENT), {"/cmd_vel"})]
+    assert site.publish("/cmd_vel") and site.publish("/arm")
+    assert site.publish("/other") == "" and site.asked == ["/arm", "/other"]
+    assert site.stops == [(str(AGENT), {"/cmd_vel"}), (str(AGENT), {"/arm"})]
+    site.moved = clock.now()
+    await site.pass_time(5)
+    assert site.asked[2:] == ["/other"], "once in each silence"
+    site.moved = 0.0  # its publisher ended
     await site.pass_time(60)
-    assert site.stops[1:] == [(str(AGENT), {"/other"})], "its guards stop it too, if there are any"
+    assert site.stops[2:] == [(str(AGENT), {"/other"})], "its guards stop it too, if there are any"
 
 
 async def test_a_lease_that_is_extended_still_ends_by_silence(site: Site) -> None:
