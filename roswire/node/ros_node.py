@@ -29,7 +29,7 @@ from roswire.node.tcpros_streams import ANY_TYPE, MessageType, NodeLimits, read_
 from roswire.node.topics import NodeLink, NodePublication, NodeSubscription, Received
 from roswire.node.xmlrpc_http import call_xmlrpc, serve_xmlrpc
 from roswire.uris import NodeUri, node_uri, parse_node_uri, parse_service_uri, service_uri
-from roswire.xmlrpc import Value
+from roswire.xmlrpc import FaultReceived, Value
 
 _CLOSE_SECONDS = 2.0  # for all unregistrations together
 _Kind = Literal["publisher", "subscriber", "service"]
@@ -108,9 +108,14 @@ class RosNode:
 
         Raises `MasterDenialError` with the master's reason, or another `RosError`.
         """
-        answer = await call_xmlrpc(
-            self._network, self._master, method, (self.name, *params), seconds=self._limits.call_seconds
-        )
+        try:
+            answer = await call_xmlrpc(
+                self._network, self._master, method, (self.name, *params), seconds=self._limits.call_seconds
+            )
+        except ProtocolError as error:
+            if isinstance(error.__cause__, FaultReceived):
+                raise MasterDenialError(error.__cause__.text[:4000]) from None
+            raise
         match answer:
             case [1, str(), value]:
                 return value

@@ -58,10 +58,10 @@ async def call_xmlrpc(
             reader, writer = await network.connect(uri.host, uri.port)
             try:
                 writer.write(head.encode("ascii") + body)
-                answer = await _read_answer(reader, limits.body)
+                status, answer = await _read_answer(reader, limits.body)
             finally:
                 writer.close()
-        return parse_response(answer, limits)
+        return _value(status, answer, limits)
     except TimeoutError:
         raise PeerUnreachableError(f"{where} did not answer {method} within {seconds:g} s") from None
     except OSError as error:
@@ -90,7 +90,21 @@ class _Message:
         return bytes(self._body)
 
 
-async def _read_answer(reader: asyncio.StreamReader, most: int) -> bytes:
+def _value(status: int, answer: bytes, limits: XmlRpcLimits) -> Value:
+    """Return the value of an answer; a status other than 200 may come with the reason as a fault."""
+    try:
+        value = parse_response(answer, limits)
+    except FaultReceived:
+        raise
+    except PeerError:
+        if status == 200:
+            raise
+    if status != 200:
+        raise ProtocolError(f"HTTP status {status}")
+    return value
+
+
+async def _read_answer(reader: asyncio.StreamReader, most: int) -> tuple[int, bytes]:
     message = _Message()
     parser = httptools.HttpResponseParser(message)
     received = 0
@@ -98,16 +112,13 @@ async def _read_answer(reader: asyncio.StreamReader, most: int) -> bytes:
         data = await reader.read(_PIECE)
         if not data:  # without a length, the body ends with the connection
             if message.rest():
-                return message.rest()
+                return parser.get_status_code(), message.rest()
             raise ConnectionResetError("the connection ended before the answer was complete")
         received += len(data)
         if received > most + _HEAD_BYTES:
             raise LimitExceededError(f"the answer is larger than {most} bytes")
         _feed(parser, data)
-    status = parser.get_status_code()
-    if status != 200:
-        raise ProtocolError(f"HTTP status {status}")
-    return message.bodies.popleft()
+    return parser.get_status_code(), message.bodies.popleft()
 
 
 def _feed(parser: "httptools.HttpResponseParser | httptools.HttpRequestParser", data: bytes) -> None:

@@ -18,9 +18,10 @@ from roswire.node import (
     ServiceFailedError,
     ServiceType,
 )
+from roswire.node.network import ByteWriter
 from roswire.tcpros import HeaderParser, encode_header
 from roswire.uris import parse_node_uri
-from roswire.xmlrpc import MethodCall, Value
+from roswire.xmlrpc import MethodCall, Value, build_fault, build_response
 from tests.support.memory_network import MemoryNetwork
 from tests.support.scripted_master import MASTER, ScriptedMaster
 
@@ -244,6 +245,36 @@ async def test_a_denied_registration_has_the_words_of_the_master_and_leaves_noth
             else:
                 await node.offer("/chatter", SET_BOOL, negated)
         assert not (node.subscribers or node.publishers or node.services)
+
+
+@pytest.mark.parametrize(
+    ("status", "body", "error", "words"),
+    [
+        (
+            "200 OK",
+            build_fault(-1, "denied by [Publishers] /a"),
+            MasterDenialError,
+            r"^denied by \[Publishers\] /a$",
+        ),
+        ("503 Busy", build_fault(503, "too many calls"), MasterDenialError, "^too many calls$"),
+        ("404 Not Found", b"<html/>", ProtocolError, "HTTP status 404"),
+        ("500 Error", build_response([1, "", 1]), ProtocolError, "HTTP status 500"),
+    ],
+)
+async def test_a_fault_of_the_master_keeps_its_words(
+    status: str, body: bytes, error: type[Exception], words: str
+) -> None:
+    async with nodes() as world:
+        node = await world.node("10.0.0.2")
+        world.master.server.close()
+
+        async def serve(reader: asyncio.StreamReader, writer: ByteWriter) -> None:
+            await reader.read(1 << 16)
+            writer.write(f"HTTP/1.1 {status}\r\nContent-Length: {len(body)}\r\n\r\n".encode() + body)
+
+        world.network.listen("10.0.0.1", serve, 11311)
+        with pytest.raises(error, match=words):
+            await node.master("getPid")
 
 
 async def negated(request: bytes) -> bytes:
