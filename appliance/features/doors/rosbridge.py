@@ -287,10 +287,11 @@ class Rosbridge:
         self.status("error", reason, request.reply_to)
 
     def _fail_call(self, call: _Call, reason: str) -> None:
+        # ros-mcp takes values without `successful` for a success.
         fields = {
             "op": "service_response",
             "service": call.service,
-            "values": {"message": reason},
+            "values": {"message": reason, "successful": False, "reason": reason},
             "result": False,
         }
         self.queue.reply(json_frame(fields, call.reply_to))

@@ -224,13 +224,14 @@ def test_a_call_is_answered_or_fails_with_a_message(client: Client) -> None:
     client.rosbridge.answered(call.call, STRING.json(b"\x01\0\0\0x"))
     (second,) = client.sends({"op": "call_service", "service": "/add", "args": [1, 2]})
     assert values(second) == [1, 2]
-    client.rosbridge.failed(second, "denied by [Services] /add (site.ini:3)")
+    reason = "denied by [Services] /add (site.ini:3)"
+    client.rosbridge.failed(second, reason)
     assert client.gets() == [
         {"op": "service_response", "service": "add", "values": {"data": "x"}, "result": True, "id": "c"},
         {
             "op": "service_response",
             "service": "/add",
-            "values": {"message": "denied by [Services] /add (site.ini:3)"},
+            "values": {"message": reason, "reason": reason, "successful": False},
             "result": False,
         },
     ]

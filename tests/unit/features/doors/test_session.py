@@ -147,7 +147,7 @@ async def test_a_denial_of_the_master_is_words_with_the_id(deflate: bool) -> Non
             assert status == {"op": "status", "level": "error", "msg": reason, "id": reply_to}
         client.send({"op": "call_service", "service": "/brake", "id": "c"})
         response = await client.next()
-        assert response["result"] is False and response["values"] == {"message": reason}
+        assert response["result"] is False and response["values"]["message"] == reason
 
 
 @pytest.mark.parametrize(
