@@ -60,13 +60,18 @@ class Budget:
         self._clock = clock
         self.owed: Pool[str] = Pool("bytes of audit records to pay off", bounds, quota_class)
         self._paid = clock()
+        self._charged: dict[str, int] = {}  # bytes that `owed` does not have yet
+        self._charged_bytes = 0
         self._changes: deque[tuple[str, int]] = deque()
         self._left: int | None = None
 
     def charge(self, record: AuditRecord) -> None:
         """Charge a record to its host; `folded` undoes the charge."""
-        if record.host is not None and not record.unknown:
-            self.owed.charge(record.host, weight(record))
+        host = record.host
+        if host is not None and not record.unknown:
+            size = weight(record)
+            self._charged[host] = self._charged.get(host, 0) + size
+            self._charged_bytes += size
 
     def folded(self, record: AuditRecord) -> None:
         """Undo the charge for a record that was only counted."""
@@ -109,17 +114,21 @@ class Budget:
 
     def _is_usual(self, host: str) -> bool:
         """Whether this host may proceed without `_pay`: it has no debt, or all debts are small and just updated."""
-        if not self.owed.held(host):
+        if not (self.owed.held(host) or host in self._charged):
             return True
-        return self.owed.total <= self._plenty.host and self._clock() - self._paid < _PAID_EVERY_SECONDS
+        owed = self.owed.total + self._charged_bytes
+        return owed <= self._plenty.host and self._clock() - self._paid < _PAID_EVERY_SECONDS
 
     @property
     def _pace(self) -> int:
         return RATE if self._left is None else RATE // _SCARCE
 
     def _pay(self) -> None:
+        charged, self._charged, self._charged_bytes = self._charged, {}, 0
         while self._changes:
             host, change = self._changes.popleft()
+            charged[host] = charged.get(host, 0) + change
+        for host, change in charged.items():
             if change > 0:
                 self.owed.charge(host, change)
             else:
