@@ -58,6 +58,9 @@ class Front(asyncio.BaseProtocol, ABC):
         self.in_request = False
         self.head_done = False
         self.received = 0  # bytes of the present request, including framing
+        self._begins = (
+            False  # whether the present piece of input began a request, and no answer is in progress
+        )
         self._socket = sock
         self._head_bytes = 0
         self.allow(limits.head_seconds)
@@ -108,10 +111,20 @@ class Front(asyncio.BaseProtocol, ABC):
         except httptools.HttpParserError as error:
             if not self.closing:
                 self.reject(b"400 Bad Request", f"sent something that is not HTTP: {error}")
+        if self._begins:
+            self._begins = False
+            self._await_rest()
         if self.in_request and not self.closing:
             self.received += len(data)
             if not self.head_done and self.received > self.limits.head_bytes:
                 self._reject_head()
+
+    def _await_rest(self) -> None:
+        """Wait for the rest of a request. Most requests end in their first piece, and wait for nothing."""
+        if self.is_quiet and (self.in_request or self.closing):
+            self.connection_table.file(self, Stage.UNFINISHED)
+            if not self.closing:
+                self.allow(self.limits.head_seconds)
 
     def on_message_begin(self) -> None:
         if self.waiting >= self.most_waiting and not self.closing:
@@ -121,9 +134,7 @@ class Front(asyncio.BaseProtocol, ABC):
             raise ConnectionAbortedError  # ignore the rest of the input
         self.in_request, self.head_done = True, False
         self.received = self._head_bytes = 0
-        if self.is_quiet:
-            self.connection_table.file(self, Stage.UNFINISHED)
-            self.allow(self.limits.head_seconds)
+        self._begins = self.is_quiet
 
     def on_url(self, url: bytes) -> None:
         """Count the bytes of a piece of the path."""

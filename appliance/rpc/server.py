@@ -433,8 +433,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
         serving = HostTask(self.server.time, self.peer.host, self._serve(request, keep))
         if not serving.done():
             self._busy = serving
-            if self._has_slot:
-                self.connection_table.file(self, Stage.SERVED)
+            self.connection_table.file(self, Stage.SERVED if self._has_slot else Stage.UNFINISHED)
 
     async def _serve(self, request: HttpRequest, keep: bool) -> None:
         try:
