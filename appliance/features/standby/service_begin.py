@@ -19,6 +19,7 @@ from appliance.features.standby.paired_role import PairedRole
 from appliance.features.standby.replication import Pair
 from appliance.features.standby.standby_orders import ActiveAppliance, SingleAppliance, StandbyOrders
 from appliance.features.standby.stored_times import note_times
+from appliance.features.standby.takeover_check import lacking_room
 from appliance.features.standby.takeover_record import TakeoverRecorder
 
 _REPAIR_SECONDS = 8.0
@@ -33,9 +34,10 @@ class ServiceReport:
         self._sound = clock.now()  # when nothing was to be repaired
 
     def now(self) -> lease_link.ControlServes:
-        failed, monitors = self._base.audit.failed, self._parts.monitors
-        obstacle = ""
-        if failed is not None and self._base.settings.audit.on_audit_failure == "deny":
+        failed, monitors, settings = self._base.audit.failed, self._parts.monitors, self._base.settings
+        # With less, hosts wait before the log fails: records still fit into SQLite's write-ahead file.
+        obstacle = lacking_room(settings.state / "control")
+        if failed is not None and settings.audit.on_audit_failure == "deny":
             obstacle = f"nothing is granted, because the audit log cannot be written: {failed}"
         keeps_state = any(
             owner.holds and monitors.switches.enabled(name) for name, owner in monitors.checked.states.items()

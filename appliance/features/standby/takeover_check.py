@@ -160,11 +160,17 @@ class TakeoverCheck:
         return next(iter(store.monitor_revisions(1)), None), store.settings().get(SWITCHES, "{}")
 
 
-def _require_room(folder: Path) -> None:
-    """Raise `OSError` if the disk of the state cannot take the first records and changes after a takeover."""
+def lacking_room(folder: Path) -> str:
+    """Return why the disk of the state cannot take the records and changes of an active appliance; empty: it can."""
     disk = os.statvfs(folder)
     free = disk.f_bavail * disk.f_frsize
-    if free < _ROOM:
-        raise OSError(f"{folder}: {free} bytes are free on its disk, {_ROOM} are wanted: free space")
+    if free >= _ROOM:
+        return ""
+    return f"{folder}: {free} bytes are free on its disk, {_ROOM} are wanted: free space"
+
+
+def _require_room(folder: Path) -> None:
+    if reason := lacking_room(folder):
+        raise OSError(reason)
     with tempfile.TemporaryFile(dir=folder) as file:  # it has no name, so nothing stays
         file.write(b"\0")

@@ -1,5 +1,6 @@
 """Tests of `appliance.features.standby.service_begin`: what an active appliance reports to its lease."""
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,7 +15,9 @@ from tests.support.virtual_clock import VirtualClock
 class Control:
     """A control that serves; a test changes its parts."""
 
-    def __init__(self) -> None:
+    def __init__(self, state: Path) -> None:
+        (state / "control").mkdir()
+        self.state = state
         self.audit = SimpleNamespace(failed=None)
         self.policy = SimpleNamespace(on_audit_failure="deny")
         self.surroundings = SimpleNamespace(probe="passed")
@@ -26,7 +29,7 @@ class Control:
         """Return its reports."""
         base: Any = SimpleNamespace(
             audit=self.audit,
-            settings=SimpleNamespace(audit=self.policy),
+            settings=SimpleNamespace(audit=self.policy, state=self.state),
             lifeline=SimpleNamespace(surroundings=self.surroundings),
         )
         parts: Any = SimpleNamespace(
@@ -36,9 +39,22 @@ class Control:
         return ServiceReport(base, parts)
 
 
-def test_a_full_disk_is_an_obstacle_only_if_nothing_is_granted_then() -> None:
+@pytest.fixture
+def control(tmp_path: Path) -> Control:
+    return Control(tmp_path)
+
+
+def test_a_full_disk_is_an_obstacle(control: Control, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The log can be written for some time, but hosts already wait; a standby with this disk could not take over."""
+    report = control.report()
+    monkeypatch.setattr("os.statvfs", lambda _folder: SimpleNamespace(f_bavail=1023, f_frsize=4096))
+    assert "4190208 bytes are free" in report.now().obstacle
+    monkeypatch.setattr("os.statvfs", lambda _folder: SimpleNamespace(f_bavail=1024, f_frsize=4096))
+    assert report.now().obstacle == ""
+
+
+def test_a_log_that_fails_is_an_obstacle_only_if_nothing_is_granted_then(control: Control) -> None:
     """`audit.on_audit_failure: allow` goes on without records."""
-    control = Control()
     report = control.report()
     assert report.now() == ControlServes("", keeps_state=False)
     control.audit.failed = "audit.db: the disk is full"
@@ -48,10 +64,12 @@ def test_a_full_disk_is_an_obstacle_only_if_nothing_is_granted_then() -> None:
 
 
 @pytest.mark.parametrize("broken", [("relay", "presence", "away"), ("surroundings", "probe", "it answers")])
-def test_damage_that_is_repaired_in_time_is_not_reported(broken: tuple[str, str, str]) -> None:
+def test_damage_that_is_repaired_in_time_is_not_reported(
+    broken: tuple[str, str, str], control: Control
+) -> None:
     """Relays start again, and the firewall is written again; if not, another appliance should serve."""
     part, field, value = broken
-    control, machine = Control(), VirtualClock()
+    machine = VirtualClock()
     with clock.using(machine):
         report = control.report()
         before = getattr(getattr(control, part), field)
@@ -66,9 +84,8 @@ def test_damage_that_is_repaired_in_time_is_not_reported(broken: tuple[str, str,
             assert bool(report.now().obstacle) is found
 
 
-def test_only_monitors_in_force_keep_state() -> None:
+def test_only_monitors_in_force_keep_state(control: Control) -> None:
     """A monitor that is disabled or in shadow mode holds nothing after a takeover."""
-    control = Control()
     control.checked.states = {"gun": SimpleNamespace(holds=True), "arm": SimpleNamespace(holds=False)}
     assert control.report().now().keeps_state
     control.checked.states = {"gun": SimpleNamespace(holds=False), "arm": SimpleNamespace(holds=True)}
