@@ -36,7 +36,6 @@ def ticking(readings: list[None]) -> Callable[[], float]:
 
 @pytest.mark.parametrize("name", WALKS)
 def test_every_walk_of_a_message_ends_with_its_time(name: str) -> None:
-    """A message that needs more than ten readings of the clock is cut off; without a limit it passes."""
     kind, parameter, pattern, action, data = WALKS[name]
     text = f"a() {{ double n = 0; event e({parameter}) /t {kind} '{pattern}' {{ {action} }} }}"
     monitors = MonitorSet.of(compiled_from({"a.rv": text}, standard_definitions()))
@@ -53,7 +52,6 @@ def test_every_walk_of_a_message_ends_with_its_time(name: str) -> None:
 
 
 def test_on_fault_decides_about_a_message_that_was_cut_off() -> None:
-    """With `pass` the message continues unchanged, and the next specification finds the time used up."""
     loop = (
         "event e(std::string s) /t std_msgs/String '{data:s}' { for (int i = 0; i < s.size(); i++) n += i; }"
     )
@@ -69,7 +67,6 @@ def test_on_fault_decides_about_a_message_that_was_cut_off() -> None:
 
 
 def test_a_hurried_message_has_a_part_of_the_time() -> None:
-    """The message gets a part of the time, and the fault says so."""
     text = "a() { int n; event e(std::string s) /t std_msgs/String '{data:s}' { for (;;) n++; } }"
     monitors = MonitorSet.of(compiled_from({"a.rv": text}, standard_definitions()))
     monitors.start(0)

@@ -37,7 +37,6 @@ def drives(monitors: MonitorSet) -> bool:
 def test_a_fault_in_an_observing_event_stops_the_robot(
     event: str, topic: str, data: bytes, apart: bool
 ) -> None:
-    """Nothing passes until an operator resumes it, also if another specification has the event."""
     sensor, driving = guard(STATE, event, head="sensor()"), guard(DRIVE)
     monitors = load(sensor, y=driving) if apart else load(guard(STATE, event, DRIVE))
     assert drives(monitors)
@@ -49,7 +48,6 @@ def test_a_fault_in_an_observing_event_stops_the_robot(
 
 
 def test_a_monitor_that_is_declared_begin_starts_again() -> None:
-    """Its initial state is the safe one, and the next message of the sensor releases it."""
     monitors = load(guard("float nearest = 0;", SCAN, DRIVE, head="begin guard()"))
     seen = []
     for data in (FREE, HUGE, FREE, NEAR):
@@ -66,7 +64,6 @@ def test_a_monitor_that_is_declared_begin_starts_again() -> None:
     ],
 )  # fmt: skip
 def test_other_faults_drop_only_their_message(text: str) -> None:
-    """The action that faulted is the one that acts, or nothing acts by a state."""
     monitors = load(text)
     zero = message("geometry_msgs/Twist")
     assert not monitors.process("/cmd_vel", zero, 1).began_holding
@@ -83,7 +80,6 @@ def test_a_timer_that_faults_stops_the_robot() -> None:
 
 
 def test_a_monitor_in_shadow_mode_holds_nothing() -> None:
-    """Its faults are only reported; the same for the setting that passes messages after a fault."""
     compiled = compiled_from({"x.rv": guard(STATE, SCAN, DRIVE)}, definitions())
     monitors = MonitorSet.of(compiled, shadows=["guard"])
     monitors.start(0)
@@ -96,7 +92,6 @@ def test_a_monitor_in_shadow_mode_holds_nothing() -> None:
 
 
 def test_a_timer_goes_on_while_its_monitor_holds() -> None:
-    """The deadman drops commands, but still publishes the stop."""
     monitors = load("""deadman() { ros::Time last; geometry_msgs::Twist zero;
         event command() /cmd_vel geometry_msgs/Twist '{}' { last = ros::Time::now(); }
         event silent() every 100ms {

@@ -30,13 +30,11 @@ def test_the_example_loads() -> None:
 
 
 def test_the_example_of_a_property_loads() -> None:
-    """Each example property of the page is valid."""
     events = "event go() /t std_msgs/Empty '{}' { } event stop() /u std_msgs/Empty '{}' { }"
     assert load(f"s() {{ {events} {PROPERTY} }}").monitors[0].properties
 
 
 def test_the_code_of_library_functions_is_on_the_page() -> None:
-    """The page has each function that it describes by code, exactly as it runs, without the comments."""
     code = re.sub(r" +// .*", "", FUNCTIONS).strip().split("\n")
     text = "\n".join(code)
     named = set(re.findall(r"^\w+ (\w+)\(", text, re.MULTILINE))
@@ -69,7 +67,6 @@ HELPER = next(re.finditer(r"`(double half.*?})`", PAGE))[1]
     ],
 )
 def test_every_sample_is_loaded_as_a_relay_loads_it(text: str) -> None:
-    """The samples are not only checked: their modules are built and loaded."""
     require_loadable(certified(compiled_from({"sample.rv": text}, definitions())).data)
 
 
@@ -78,7 +75,6 @@ def test_every_sample_is_loaded_as_a_relay_loads_it(text: str) -> None:
     ["bool", "char", "short", "int", "long", "unsigned long", "float", "double", "std::string", "ros::Time"],
 )
 def test_helpers_that_return_any_type_are_loaded(kind: str) -> None:
-    """A module has a stub of each helper while its steps are checked."""
     helper = f"{kind} of({kind} x) {{ return x; }} {kind} kept;"
     text = in_specification(helper, "kept = of(kept); if (v > 1) { return; }")
     require_loadable(certified(compiled_from({"sample.rv": text}, definitions())).data)
@@ -99,13 +95,11 @@ def row(head: str) -> str:
     ],
 )
 def test_every_function_is_on_the_page(head: str, names: dict[str, object]) -> None:
-    """Each function that can be called is documented."""
     words = set(re.findall(r"\w+", row(head)))
     assert set(names) - words - {"data", "nearbyint", "fromNSec"} == set()
 
 
 def test_every_function_of_the_library_is_on_the_page() -> None:
-    """Functions from several headers are included; those on `float` are one rule."""
     words = set(re.findall(r"\w+", PAGE))
     words |= {f"{name}f" for name in MATH} if "(also as `sqrtf`, …)" in PAGE else set()
     assert (
@@ -115,7 +109,6 @@ def test_every_function_of_the_library_is_on_the_page() -> None:
 
 
 def test_the_limits_are_those_of_the_code() -> None:
-    """Numbers on the page are the numbers in force."""
     assert f"{BUDGET:,};" in row("instructions for one message and specification")
     assert f"| {MAX_BYTES >> 20} MiB |" in PAGE
     assert f"| {MAX_CALLS} deep |" in PAGE

@@ -42,7 +42,6 @@ def printed(outcome: Outcome) -> list[str]:
 
 
 def test_a_message_without_events_keeps_its_buffer() -> None:
-    """The returned buffer is the received one."""
     monitors = load("a() {" + on("/t") + "}")
     buffer = bytearray(b"anything")
     outcome = monitors.process("/other", buffer, 0)
@@ -74,7 +73,6 @@ def test_a_name_of_its_own_does_not_use_the_variable_of_another_specification(
 
 
 def test_the_events_of_a_change_are_those_found_by_comparing_all_bytes() -> None:
-    """For random monitors, comparing the bytes before and after each event gives the same authors of changes."""
     most = 0
     for seed in range(examples(60)):
         try:
@@ -127,7 +125,6 @@ def _compared(
 
 
 def test_timers_wait_for_messages_that_a_recording_has() -> None:
-    """If a recording has messages for the specification, the first tick waits for the first of them."""
     monitors = MonitorSet.of(
         compiled_from({"x.rv": "a() { event tick() every 1s { }" + on("/t") + "}"}, definitions())
     )
@@ -138,7 +135,6 @@ def test_timers_wait_for_messages_that_a_recording_has() -> None:
 
 
 def test_a_leap_of_the_clock_skips_ticks() -> None:
-    """However far the clock jumps, the number of ticks is bounded, and left-out ticks are reported."""
     monitors = load("a() { event tick() every 1ms { } }")
     ticks = monitors.advance(10**18)
     assert len(ticks) == MAX_TICKS
@@ -176,7 +172,6 @@ def test_faults_are_counted() -> None:
 
 
 def test_each_message_has_a_whole_budget() -> None:
-    """The budget applies to each message separately."""
     monitors = load(
         "a() {" + on("/t", "e", "for (int i = 0; i < 100000; i++) { x = i; } if (x == 3) while (1);") + "}"
     )
@@ -188,7 +183,6 @@ def test_each_message_has_a_whole_budget() -> None:
 
 
 def test_a_set_with_an_error_is_rejected_whole() -> None:
-    """The set in force stays unchanged."""
     monitors = load("a() {" + on("/t", "e", "return;") + "}")
     with pytest.raises(SpecificationError):
         replaced(monitors, {"x.rv": "a() {"}, definitions(), 0)
@@ -196,7 +190,6 @@ def test_a_set_with_an_error_is_rejected_whole() -> None:
 
 
 def test_a_specification_whose_variables_others_use_cannot_be_removed_alone() -> None:
-    """Without it the set is refused, at the position where its variable is used."""
     user = "b() {" + on("/u", "e", "n = 1;") + "}"
     monitors = load("a() { int n;" + on("/t") + "}", y=user)
     assert monitors.monitor("b").code.uses == {"a"}
@@ -211,7 +204,6 @@ def test_a_specification_whose_variables_others_use_cannot_be_removed_alone() ->
 
 
 def test_a_changed_message_type_resets_the_state() -> None:
-    """Values of a type whose definition changed are not kept."""
     text = "a() { own::T v; int n; event e(int x) /t own/T '{x:x}' { n++; ROS_INFO(\"%d\", n); } }"
     first = Definitions.from_files({"own/T.msg": "int32 x\n"})
     monitors = MonitorSet.of(compiled_from({"x.rv": text}, first))
@@ -226,7 +218,6 @@ def test_a_changed_message_type_resets_the_state() -> None:
 
 
 def test_only_specifications_that_use_a_changed_message_type_are_reset() -> None:
-    """The type may be deep inside another, under any of its names; an unrelated definition resets no state."""
     texts = {
         "deep": "nested() { int n; event e() /a own/Outer '{}' { n++; ROS_INFO(\"%d\", n); } }",
         "kept": "kept() { int n; event e() /b own/Other '{}' { n++; ROS_INFO(\"%d\", n); } }",
@@ -245,7 +236,6 @@ def test_only_specifications_that_use_a_changed_message_type_are_reset() -> None
 
 
 def test_a_set_knows_its_topics_services_and_publications() -> None:
-    """A set also knows those of a disabled specification, but then wants no message for it."""
     monitors = load("""a() { std_msgs::String s; event e() /t std_msgs/Int32 '{}' { PUBLISH("/said", "std_msgs::String", s); }
         event ask() service /set std_srvs/SetBool request '{}' { } }""")
     assert monitors.wants("/t")

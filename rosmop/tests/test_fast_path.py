@@ -71,7 +71,6 @@ def test_the_random_messages_reach_every_outcome() -> None:
 
 
 def test_only_changes_faults_and_large_messages_reach_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`judge` asks the engine about a change or a fault, and about data that the module has no room for."""
     both = BothWays("""s() { int n = 0; int m = 0;
         event a(int c) /plain own/Plain '{count:c}' { n++; if (c == 3) { c = 4; } }
         event b(int kind, int x) /plain own/Plain '{kind:kind, three[0]:x}' when (kind == 1) { m = 10 / (n - 5); } }""")
@@ -150,7 +149,6 @@ ALWAYS_LEFT = (
 
 @pytest.mark.parametrize("case", LEFT, ids=lambda case: case.beside)
 def test_messages_that_do_not_need_the_engine_are_the_modules(case: Case) -> None:
-    """The module handles all of them, even if it leaves others of the topic; if it leaves all, there is no lane."""
     both = BothWays(case.text)
     both.check([stamped(count=1)] * 3, "/stamped")
     assert both.came == {"together": 1, "passed": 3}
@@ -159,7 +157,6 @@ def test_messages_that_do_not_need_the_engine_are_the_modules(case: Case) -> Non
 
 
 def test_an_array_with_too_many_strings_is_left_to_the_engine() -> None:
-    """The module leaves the message to the engine."""
     both = BothWays(next(case.text for case in cases(PROGRAMS) if case.beside == "arrays of strings"))
     many = message("sensor_msgs/JointState", name=["b"] * (MOST_TEXTS + 1), position=[0.5] * (MOST_TEXTS + 1))
     few = message("sensor_msgs/JointState", name=["b"], position=[0.5])
@@ -168,21 +165,18 @@ def test_an_array_with_too_many_strings_is_left_to_the_engine() -> None:
 
 
 def test_more_output_than_the_module_stores_is_printed() -> None:
-    """All output is printed."""
     both = BothWays(event('ROS_INFO("%d %d", count, n); n++;'))
     both.check([plain(number) for number in range(LINES // 24 + 50)])
     assert both.came["together"] >= 2
 
 
 def test_output_without_end_is_a_fault() -> None:
-    """It ends with the fault of a message that has used up its budget."""
     both = BothWays(event('while (true) { ROS_INFO("%1000d", count); }'))
     both.check([plain(1)])
     assert +both.came == {"fault": 1}
 
 
 def test_throttled_output_is_printed_when_it_is_due() -> None:
-    """The module knows when a line was last printed, and leaves the message at which the next one is due."""
     both = BothWays(event('n++; ROS_INFO_THROTTLE(2, "%d", n);'))
     second = 1_000_000_000
     for time in (
@@ -202,7 +196,6 @@ def test_throttled_output_is_printed_when_it_is_due() -> None:
 
 @pytest.mark.parametrize("text", ["", "a", "abc", "map_frame", "a name of thirty bytes exactly", "x" * 64])
 def test_strings_are_compared_to_the_last_byte(text: str) -> None:
-    """Covers constants of all lengths, in patterns and conditions, with strings of equal or similar length."""
     pattern = text.replace('"', "")
     both = BothWays(f"""s() {{ int n = 0; event a() /stamped own/Stamped '{{frame:"{pattern}"}}' {{ n++; }}
         event b(std::string f) /stamped own/Stamped '{{frame:f}}' {{ if (f != "{pattern}") {{ n += 100; }} }} }}""")
@@ -214,7 +207,6 @@ def test_strings_are_compared_to_the_last_byte(text: str) -> None:
 
 
 def test_seconds_of_every_size_are_rounded_once() -> None:
-    """The result equals that of C++ and Python, although the module divides in two steps."""
     both = BothWays(
         "s() { double d = 0; event e(ros::Time t) /plain own/Plain '{when:t}' { d = t.toSec(); } }"
     )
@@ -226,7 +218,6 @@ def test_seconds_of_every_size_are_rounded_once() -> None:
 
 
 def test_seconds_that_overflow_wrap() -> None:
-    """A message may have more nanoseconds than a second has."""
     both = BothWays("s() { long n = 0; event e(ros::Time t) /plain own/Plain '{when:t}' { n = t.sec; } }")
     both.check([plain()[:18] + struct.pack("<II", 2**32 - 1, 2**32 - 1) + plain()[26:]])
     assert both.state() == ["n 3"]
@@ -236,7 +227,6 @@ def test_seconds_that_overflow_wrap() -> None:
 
 
 def test_a_fault_in_the_middle_of_a_batch_undoes_its_message_only() -> None:
-    """When the engine begins, variables, fields and states changed by earlier events have their old values."""
     both = BothWays(
         """a() { int n = 0; event e(int count, double x) /plain own/Plain '{count:count, x:x}' { n += count; x = n; }
                fsm: one [ e -> two ] two [ e -> one ] @fail { } }
@@ -249,7 +239,6 @@ def test_a_fault_in_the_middle_of_a_batch_undoes_its_message_only() -> None:
 
 
 def test_a_message_without_fuel_is_left_to_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wherever the fuel ends, completed messages stay and the begun message is undone."""
     text = event("for (int i = 0; i < 50; i++) { n += i; } count = n;")
     for fuel in range(2000, 12000, 500):
         monkeypatch.setattr(wasm_runner, "FUEL", fuel)
@@ -259,7 +248,6 @@ def test_a_message_without_fuel_is_left_to_the_engine(monkeypatch: pytest.Monkey
 def test_fuel_lasts_for_many_calls_and_is_renewed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The message is left as if it had not been begun; the next ones have fuel again."""
     monkeypatch.setattr(wasm_runner, "FUEL", 1000)
     both = BothWays(event("n++;"))
     lane, one = both.lane(), frames([plain()])
@@ -295,7 +283,6 @@ def test_only_the_beginning_of_a_long_message_is_copied() -> None:
 
 
 def test_large_batches_are_processed_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A large batch is processed in several pieces."""
     monkeypatch.setattr("rosmop.fast.wasm_runner.FUEL", 10**9)
     both = BothWays("""one() { int n = 0; event e(int count, double x) /plain own/Plain '{count:count, x:x}' {
         n++; if (count % 2) { x = n; } } }
@@ -310,7 +297,6 @@ def test_large_batches_are_processed_in_pieces(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_the_module_and_the_engine_share_variables() -> None:
-    """Specifications that share messages agree, whether module or engine handles the next; so does a replacing set."""
     first = """a() { int n = 0; double d = 0; bool b = false; unsigned int u = 1; long l = -1; float f = 0; ros::Time t;
         event e(int count) /plain own/Plain '{count:count}' {
             n += count; d = n / 3.0; b = n % 2; u = u * 5; l = l * 7; f = d; t = ros::Time(1, 2); }
@@ -329,7 +315,6 @@ def test_the_module_and_the_engine_share_variables() -> None:
 
 
 def test_events_and_drops_are_counted() -> None:
-    """Each event is counted once."""
     both = BothWays("""s() { event a(int kind) /plain own/Plain '{kind:kind}' { }
         event b(int count) /plain own/Plain '{count:count}' when (count > 1) { if (count > 2) { return; } } }""")
     lane, view = both.lane(), memoryview(bytearray(frames(plain(number) for number in (1, 2, 3, 3, 1, 4))))
@@ -362,14 +347,12 @@ def test_events_and_drops_are_counted() -> None:
     ],
 )
 def test_a_topic_whose_messages_all_need_the_engine_has_no_lane(body: str, has: bool) -> None:
-    """If the module can handle some of the messages, the topic has a lane."""
     before = "int n = 0; std::vector<int> v; int down(int i) { return i ? down(i - 1) : 0; }"
     both = BothWays(event(body, before=before))
     assert (both.monitors.lane("/plain") is not None) == has
 
 
 def test_lanes_wait_until_a_monitor_has_begun() -> None:
-    """A lane is not ready before the first message, or while the topic is held."""
     monitors = on_module(
         compiled_from({"x.rv": "hold s() { event e() /plain own/Plain '{}' { } }"}, definitions())
     )
@@ -386,7 +369,6 @@ def test_lanes_wait_until_a_monitor_has_begun() -> None:
 
 
 def test_lanes_wait_while_something_is_due() -> None:
-    """A tick that is due precedes the next message, and sees the state that the fast path left."""
     both = BothWays(
         "s() { int n = 0; event e() /plain own/Plain '{}' { n++; } event t() every 1ms { n = n * 10; } }"
     )
@@ -452,7 +434,6 @@ HANDLED = (
 
 @pytest.mark.parametrize("text", HANDLED)
 def test_handlers_run_where_verdicts_are_only_counted(text: str) -> None:
-    """Variables, drops, restarts, faults, parts without a module, and explanations of repeated verdicts agree."""
     both = BothWays(
         f"""s() {{ int n = 0; int m = 0; int k = 0; std::vector<int> v;
         event a(int c) /plain own/Plain '{{count:c}}' when (c % 2 == 0) {{ k++; if (c == 8) {{ k = 1 / (k - k); }} }}
@@ -474,7 +455,6 @@ def test_handlers_run_where_verdicts_are_only_counted(text: str) -> None:
 
 
 def test_a_deadline_set_by_the_module_is_known_at_once() -> None:
-    """Both runs return the same next due time; a postponed one keeps its time."""
     both = BothWays("""s() { event a() /plain own/Plain '{count:1}' { } event b() /plain own/Plain '{count:2}' { }
         event tick() every 1s { } pattern: globally: a causes b within 1ms @violation { } }""")
     both.check([plain(1)], time=5_000_000)
@@ -499,7 +479,6 @@ def test_a_disabled_monitor_is_not_in_the_lane() -> None:
 
 
 def test_a_batch_stops_before_a_change_or_drop_to_report() -> None:
-    """The module leaves changes while they are reported in full, and likewise drops."""
     both = BothWays(event("count = 7; if (n > 2) { return; } n++;"))
     lane, given = both.lane(), frames([plain()] * 6)
     assert both.monitors.area is not None

@@ -84,7 +84,6 @@ def test_random_programs_of_strings(seed: int) -> None:
 
 @pytest.mark.parametrize("text", TEXTS, ids=lambda text: f"{len(text)} {text[:6]!r}")
 def test_every_kind_of_string_is_kept_and_compared(text: bytes) -> None:
-    """Each string is compared with every other in every order: up to the limit in the module, above in the engine."""
     both = BothWays(
         kept(
             'if (a < f) { n++; } if (f == a) { n += 3; } if (a >= c) { n += 5; } a = f; ROS_INFO("%s", a.c_str());'
@@ -96,7 +95,6 @@ def test_every_kind_of_string_is_kept_and_compared(text: bytes) -> None:
 
 
 def test_up_to_the_bound_nothing_is_for_the_engine() -> None:
-    """A longer string, and the first message that reads it, is for the engine; a message that replaces it is not."""
     both = BothWays(kept("if (x == 1) { n += a.size(); } a = f; b = a;"))
     both.check([stamped(LONG[:size]) for size in (0, 1, 7, 1000, MOST_KEPT)], "/stamped")
     assert both.came["together"] == 1
@@ -112,7 +110,6 @@ def test_up_to_the_bound_nothing_is_for_the_engine() -> None:
 
 
 def test_lines_show_the_string_of_their_message() -> None:
-    """The line does not show the string of a later message of the batch, or of the end of the batch."""
     both = BothWays(kept('ROS_INFO("%s %s", a.c_str(), b.c_str()); b = a; a = f; ROS_INFO("%s", b.c_str());'))
     for batch in ([b"one", b"two", b"three"], [b"four"], [b"five", b""]):
         both.check([stamped(frame) for frame in batch], "/stamped")
@@ -121,7 +118,6 @@ def test_lines_show_the_string_of_their_message() -> None:
 
 
 def test_a_fault_in_the_middle_takes_back_what_was_assigned() -> None:
-    """The variables and their bytes are as before the message; then the engine handles the message."""
     both = BothWays(
         kept(
             "std::string t = a; a = b; b = t; if (x == 7) { n = 1 / (x - 7); } a = f;",
@@ -135,7 +131,6 @@ def test_a_fault_in_the_middle_takes_back_what_was_assigned() -> None:
 
 
 def test_strings_survive_wherever_the_module_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The module may be stopped even while it copies strings at the end."""
     text = kept("{ std::string t = a; a = b; b = c; c = t; } if (x == 2) { a = f; } n++;")
     for fuel in [*range(3500, 6000, 37), *range(6000, 12000, 331)]:
         monkeypatch.setattr(wasm_runner, "FUEL", fuel)
@@ -145,7 +140,6 @@ def test_strings_survive_wherever_the_module_is_stopped(monkeypatch: pytest.Monk
 
 
 def test_strings_go_to_the_set_that_follows() -> None:
-    """The replacing set gets the strings while the module has the state, and they are persisted unchanged."""
     text = kept("a = f; if (x == 1) { b = f; }")
     both = BothWays(text)
     both.check([stamped(b"one", 1), stamped(b"two\0\xff")], "/stamped")

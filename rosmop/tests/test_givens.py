@@ -30,7 +30,6 @@ def speeds(monitors: MonitorSet, time: int = 1) -> tuple[float, float]:
 
 @pytest.mark.parametrize("module", [True, False])
 def test_a_value_is_set_between_two_messages_and_the_state_stays(module: bool) -> None:
-    """The same with the module and without; a value that is left out, or not allowed, is the default."""
     compiled = compiled_from({"x.rv": CAP}, definitions())
     monitors = on_module(compiled, "drop") if module else MonitorSet.of(compiled)
     monitors.start(0)
@@ -46,7 +45,6 @@ def test_a_value_is_set_between_two_messages_and_the_state_stays(module: bool) -
 
 
 def test_values_are_outside_of_the_state() -> None:
-    """A kept state, another text of another monitor, and the check for an initial state ignore them."""
     monitors = on_module(compiled_from({"x.rv": CAP}, definitions()), "drop")
     monitors.start(0)
     monitors.give({"cap": {"vMax": 1.5}})
@@ -70,7 +68,6 @@ def test_values_are_outside_of_the_state() -> None:
 
 
 def test_the_module_and_the_interpreter_agree_for_all_values() -> None:
-    """Random values between random batches."""
     both = BothWays("""s() given { int n = 3 in -9..9; double x = 1 in -2..2; } { double sum;
         event e(int c, double y) /plain own/Plain '{count:c, x:y}' {
             sum += x * c; if (c > n) { return; } y = sum + n; } }""")
@@ -127,7 +124,6 @@ REFUSED = [
 
 @pytest.mark.parametrize(("given", "why"), REFUSED)
 def test_invalid_givens_are_refused(given: str, why: str) -> None:
-    """The error says what to write."""
     body = given if "} {" in given else f"{given} }} {{"
     errors = refused(f"s() given {{ {body} event e() /t std_msgs/Empty '{{}}' {{ }} }}")
     assert any(why in one.text for one in errors), errors
@@ -146,7 +142,6 @@ def test_another_specification_reads_a_given_constant() -> None:
 
 
 def test_old_files_may_use_the_new_words_as_names() -> None:
-    """`given` and `topic` are words of the language only after the parentheses of a specification."""
     monitors = load("given() { int given; int topic; event topic(int in) /t std_msgs/Int32 '{data:in}'"
                     " { given = in; topic = given; } }")  # fmt: skip
     monitors.process("/t", message("std_msgs/Int32", data=2), 1)

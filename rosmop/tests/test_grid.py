@@ -27,7 +27,6 @@ GRID = {
 
 @pytest.mark.parametrize("row", GRID)
 def test_each_back_end_has_a_row_for_each_kind_of_node(row: str) -> None:
-    """A missing or superfluous row is named."""
     rows, kinds = GRID[row]
     assert _names(get_args(kinds)) == _names(rows)
 
@@ -92,7 +91,6 @@ SLOW = {
 
 @pytest.mark.parametrize("name", SLOW)
 def test_slow_paths_have_places_and_reasons(name: str) -> None:
-    """Each part that the interpreter processes is listed with topic, event or handler, line, and reason."""
     body, expected = SLOW[name]
     compiled = compiled_from({"s.rv": f"{HEAD}{body} }}"}, standard_definitions())
     found = slow_paths(compiled)
@@ -100,7 +98,6 @@ def test_slow_paths_have_places_and_reasons(name: str) -> None:
 
 
 def test_parametric_specifications_are_slow_paths() -> None:
-    """The engine processes each message of their topics."""
     text = f"p(int x) {{ {EVENT} {{ }} }}"
     (found,) = slow_paths(compiled_from({"p.rv": text}, standard_definitions()))
     assert (found.topic, found.reason) == ("/t", "has a parametric specification")

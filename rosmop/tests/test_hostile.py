@@ -55,7 +55,6 @@ BOMBS = [
 
 @pytest.mark.parametrize(("body", "before", "text"), BOMBS)
 def test_a_bomb_is_a_fault(body: str, before: str, text: str) -> None:
-    """Endless loops, recursion and growth stop at the budget or the memory limit, and drop the message."""
     if text == MEMORY:  # counting memory takes many times as long
         tracemalloc.start()
     most = BUDGET_SIZE if text != BUDGET or body in SPENT_WHOLE else BUDGET_SIZE // 20
@@ -125,7 +124,6 @@ def test_short_operations_are_not_charged() -> None:
 
 
 def test_a_formatted_text_is_charged_before_it_is_made() -> None:
-    """A format that repeats a long text many times is a fault, and does not take many times the memory."""
     many = "%s" * 90
     body = f"std::string s(1000000, 'x'); ROS_INFO(\"{many}\"{', s' * 90});"
     streamed = f"std::string s(1000000, 'x'); ROS_INFO_STREAM(s{' << s' * 40});"
@@ -139,7 +137,6 @@ def test_a_formatted_text_is_charged_before_it_is_made() -> None:
 
 
 def test_memory_is_measured_over_all_variables() -> None:
-    """Many small values count together, and freed values no longer count."""
     many = "".join(f"std::string s{i}(1000000, 'x'); " for i in range(20))
     assert MEMORY in act(many).faults[0].text
     freed = "std::string s; for (int i = 0; i < 60; i++) { s = std::string(1000000, 'x'); }"
@@ -147,7 +144,6 @@ def test_memory_is_measured_over_all_variables() -> None:
 
 
 def test_a_value_of_less_than_the_limit_is_held() -> None:
-    """A value just below the limit of 16 MiB is accepted."""
     assert act("std::string s(16000000, 'x'); ROS_INFO(\"%d\", (int) s.size());").log[0].text == "16000000"
 
 
@@ -159,14 +155,12 @@ GROWN = [
 
 @pytest.mark.parametrize("change", GROWN)
 def test_a_replaced_value_counts_once(change: str) -> None:
-    """A long string can be changed up to the limit, although Python makes a new string."""
     outcome = act(f"std::string s(15000000, 'x'); {change} ROS_INFO(\"%d\", (int) s.size());")
     assert outcome.faults == ()
     assert outcome.log[0].text == "15000001"
 
 
 def test_a_string_that_grows_beyond_the_limit_is_a_fault() -> None:
-    """The size of the new value counts."""
     assert MEMORY in act("std::string s(10000000, 'x'); s += std::string(7000000, 'y');").faults[0].text
 
 
@@ -185,7 +179,6 @@ REFUSED = [
 
 @pytest.mark.parametrize(("body", "text"), REFUSED)
 def test_texts_beyond_the_limits_are_rejected(body: str, text: str) -> None:
-    """Excessive nesting, sizes and names are errors at load, in bounded time."""
     began = time.process_time()
     findings = refused_action(body)
     assert any(text in finding.text for finding in findings)
@@ -205,12 +198,10 @@ DEEP_BUT_RIGHT = [
 
 @pytest.mark.parametrize("body", DEEP_BUT_RIGHT)
 def test_texts_within_the_limits_run(body: str) -> None:
-    """Python's compiler accepts everything within the limits."""
     assert act(body, data=3).faults == ()
 
 
 def test_no_string_of_a_specification_becomes_code() -> None:
-    """Quotes, escapes and braces in strings are printed as they are."""
     text = r"""'); import os; ("\n\\ {0} %% ' \" \x00 b' + v1"""
     outcome = act(
         f"""ROS_INFO("{text.replace('"', chr(92) + '"').replace(chr(92) * 2 + '"', chr(92) + '"')}");"""
@@ -228,7 +219,6 @@ HUGE_COUNTS = [
 
 @pytest.mark.parametrize(("kind", "parameter", "data"), HUGE_COUNTS)
 def test_a_count_beyond_the_message_is_a_fault(kind: str, parameter: str, data: bytes) -> None:
-    """If a length in a message exceeds the message, it costs no memory and no loop."""
     field = {"nav_msgs/Path": "poses", "sensor_msgs/JointState": "name"}.get(kind, "data")
     text = f"a() {{ event e({parameter}) /t {kind} '{{{field}:x}}' {{ auto y = x; }} }}"
     outcome = load(text).process("/t", data, 0)
@@ -247,7 +237,6 @@ WALKS = [
 def test_a_walk_over_millions_of_elements_is_charged_before_it_is_made(
     kind: str, pattern: str, data: bytes
 ) -> None:
-    """A publisher that puts more elements than a budget before a field costs no time, nested or not."""
     monitors = load(f"a() {{ event e(auto x) /t {kind} '{{{pattern}}}' {{ auto y = x; }} }}")
     took = []
     for at in range(3):  # the minimum, because other processes may disturb the caches
@@ -260,7 +249,6 @@ def test_a_walk_over_millions_of_elements_is_charged_before_it_is_made(
 
 
 def test_few_elements_before_a_field_cost_nothing_and_many_their_number() -> None:
-    """So an event that reads a field of a robot's joint states keeps its full budget."""
     for names, cost in ((50, 0), (500, 500)):
         monitors = load(
             "a() { event e(double x) /t sensor_msgs/JointState '{position[1]:x}' { double y = x; } }"
@@ -279,7 +267,6 @@ def test_an_array_of_too_many_strings_is_a_fault() -> None:
 
 
 def test_unreadable_texts_are_rejected_with_a_position() -> None:
-    """For any file contents, the answer is an error with a position."""
     for text in (
         "\0",
         "\x1b[31m",
@@ -316,7 +303,6 @@ LONG = [
 
 @pytest.mark.parametrize("text", LONG, ids=range(len(LONG)))
 def test_a_long_text_is_answered_in_time(text: str) -> None:
-    """The errors of any file are reported within seconds."""
     began = time.process_time()
     assert refused(text)
     assert time.process_time() - began < PATIENCE

@@ -191,7 +191,6 @@ HEARTBEAT = """beat() { std_msgs::Empty m; int n; void f() { PUBLISH(/b, std_msg
 def test_an_inserted_answer_is_a_trigger_again_in_an_ordered_specification(
     order: str, times: list[int]
 ) -> None:
-    """Without a statement it counts only as the answer, as before there were statements."""
     monitors = load(HEARTBEAT + order)
     monitors.process("/b", b"", 0)
     due = [one.time // 10**9 for one in monitors.advance(5 * 10**9) if one.published]
@@ -208,7 +207,6 @@ ORDERS = [
 
 @pytest.mark.parametrize(("order", "speed"), ORDERS)
 def test_an_order_replaces_the_order_of_the_files(order: str, speed: list[float]) -> None:
-    """It may be in any file, also in one without a specification; state stays when it changes."""
     monitors = load(CAP, y=MUX, z=order)
     assert speeds(monitors.process("/joy", FAST, 1)) == speed
     assert [*monitors.names] == (["mux", "cap"] if speed == [0.22] else ["cap", "mux"])
@@ -221,7 +219,6 @@ def test_an_order_replaces_the_order_of_the_files(order: str, speed: list[float]
 
 
 def test_specifications_without_a_place_in_the_order_stay_where_they_are() -> None:
-    """Each moves only as far as the statements need."""
     texts = {name: CAP.replace("cap()", f"{name}()") for name in "pqrst"}
     for order, expected in (
         ("order t < q;", "prstq"), ("order t < p; order s < q < p;", "rsqtp"), ("order p < q < r < s < t;", "pqrst"),
@@ -237,12 +234,10 @@ def test_specifications_without_a_place_in_the_order_stay_where_they_are() -> No
     "order", ["order cap < cap;", "order cap < mux; order mux < cap;", "order a < b < c < a;"]
 )
 def test_a_circle_is_refused(order: str) -> None:
-    """The error names a specification in it."""
     assert "would come before itself" in refused(CAP + MUX + order)[0].text
 
 
 def test_old_files_may_use_order_as_a_name() -> None:
-    """Only `order name;` and `order name < …` are statements."""
     monitors = load("order() { int order; event e(int x) /n std_msgs/Int32 '{data:x}' { order = x; } }")
     monitors.process("/n", message("std_msgs/Int32", data=3), 1)
     assert monitors.value("order", "order") == 3

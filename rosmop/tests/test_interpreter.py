@@ -53,7 +53,6 @@ def check(given: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) -> 
 def test_single_messages_have_the_outcomes_of_the_interpreter(
     seed: int, on_fault: OnFault, step_ns: int, wild: list[bytes]
 ) -> None:
-    """Covers actions, conditions, helper functions, loops, timers and properties, on whole and damaged messages."""
     sources = {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())}
     messages = Messages(seed)
     together = [
@@ -79,7 +78,6 @@ def test_single_messages_have_the_outcomes_of_the_interpreter(
     ids=["kind", "type", "missing", "missing in a type", "statement as a value", "no value of the language"],
 )
 def test_data_that_is_not_a_form_is_rejected(wrong: list[object]) -> None:
-    """Only data that is completely a valid form is read; anything else is rejected."""
     statement = msgspec.msgpack.Decoder(nodes.Statement)
     assert statement.decode(msgspec.msgpack.encode(["Break", 1])) == nodes.Break(1)
     with pytest.raises(msgspec.ValidationError):
@@ -152,7 +150,6 @@ def test_shipped_specifications(data: st.DataObject) -> None:
     ],
 )
 def test_growing_values_and_fields_of_any_size_do_the_same(body: str) -> None:
-    """Covers vectors, strings, whole messages, references, recursion, and the limits of memory and work."""
     text = f"""s() {{ int n = 0; sensor_msgs::JointState v;
     void f(int &x) {{ x = x * 3; }}
     void swap(double &a, double &b) {{ double c = a; a = b; b = c; }}

@@ -53,7 +53,6 @@ def trap_of(one: WasmInstance, name: str | int, *arguments: int, fuel: int = FUE
 
 
 def test_arguments_and_results_by_name_and_number() -> None:
-    """Results are signed with 32 or 64 bits, or missing; functions of other types have no number."""
     one = made("""
         (func (export "first") (param f64))
         (func (export "mixed") (param i32 i64 i32) (result i64)
@@ -80,7 +79,6 @@ def test_other_arguments(arguments: tuple[int, ...]) -> None:
 
 @pytest.mark.parametrize("reason", TRAPS)
 def test_every_trap_has_its_reason_and_the_machine_goes_on(reason: str) -> None:
-    """Writes before a trap stay in memory."""
     one = made(f"""(type $none (func)) (table 2 funcref) (elem (i32.const 1) $other)
         (func $other (param i32))
         (func $self (export "fail") (i32.store (i32.const 8) (i32.const 7)) {TRAPS[reason]})
@@ -92,7 +90,6 @@ def test_every_trap_has_its_reason_and_the_machine_goes_on(reason: str) -> None:
 
 
 def test_each_call_has_its_own_fuel() -> None:
-    """The same work needs the same fuel; a call neither saves fuel for the next call nor owes any."""
     one = made("""(func (export "turns") (param i32)
         (loop (br_if 0 (local.tee 0 (i32.sub (local.get 0) (i32.const 1))))))""")
 
@@ -125,7 +122,6 @@ def test_an_unknown_wasmtime_is_not_called(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_the_memory_grows_in_place_and_views_stay_right() -> None:
-    """The module or the host may grow the memory, up to the limit and not beyond."""
     one = made("""(func (export "grow") (param i32) (result i32) (memory.grow (local.get 0)))
         (func (export "at") (param i32) (result i32) (i32.load8_u (local.get 0)))""")
     first = one.memory
@@ -149,7 +145,6 @@ def test_the_memory_grows_in_place_and_views_stay_right() -> None:
 
 @pytest.mark.parametrize("limit", [PAGE, 3 * PAGE, 5 * PAGE + 1])
 def test_the_limit_is_whole_pages_of_what_is_given(limit: int) -> None:
-    """The limit is rounded down to whole pages."""
     one = made("", limit)
     one.reserve(limit // PAGE * PAGE)
     with pytest.raises(WasmError):
@@ -169,13 +164,11 @@ def test_the_limit_is_whole_pages_of_what_is_given(limit: int) -> None:
     ],
 )
 def test_an_invalid_module_is_refused(code: str | bytes, reason: str) -> None:
-    """The error gives the reason."""
     with pytest.raises(WasmError, match=reason):
         run(code if isinstance(code, bytes) else bytes(wasmtime.wat2wasm(code)))
 
 
 def test_the_start_function_of_a_module_is_bounded() -> None:
-    """It has fuel, and its traps are reported as such."""
     with pytest.raises(WasmTrap) as caught:
         made("(func $begin (loop (br 0))) (start $begin)")
     assert caught.value.reason == "out of fuel"
@@ -203,7 +196,6 @@ def test_other_threads_go_on_while_a_module_is_translated() -> None:
 
 
 def test_a_view_outlives_its_machine() -> None:
-    """A view of a closed machine's memory still has its bytes."""
     one = made("")
     view = one.memory[10:20]
     view[0] = 3
@@ -217,7 +209,6 @@ def test_a_view_outlives_its_machine() -> None:
 
 
 def test_machines_share_an_engine_and_nothing_else() -> None:
-    """A machine that traps or is closed does not affect the others."""
     text = """(global $n (mut i32) (i32.const 0))
         (func (export "count") (result i32) (global.set $n (i32.add (global.get $n) (i32.const 1))) (global.get $n))
         (func (export "trap") unreachable)"""
@@ -272,7 +263,6 @@ def resident() -> int:
 
 
 def test_calls_and_traps_leave_nothing_behind() -> None:
-    """Closed machines also leave nothing behind."""
     one = made("""(func $deep (export "fail") (param i32)
             (if (local.get 0) (then (call $deep (i32.sub (local.get 0) (i32.const 1))))) unreachable)
         (func (export "fine"))""")
@@ -295,7 +285,6 @@ def test_calls_and_traps_leave_nothing_behind() -> None:
 
 @pytest.mark.nightly
 def test_many_machines_need_few_addresses() -> None:
-    """Machines reserve as many addresses as their limits need, even in a process with little address space."""
     done = subprocess.run(
         [sys.executable, "-c", f"""
 import resource, wasmtime

@@ -81,7 +81,6 @@ def test_a_part_is_the_same_whatever_else_is_in_the_set() -> None:
 
 @pytest.mark.nightly
 def test_another_process_makes_the_same_module() -> None:
-    """The other process has different string hashes."""
     hashes = {
         subprocess.run(
             [sys.executable, "-c", PROGRAM],
@@ -97,7 +96,6 @@ def test_another_process_makes_the_same_module() -> None:
 @FEW
 @given(seed=st.integers(0, 1 << 30))
 def test_it_does_what_its_specifications_do_in_the_set(seed: int) -> None:
-    """Random specifications have the same effects with their own, sent module as in the whole set."""
     texts = {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())}
     try:
         whole = compiled_from(texts, definitions())
@@ -121,7 +119,6 @@ def test_it_does_what_its_specifications_do_in_the_set(seed: int) -> None:
 
 
 def test_only_what_is_not_in_shadow_mode_has_a_module() -> None:
-    """Specifications in shadow mode get copies; those that share variables with them are in shadow mode as well."""
     part = part_of(compiled("a", "b"), ["a", "b"], ["b"])
     assert list(part.module.feeds) == ["/a"]
     assert {one.name for one in part.compiled.specifications} == {"a", "b"}
@@ -129,7 +126,6 @@ def test_only_what_is_not_in_shadow_mode_has_a_module() -> None:
 
 @pytest.mark.parametrize("wrong", [b"", b"\x7fELF", b"\0asm\1\0\0\0"])
 def test_foreign_machine_code_is_refused(wrong: bytes) -> None:
-    """Foreign machine code is never run."""
     part = part_of(compiled("a"), ["a"], [])
     with pytest.raises(WasmError):
         MonitorSet.of(part.compiled, fast=WasmFastPath(replace(part.module, code=wrong)))
@@ -137,6 +133,5 @@ def test_foreign_machine_code_is_refused(wrong: bytes) -> None:
 
 @pytest.mark.parametrize("length", [0, 1, 100])
 def test_a_part_that_is_cut(length: int) -> None:
-    """A part with missing bytes is rejected."""
     with pytest.raises(msgspec.MsgspecError):
         decoded_part(encoded_part(part_of(compiled("a"), ["a"], []))[:length])

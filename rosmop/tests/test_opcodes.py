@@ -40,7 +40,6 @@ def literals(source: str) -> Iterator[str]:
 
 @pytest.mark.parametrize("path", sorted(set(TABLE.parent.glob("*.py")) - {TABLE}), ids=lambda path: path.stem)
 def test_opcodes_are_in_the_table(path: Path) -> None:
-    """All other files of the generator use the names of instructions."""
     assert list(literals(path.read_text())) == []
 
 
@@ -61,7 +60,6 @@ def test_literals_are_found(source: str) -> None:
     ['part.value == b"sec"', "bytes(memory[at:end])", 'b"".join(parts)', "br(1)", "unsigned(len(raw))"],
 )
 def test_other_bytes_are_not_opcodes(source: str) -> None:
-    """Covers empty bytes, copies, comparisons with a string, and operands."""
     assert not list(literals(source))
 
 

@@ -22,13 +22,11 @@ def speeds(outcome: Outcome) -> list[float]:
 
 
 def test_a_cap_limits_what_a_mux_publishes() -> None:
-    """Behind the mux it changes the message; before the mux it never sees it."""
     assert speeds(load(MUX, y=CAP).process("/joy", FAST, 1)) == [0.22]
     assert speeds(load(CAP, y=MUX).process("/joy", FAST, 1)) == [9.0]
 
 
 def test_published_messages_step_properties_and_are_dropped() -> None:
-    """The handler of a property behind the publisher drops its second message."""
     monitors = load(MUX, y=COUNT)
     outcomes = [monitors.process("/joy", FAST, time) for time in (1, 2, 3)]
     assert [speeds(one) for one in outcomes] == [[9.0], [], [9.0]]
@@ -37,7 +35,6 @@ def test_published_messages_step_properties_and_are_dropped() -> None:
 
 
 def test_messages_of_timers_are_judged() -> None:
-    """Publications of a tick go through the monitors behind it."""
     tick = """p() { geometry_msgs::Twist t;
         event e() every 1s { t.linear.x = 9; PUBLISH(/cmd_vel, geometry_msgs/Twist, t); } }"""
     [outcome] = load(tick, y=CAP).advance(10**9)
@@ -52,7 +49,6 @@ CHAIN = [
 
 
 def test_a_circle_ends_with_the_order() -> None:
-    """Monitors that all listen to their own topic publish a finite tree: each message goes only further back."""
     monitors = load(CHAIN[0], **dict(zip("yzuvw", CHAIN[1:], strict=True)))  # type: ignore[arg-type]  # the keys are names
 
     def count(outcome: Outcome) -> int:
@@ -71,7 +67,6 @@ def test_a_monitor_that_holds_drops_what_others_publish() -> None:
 
 @pytest.mark.parametrize("name", ["cap", "mux"])
 def test_a_disabled_monitor_judges_nothing(name: str) -> None:
-    """Neither as the publisher nor behind it."""
     monitors: MonitorSet = load(MUX, y=CAP)
     monitors.switch({name: False}, 0)
     assert speeds(monitors.process("/joy", FAST, 1)) == ([9.0] if name == "cap" else [])

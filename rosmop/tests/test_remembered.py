@@ -44,7 +44,6 @@ def compiled(formula: str) -> MonitorSet:
 @pytest.mark.parametrize("name", FORMULAS)
 @pytest.mark.parametrize("seed", range(20))
 def test_a_run_goes_on_where_it_was(name: str, seed: int) -> None:
-    """A run of each kind, saved and loaded after any step or deadline, continues with the same verdicts."""
     random = Random(seed)  # noqa: S311  draws examples, not keys
     [declared] = compiled(FORMULAS[name]).compiled.specifications[0].properties
     formula = declared.property
@@ -69,7 +68,6 @@ def again(formula: Any, run: Any) -> Any:
 @pytest.mark.parametrize("name", FORMULAS)
 @pytest.mark.parametrize("data", [[], [[], []], [["x"], []], [[["o", 3]], []], 7, [[10**6, 0, 0], []], None])
 def test_an_invalid_state_of_a_property_is_refused(name: str, data: object) -> None:
-    """For any stored data in place of a run, only ValueError is raised."""
     formula = compiled(FORMULAS[name]).compiled.specifications[0].properties[0].property
     with pytest.raises(ValueError):
         run_of(formula, data, 0)

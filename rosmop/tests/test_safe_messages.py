@@ -51,7 +51,6 @@ def sent(outcomes: list[Outcome]) -> list[Any]:
 
 
 def test_a_stop_replaces_the_message_and_keeps_its_stamp() -> None:
-    """Assignments after it have no effect; the record names the statement."""
     monitors = load(guard())
     assert drive(monitors, command()) == command()
     monitors.process("/scan", NEAR, 1)
@@ -62,7 +61,6 @@ def test_a_stop_replaces_the_message_and_keeps_its_stamp() -> None:
 
 
 def test_a_stop_without_a_message_of_its_topic_is_published() -> None:
-    """In a timer, or on another topic, each safe message is sent, with the time in its header."""
     text = guard(SAFE, SCAN.replace("near = r[0];", "STOP;"), DRIVE, "event e() every 1s { STOP; }")
     monitors = load(text)
     [scan] = sent([monitors.process("/scan", NEAR, 2 * 10**9 + 5)])
@@ -71,7 +69,6 @@ def test_a_stop_without_a_message_of_its_topic_is_published() -> None:
 
 
 def test_monitors_behind_a_stop_see_the_safe_message() -> None:
-    """They may still change it, and their formulas count it, not the replaced message."""
     behind = f"""behind() {{ event fast(double v) /cmd_vel {TWIST} '{{twist.linear.x:v}}' when (v > 0) {{ }}
         event slow(double z) /cmd_vel {TWIST} '{{twist.angular.z:z}}' {{ z = 0.25; }}
         ere: fast @match {{ ROS_WARN("fast"); }} }}"""
@@ -93,7 +90,6 @@ FAULTY = [
 
 @pytest.mark.parametrize(("text", "data"), FAULTY)
 def test_a_fault_on_a_command_sends_the_safe_message(text: str, data: bytes) -> None:
-    """A division by zero, an endless loop, malformed bytes: the base never gets silence."""
     monitors = load(text)
     found = fields(TWIST, drive(monitors, data))
     assert (found.header.frame_id, found.twist.linear.x, found.twist.angular.z) == ("base", 0, 0.5)
@@ -101,7 +97,6 @@ def test_a_fault_on_a_command_sends_the_safe_message(text: str, data: bytes) -> 
 
 
 def test_time_that_one_monitor_used_up_is_given_again() -> None:
-    """Behind a monitor that took too long, the safe message is not dropped for lack of time."""
     monitors = load(FAULTY[1][0], y=guard(head="other()"))
     monitors.limit_time(iter(range(10_000_000)).__next__, 500)
     outcome = monitors.process("/cmd_vel", bytearray(command()), 1)
@@ -129,7 +124,6 @@ def held(how: str) -> MonitorSet:
 
 @pytest.mark.parametrize("how", ["fault", "lost", "changed", "broken"])
 def test_a_monitor_that_cannot_judge_passes_and_sends_only_the_safe_message(how: str) -> None:
-    """It is sent at once and then periodically, without a backlog; `seq` and `stamp` do not count."""
     monitors = held(how)
     times = [TENTH, TENTH + 1, 2 * TENTH, 9 * TENTH, 9 * TENTH + 1]
     outcomes = [monitors.advance(time) for time in times]
@@ -144,7 +138,6 @@ def test_a_monitor_that_cannot_judge_passes_and_sends_only_the_safe_message(how:
 
 
 def test_a_monitor_that_starts_again_sends_until_the_first_command() -> None:
-    """After a restart, a takeover, or a fault in a monitor that is declared `begin`; never at the first start."""
     restarted, first = (MonitorSet.of(compiled_from({"x.rv": guard()}, definitions())) for _ in range(2))
     first.start(0)
     assert first.next_due is None
@@ -171,7 +164,6 @@ def test_a_monitor_that_is_disabled_or_in_shadow_mode_sends_nothing(on_fault: On
 
 
 def test_a_safe_message_passes_only_monitors_behind_that_do_not_forbid_it() -> None:
-    """It is an event for them like any other published message."""
     monitors = load(
         guard(), y=f"cap() {{ event c(double z) /cmd_vel {TWIST} '{{twist.angular.z:z}}' {{ z = 0; }} }}"
     )
@@ -197,12 +189,10 @@ REFUSED = [
 
 @pytest.mark.parametrize(("safe", "why"), REFUSED)
 def test_a_safe_message_that_cannot_be_sent_is_refused(safe: str, why: str) -> None:
-    """The error names the place and the remedy."""
     assert any(why in one.text for one in refused(guard(safe, SCAN, DRIVE)))
 
 
 def test_old_files_may_use_the_new_words_as_names() -> None:
-    """`safe`, `on` and `STOP` are words of the language only in the new forms."""
     monitors = load("s() { const int STOP = 2; bool safe = true; int on; event e(int x) /t std_msgs/Int32 '{data:x}'"
                     " { on = STOP; switch (x) { case STOP: safe = x != STOP; } } }")  # fmt: skip
     monitors.process("/t", message("std_msgs/Int32", data=2), 1)
@@ -232,7 +222,6 @@ def passed(monitors: MonitorSet, trace: Timed) -> list[bool]:
 
 @pytest.mark.parametrize("formula", FORMULAS)
 def test_a_stopped_message_has_not_happened_for_formulas(formula: str) -> None:
-    """A message is stopped exactly if it violates the formula after the messages that passed."""
     logic, _, text = formula.partition(": ")
     property_, random = compiled(logic, text), seeded(31)
     traces = [timed(random, 9) for _ in range(examples(60))]
@@ -266,7 +255,6 @@ STOPPING = [
 
 @pytest.mark.parametrize("text", STOPPING)
 def test_the_module_and_the_interpreter_stop_the_same_messages(text: str) -> None:
-    """Random batches for three monitors in a row, and messages of another size than the safe one."""
     others = [
         text.replace("s()", f"{name}()").replace("> 6", limit) for name, limit in (("t", "> 4"), ("u", "< 2"))
     ]
@@ -284,7 +272,6 @@ STAMPED = f"""s() {{ int n; {SAFE} event e(double v) /cmd_vel {TWIST} '{{twist.l
 
 
 def test_the_module_sends_the_safe_message() -> None:
-    """Only messages of another size go to the engine; `seq` and `stamp` stay."""
     both, random = BothWays(STAMPED), seeded(33)
     alike = [command(float(random.randint(0, 9)), "bose", random.choice((0.5, 1.0))) for _ in range(100)]
     both.check(alike, "/cmd_vel")

@@ -142,7 +142,6 @@ def test_random_specifications_and_messages(seed: int, wild: list[bytes]) -> Non
 
 
 def test_the_random_specifications_reach_every_outcome() -> None:
-    """Drops, changes, verdicts, faults and ticks all occur."""
     found: set[str] = set()
     for seed in range(40):
         try:
@@ -212,7 +211,6 @@ def test_every_parametric_logic(logic: str) -> None:
 
 @pytest.mark.parametrize("handler", ["@enforced { late++; }", "@violation { late++; __RESET; }"])
 def test_publications_enforced_at_a_deadline(handler: str) -> None:
-    """Withheld publications equal real ones, at the same times and with the same variables."""
     remedy = "help() { std_msgs::UInt8 one; one.data = late; PUBLISH(/n1, std_msgs/UInt8, one); }"
     events = "".join(f"event e{at}() /n{at} std_msgs/UInt8 '{{}}' {{ }} " for at in range(2))
     rule = f"pattern: globally: e0 causes e1 within 3ms enforced by help {handler}"
@@ -271,7 +269,6 @@ def test_specifications_that_share_variables_are_in_shadow_mode_together() -> No
 
 
 def test_a_disabled_specification_sees_nothing_and_holds_nothing() -> None:
-    """A disabled specification declared `hold` holds no topic in shadow mode, nor after its promotion."""
     text = f"hold a() {{ event e({NUMBER} {{ return; }} }}"
     monitors = MonitorSet.of(compiled_from({"0.rv": text}, definitions()), shadows=["a"])
     monitors.start(0, restarted=True)
@@ -287,7 +284,6 @@ def test_a_disabled_specification_sees_nothing_and_holds_nothing() -> None:
 
 
 def test_an_incomplete_state_is_reset_when_it_is_enforced() -> None:
-    """In shadow mode the incomplete state is kept; faults there do not count after the promotion."""
     text = f"a() {{ int k = 0; event e({NUMBER} {{ k += 1; if (n == 9) {{ n = n / (n - 9); }} }} }}"
     sources = {"0.rv": text}
     monitors = shadow(text, shadowed=["a"])

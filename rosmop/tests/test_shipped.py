@@ -48,7 +48,6 @@ def drive(forward: float) -> bytes:
 
 
 def test_they_load_together_without_a_warning() -> None:
-    """All shipped monitors are valid together."""
     monitors = shipped(*sorted(path.stem for path in MONITORS.glob("*.rv")))
     assert monitors.warnings == ()
     assert [monitor.name for monitor in monitors.monitors] == [
@@ -69,7 +68,6 @@ def test_the_gun_fires_only_in_a_safe_pose(tilt: float | None, result: str) -> N
 
 
 def test_the_gun_is_watched_all_the_time() -> None:
-    """If a pose becomes unsafe, a shot that was allowed before is forbidden."""
     monitors = shipped("safe_triggering")
     seen = []
     for time, tilt in enumerate((0.2, -0.7, 0.1)):
@@ -99,7 +97,6 @@ def fix(latitude: float, longitude: float) -> bytes:
     ],
 )
 def test_the_robot_stays_in_its_zone(topic: str, inside: bytes, outside: bytes) -> None:
-    """Outside by either measure, forward commands are dropped; commands to back up and turn pass."""
     monitors = shipped("safe_zone")
     command = "/landshark_control/base_velocity"
     monitors.process(topic, inside, 1)
@@ -127,7 +124,6 @@ def commanded(monitors: MonitorSet, time: int, forward: float = 1.0) -> Outcome:
 
 
 def test_the_robot_stops_before_an_obstacle() -> None:
-    """The free distance that is required grows with the speed; an alarm is published on its own topic."""
     monitors = shipped("obstacle_avoidance")
     monitors.process("/landshark/odom", odometry(0, speed=1.0), 1)
     monitors.process("/landshark/scan", scan(5.0), 2)
@@ -146,7 +142,6 @@ def test_the_robot_stops_before_an_obstacle() -> None:
 
 
 def test_an_obstacle_beside_the_robot_does_not_stop_it() -> None:
-    """Only objects ahead of the robot count."""
     monitors = shipped("obstacle_avoidance")
     ranges = [0.2] * 5 + [9.0] * 51 + [0.2] * 5
     step = math.radians(120) / 60
@@ -156,7 +151,6 @@ def test_an_obstacle_beside_the_robot_does_not_stop_it() -> None:
 
 
 def test_a_silent_laser_stops_the_robot() -> None:
-    """Half a second without a scan, also before the first one, counts as an obstacle until scans arrive again."""
     monitors = shipped("obstacle_avoidance")
     assert commanded(monitors, 1).result == "changed"
     monitors.process("/landshark/scan", scan(9.0), SECOND)
@@ -200,7 +194,6 @@ def goal(monitors: MonitorSet, part: str, name: str, time: float) -> Outcome:
 
 
 def test_each_goal_is_answered_within_its_cancel() -> None:
-    """If one of two cancelled goals has no answer within three seconds, only that goal is reported."""
     monitors = shipped("goals")
     for number, name in enumerate(("a", "b", "c")):
         goal(monitors, "goal", name, number)
@@ -212,7 +205,6 @@ def test_each_goal_is_answered_within_its_cancel() -> None:
 
 
 def test_an_id_is_that_of_one_goal() -> None:
-    """A second goal with the same id is reported; after the answer only the id is kept."""
     monitors = shipped("goals")
     goal(monitors, "goal", "a", 1)
     (verdict,) = goal(monitors, "goal", "a", 2).verdicts

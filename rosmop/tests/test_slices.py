@@ -151,7 +151,6 @@ def naive(one: Made, trace: Trace) -> list[Told]:
 
 @pytest.mark.parametrize("seed", range(60))
 def test_slices_equal_one_specification_for_each_binding(seed: int) -> None:
-    """Verdicts, output and variables of random specifications equal the definition, also in the interpreter."""
     random = Random(seed)  # noqa: S311  draws examples, not keys
     one = made(random)
     monitors = load(one.text(binding=True))
@@ -166,7 +165,6 @@ def test_slices_equal_one_specification_for_each_binding(seed: int) -> None:
 
 
 def test_the_named_events_of_a_slice_alone_give_its_verdict() -> None:
-    """These events alone, given to the specification without parameters, have the verdict, and all are of the slice."""
     random, explained = seeded(44), 0
     for _ in range(examples(60)):
         one = replace(made(random), actions=dict.fromkeys("abc", ""))
@@ -213,7 +211,6 @@ def slice_of(one: Made, trace: Trace, binding: Mapping[str, object]) -> Sequence
     ids=["a condition", "a drop"],
 )
 def test_an_event_that_did_not_happen_in_a_slice_does_not_explain_it(look: str, handler: str) -> None:
-    """An event without the parameter may happen in one slice only; then no explanation is guessed."""
     text = f"""s(int id) {{
         int n = 0;
         creation event go(int id) /go std_msgs/Int32 '{{data:id}}' {{ n = n + id - 1; }}
@@ -259,7 +256,6 @@ def live(monitors: MonitorSet) -> int:
 
 
 def test_a_long_binding_is_a_fault() -> None:
-    """If a binding has more bytes than a slice may have, it is a fault."""
     monitors = load(GOALS)
     assert not monitors.process("/goal", text("x" * MAX_BINDING), 1).faults
     outcome = monitors.process("/goal", text("x" * (MAX_BINDING + 1)), 2)
@@ -283,7 +279,6 @@ def test_finished_slices_are_collected_and_do_not_begin_again() -> None:
 
 
 def test_a_slice_in_its_initial_state_is_forgotten() -> None:
-    """Hosts that connect and leave again use no memory, whatever their number."""
     clients = (
         "clients(std::string id) {"
         "event connect(std::string id) /c std_msgs/String '{data:id}' { }"
@@ -301,7 +296,6 @@ def test_a_slice_in_its_initial_state_is_forgotten() -> None:
 
 
 def test_slices_stay_when_specifications_are_loaded_again() -> None:
-    """Slices of an unchanged text continue; slices of a changed text begin again."""
     monitors = load(GOALS)
     monitors.process("/goal", text("a"), 1)
     other = "other() { event e() /o std_msgs/Empty '{}' { } }"
@@ -326,7 +320,6 @@ def test_nan_is_one_binding() -> None:
 
 
 def test_the_automaton_of_a_slice_is_certified() -> None:
-    """The automaton is the same as for the formula without parameters."""
     with_, without = (
         certificates_of(load(one).compiled.specifications)[0]["goals"]
         for one in (GOALS, GOALS.replace("goals(std::string id)", "goals()").replace("id.c_str()", '"x"'))
@@ -336,7 +329,6 @@ def test_the_automaton_of_a_slice_is_certified() -> None:
 
 
 def test_a_slice_takes_less_than_a_kilobyte() -> None:
-    """With ids of 36 characters, 100,000 slices fit into 100 MB, by Python's count of allocations."""
     monitors = load(GOALS)
     slices = monitors.monitors[0].slices
     assert slices is not None
@@ -365,7 +357,6 @@ def test_runs_that_may_grow_have_a_lower_limit() -> None:
 
 
 def test_topics_of_parametric_specifications_have_no_lane() -> None:
-    """The module does not support slices, but it handles the messages of other topics."""
     other = "other() { bool b = false; event e(bool x) /o std_msgs/Bool '{data:x}' { b = x; } }"
     monitors = on_module(compiled_from({"x.rv": GOALS, "y.rv": other}, definitions()))
     monitors.start(0)
@@ -375,7 +366,6 @@ def test_topics_of_parametric_specifications_have_no_lane() -> None:
 
 
 def test_one_message_may_concern_all_slices() -> None:
-    """Hundreds of verdicts come at once, in the order in which the slices began."""
     monitors = load(ANSWERED)
     for number in range(200):
         monitors.process("/goal", text(str(number)), 1)

@@ -51,7 +51,6 @@ def of_host(slices: Slices, host: str) -> list[Binding]:
 
 
 def test_a_guest_that_makes_up_ids_refuses_the_robot_nothing() -> None:
-    """If a specification acts, the guest's new ids are faults; the robot's goals are judged as before."""
     monitors = begun(ACTING, 100)
     assert not send(monitors, "/goal", "r", ROBOT).faults
     outcomes = [send(monitors, "/goal", f"g{number}", GUEST) for number in range(1000)]
@@ -65,7 +64,6 @@ def test_a_guest_that_makes_up_ids_refuses_the_robot_nothing() -> None:
 
 
 def test_a_guest_that_makes_up_ids_pushes_out_its_own() -> None:
-    """If a specification only observes, the guest's oldest goals are dropped and reported; other hosts' goals stay."""
     monitors = begun(OBSERVING, 100)
     send(monitors, "/goal", "r", ROBOT)
     outcomes = [send(monitors, "/goal", f"g{number}", GUEST) for number in range(1000)]
@@ -80,7 +78,6 @@ def test_a_guest_that_makes_up_ids_pushes_out_its_own() -> None:
 
 
 def test_hosts_that_are_not_told_apart_have_the_whole() -> None:
-    """A recording has no hosts, so all slices count for one host."""
     monitors = begun(ACTING, 100)
     for number in range(100):
         assert not send(monitors, "/goal", str(number), MessageSender(9)).faults
@@ -89,7 +86,6 @@ def test_hosts_that_are_not_told_apart_have_the_whole() -> None:
 
 @pytest.mark.parametrize("text", [ACTING, OBSERVING])
 def test_no_sequence_removes_a_slice_for_another_host(text: str) -> None:
-    """For any senders and order the limit holds, and only a host's own messages end its slices."""
     for seed in range(examples(60)):
         random = Random(seed)  # noqa: S311  draws examples, not keys
         monitors = begun(text, 12)
@@ -110,7 +106,6 @@ def test_no_sequence_removes_a_slice_for_another_host(text: str) -> None:
 
 
 def test_a_guest_has_no_binding_of_the_robot_forgotten() -> None:
-    """However many goals of a guest end, late messages of the robot never restart one of the robot's goals."""
     monitors = begun(ACTING, 10)
     send(monitors, "/goal", "r", ROBOT)
     send(monitors, "/result", "r", ROBOT)
@@ -144,7 +139,6 @@ def states(monitors: MonitorSet) -> list[object]:
 
 
 def test_one_message_concerns_a_bounded_number_of_slices() -> None:
-    """If an event does not bind all parameters, the number of its slices is limited, whatever the setting."""
     monitors = begun(STOPPED % "{ }", 100_000)
     for number in range(TOGETHER_LIMIT):
         send(monitors, "/goal", str(number), MessageSender(9))
@@ -156,7 +150,6 @@ def test_one_message_concerns_a_bounded_number_of_slices() -> None:
 
 @pytest.mark.parametrize("on_fault", ["drop", "pass"])
 def test_a_message_that_is_cut_has_happened_in_no_slice(on_fault: OnFault) -> None:
-    """If the budget ends in the middle of the slices, there is one fault, no output, and all slices are unchanged."""
     action = '{ times = times + 1; ROS_INFO("stop"); for (int i = 0; i < 300000; i++) { times = times; } }'
     monitors = MonitorSet.of(compiled_from({"x.rv": STOPPED % action}, definitions()), on_fault)
     monitors.start(0)
@@ -170,7 +163,6 @@ def test_a_message_that_is_cut_has_happened_in_no_slice(on_fault: OnFault) -> No
 
 
 def test_slices_of_a_guest_take_no_tick_from_those_of_the_robot() -> None:
-    """Each slice has its own budget at a tick: the robot's stop is published, however many other slices loop."""
     text = """goals(std::string id) {
         static std_msgs::Empty stop; int loops = 0; bool waits = true;
         creation event goal(std::string id, int seq) /goal std_msgs/Header '{frame_id:id, seq:seq}' { loops = seq; }
@@ -186,7 +178,6 @@ def test_slices_of_a_guest_take_no_tick_from_those_of_the_robot() -> None:
 
 
 def test_the_time_limit_of_a_message_grows_with_its_slices() -> None:
-    """The robot's stop for all its goals is not cut off, although each handler takes some microseconds."""
     text = STOPPED.replace("@again { DROP; }", '@stopped { ROS_INFO("stopped"); }') % "{ }"
     monitors = begun(text, 1000)
     for number in range(200):
@@ -198,7 +189,6 @@ def test_the_time_limit_of_a_message_grows_with_its_slices() -> None:
 
 
 def test_slices_of_a_guest_take_no_time_of_a_tick_from_those_of_the_robot() -> None:
-    """At a tick each slice also has its own processor time."""
     text = """goals(std::string id) {
         static std_msgs::Empty stop; bool waits = true;
         creation event goal(std::string id) /goal std_msgs/String '{data:id}' { }

@@ -173,7 +173,6 @@ def trace_of(random: Random, length: int) -> Timed:
 @pytest.mark.parametrize("part", range(4))
 @pytest.mark.parametrize("deadlines", [1, 1_000_000])
 def test_each_binding_has_a_time_of_its_own(part: int, deadlines: int) -> None:
-    """Verdicts, times and output equal the definition, also if deadlines pass one at a time."""
     for seed in range(part, 4 * examples(60), 4):
         random = Random(seed)  # noqa: S311  draws examples, not keys
         agree(timed(random), trace_of(random, 14), deadlines=deadlines)
@@ -181,7 +180,6 @@ def test_each_binding_has_a_time_of_its_own(part: int, deadlines: int) -> None:
 
 @pytest.mark.parametrize("formula", [*TIMED["pattern"][:3], *TIMED["tfsm"], *TIMED["mtl"][:4]])
 def test_all_short_traces_of_two_bindings(formula: str) -> None:
-    """Covers all traces of three events and two bindings, each before a bound, at it, and just after it."""
     logic = next(name for name, formulas in TIMED.items() if formula in formulas)
     handlers = " ".join(
         f'@{one} {{ ROS_INFO("%d", n); }}' for one in HANDLED[logic] if one != "late" or "late" in formula
@@ -214,7 +212,6 @@ def text(value: str) -> bytes:
 
 
 def test_a_goal_without_a_result_publishes_the_stop_once_at_its_deadline() -> None:
-    """Five goals with four results give one stop, for the fifth goal after its 30 s; then no slice is left."""
     monitors = running(STOP, 0)
     for number in range(5):
         monitors.process("/goal", text(str(number)), number * SECOND)
@@ -237,7 +234,6 @@ def test_a_goal_without_a_result_publishes_the_stop_once_at_its_deadline() -> No
 
 
 def test_deadlines_beyond_the_limit_wait_but_precede_messages_of_their_slice() -> None:
-    """A limited number of deadlines pass at once; a message of a goal still follows the goal's own deadline."""
     monitors = running(STOP, 0, deadlines=10)
     for number in range(40):
         monitors.process("/goal", text(str(number)), SECOND)
@@ -257,7 +253,6 @@ def slices_in_memory() -> int:
 
 
 def test_finished_slices_leave_no_deadlines() -> None:
-    """Goals answered within their bound leave no deadline behind, whatever their number."""
     monitors = running(STOP, 0)
     slices = monitors.monitors[0].slices
     assert slices is not None
@@ -270,7 +265,6 @@ def test_finished_slices_leave_no_deadlines() -> None:
 
 
 def test_a_slice_lives_while_its_timer_may_act() -> None:
-    """A timer that publishes the stop continues, even if no handler can run any more."""
     watched = """goals(std::string id) {
         static std_msgs::Empty stop; bool waits = false; ros::Time since;
         creation event goal(std::string id) /goal std_msgs/String '{data:id}' { waits = true; since = ros::Time::now(); }
@@ -292,7 +286,6 @@ def test_a_slice_lives_while_its_timer_may_act() -> None:
 
 
 def test_deadlines_name_the_events_of_their_own_slice() -> None:
-    """A verdict at a deadline is explained by events of its binding, and those alone have the verdict."""
     explained = 0
     for seed in range(examples(120)):
         random = Random(seed)  # noqa: S311  draws examples, not keys
@@ -314,7 +307,6 @@ def test_deadlines_name_the_events_of_their_own_slice() -> None:
 
 
 def test_the_example_of_the_tutorial_works() -> None:
-    """Five goals and four results publish one stop, 30 s after the fifth goal."""
     page = (Path(__file__).parents[2] / "docs/monitors-tutorial.md").read_text()
     (written,) = re.findall(r"```cpp\n(watchdog\(.*?\n)```", page, re.DOTALL)
     monitors = running(written, 0)
@@ -338,7 +330,6 @@ WAITING = ["pattern: globally: a causes b within 2s @violation { %s }", "mtl: a 
 
 
 def test_a_drop_is_undone_in_its_slice() -> None:
-    """With drops beside deadlines, each binding has the effects of the definition."""
     for seed in range(examples(400)):
         random = Random(seed)  # noqa: S311  draws examples, not keys
         formula = random.choice(DROPPING)
@@ -358,7 +349,6 @@ def test_a_drop_is_undone_in_its_slice() -> None:
 
 
 def test_a_remedy_is_published_for_each_binding() -> None:
-    """With `enforced by`, the result is published at the deadline of each goal, and the goal is over."""
     enforced = STOP.replace(
         "within 30s\n    @violation { PUBLISH(/stop, std_msgs/Empty, stop); __RESET; }",
         "within 30s enforced by halt",

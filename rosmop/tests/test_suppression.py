@@ -127,7 +127,6 @@ def _bounded(random: Random, operators: Sequence[str]) -> tuple[Tree, str]:
 
 @pytest.mark.parametrize("operators", [PAST, (*PAST, *FUTURE)], ids=["past", "future"])
 def test_random_metric_formulas_by_definition(operators: Sequence[str]) -> None:
-    """Each passed message agrees with the formula's definition on the trace that passed before."""
     random, dropped = seeded(26), 0
     for _ in range(examples(600)):
         tree, text = _bounded(random, operators)
@@ -143,7 +142,6 @@ def test_random_metric_formulas_by_definition(operators: Sequence[str]) -> None:
 
 
 def test_random_patterns_by_definition() -> None:
-    """Random patterns behave as in the test above."""
     random, dropped = seeded(27), 0
     for _ in range(examples(600)):
         kind, within = random.choice(("no", "requires", "forbids")), random.choice((None, 1, 3))
@@ -187,7 +185,6 @@ def test_random_linear_formulas() -> None:
 
 
 def test_a_run_goes_on_as_if_it_had_never_stepped() -> None:
-    """After several steps are undone together, the run has the same verdicts as its twin at each event and deadline."""
     random = seeded(29)
     for _ in range(examples(400)):
         _, text = _bounded(random, (*PAST, *FUTURE))
@@ -216,7 +213,6 @@ def _dropping(how: str) -> str:
 
 @pytest.mark.parametrize("how", ["action", "fault", "handler"])
 def test_whatever_drops_the_message_formulas_of_all_specifications_have_not_seen_it(how: str) -> None:
-    """Specifications before the dropping one are included; a machine has seen it, and variables stay assigned."""
     machine = "fsm: idle [b -> moved] moved [default moved] @moved { moved = true; }"
     formula = "ptltl: !(<*> b) @violation { seen = true; }"
     events = "".join(f"event {name} () /{name} std_msgs/Empty '{{}}' {{ }}\n" for name in ABC)
@@ -230,7 +226,6 @@ def test_whatever_drops_the_message_formulas_of_all_specifications_have_not_seen
 
 
 def test_a_reset_by_a_message_that_is_dropped_later_is_none() -> None:
-    """The property is as it was before the message."""
     one = guard("ptltl: !(b and <*> a)", "__RESET;", name="one")
     monitors = load(
         one, z="z() { bool go = false; event b() /b std_msgs/Empty '{}' { if (!go) { return; } } }"
@@ -241,7 +236,6 @@ def test_a_reset_by_a_message_that_is_dropped_later_is_none() -> None:
 
 
 def test_in_shadow_mode_the_trace_is_the_one_that_there_would_be() -> None:
-    """A specification in shadow mode drops nothing, and continues as if it had dropped."""
     monitors = MonitorSet.of(
         compiled_from({"s.rv": guard("pattern: globally: a forbids b within 5s")}, definitions()),
         shadows=["s"],
@@ -256,7 +250,6 @@ def test_in_shadow_mode_the_trace_is_the_one_that_there_would_be() -> None:
 
 
 def test_a_dropped_request_has_not_happened() -> None:
-    """The parts of services behave in the same way."""
     text = """s() { event on() service /set std_srvs/SetBool request '{data:true}' { }
         event off() service /set std_srvs/SetBool request '{data:false}' { }
         pattern: globally: on forbids on within 5s @violation { DROP; } }"""
@@ -269,7 +262,6 @@ def test_a_dropped_request_has_not_happened() -> None:
 
 
 def test_explanations_name_no_event_that_was_dropped() -> None:
-    """The named events gave the verdict on the trace that subscribers saw."""
     for formula in (
         "pattern: globally: a forbids b within 5s",
         "ptltl: b => !(<*> a)",
@@ -300,7 +292,6 @@ def _formulas(random: Random) -> Iterator[str]:
 
 
 def test_the_module_takes_back_what_the_interpreter_takes_back() -> None:
-    """For several properties, specifications and events, bytes, drops, states and variables are the same."""
     random, came = seeded(30), 0
     for _ in range(examples(60)):
         texts = []
@@ -361,7 +352,6 @@ def test_slices_take_back_theirs(creation: str) -> None:
 
 
 def test_a_fault_of_the_run_itself_drops_and_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With more open events than a run may have, the message is dropped, and no formula has seen it."""
     monkeypatch.setattr("rosmop.logics.bounded.BoundedProperty.most", 2)
     monitors = load(guard("mtl: a => always[0,9s] !b"))
     assert passed(monitors, [(1, "a"), (2, "a"), (3, "a"), (4, "b")]) == [True, True, False, False]

@@ -193,7 +193,6 @@ def explained(
 
 @pytest.mark.parametrize("logic", ["tfsm", "pattern"])
 def test_clocked_steps_explain_the_same_as_steps(logic: str) -> None:
-    """Clocked steps use a fixed amount of memory for traces of any length."""
     random, compared = seeded(43), 0
     for _ in range(12):
         made = compiled(logic, MAKERS[logic](random), EVENTS)
@@ -219,7 +218,6 @@ def test_clocked_steps_explain_the_same_as_steps(logic: str) -> None:
 
 @pytest.mark.parametrize("logic", MAKERS)
 def test_the_named_events_alone_give_the_verdict(logic: str) -> None:
-    """No named event can be left out; all of them are received messages, in order."""
     random = seeded(41)
     count = cut = 0
     for _ in range(40):
@@ -246,7 +244,6 @@ def test_the_named_events_alone_give_the_verdict(logic: str) -> None:
 
 @pytest.mark.parametrize("logic", MAKERS)
 def test_a_shortened_explanation_says_so(logic: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With almost no history kept, the named events lead from the property's state at `since` to the verdict."""
     monkeypatch.setattr(explain, "KEPT", 2)
     random = seeded(42)
     whole = cut = 0
@@ -271,7 +268,6 @@ def test_a_shortened_explanation_says_so(logic: str, monkeypatch: pytest.MonkeyP
 
 
 def test_a_long_path_is_explained_in_full() -> None:
-    """Loops back to an earlier state are left out; a path too long to be shortened is marked."""
     states = 400
     text = " ".join(f"s{number} [ a -> s{number + 1}, b -> s{number} ]" for number in range(states))
     made = compiled("fsm", f"{text} s{states} [ ]")
@@ -287,7 +283,6 @@ def test_a_long_path_is_explained_in_full() -> None:
 
 
 def test_the_latest_of_equal_explanations() -> None:
-    """An explanation prefers recent events to equally good ones of an hour ago."""
     made = compiled("ere", "(a b)* c")
     run, history = made.start(0), history_of(made, 0)
     for number, event in enumerate((0, 1, 0, 1, 2)):
@@ -310,7 +305,6 @@ def test_a_verdict_of_now_is_not_explained_by_one_of_before() -> None:
 
 @pytest.mark.parametrize("logic", ["ptltl", "mtl", "ptcaret"])
 def test_sub_formulas_have_the_meaning_of_the_monitors(logic: str) -> None:
-    """On random formulas, the meaning that names the deciding parts equals the monitors' meaning."""
     random = seeded(43)
     syntax = {"ptltl": ptltl.SYNTAX, "mtl": mtl.SYNTAX, "ptcaret": ptcaret.SYNTAX}[logic]
     events = CALLS if logic == "ptcaret" else EVENTS
@@ -328,7 +322,6 @@ def test_sub_formulas_have_the_meaning_of_the_monitors(logic: str) -> None:
 
 
 def test_sub_formulas_that_decide_a_formula() -> None:
-    """Sub-formulas are named as written, with their values."""
     made = compiled("mtl", "a -> once[0,500ms] b and !c")
     run, history = made.start(0), history_of(made, 0)
     for event, time in ((1, 1), (0, 700 * MILLISECOND)):
@@ -340,7 +333,6 @@ def test_sub_formulas_that_decide_a_formula() -> None:
 
 
 def test_an_old_event_is_explained_by_its_effect() -> None:
-    """Without tables only the last events are kept; the deciding event is older, and the explanation says so."""
     made = compiled("mtl", "a -> !(once[0,10s] b)")
     run, history = made.start(0), history_of(made, 0)
     for number, event in enumerate((1, *[0] * 4 * explain.KEPT)):
@@ -360,7 +352,6 @@ def test_an_old_event_is_explained_by_its_effect() -> None:
     ids=["by a deadline", "by an event"],
 )
 def test_a_long_trace_of_the_future(formula: str, last: int, because: list[int], between: int) -> None:
-    """The explanation has the event that the verdict is for and the deciding events, however many came in between."""
     made = compiled("mtl", formula)
     run, history, now = made.start(0), history_of(made, 0), 0
     for event in [1, *[2] * 30, 0, *[2] * between, last]:
@@ -375,7 +366,6 @@ def test_a_long_trace_of_the_future(formula: str, last: int, because: list[int],
 
 
 def test_a_verdict_of_a_slice_is_explained_by_its_own_events() -> None:
-    """Events of another binding are not named, even if they came in between."""
     text = """goals(int id) {
         event start(int id) /start std_msgs/Int32 '{data:id}' { }
         event end(int id) /end std_msgs/Int32 '{data:id}' { }
@@ -396,7 +386,6 @@ def test_a_verdict_of_a_slice_is_explained_by_its_own_events() -> None:
 
 
 def test_compared_values_and_the_statement_that_dropped() -> None:
-    """The values are those at the comparison, even if the action changes them afterwards."""
     text = """gun() {
         int count = 0;
         event fire(int x) /fire std_msgs/Int32 '{data:x}' when (x > 3 && count < 5) {

@@ -26,7 +26,6 @@ HIDE, SHOW, SHORT = (message("std_msgs/Float64MultiArray", data=data) for data i
 def test_hosts_get_messages_exactly_while_the_variable_is_false(
     made: Callable[..., MonitorSet],
 ) -> None:
-    """By the interpreter and by the module; a fault and a start withhold, and each other topic is free."""
     monitors, chance = made(compiled_from({"x.rv": TEXT}, definitions())), seeded(1)
     monitors.start(0)
     assert monitors.withheld_from("/image") == NETWORKS
@@ -55,7 +54,6 @@ def test_only_an_enabled_monitor_in_force_withholds() -> None:
 
 
 def test_a_monitor_without_begin_holds_its_topics_after_a_fault() -> None:
-    """No host gets a message until an operator resumes it."""
     monitors = load(TEXT.removeprefix("begin "))
     monitors.process("/pose", SHOW, 1)
     assert monitors.process("/pose", SHORT, 2).began_holding == ("w",)

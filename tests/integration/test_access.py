@@ -51,7 +51,6 @@ def second(common_lab: Lab) -> Host:
 
 @pytest.mark.real
 def test_publisher_of_the_wrong_machine(appliance: Appliance, ros: RosSession, second: Host) -> None:
-    """Only the first machine is heard on the topic; the denial names the rule, in the answer and in the log."""
     listener = ros.listener("roscpp", "/topic1")
     ros.talker("rospy", "/topic1", name="rightful")
     answer = call_on(
@@ -82,7 +81,6 @@ def test_second_machine_may_publish_elsewhere(ros: RosSession, second: Host) -> 
 
 @pytest.mark.real
 def test_kill_from_the_wrong_machine(appliance: Appliance, ros: RosSession, second: Host) -> None:
-    """`rosnode kill` has no effect from the second machine; from the first it works as usual."""
     talker = ros.talker("roscpp", "/topic1", name="driver")
     listener = ros.listener("rospy", "/topic1")
     ros.on(second).run("rosnode", "kill", "/driver", check=False)

@@ -112,7 +112,6 @@ def small() -> Iterator[SmallDisk]:
 
 
 def test_a_change_that_cannot_be_stored_has_no_effect(small: SmallDisk) -> None:
-    """Each refusal asks for disk space; once there is space, the change is carried out and survives a crash."""
     before = small.all()
     small.fill()
     for order in ORDERS:

@@ -65,7 +65,6 @@ def robot(appliance: Appliance, ros: RosSession, tablet: Host) -> Iterator[Robot
 
 @pytest.mark.real
 def test_a_blocked_host_is_silent_until_it_is_unblocked(appliance: Appliance, robot: Robot) -> None:
-    """The answer has the numbers; calls of the host are denied with the reason; no node is restarted."""
     said = appliance.rosrv("host", "block", TABLET, "--for", "1h", "--note", "tablet lost").stdout
     assert said.startswith(f"{TABLET} is blocked until ")
     assert "it lost 2 publications, 2 services, " in said  # /chatter and /rosout, and rospy's loggers

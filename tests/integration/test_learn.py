@@ -27,7 +27,6 @@ def run_nodes(appliance: Appliance, home: Path) -> None:
 
 
 def test_the_same_robot_works_under_the_learned_policy(tmp_path: Path) -> None:
-    """After learning in audit-only mode, a second run has no denial, except for another topic, node and call."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with Appliance(policy=TRIAL) as appliance:
         run_nodes(appliance, tmp_path / "first")

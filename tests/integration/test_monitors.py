@@ -57,7 +57,6 @@ def monitor(appliance: Appliance, name: str) -> dict[str, object]:
 
 @pytest.mark.real
 def test_changed_and_dropped_messages_are_recorded(appliance: Appliance, ros: RosSession) -> None:
-    """Both listeners get both talkers with their own headers; messages of a monitor come from the appliance."""
     alarms = [ros.listener(client, "/alarm") for client in CLIENTS]
     listeners = [ros.listener(client, "/chatter") for client in CLIENTS]
     for client in CLIENTS:
@@ -164,7 +163,6 @@ def test_a_monitor_in_shadow_mode_records_only_until_it_is_promoted(
 def test_an_invalid_specification_is_rejected_without_effect(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """The exit status is 1, as for `monitor check`."""
     spec = tmp_path / "words.rv"
     spec.write_text(WORDS.replace("heard + 1", "herd + 1"))
     done = appliance.rosrv("monitor", "load", str(spec), check=False)
@@ -181,7 +179,6 @@ def test_an_invalid_specification_is_rejected_without_effect(
 def test_a_new_relay_reports_that_it_begins_in_the_initial_state(
     appliance: Appliance, ros: RosSession
 ) -> None:
-    """An alarm reports the new relay; switches and loaded files stay, and `hold` blocks messages until resumed."""
     held = WORDS.strip().replace("begin words()", "hold gate()").replace("/chatter", "/held")
     path = Path(appliance.directory) / "gate.rv"
     path.write_text(held)
@@ -229,7 +226,6 @@ def test_loaded_and_switched_monitors_survive_a_restart(appliance: Appliance, tm
 
 
 def test_an_incompatible_stored_revision_can_be_discarded(appliance: Appliance, tmp_path: Path) -> None:
-    """The start, as after an upgrade, leaves its files out; the next start uses the folder."""
     spec = tmp_path / "more.rv"
     spec.write_text(WORDS.replace("words()", "more()").replace("/chatter", "/other"))
     appliance.rosrv("monitor", "load", str(spec))
@@ -268,7 +264,6 @@ def test_a_file_with_an_error_does_not_keep_the_robot_without_a_master(tmp_path:
 
 
 def test_a_first_start_leaves_out_a_file_that_it_cannot_parse() -> None:
-    """The robot has its master and its other monitors; the status has the error."""
     with Appliance(
         monitors={"words": WORDS, "broken": "broken() { event }"}, options=("--api", "off")
     ) as running:
@@ -319,7 +314,6 @@ def test_requests_are_refused_and_responses_changed(
 
 
 def test_settings_of_the_monitors_publisher(tmp_path: Path) -> None:
-    """Test `publish_as`, `hide_publisher` and `on_fault` of appliance.yaml."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     divide = 'if (text.find("9") != std::string::npos) { int zero = 0; zero = 1 / zero; }\n        text = '
     monitors = {"words": WORDS.replace("text = ", divide, 1)}

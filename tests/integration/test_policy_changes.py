@@ -57,7 +57,6 @@ def test_revocations_survive_a_crash_of_control(
 def test_a_policy_changed_during_downtime_applies_to_running_nodes(
     appliance: Appliance, ros: RosSession
 ) -> None:
-    """After the file was edited between a stop and a start, running nodes lose the revoked rights at the start."""
     appliance.reload(OPEN_POLICY)  # the policy in force is the file's
     listener = ros.listener("rospy", "/chatter")
     ros.talker("roscpp", "/chatter", name="voice")

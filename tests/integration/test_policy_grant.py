@@ -69,7 +69,6 @@ def test_a_full_disk_leaves_the_policy_as_it_was(appliance: Appliance, tmp_path:
 
 
 def test_a_denied_call_is_granted_with_commit_confirm(appliance: Appliance, tmp_path: Path) -> None:
-    """The change is shown as a diff, also over REST, and loaded with a time limit; then the node has the right."""
     call = ("registerPublisher", "/base", "/cmd_vel", "std_msgs/String", HERE)
     record = refused(appliance, *call)
     shown = appliance.rosrv("policy", "grant", record).stdout
@@ -96,7 +95,6 @@ def test_a_denied_call_is_granted_with_commit_confirm(appliance: Appliance, tmp_
 
 
 def test_calls_that_no_policy_can_grant(appliance: Appliance) -> None:
-    """An unknown call, and a missing or unsuitable record, are reported as such."""
     record = refused(appliance, "bogus", "/base")
     done = appliance.rosrv("policy", "grant", record, check=False)
     assert (done.returncode, "is not a call that the appliance knows" in done.stderr) == (1, True)

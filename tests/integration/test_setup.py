@@ -56,7 +56,6 @@ def test_another_failure_of_apt_ends_it(tmp_path: Path) -> None:
 
 
 def test_it_does_not_begin_without_space(tmp_path: Path) -> None:
-    """A full folder of temporary files is reported before anything is fetched, with the variable that changes it."""
     (tmp_path / "df").write_text("#!/bin/sh\necho Avail; echo ' 12'\n")
     (tmp_path / "df").chmod(0o755)
     done = run_setup(tmp_path, busy=0, said="")
@@ -107,7 +106,6 @@ def test_it_does_nothing_twice(checkout: Path) -> None:
 
 
 def test_the_demo_keeps_the_packages_of_a_developer(checkout: Path) -> None:
-    """After a change of the lock files `--run` installs packages and removes none."""
     set_up(checkout)
     with (checkout / "pyproject.toml").open("a") as project:
         project.write("# changed\n")

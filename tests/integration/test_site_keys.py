@@ -57,7 +57,6 @@ def in_force(appliance: Appliance) -> dict[str, Any] | None:
 
 
 def test_an_unsigned_policy_fails_the_start() -> None:
-    """The error gives advice; no process is started and no state directory is made."""
     with of_a_site() as appliance:
         Path(f"{appliance.policy_file}.sig").unlink()
         with pytest.raises(AssertionError, match="ended"):
@@ -71,7 +70,6 @@ def test_an_unsigned_policy_fails_the_start() -> None:
 
 
 def test_every_way_requires_the_signature_of_a_policy(started: Appliance) -> None:
-    """File, SIGHUP, REST, rollback and the start after a crash require it; the record names the key."""
     appliance = started
     appliance.policy_file.write_text(OTHER)
     assert "it is not the text that" in appliance.rosrv("policy", "reload", check=False).stderr
@@ -97,7 +95,6 @@ def test_every_way_requires_the_signature_of_a_policy(started: Appliance) -> Non
 
 
 def test_every_way_requires_the_signature_of_a_specification(started: Appliance) -> None:
-    """Command, folder and REST require the signature; the record names the key."""
     appliance = started
     file = appliance.directory / "monitors" / "count.rv"
     file.write_text(SPECIFICATION)

@@ -14,7 +14,6 @@ FAILING = "- {deny: publish, node: /a, host: 10.0.0.1, topic: /chatter}\n"
 
 
 def test_a_policy_that_a_reload_refused_is_not_in_force_after_a_restart() -> None:
-    """The revision before it stays, over an orderly restart and a crash of control, and the status says why."""
     with Appliance() as appliance:
         revision = appliance.status()["policy"]["revision"]
         appliance.policy_file.write_text(OPEN_POLICY + "# refused\n")
@@ -38,7 +37,6 @@ def test_a_policy_that_a_reload_refused_is_not_in_force_after_a_restart() -> Non
 
 @pytest.mark.parametrize("left", [6 << 20, 2 << 20])
 def test_a_start_on_a_nearly_full_disk_serves_the_robot(left: int) -> None:
-    """No host has a registration then; the robot is served from the last quarter of the reserve."""
     appliance = Appliance(settings=json.dumps({"audit": {"reserve_bytes": 16 << 20}}))
     try:
         with small_disk(appliance.state, "160m", "mode=755"):

@@ -42,7 +42,6 @@ def test_echo_shows_the_subscribers_messages_and_is_recorded(
 
 
 def test_over_rest_it_is_for_operators(appliance: Appliance, ros: RosSession) -> None:
-    """A viewer is refused; the answer names type, publishers and subscribers; limits and unknown topics are errors."""
     ros.talker("rospy", "/chatter", name="voice").wait_for(event="ready")
     ros.listener("roscpp", "/chatter", name="ear").wait_for(event="ready")
     rest = appliance.rest()

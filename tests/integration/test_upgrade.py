@@ -79,7 +79,6 @@ def call(appliance: Appliance, method: str, *parameters: str) -> Any:
 
 
 def test_the_policy_in_force_survives(upgraded: Upgraded) -> None:
-    """The revision that an operator loaded over REST is in force, even though the file has another policy."""
     status = upgraded.appliance.status()["policy"]
     assert (status["revision"], status["who"], status["differs_from_file"]) == (2, "first", True)
     rest = upgraded.appliance.rest(upgraded.token)
@@ -103,7 +102,6 @@ def test_tokens_survive(upgraded: Upgraded) -> None:
 
 
 def test_specifications_in_force_survive(upgraded: Upgraded) -> None:
-    """The loaded specification is in force and enabled, under its revision."""
     status = upgraded.appliance.status()["monitors"]
     assert (status["revision"], status["loaded"], status["enabled"], status["who"]) == (1, 1, 1, "operator")
     [row] = upgraded.appliance.rest(upgraded.token).get("/v1/monitors").json["monitors"]

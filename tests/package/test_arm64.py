@@ -15,7 +15,6 @@ pytestmark = pytest.mark.timeout(900)
 
 
 def test_the_compiled_module_is_built_for_arm64() -> None:
-    """The relay's module is built as a library for arm64, with the function that Python calls to load it."""
     need_program("aarch64-linux-gnu-gcc", "gcc-aarch64-linux-gnu")
     made = build(ARCHITECTURES["arm64"].triplet).read_bytes()
     assert int.from_bytes(made[18:20], "little") == EM_AARCH64
@@ -23,7 +22,6 @@ def test_the_compiled_module_is_built_for_arm64() -> None:
 
 
 def test_every_locked_package_exists_for_arm64(tmp_path: Path) -> None:
-    """Wheels for both Pythons exist, python-iptables compiles, and every library in the tree is one for arm64."""
     need_program("aarch64-linux-gnu-gcc", "gcc-aarch64-linux-gnu")
     work = tmp_path / "work"
     work.mkdir()

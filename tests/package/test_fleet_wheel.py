@@ -35,7 +35,6 @@ def run(program: Path, folder: Path, *arguments: str) -> subprocess.CompletedPro
 
 
 def test_the_command_runs_without_a_checkout(program: Path, tmp_path: Path) -> None:
-    """Every verb has its help; `init` makes the certificate, and then asks for PostgreSQL."""
     shown = run(program, tmp_path, "--help").stdout
     for verb in ("init", "serve", "robot", "search", "verify", "bundle", "rollout"):
         assert verb in shown
@@ -52,7 +51,6 @@ def test_the_command_runs_without_a_checkout(program: Path, tmp_path: Path) -> N
 
 
 def test_it_has_the_version_of_the_appliance(program: Path) -> None:
-    """pip lists the collector with the appliance's version."""
     pip = program.with_name("pip")
     shown = subprocess.run([pip, "show", "rosrv-fleet"], capture_output=True, text=True, check=True).stdout
     assert f"\nVersion: {__version__}\n" in shown

@@ -106,7 +106,6 @@ def of(parts: list[dict[str, Any]], kind: str) -> set[tuple[str, str]]:
 
 
 def test_every_part_is_in_the_list(engine: Engine, unpacked: Path, parts: list[dict[str, Any]]) -> None:
-    """The list has exactly the components that dpkg and Python report in the running image."""
     listed = run(engine, "dpkg-query", "--show", "--showformat", "${Package} ${Version}\\n")
     assert {tuple(line.split()) for line in listed.splitlines()} == of(parts, "deb")
     installed = run(engine, "/opt/rosrv/bin/python", "-P", "-", text=INSIDE)
@@ -119,7 +118,6 @@ def test_every_part_is_in_the_list(engine: Engine, unpacked: Path, parts: list[d
 
 
 def test_every_file_belongs_to_a_part(engine: Engine, unpacked: Path) -> None:
-    """Each file of the image belongs to a component of the list; an additional file is found."""
     python = ("/opt/rosrv/bin/python", "-P", "-")
     assert [
         one for one in run(engine, *python, text=NOBODYS).splitlines() if not EXPECTED.fullmatch(one)
@@ -131,14 +129,12 @@ def test_every_file_belongs_to_a_part(engine: Engine, unpacked: Path) -> None:
 
 
 def test_every_part_has_a_licence(parts: list[dict[str, Any]]) -> None:
-    """The licence is an identifier, an expression, a name, or the file in the image with its text."""
     assert [one["name"] for one in parts if not one.get("licenses")] == []
     unread = [one["name"] for one in parts if "see /usr/share/doc" in json.dumps(one["licenses"])]
     assert len(unread) < 10, unread
 
 
 def test_the_list_is_valid(unpacked: Path) -> None:
-    """The list is valid by the schema of CycloneDX 1.6."""
     folder = files("cyclonedx.schema._res")
     names = [f"{name}.SNAPSHOT.schema.json" for name in ("bom-1.6", "spdx", "jsf-0.82")]
     schemas = {name: json.loads((folder / name).read_text()) for name in names}
@@ -151,7 +147,6 @@ def test_the_list_is_valid(unpacked: Path) -> None:
 
 
 def test_it_reports_its_version_and_commit(engine: Engine, unpacked: Path) -> None:
-    """Its annotations and `rosrv version --json` contain version and commit; the list is also in the image."""
     labels = engine.inspect(NAME)["Config"]["Labels"]
     build = json.loads(run(engine, "rosrv", "version", "--json"))["build"]
     assert build["kind"] == "image"
@@ -162,7 +157,6 @@ def test_it_reports_its_version_and_commit(engine: Engine, unpacked: Path) -> No
 
 
 def test_the_packages_match_the_lock(parts: list[dict[str, Any]]) -> None:
-    """Each pinned package is in the image with its version."""
     lock = (ROOT / "distribution/image-packages.lock").read_text().splitlines()
     pinned = {tuple(line.split("=", 1)) for line in lock if not line.startswith("#")}
     assert len(pinned) > 50
@@ -170,7 +164,6 @@ def test_the_packages_match_the_lock(parts: list[dict[str, Any]]) -> None:
 
 
 def test_the_archive_has_all_that_a_site_needs(unpacked: Path) -> None:
-    """Its checksums are correct; it contains compose files, policies, monitors and pages."""
     done = subprocess.run(
         ["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=unpacked, capture_output=True, check=False
     )
@@ -189,7 +182,6 @@ def test_the_archive_has_all_that_a_site_needs(unpacked: Path) -> None:
 
 
 def test_the_archive_protects_a_robot(unpacked: Path, tmp_path: Path) -> None:
-    """On a machine with an empty engine, the page's commands work, and nodes of the machine communicate through it."""
     needs(has_ros(), "ROS 1 (run `make setup`)")
     with Lab("rosrv-site") as lab:
         machine = lab.host("machine", "10.79.0.1/24")

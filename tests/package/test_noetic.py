@@ -41,7 +41,6 @@ def system(tmp_path: Path) -> Path:
 
 
 def test_a_robot_beside_the_container(system: Path, tmp_path: Path) -> None:
-    """Its rospy and roscpp nodes communicate through the appliance; its own nftables close its ports."""
     with builder() as engine:
         engine.build("appliance", APPLIANCE)
     (tmp_path / "project").mkdir()

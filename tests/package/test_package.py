@@ -77,7 +77,6 @@ def serves(machine: Machine) -> dict[str, object]:
 
 
 def test_the_life_of_the_package(machine: Machine) -> None:
-    """One command protects the robot; reboot, kill and upgrade keep it so, and removal leaves the machine as it was."""
     machine.start()
     before = state_of(machine)
     machine.run("dpkg", "--install", "old.deb", seconds=SLOW_SECONDS)
@@ -132,7 +131,6 @@ def test_the_life_of_the_package(machine: Machine) -> None:
 
 
 def test_it_contains_the_compiled_module(package: Path, tmp_path: Path) -> None:
-    """The package has the relay's module for its own architecture, once for both versions of Python."""
     subprocess.run(["dpkg-deb", "--extract", str(package), str(tmp_path)], check=True)
     module = IN_PLACE.relative_to(ROOT)
     assert [*tmp_path.rglob("pump*.so")] == [tmp_path / LIBRARY / "common" / module]
@@ -142,7 +140,6 @@ def test_it_contains_the_compiled_module(package: Path, tmp_path: Path) -> None:
 
 
 def test_lintian_finds_no_error(package: Path) -> None:
-    """Debian's checker finds no error."""
     done = subprocess.run(
         ["lintian", "--fail-on", "none", str(package)], capture_output=True, text=True, check=False
     )
@@ -150,7 +147,6 @@ def test_lintian_finds_no_error(package: Path) -> None:
 
 
 def test_two_builds_are_the_same(package: Path, tmp_path: Path) -> None:
-    """A build of the same commit in another folder, two days later, gives the same package, byte by byte."""
     folder = elsewhere(tmp_path / "elsewhere")
     (folder / ".venv").symlink_to(ROOT / ".venv")
     second = build_later("distribution.deb", "amd64", folder=folder)

@@ -52,7 +52,6 @@ def run(rosrv: Path, *arguments: str, folder: Path, seconds: float = 60) -> subp
 
 
 def test_it_reports_its_version_and_packages(rosrv: Path, tmp_path: Path) -> None:
-    """Version and packages are those of the project and its constraints; the verbs have their help."""
     assert re.fullmatch(r"rosrv \d+\.\d+\.\d+\n", run(rosrv, "--version", folder=tmp_path).stdout)
     facts = json.loads(run(rosrv, "version", "--json", folder=tmp_path).stdout)
     constraints = ROOT / "dist" / f"rosrv_appliance-{__version__}-constraints.txt"
@@ -71,7 +70,6 @@ def test_it_reports_its_version_and_packages(rosrv: Path, tmp_path: Path) -> Non
 
 
 def test_its_selftest_names_a_policy_to_begin_with(rosrv: Path, tmp_path: Path) -> None:
-    """Without any configuration, the advice names an existing, valid file."""
     done = run(rosrv, "selftest", "--json", "--state", str(tmp_path / "none"), folder=tmp_path)
     rows = {row["check"]: row for row in map(json.loads, done.stdout.splitlines())}
     assert rows["policy"]["outcome"] == "warn", done.stdout + done.stderr

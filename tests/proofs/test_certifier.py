@@ -113,15 +113,12 @@ def _compare(program: Path, logic: str, line: Callable[[str, list[str], Automato
 
 
 def test_the_check_of_ptltl_agrees_with_the_proof(past: Path) -> None:
-    """Compare the checks of `ptltl`."""
     _compare(past, "ptltl", _past)
 
 
 def test_the_check_of_ere_agrees_with_the_proof(words: Path) -> None:
-    """Compare the checks of `ere`."""
     _compare(words, "ere", _expression)
 
 
 def test_the_check_of_fsm_agrees_with_the_proof(words: Path) -> None:
-    """Compare the checks of `fsm`."""
     _compare(words, "fsm", _machine)

@@ -19,7 +19,6 @@ BOUNDS = [
 
 @pytest.mark.parametrize("bounds", BOUNDS, ids=str)
 def test_every_order_keeps_the_promises(tmp_path: Path, bounds: Bounds) -> None:
-    """No reachable state of the model breaks a property, and the number of states is large enough to be meaningful."""
     found = search(tmp_path, bounds)
     assert found.broken == ""
     assert found.states > 1000

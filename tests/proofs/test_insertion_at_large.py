@@ -21,7 +21,6 @@ BOUNDS = [
 
 @pytest.mark.parametrize("bounds", BOUNDS, ids=str)
 def test_every_order_keeps_the_promises(tmp_path: Path, bounds: Bounds) -> None:
-    """No reachable state of the model breaks a property, and there are many."""
     found = search(tmp_path, bounds, large=True)
     assert found.broken == ""
     assert found.states > 50_000

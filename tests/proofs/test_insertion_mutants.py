@@ -27,6 +27,5 @@ MUTANTS = {
 
 @pytest.mark.parametrize("mutant", MUTANTS)
 def test_a_wrong_program_would_be_found(tmp_path: Path, mutant: str) -> None:
-    """With one fault the model breaks the related property."""
     broken, bounds = MUTANTS[mutant]
     assert search(tmp_path, bounds, mutant).broken == broken

@@ -114,7 +114,6 @@ def bounds(trace: Trace) -> Bounds:
 
 
 def test_a_run_is_an_execution_of_the_model(trace: Trace, tmp_path: Path) -> None:
-    """The trace contains all changes, and an execution of the model leaves it."""
     happened = [what for what, _, _ in trace]
     assert [step for step in trace if step[0] in ("loaded", "heard")] == [
         ("heard", 1, 1), ("loaded", 2, 1), ("heard", 2, 2), ("heard", 2, 2), ("heard", 2, 2), ("loaded", 3, 0),
@@ -150,6 +149,5 @@ def twice(trace: Trace) -> Trace:
 def test_a_tampered_run_is_not_an_execution_of_the_model(
     tampered: Callable[[Trace], Trace], trace: Trace, tmp_path: Path
 ) -> None:
-    """No execution of the model leaves it, though one leaves everything before the last step."""
     wrong = tampered(trace)
     assert not accepts(tmp_path, bounds(wrong), wrong), wrong

@@ -14,7 +14,6 @@ BOUNDS = [LeaseBounds(grants=2, last_fault=True)]
 
 @pytest.mark.parametrize("bounds", BOUNDS, ids=str)
 def test_every_order_keeps_the_promises(tmp_path: Path, bounds: LeaseBounds) -> None:
-    """No reachable state of the model breaks a property, and the number of states is large enough to be meaningful."""
     found = search(tmp_path, bounds, large=True)
     assert found.broken == ""
     assert found.states > 1_000_000

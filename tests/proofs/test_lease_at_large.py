@@ -11,7 +11,6 @@ BOUNDS = [LeaseBounds(grants=4), LeaseBounds(grants=3, last_fault=True)]
 
 @pytest.mark.parametrize("bounds", BOUNDS, ids=str)
 def test_every_order_keeps_the_promises(tmp_path: Path, bounds: LeaseBounds) -> None:
-    """No reachable state of the model breaks a property, and there are many."""
     found = search(tmp_path, bounds, large=True)
     assert found.broken == ""
     assert found.states > 2_000_000

@@ -41,6 +41,5 @@ MUTANTS = {
 
 @pytest.mark.parametrize("mutant", MUTANTS)
 def test_a_wrong_rule_would_be_found(tmp_path: Path, mutant: str) -> None:
-    """With one rule changed the model breaks the related property."""
     broken, bounds = MUTANTS[mutant]
     assert search(tmp_path, bounds, mutant, large=True).broken == broken

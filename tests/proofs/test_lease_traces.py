@@ -99,13 +99,11 @@ TAMPERED = {
 
 @pytest.mark.parametrize("trace", VALID)
 def test_an_execution_is_accepted(tmp_path: Path, trace: str) -> None:
-    """An execution of the model leaves the trace."""
     assert lease_accepts(tmp_path, VALID[trace].splitlines())
 
 
 @pytest.mark.parametrize("fault", TAMPERED)
 def test_a_tampered_execution_is_rejected(tmp_path: Path, fault: str) -> None:
-    """No execution of the model leaves it."""
     trace, lines, instead = TAMPERED[fault]
     tampered = trace.replace(lines, instead)
     assert tampered != trace
@@ -123,14 +121,12 @@ def test_a_tampered_execution_is_rejected(tmp_path: Path, fault: str) -> None:
     ],
 )
 def test_a_line_that_is_not_an_event_is_an_error(tmp_path: Path, line: str, error: str) -> None:
-    """The error names the line and says what is allowed."""
     with pytest.raises(ValueError, match=error):
         lease_accepts(tmp_path, [line])
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_a_history_of_the_product_is_an_execution(seed: int, tmp_path: Path) -> None:
-    """The witness and the lease of the product leave a trace of the model in a random history of faults."""
     events: list[str] = []
     History(seed, on_event=events.append).run()
     assert lease_accepts(tmp_path, events)

@@ -50,7 +50,6 @@ def rest(machine: Host, demo: Compose, tmp_path_factory: pytest.TempPathFactory)
 
 
 def test_messages_pass_and_a_visitor_is_denied(demo: Compose) -> None:
-    """The operator receives the robot's position; a call of the visitor is denied, with the rule in the audit log."""
     demo.wait_for_log("ocu", '"position"', timeout=240)
     denied = eventually(lambda: demo.audit("--deny", "--host", TABLET), demo.story)
     assert {one["rule"]["file"] for one in denied if one["rule"]} == {"/etc/rosrv/policies/containers.ini"}
@@ -58,7 +57,6 @@ def test_messages_pass_and_a_visitor_is_denied(demo: Compose) -> None:
 
 
 def test_a_policy_is_reloaded_over_rest(machine: Host, demo: Compose, rest: Rest) -> None:
-    """A reload makes the edited file the policy in force, and is recorded."""
     before = machine.run(lambda: rest.get("/v1/policy")).json
     policy: Path = demo.directory / "policies" / "containers.ini"
     policy.write_text(policy.read_text() + "\n# edited by its operator\n")

@@ -7,7 +7,6 @@ from benchmarks.learning import KINDS, judge
 
 
 def test_other_drives_are_quiet_and_four_fifths_of_the_faults_are_flagged() -> None:
-    """The bounded version of `benchmarks/learning.py`: twenty drives, two faults of each kind, always the same."""
     judged = judge(count=20, faults=2 * len(KINDS), seed=1)
     assert judged.false_alarms == []
     assert sum(judged.flagged.values()) >= 16, judged.missed

@@ -21,13 +21,11 @@ def granted() -> set[str]:
 
 
 def test_the_image_has_every_user() -> None:
-    """The image creates each process's user with its number."""
     made = re.findall(r"\b(ros[a-z-]+):(610\d\d)\b", (ROOT / "Dockerfile").read_text())
     assert {name: int(number) for name, number in made} == NUMERIC_IDS
 
 
 def test_the_archive_of_a_site_has_what_its_compose_files_mount() -> None:
-    """The archive has compose.yaml, compose.host.yaml, and the files that they mount."""
     for name in ("compose.yaml", "compose.host.yaml"):
         assert name in BESIDE
         services = yaml.safe_load((ROOT / name).read_text())["services"].values()
@@ -38,7 +36,6 @@ def test_the_archive_of_a_site_has_what_its_compose_files_mount() -> None:
 
 
 def test_each_appliance_has_a_name() -> None:
-    """Without `hostname`, its name is the id of the container, which each upgrade changes."""
     named = {"compose.yaml": ["appliance"], "compose.standby.yaml": ["a", "b"]}
     for file, services in named.items():
         made = yaml.safe_load((ROOT / file).read_text())["services"]
@@ -46,7 +43,6 @@ def test_each_appliance_has_a_name() -> None:
 
 
 def test_every_process_is_in_the_table_of_processes() -> None:
-    """The documentation names each process with its user and capabilities."""
     text = (ROOT / "docs" / "operating.md").read_text()
     rows = re.findall(r"^\| `([a-z]+)` \| `([a-z-]+)` \| ([^|]*) \|", text, re.MULTILINE)
     documented = {name: (user, set(re.findall(r"[A-Z][A-Z_]+", rights))) for name, user, rights in rows}
@@ -60,7 +56,6 @@ def test_the_container_is_given_what_the_supervisor_knows() -> None:
 
 
 def test_each_right_has_its_reason_beside_it() -> None:
-    """In compose.yaml every capability has a comment on its line."""
     lines = [
         line for line in (ROOT / "compose.yaml").read_text().splitlines() if re.match(r" +- [A-Z_]+\b", line)
     ]
@@ -78,13 +73,11 @@ def environment(**outside: str) -> dict[str, str]:
 
 
 def test_the_endpoint_is_one_line_in_env() -> None:
-    """Kits get `ROSRV_ENDPOINT=192.168.1.20` from `.env`; without it the configuration is still valid."""
     assert resolve(None, environment(), {}).ipsec.endpoint is None
     assert resolve(None, environment(ROSRV_ENDPOINT="192.168.1.20"), {}).ipsec.endpoint == "192.168.1.20"
 
 
 def test_a_flood_ends_in_the_container() -> None:
-    """Memory and processes are limited, and the relay's own limit is below these limits."""
     appliance = yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]
     assert appliance["mem_limit"] == appliance["memswap_limit"] == "2g"
     assert 100 <= appliance["pids_limit"] <= 1000

@@ -25,13 +25,11 @@ ROWS = re.findall(
 
 
 def test_every_requirement_has_one_row() -> None:
-    """No requirement is missing or listed twice, and the order is that of the standard."""
     assert [row[0] for row in ROWS] == [name.strip() for name in REQUIRED.strip().split(",")]
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: str(row[0]))
 def test_every_claim_names_a_test(row: tuple[str, str, str, str]) -> None:
-    """A requirement that is met, even in part, names a test (test_threat_model.py checks it); others give a reason."""
     requirement, state, how, shown = row
     assert state in ("met", "site", "partly", "no", "none"), requirement
     assert len(how) > 10, requirement

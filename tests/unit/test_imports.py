@@ -16,7 +16,6 @@ def imports() -> dict[str, set[str]]:
 
 
 def test_no_module_needs_one_that_needs_it(imports: dict[str, set[str]]) -> None:
-    """Imports have no cycle, including imports for types only."""
     assert "rosmop.run.engine" in imports["appliance.api.routes.monitor_judgement"], (
         "a type-only import is seen"
     )
@@ -38,7 +37,6 @@ PUBLIC = {
 
 
 def test_the_appliance_imports_only_public_modules_of_the_language(imports: dict[str, set[str]]) -> None:
-    """They are the modules of the table, and the command's modules, which only verbs import."""
     found = {
         (module, imported.removeprefix("rosmop."))
         for module, all_imported in imports.items()

@@ -63,12 +63,10 @@ def _number(text: str) -> int:
 
 @pytest.mark.parametrize("path", SIZES)
 def test_a_listed_module_exists_with_its_printed_size(path: str) -> None:
-    """The size on the page is within 10 % of the file."""
     assert abs(_lines(path) - SIZES[path]) <= SIZES[path] / 10, f"{path} has {_lines(path)} lines"
 
 
 def test_the_sums_on_the_page_are_those_of_its_rows() -> None:
-    """Each row's sum and the total are correct."""
     rows = re.findall(r"^\| [^|*]+ \|(.+)\| ([\d,]+) \|$", SECTION, flags=re.MULTILINE)
     for modules, total in rows:
         assert sum(map(int, re.findall(r"` (\d+)", modules))) == _number(total), modules
@@ -77,13 +75,11 @@ def test_the_sums_on_the_page_are_those_of_its_rows() -> None:
 
 
 def test_the_kernel_stays_within_its_budget() -> None:
-    """The page and this test have the same budget, and the files fit."""
     assert f"The budget is {BUDGET:,} lines" in SECTION
     assert sum(map(_lines, SIZES)) <= BUDGET
 
 
 def test_the_kernel_imports_only_the_modules_on_the_list() -> None:
-    """Each import of the appliance is in the kernel or in `OUTSIDE`, and each name in `OUTSIDE` is imported."""
     graph = grimp.build_graph("appliance", cache_dir=None)
     kernel = {
         "appliance." + path.removesuffix(".py").replace("/", ".") for path in SIZES if path.endswith(".py")

@@ -13,7 +13,6 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_it_depends_on_what_the_image_has() -> None:
-    """The package depends on the programs of the container; only the container needs its own init."""
     stage = (ROOT / "Dockerfile").read_text().partition("FROM ${BASE} AS appliance")[2]
     installed = re.search(r"--no-install-recommends \\\n((?: +\S+ \\\n)+)", stage)
     assert installed is not None
@@ -21,13 +20,11 @@ def test_it_depends_on_what_the_image_has() -> None:
 
 
 def test_each_dependency_has_its_reason() -> None:
-    """Every dependency of the package is listed in packages.txt, with its reason."""
     listed = {line.partition("#")[0].strip() for line in (ROOT / "packages.txt").read_text().splitlines()}
     assert set(RUNS) <= listed
 
 
 def test_the_service_has_the_rights_of_the_supervisor() -> None:
-    """systemd leaves the service exactly the capabilities that the supervisor keeps."""
     unit = (ROOT / "distribution/debian/rosrv.service").read_text()
     given = {
         name.removeprefix("CAP_")
@@ -38,7 +35,6 @@ def test_the_service_has_the_rights_of_the_supervisor() -> None:
 
 
 def test_the_installed_configuration_is_right() -> None:
-    """The configuration that the package installs in /etc/rosrv is valid, and every commented key exists."""
     file = ROOT / "distribution/appliance.yaml"
     settings = resolve(file, {}, {})
     assert settings.enable == "none"
@@ -47,7 +43,6 @@ def test_the_installed_configuration_is_right() -> None:
 
 
 def test_it_serves_the_interpreters_that_it_says() -> None:
-    """The package depends on the python3 versions for which its environments are built."""
     control = (ROOT / "distribution/debian/control").read_text()
     bounds = re.findall(r"python3 \((>=|<<) 3\.(\d+)\)", control)
     assert [f"3.{minor}" for minor in range(int(bounds[0][1]), int(bounds[1][1]))] == list(INTERPRETERS)

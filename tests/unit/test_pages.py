@@ -31,7 +31,6 @@ _ADVICE = re.compile(r"\brosrv ([a-z][a-z-]*(?: [^\n`|…\"'<;()]*)?)")
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_page_is_in_the_list_for_readers(page: Path) -> None:
-    """The README links to the list of pages, and the list links to every page."""
     assert "(docs/README.md)" in (ROOT / "README.md").read_text()
     link = f"({page.relative_to(ROOT / 'docs')})"
     assert page.name == "README.md" or link in (ROOT / "docs" / "README.md").read_text()
@@ -49,7 +48,6 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 @pytest.mark.parametrize("page", WITH_LINKS, ids=lambda page: page.name)
 def test_links_lead_to_headings(page: Path) -> None:
-    """The part of a link after `#` is a heading of the page before it."""
     prose = re.sub(r"```.*?```|`[^`\n]*`", "", page.read_text(), flags=re.DOTALL)
     links = re.findall(r"\]\((?!https?:)([^)#]*)#([^)]+)\)", prose)
     assert [
@@ -90,7 +88,6 @@ def test_tests_that_the_assurance_names_are_there() -> None:
 
 
 def test_every_operation_of_rest_is_on_its_page() -> None:
-    """Covers each path that the command line calls, with a name for each parameter."""
     text = (ROOT / "docs" / "reference" / "rest.md").read_text()
     paths = {re.sub(r"{\w+}", r"[^/\\s?\"]+", one.path) for one in OPERATIONS if one.path}
     assert [path for path in paths if not re.search(rf"{path}(?![\w/])", text)] == []
@@ -108,7 +105,6 @@ def test_commands_of_pages_exist(page: Path) -> None:
 
 
 def test_options_that_the_product_names_exist() -> None:
-    """Advice in errors, in the console and in files of the examples has only options that its command still has."""
     options = {
         name: {one for each in verb.params for one in (*each.opts, *each.secondary_opts, "--help")}
         for name, verb in commands()
@@ -138,7 +134,6 @@ OTHERS = {
 
 
 def test_options_that_pages_name_alone_exist() -> None:
-    """`--option` without its command belongs to a command of the product, a program of this repository, or `OTHERS`."""
     options = {
         one for _, verb in commands() for each in verb.params for one in (*each.opts, *each.secondary_opts)
     }
@@ -155,7 +150,6 @@ def test_options_that_pages_name_alone_exist() -> None:
 
 
 def test_commands_of_the_collector_on_pages_exist() -> None:
-    """Each `rosrv-fleet` and `rosmop` command in the code of a page exists with the options that the page gives it."""
     options = {
         " ".join(words): {one for each in command.get_params(context) for one in (*each.opts, "--help")}
         for name, program in (("rosrv-fleet", fleet_app), ("rosmop", rosmop_app))
@@ -172,7 +166,6 @@ def test_commands_of_the_collector_on_pages_exist() -> None:
 
 
 def test_variables_that_the_product_names_exist() -> None:
-    """Each `ROSRV_…` of pages, console, examples and compose files is a setting, or a program reads it."""
     folders = ("appliance", "fleet", "rosmop", "scripts")
     sources = [file for one in folders for kind in ("py", "sh") for file in (ROOT / one).rglob(f"*.{kind}")]
     compose = [*ROOT.glob("compose*.yaml"), *(ROOT / "fleet").glob("*.y*ml")]

@@ -159,7 +159,6 @@ def _methods(tree: ast.Module) -> dict[str, set[str]]:
 
 
 def test_no_pattern_has_many_steps() -> None:
-    """Each pattern needs few steps for the longest text, or is listed with its limit."""
     found = {
         one.name: (steps(one.pattern, one.flags, UNLIMITED, anywhere=one.anywhere), one.pattern)
         for path in files()
@@ -190,7 +189,6 @@ def test_backtracking_is_found(pattern: str) -> None:
 
 
 def test_a_scan_costs_nothing_except_in_a_search() -> None:
-    """A possessive repeat is quick at one place, and quadratic if every place may begin it."""
     assert steps(r"\s*+x", 0, UNLIMITED, anywhere=False) < 10
     assert steps(r"\s*+x", 0, UNLIMITED, anywhere=True) > MOST_STEPS
     assert steps(r"[^\s,]++", 0, UNLIMITED, anywhere=True) < 10
@@ -217,7 +215,6 @@ def test_a_scalar_is_short(tag: str) -> None:
 def test_a_name_is_measured_before_it_is_matched(
     check: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A name that is too long reaches no pattern."""
     for pattern in ("_NAME", "_CANONICAL", "_TOOL", "_PARAMETER"):
         monkeypatch.setattr(names, pattern, None)
     with pytest.raises(InvalidNameError, match="1024"):

@@ -119,7 +119,6 @@ def said_in(source: str, nodes: Sequence[ast.AST]) -> str:
 
 
 def test_no_page_has_a_bad_habit() -> None:
-    """Each finding has its line and the words to write instead."""
     folders = [path for name in ("docs/", *FOLDERS) for path in sorted((ROOT / name).rglob("*.md"))]
     found = [
         f"{page.relative_to(ROOT)}:{line}: {what}"

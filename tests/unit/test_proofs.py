@@ -20,7 +20,6 @@ def named(model: Model) -> list[tuple[str, str]]:
 
 @pytest.mark.parametrize(("path", "name"), named(INSERTION) + named(LEASE))
 def test_the_model_names_existing_code(path: str, name: str) -> None:
-    """The code that a step models exists under the name that the step gives."""
     inside: list[ast.stmt] = ast.parse((ROOT / path).read_text()).body
     for part in name.split("."):
         found = [
@@ -38,7 +37,6 @@ def test_the_model_names_existing_code(path: str, name: str) -> None:
     ids=["insertion", "lease"],
 )
 def test_every_process_names_what_it_models(model: Model, others: set[str]) -> None:
-    """Every process except `others` names its code, before or inside the process, in a checked notation."""
     text = model.path.read_text()
     parts = re.split(r"^proctype (\w+)", text, flags=re.MULTILINE)
     heads = [part.rpartition("\n}\n")[2] for part in parts[0:-1:2]]
@@ -55,5 +53,4 @@ def test_every_process_names_what_it_models(model: Model, others: set[str]) -> N
     ids=["insertion", "lease"],
 )
 def test_every_mutant_is_tried(model: Model, mutants: Collection[str]) -> None:
-    """The table has exactly the mutants of the model."""
     assert set(re.findall(r"MUTANT_(\w+)", model.path.read_text())) == set(mutants)

@@ -508,7 +508,6 @@ RULES = {
 
 
 def test_the_source_keeps_its_rules() -> None:
-    """Each finding has its place and what to do."""
     seen: dict[str, list[Seen]] = {name: [] for name in RULES}
     for file in sorted({path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}):
         source = parsed(str(file.relative_to(ROOT)), file.read_text())
@@ -534,7 +533,6 @@ def test_a_rule_finds_what_it_forbids(rule: Rule) -> None:
 )
 @pytest.mark.parametrize("begin", ["self.changed: Callable[[], int] | None", "changed: 'Callable[[], None]'"])
 def test_a_slot_that_another_file_fills_is_found(begin: str, value: str) -> None:
-    """A constructor that fills its own attribute is fine, and an attribute that is not a function."""
     fillers = ("parts.hosts.changed = f", "x.changed, x.lost = f, g", "x.changed: Callable[[], None] = f")
     for filler in fillers:
         assert findings(RULES["slots"], f"{begin} = {value}", filler), filler

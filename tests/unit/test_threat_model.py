@@ -11,14 +11,12 @@ TESTS = Path(__file__).parents[1]
 
 @pytest.mark.parametrize("page", ["threat-model.md", "reference/iec-62443.md"])
 def test_every_test_that_is_named_exists(page: str) -> None:
-    """Each test in the tables is a function with that name in that file, and is not skipped."""
     text = (TESTS.parent / "docs" / page).read_text()
     assert len(named(text)) > 40
     assert missing(text, TESTS) == []
 
 
 def test_a_test_that_was_removed_is_missed(tmp_path: Path) -> None:
-    """Renamed, moved and disabled tests are found as well, and names that are not tests."""
     (tmp_path / "unit").mkdir()
     (tmp_path / "unit/test_a.py").write_text(
         "def test_there(): ...\n@pytest.mark.skip('later')\ndef test_off(): ...\n"

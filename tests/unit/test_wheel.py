@@ -45,7 +45,6 @@ def metadata(wheel: Path) -> Message:
 
 @pytest.mark.parametrize("requirement", sorted({*RUNS, *LANGUAGE_RUNS}, key=str), ids=lambda one: one.name)
 def test_each_dependency_has_both_bounds(requirement: Requirement) -> None:
-    """The tested version is within the bounds; no older version and no newer major version is allowed."""
     locked = LOCKED[requirement.name]
     major, minor = locked.split(".")[:2]
     bounds = {one.operator: one.version for one in requirement.specifier}
@@ -53,7 +52,6 @@ def test_each_dependency_has_both_bounds(requirement: Requirement) -> None:
 
 
 def test_the_constraints_name_every_package_that_pip_installs() -> None:
-    """An installation with the constraints has the tested versions only, also of packages that the lock leaves out."""
     made = subprocess.run(
         ["make", "--silent", "--no-print-directory", "constraints"],
         cwd=ROOT, env={name: value for name, value in os.environ.items() if name != "MAKEFLAGS"},
@@ -72,7 +70,6 @@ def test_the_constraints_name_every_package_that_pip_installs() -> None:
 
 
 def test_it_says_what_it_is(wheel: Path) -> None:
-    """Name, version, licence, readme and interpreter equal those of the project."""
     says = metadata(wheel)
     assert (says["Name"], says["Version"]) == ("rosrv-appliance", __version__)
     assert (says["License-Expression"], says["Requires-Python"]) == ("Apache-2.0", ">=3.11")
@@ -81,7 +78,6 @@ def test_it_says_what_it_is(wheel: Path) -> None:
 
 
 def test_it_brings_what_is_not_code(wheel: Path) -> None:
-    """The wheel contains every policy, monitor, example and page, and every file of the console."""
     with zipfile.ZipFile(wheel) as archive:
         names = {name.partition(".data/data/")[2] or name for name in archive.namelist()}
     tracked = subprocess.run(
@@ -102,7 +98,6 @@ def test_it_brings_what_is_not_code(wheel: Path) -> None:
 
 
 def test_it_contains_the_compiled_module(wheel: Path) -> None:
-    """The module is included. The wheel is for this architecture, each Python from 3.11 on, and this glibc or newer."""
     assert re.fullmatch(
         r"rosrv_appliance-[0-9.]+-cp311-abi3-manylinux_2_\d+_(x86_64|aarch64)\.whl", wheel.name
     )
@@ -116,7 +111,6 @@ def test_it_contains_the_compiled_module(wheel: Path) -> None:
 
 
 def test_a_missing_compiler_differs_from_a_wrong_source(tmp_path: Path) -> None:
-    """`rosrv demo` continues without its compiled node only if the compiler or the library is missing."""
     source = tmp_path / "wrong.cpp"
     source.write_text("int main() { return ")
     build = ["/bin/bash", str(ROOT / "scripts/build-roscpp"), str(source), str(tmp_path / "made")]

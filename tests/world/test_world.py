@@ -16,14 +16,12 @@ _IN_ONE_CASE = 20
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("first", range(0, _SEEDS, _IN_ONE_CASE))
 def test_no_history_of_an_appliance_breaks_a_promise(first: int) -> None:
-    """Each of these seeds is a history of faults."""
     _run(first, World, "")
 
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("first", range(0, _PAIR_SEEDS, _IN_ONE_CASE))
 def test_no_history_of_two_appliances_breaks_a_promise(first: int) -> None:
-    """Each of these seeds is a history of crashes, cuts and takeovers."""
     _run(first, PairWorld, "--pair ")
 
 
@@ -38,7 +36,6 @@ def _run(first: int, kind: type[World], option: str) -> None:
 
 @pytest.mark.parametrize("kind", [World, PairWorld])
 def test_a_seed_gives_the_same_history_again(kind: type[World]) -> None:
-    """A finding can be repeated."""
     traces: list[list[str]] = [[], []]
     for trace in traces:
         run(7, trace.append, kind)
@@ -50,5 +47,4 @@ def test_a_seed_gives_the_same_history_again(kind: type[World]) -> None:
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("fault", sorted((MUTANTS.keys() | PAIR_MUTANTS.keys()) - NOT_SEEN))
 def test_each_fault_of_the_product_is_found(fault: str) -> None:
-    """The faults that the world does not see are listed in `NOT_SEEN`."""
     assert first_broken(fault, range(500)) is not None

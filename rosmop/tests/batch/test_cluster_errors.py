@@ -17,5 +17,4 @@ from rosmop.batch.ray_cluster import _reason
     ],
 )
 def test_the_line_has_the_cause(message: str, reason: str) -> None:
-    """Ray's client reports a failed start of its server as a traceback."""
     assert _reason(ConnectionAbortedError(message)) == f"ConnectionAbortedError: {reason}"

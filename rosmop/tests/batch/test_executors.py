@@ -15,7 +15,6 @@ JOBS = [(number, bytes([number]) * (number * 40_000)) for number in range(12)]
 
 @pytest.mark.nightly
 def test_a_pool_gives_the_results_of_this_process() -> None:
-    """Every job has its own result, also if that is larger than the buffer of a pipe."""
     pool = ProcessPool(double, 2)
     try:
         assert dict(execute(pool, iter(JOBS))) == dict(execute(ThisProcess(double), JOBS))
@@ -26,7 +25,6 @@ def test_a_pool_gives_the_results_of_this_process() -> None:
 
 @pytest.mark.nightly
 def test_a_worker_that_dies_is_tried_again(tmp_path: Path) -> None:
-    """A job whose worker dies once has a result; one whose worker always dies fails alone, after three tries."""
     pool = ProcessPool(fragile, 2)
     jobs = [
         (number, f"{how} {tmp_path / str(number)}".encode())
@@ -50,7 +48,6 @@ def test_a_worker_that_dies_is_tried_again(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_a_worker_that_dies_while_idle_is_replaced(tmp_path: Path) -> None:
-    """The next job does not fail."""
     pool = ProcessPool(fragile, 1)
     try:
         assert dict(execute(pool, [(0, f"never {tmp_path / 'a'}".encode())])) == {0: b"never"}
@@ -64,7 +61,6 @@ def test_a_worker_that_dies_while_idle_is_replaced(tmp_path: Path) -> None:
 
 
 def test_jobs_are_read_as_they_are_needed() -> None:
-    """A list of any length does not fill the memory."""
     taken: list[int] = []
 
     def jobs() -> Iterator[tuple[int, bytes]]:

@@ -64,7 +64,6 @@ def test_any_name_is_reported(command: str, folder: Path) -> None:
 
 @pytest.mark.nightly
 def test_bytes_outside_utf8_in_specifications(folder: Path) -> None:
-    """A specification with such bytes is refused with their position. File names and definitions may have them."""
     definition = Path("msg/own/msg/Level.msg")
     definition.parent.mkdir(parents=True)
     definition.write_bytes(b"int32 data  # \xb0C\n")
@@ -82,7 +81,6 @@ def test_bytes_outside_utf8_in_specifications(folder: Path) -> None:
 
 @pytest.mark.nightly
 def test_other_kinds_of_files_are_rows(folder: Path) -> None:
-    """Pipes, devices and links that lead nowhere or in a circle fail alone, and at once."""
     os.mkfifo("bags/pipe.bag")
     Path("bags/device.bag").symlink_to("/dev/zero")
     Path("bags/circle.bag").symlink_to("circle.bag")
@@ -99,7 +97,6 @@ def test_other_kinds_of_files_are_rows(folder: Path) -> None:
 
 @pytest.mark.nightly
 def test_circles_of_folders_are_not_followed(folder: Path) -> None:
-    """Links to folders above do not multiply the search of a pattern or of a folder."""
     for name in ("x", "y", "z"):
         Path("bags", name).symlink_to(".")
     begin = time.perf_counter()
@@ -111,7 +108,6 @@ def test_circles_of_folders_are_not_followed(folder: Path) -> None:
 
 
 def test_a_folder_that_cannot_be_read_is_an_error(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The recordings in it are not silently left out."""
     for _level in range(20):  # longer than a path may be
         deep = Path("x" * 250)
         (Path("bags") if not _level else Path()).joinpath(deep).mkdir()
@@ -122,7 +118,6 @@ def test_a_folder_that_cannot_be_read_is_an_error(folder: Path, monkeypatch: pyt
 
 
 def test_a_recording_that_changes_fails(folder: Path) -> None:
-    """The result of contents that were not listed does not count."""
     (first, second) = recordings_of([], ["bags"])
     with Path("bags/1.bag").open("ab") as file:
         file.write(b"\0")
@@ -136,7 +131,6 @@ def test_a_recording_that_changes_fails(folder: Path) -> None:
 # The limit may end a callback of the garbage collector, where Python only reports it; the next signal ends the work.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_recording_cannot_take_for_ever(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A recording that makes timers work for hours fails alone, after a limit of processor time."""
     Path("limit.rv").write_text(
         "m() { event t() every 1ms { } event e(int n) /n std_msgs/Int32 '{data:n}' { } }"
     )
@@ -154,7 +148,6 @@ def test_a_recording_cannot_take_for_ever(folder: Path, monkeypatch: pytest.Monk
 
 
 def test_a_worker_that_answers_something_else_fails_alone(folder: Path) -> None:
-    """Answers of workers are data of the expected form; nothing else is decoded."""
     jobs_ = [SurveyJob(recording, ["*"]) for recording in recordings_of([], ["bags"])]
     for answer in (b"", b"\x80\x04K\x01.", b"\xc0", b"\x81\xa4type\xa5Other"):
 
@@ -169,7 +162,6 @@ def test_a_worker_that_answers_something_else_fails_alone(folder: Path) -> None:
 
 
 def test_a_damaged_journal_gives_no_other_result(tmp_path: Path) -> None:
-    """Cut off or changed at any byte, it has each result, or lacks it, or is rejected; and it can be continued."""
     path = tmp_path / "journal"
     with ResumeJournal(path) as journal:
         journal.add(b"one", b"1")
@@ -199,7 +191,6 @@ def test_a_damaged_journal_gives_no_other_result(tmp_path: Path) -> None:
 
 
 def test_only_a_journal_is_written(tmp_path: Path) -> None:
-    """A file of the user, a pipe, a device or a folder is rejected and unchanged."""
     for text in ("one line", '{"job": 1}', "two\nlines"):
         (tmp_path / "file").write_text(text)
         with pytest.raises(JournalError, match="is not a journal"):
@@ -216,7 +207,6 @@ def test_only_a_journal_is_written(tmp_path: Path) -> None:
 @pytest.mark.nightly
 @pytest.mark.parametrize("option", ["--resume", "--report"])
 def test_a_full_disk_is_reported(option: str, folder: Path) -> None:
-    """The command ends with the reason; afterwards it continues, and no report was begun."""
     words = [*ROSMOP, *RUN.split(), "--workers", "2", option, "file"]
 
     def fill() -> None:
@@ -233,7 +223,6 @@ def test_a_full_disk_is_reported(option: str, folder: Path) -> None:
 
 
 def test_a_report_without_a_folder_is_refused_first(folder: Path) -> None:
-    """The command does not work for hours first."""
     status, out, err = rosmop(f"{RUN} --report none/report")
     assert (status, out) == (2, "")
     assert err == "rosmop: cannot write none/report: its folder is missing or not writable\n"
@@ -255,7 +244,6 @@ def command_line(pid: int) -> bytes:
 @pytest.mark.nightly
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
 def test_workers_end_while_they_start(end: signal.Signals, folder: Path) -> None:
-    """Ctrl-C in the first second prints no traceback of a worker; a worker that is killed then is replaced."""
     assert rosmop(f"{RUN} --report expected")[0] == 0
     words = [*ROSMOP, *RUN.split(), "--workers", "2", "--report", "report"]
     with subprocess.Popen(
@@ -283,7 +271,6 @@ def test_workers_end_while_they_start(end: signal.Signals, folder: Path) -> None
 
 @pytest.mark.nightly
 def test_a_topic_cannot_add_to_the_learnt_text(folder: Path) -> None:
-    """A topic with an invalid name is listed in a comment, on one line, and the others are learnt from."""
     name = "/n\n} evil() { event e() /n std_msgs/Int32 '{}' { DROP; } }\x1b[2J"
     definitions = standard_definitions()
     for seed in range(2, 4):

@@ -65,7 +65,6 @@ def rosmop(command: str) -> tuple[int, str, str]:
 @pytest.mark.nightly
 @pytest.mark.parametrize("command", ["run limit.rv", "learn", "coverage limit.rv"])
 def test_processes_give_the_same_report(command: str, folder: Path) -> None:
-    """One process and two print the same, also if a recording fails: then it has a row, and the exit status is 3."""
     Path("bags/broken.bag").write_text("nonsense")
     one = rosmop(f"{command} --bags bags --workers 1 --report one.ndjson")
     two = rosmop(f"{command} --bags bags --workers 2 --report two.ndjson")
@@ -79,7 +78,6 @@ def test_processes_give_the_same_report(command: str, folder: Path) -> None:
 
 @pytest.mark.nightly
 def test_violations_are_listed_by_specification_recording_and_time(folder: Path) -> None:
-    """The rows have each drop, its count for each recording, and the number of messages."""
     status, out, _err = rosmop("run limit.rv --bags bags --json")
     assert status == 0
     rows = [json.loads(line) for line in out.splitlines()]
@@ -97,7 +95,6 @@ def test_violations_are_listed_by_specification_recording_and_time(folder: Path)
 
 @pytest.mark.nightly
 def test_sets_are_folders_and_patterns(folder: Path) -> None:
-    """Overlapping sets name a recording once; a set without recordings is an error."""
     assert "2400 messages of 6 recordings" in rosmop("run limit.rv --bags bags --bags bags/*.bag")[1]
     assert "800 messages of 2 recordings" in rosmop("run limit.rv --bags bags/[01].bag")[1]
     status, _out, err = rosmop("run limit.rv --bags none")
@@ -107,7 +104,6 @@ def test_sets_are_folders_and_patterns(folder: Path) -> None:
 
 @pytest.mark.nightly
 def test_errors_of_a_specification_are_reported_once(folder: Path) -> None:
-    """They are not an error of each recording."""
     Path("limit.rv").write_text(SPECIFICATION.replace("data:n", "date:n"))
     status, _out, err = rosmop("run limit.rv --bags bags --workers 2")
     assert status == 1
@@ -166,7 +162,6 @@ def test_an_interrupted_command_continues(end: signal.Signals, folder: Path) -> 
 def test_a_journal_is_bound_to_specifications_and_recordings(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Unchanged recordings are not read again; a changed recording or specification is. Failures are tried again."""
     monkeypatch.setenv("COUNTED", "counted")
     monkeypatch.setattr("rosmop.batch.runner.ThisProcess", lambda _work: ThisProcess(counted_work))
 
@@ -205,7 +200,6 @@ def test_a_journal_that_was_cut_off_is_continued(tmp_path: Path) -> None:
 
 
 def test_the_cluster_is_checked_first(folder: Path) -> None:
-    """An address that is none is an error with the form of one."""
     status, _out, err = rosmop("run limit.rv --bags bags --on somewhere")
     assert status == 2
     assert "give ray://HEAD:PORT" in err

@@ -79,7 +79,6 @@ def merged(facts: list[Facts], chance: random.Random) -> Facts:
 def test_facts_are_merged_in_any_order(
     recordings: list[list[tuple[tuple[str, bytes], int]]], seed: int
 ) -> None:
-    """Any order and grouping of recordings gives equal facts."""
     chance = random.Random(seed)  # noqa: S311  no secret
     sources = [recorded(number, rows) for number, rows in enumerate(recordings)]
     spans = [
@@ -98,8 +97,6 @@ def test_facts_are_merged_in_any_order(
 
 
 def test_learning_does_not_depend_on_the_order_of_results() -> None:
-    """The text is the same if workers finish in another order."""
-
     def shuffled(seed: int) -> Run:
         run = run_here(DRIVES, DEFINITIONS)
 
@@ -115,7 +112,6 @@ def test_learning_does_not_depend_on_the_order_of_results() -> None:
 
 
 def test_a_recording_that_fails_later_is_named() -> None:
-    """Its reason is in the head of the text, and the others are learnt from."""
     run = run_here(DRIVES, DEFINITIONS)
 
     def failing(steps: list[AnyStep]) -> Iterator[tuple[int, Facts | LearningError]]:

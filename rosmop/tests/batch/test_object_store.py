@@ -60,7 +60,6 @@ def test_objects_are_recordings(bucket: Any) -> None:
 
 
 def test_a_changed_object_is_not_read(bucket: Any) -> None:
-    """An object that changes after it was listed gives an error, not the outcome of other contents."""
     bucket.put_object(Bucket="robots", Key="changed/a.bag", Body=b"one")
     ((uri, _size, version),) = object_store.listed("s3://robots/changed/")
     with object_store.fetched(uri, version) as path:
@@ -72,7 +71,6 @@ def test_a_changed_object_is_not_read(bucket: Any) -> None:
 
 
 def test_errors_of_the_store_are_usage_errors(bucket: Any) -> None:
-    """A missing bucket, an empty prefix and a name without a bucket are reported."""
     Path("limit.rv").write_text(SPECIFICATION)
     for prefix, reason in (
         ("s3://none/", "NoSuchBucket"),

@@ -197,7 +197,6 @@ def test_an_invalid_automaton_is_refused(logic: str) -> None:
 
 @pytest.mark.parametrize("logic", LOGICS)
 def test_a_thousand_faults_of_compilers_are_refused(logic: str) -> None:
-    """Each logic has two hundred faults, each found with a trace; a change that changes no verdict does not count."""
     random = Random(2)  # noqa: S311  no secret
     refused = 0
     for compiled in properties(logic, 3, 1000):
@@ -215,7 +214,6 @@ def test_a_thousand_faults_of_compilers_are_refused(logic: str) -> None:
 
 
 def test_a_fault_is_shown_by_a_trace() -> None:
-    """The trace is the shortest possible one."""
     wrong = AutomatonTables(0, [[0, 1], [1, 1]], [(), ("violation",)])
     certificate = certify("ltl", "[](a => o (!b U a))", ["a", "b"], wrong)
     assert certificate.wrong
@@ -232,7 +230,6 @@ def test_a_fault_is_shown_by_a_trace() -> None:
     ],
 )
 def test_unproved_properties_have_a_reason(logic: str, formula: str, why: str) -> None:
-    """Each reason is given, and the property never counts as proved."""
     certificate = certificate_of(compile_property(logic, formula, ["a", "b"], ORIGIN))
     assert not certificate.proved
     assert not certificate.wrong
@@ -241,7 +238,6 @@ def test_unproved_properties_have_a_reason(logic: str, formula: str, why: str) -
 
 
 def test_a_machine_that_is_too_large_is_not_proved() -> None:
-    """The machine has more transitions than the proof follows."""
     events = [f"e{number}" for number in range(200)]
     states = MOST_STEPS // len(events) + 10
     formula = " ".join(f"s{number} [ default s{(number + 1) % states} ]" for number in range(states))
@@ -251,7 +247,6 @@ def test_a_machine_that_is_too_large_is_not_proved() -> None:
 
 
 def test_an_expression_that_is_too_large_is_not_proved() -> None:
-    """Its automaton lacks one state at the very end, which the proof does not reach."""
     certificate = certify(
         "ere", "(a|b)* a (a|b)^30 c", ["a", "b", "c"], AutomatonTables(0, [[0, 0, 0]], [()])
     )
@@ -279,7 +274,6 @@ def certified() -> tuple[dict[str, list[str]], list[str]]:
 
 
 def test_each_property_has_a_certificate() -> None:
-    """The lines are in the order of the text."""
     lines, wrong = certified()
     proved, tested = lines["guard"]
     assert proved.startswith("ltl: proved: ")
@@ -288,8 +282,6 @@ def test_each_property_has_a_certificate() -> None:
 
 
 def test_a_wrong_compiler_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The error has the formula's position, a trace, and the component with the defect."""
-
     def compile_wrong(source: Source) -> FiniteProperty:
         return FiniteProperty(source, ("violation", "validation"), Automaton(0, ((0, 0),), ((),)))
 
@@ -301,7 +293,6 @@ def test_a_wrong_compiler_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_certifier_shares_no_code_with_the_compilers() -> None:
-    """Only the files that receive results import the compilers, and none imports an encoder of the generator."""
     receiving = {"properties.py", "steps.py", "expected_steps.py", "scripted_module.py"}
     pure = 0
     folder = Path(rosmop.certify.__file__).parent

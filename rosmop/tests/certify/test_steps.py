@@ -49,7 +49,6 @@ def module(of: Compiled) -> WasmModule:
 
 
 def test_the_modules_of_random_specifications_pass() -> None:
-    """The modules agree with the automata in every state."""
     steps = 0
     for seed, numbers in product(range(examples(60)), (True, False)):
         texts = Specifications(seed, numbers=numbers).texts()
@@ -62,7 +61,6 @@ def test_the_modules_of_random_specifications_pass() -> None:
 
 
 def test_a_large_table_is_run_in_all_of_its_states() -> None:
-    """All cells of the table are run, not a sample."""
     states = " ".join(f"q{n} [a -> q{(n + 1) % 900}, b -> q{n * 7 % 900}]" for n in range(900))
     of = compiled(f"{GUARD.split('ptltl', maxsplit=1)[0]} fsm: {states} @q5 {{ DROP; }} }}")
     assert check_steps(of, module(of)) > 900 * 2
@@ -147,7 +145,6 @@ TWO = """s() { event a(int x) /plain own/Plain '{kind:0, count:x}' { if (x > 8) 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_faults_of_one_line_are_rejected(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If the generator has a fault, no module is built."""
     of = compiled(TWO)
     assert build.part_of(of, ["s"], [])
     monkeypatch.setattr(*FAULTS[fault])
@@ -156,7 +153,6 @@ def test_faults_of_one_line_are_rejected(fault: str, monkeypatch: pytest.MonkeyP
 
 
 def test_functions_in_another_order_are_rejected() -> None:
-    """Each event calls its own function, and the first event comes first."""
     of = compiled(GUARD)
     whole = module(of)
     walk = whole.feeds["/plain"]

@@ -168,7 +168,6 @@ def compiler_of_cpp() -> str:
 
 
 def test_functions_on_floats_are_the_compilers(tmp_path: Path) -> None:
-    """C++ takes the overload for floats, which differs from a rounded double; results are equal to the last bit."""
     compiler = compiler_of_cpp()
     body = float_program(Random(1))  # noqa: S311  draws examples, not keys
     source = tmp_path / "program.cpp"

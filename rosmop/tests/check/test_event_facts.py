@@ -26,7 +26,6 @@ TEXT = """s() { double own = 0; double other = 0; bool ever = false;
 
 @pytest.mark.parametrize("seed", range(examples(60)))
 def test_ages_are_those_of_a_naive_account(seed: int) -> None:
-    """An event counts if its `when` holds and its action neither drops the message nor faults."""
     both, random = BothWays(TEXT), Random(seed)  # noqa: S311  draws examples, not keys
     last, time = {"a": -inf, "b": -inf}, 1 << 60
     for _ in range(40):
@@ -45,7 +44,6 @@ def test_ages_are_those_of_a_naive_account(seed: int) -> None:
 
 
 def test_an_age_outlives_the_process() -> None:
-    """The time is part of the saved state, also if the module has it."""
     sets = [on_module(compiled_from({"x.rv": TEXT}, definitions())) for _ in range(2)]
     sets[0].start(0)
     [group] = sets[0].kept_groups()
@@ -60,7 +58,6 @@ def test_an_age_outlives_the_process() -> None:
 
 
 def test_each_slice_has_ages_of_its_own() -> None:
-    """A parametric specification knows when the event happened with the binding."""
     text = """s(int c) { event a(int c) /t std_msgs/Int32 '{data:c}' { }
         event b(int c) /u std_msgs/Int32 '{data:c}' { ROS_INFO("%g", age(a)); } }"""
     monitors = MonitorSet.of(compiled_from({"x.rv": text}, definitions()))
@@ -73,7 +70,6 @@ def test_each_slice_has_ages_of_its_own() -> None:
 
 
 def test_equal_texts_with_ages_give_equal_sets() -> None:
-    """The bytes of a compiled set identify it."""
     data = {encoded(compiled_from({"x.rv": TEXT}, definitions())) for _ in range(2)}
     [one] = data
     require_loadable(one)
@@ -87,7 +83,6 @@ SENDERS = """s() { std::string mine; int n = 0;
 
 @pytest.mark.parametrize("seed", range(examples(60)))
 def test_senders_are_those_of_a_naive_account(seed: int) -> None:
-    """`host` and `caller` are of this message in the action, and of the last message that was not dropped elsewhere."""
     random = Random(seed)  # noqa: S311  draws examples, not keys
     long = "/" + "x" * (MOST_KEPT + 1)
     who = {1: ("10.0.0.7", "/a"), 2: ("10.0.0.8", "/evil"), 3: ("", long), 4: ("fe80::1", "/b")}
@@ -115,13 +110,11 @@ def test_senders_are_those_of_a_naive_account(seed: int) -> None:
 
 
 def test_the_sender_is_read_in_the_module() -> None:
-    """A monitor that decides by the sender has no message that each goes to the engine."""
     monitors = on_module(compiled_from({"x.rv": SENDERS}, definitions()))
     assert monitors.lane("/plain")
 
 
 def test_a_published_message_has_no_sender() -> None:
-    """The monitor that publishes is not a node with an address."""
     text = """a() { event e() /plain own/Plain '{}' { std_msgs::String s; PUBLISH(/told, std_msgs/String, s); } }
         b() { event e() /told std_msgs/String '{}' { ROS_INFO("<%s>", caller(e).c_str()); } }"""
     monitors = MonitorSet.of(compiled_from({"x.rv": text}, definitions()))

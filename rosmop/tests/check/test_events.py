@@ -44,14 +44,12 @@ UINT8S, INT8S = "std_msgs/UInt8MultiArray", "std_msgs/Int8MultiArray"
 
 
 def test_a_change_of_fixed_size_is_made_in_place() -> None:
-    """A number is written into the received buffer, without another buffer."""
     buffer = bytearray(message("std_msgs/Int32", data=1))
     assert process(event("std_msgs/Int32", "int x", "data:x", "x = 2;"), buffer).buffer is buffer
     assert buffer == message("std_msgs/Int32", data=2)
 
 
 def test_a_writable_view_is_changed_in_place_and_a_readonly_one_is_not() -> None:
-    """The relay passes views of its receive buffer; a read-only view is copied first."""
     text = event("std_msgs/Int32", "int x", "data:x", "x = 2;")
     received = bytearray(b"??" + message("std_msgs/Int32", data=1))
     outcome = load(text).process("/t", memoryview(received)[2:], 0)
@@ -70,7 +68,6 @@ SIMPLE_TYPES = sorted(
 
 @pytest.mark.parametrize("kind", SIMPLE_TYPES)
 def test_a_message_survives_a_copy_and_a_publish(kind: str) -> None:
-    """Decoding and encoding any ROS message gives the same bytes, which equal another encoder's."""
     data = message(kind)
     text = event(kind, "", "", f"v = MESSAGE; PUBLISH(/copy, {kind}, v);", f"{kind} v;")
     outcome = process(text, data)
@@ -82,7 +79,6 @@ def test_a_message_survives_a_copy_and_a_publish(kind: str) -> None:
     "kind", ["sensor_msgs/JointState", "nav_msgs/Odometry", "sensor_msgs/LaserScan", "nav_msgs/Path"]
 )
 def test_a_message_with_content_survives(kind: str) -> None:
-    """This also holds for messages with strings, arrays and nested messages."""
     given: dict[str, dict[str, object]] = {
         "sensor_msgs/JointState": {"name": ["a", "", "ccc"], "position": [1.5, float("inf")], "header__frame_id": "x"},
         "nav_msgs/Odometry": {"child_frame_id": "b", "pose__covariance": [float(i) for i in range(36)], "header__stamp__sec": 4},
@@ -96,7 +92,6 @@ def test_a_message_with_content_survives(kind: str) -> None:
 
 @pytest.mark.parametrize("length", range(len(JOINTS)))
 def test_a_message_that_is_cut_short_is_a_fault(length: int) -> None:
-    """A message cut at any byte is dropped and recorded."""
     text = event("sensor_msgs/JointState", "double[] e", "effort:e", "double y = e[0];")
     outcome = process(text, JOINTS[:length])
     assert (outcome.result, len(outcome.faults)) == ("dropped", 1)

@@ -45,7 +45,6 @@ def lines_run(number: int) -> Counter[str]:
 
 
 def test_twice_as_many_specifications_take_twice_as_long() -> None:
-    """Compiling one specification does not visit the others again."""
     lines_run(1)  # made once for all specifications
     few, some, many = (lines_run(number) for number in (10, 20, 40))
     for file in many:

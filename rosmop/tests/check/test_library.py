@@ -37,7 +37,6 @@ def called(expression: str, kind: str = "double") -> Callable[..., object]:
 
 
 def test_clamp_maps_nan_to_the_allowed_value_nearest_to_zero() -> None:
-    """Whatever the arguments are, the result is a bound, 0 or a value between the bounds, and never NaN."""
     clamp = called("clamp(x, y, z)")
     for low, high in ((-1.0, 2.0), (0.5, 2.0), (-3.0, -1.5), (0.0, 0.0)):
         assert clamp(math.nan, low, high) == min(max(0.0, low), high)
@@ -59,7 +58,6 @@ def winding(x: Fraction, y: Fraction) -> int:
 
 
 def test_inside_is_the_winding_number() -> None:
-    """Points that are a millionth or more from the edge are judged as exact arithmetic judges them; NaN is outside."""
     inside, distance = called("inside(x, y, P)", "bool"), called("distance(x, y, P)")
     for _ in range(examples(1200)):
         x, y = (RANDOM.choice((RANDOM.uniform(-4, 4), RANDOM.randrange(-4, 5))) for _ in range(2))
@@ -86,7 +84,6 @@ def test_inside_is_the_winding_number() -> None:
 
 
 def test_yaw_is_the_angle_of_any_multiple_of_a_quaternion() -> None:
-    """A quaternion need not have the length 1."""
     monitors = load("""s() { double r; event e(geometry_msgs::Quaternion q) /q geometry_msgs/PoseStamped
         '{pose.orientation:q}' { r = yaw(q); } }""")
     for _ in range(examples(240)):
@@ -110,7 +107,6 @@ def ecef(lat: float, lon: float) -> tuple[float, float, float]:
 
 @pytest.mark.parametrize(("lat", "lon"), [(0, 0), (48.1, 11.6), (-33.9, 151.2), (60.0, 179.999)])
 def test_metres_are_those_of_the_ellipsoid(lat: float, lon: float) -> None:
-    """Within a kilometre, east and north differ from a tangent plane by less than 0.3 m, also at the date line."""
     ways = [called(f"metres_{way}(x, y, {lat}, {lon})") for way in ("east", "north")]
     for _ in range(examples(600)):
         there = lat + RANDOM.uniform(-0.006, 0.006), lon + RANDOM.uniform(-0.006, 0.006)
@@ -124,7 +120,6 @@ def test_metres_are_those_of_the_ellipsoid(lat: float, lon: float) -> None:
 
 
 def test_nearest_ignores_nan_and_wraps() -> None:
-    """Limits are clipped to the list, and a first index after the last goes on at the beginning."""
     monitors = load("""s() { double r; long first; long last;
         event from(long i) /from std_msgs/Int64 '{data:i}' { first = i; }
         event to(long i) /to std_msgs/Int64 '{data:i}' { last = i; }
@@ -144,7 +139,6 @@ def test_nearest_ignores_nan_and_wraps() -> None:
 
 
 def test_a_scan_of_400_000_ranges_is_searched_within_the_budget() -> None:
-    """Each element costs one instruction, besides those for reading it."""
     monitors = load(
         "s() { double r; event e(float[] v) /v std_msgs/Float32MultiArray '{data:v}' { r = nearest(v, 0, v.size()); } }"
     )
@@ -155,7 +149,6 @@ def test_a_scan_of_400_000_ranges_is_searched_within_the_budget() -> None:
 
 
 def test_isfinite_of_a_message_covers_all_its_numbers() -> None:
-    """Numbers in nested messages and in lists of messages count."""
     monitors = load("""s() { bool r; event e(trajectory_msgs::JointTrajectoryPoint[] p) /t
         trajectory_msgs/JointTrajectory '{points:p}' { r = isfinite(p) && isfinite(MESSAGE); } }""")
     kind = "trajectory_msgs/JointTrajectory"
@@ -178,7 +171,6 @@ def error(value: float, other: float) -> float:
 
 @pytest.mark.parametrize("name", ["sin", "cos", "atan2", "hypot"])
 def test_elementary_functions_are_exact_to_the_last_place(name: str) -> None:
-    """Special values are those of C; other results differ from the C library by at most the last bit."""
     ours, theirs = getattr(elementary, name), getattr(math, name)
     two = name in {"atan2", "hypot"}
     for x in SPECIAL:

@@ -70,7 +70,6 @@ def change(kind: value_types.Type, name: str) -> str:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", range(3))
 def test_every_field_of_a_random_message(kind: str, seed: int) -> None:
-    """Each field, bound alone, is read correctly and changed correctly."""
     random = Random(f"{kind} {seed}")  # noqa: S311  draws examples, not keys
     value = content(random, value_types.RecordType(kind))
     data = _encoded(kind, value)

@@ -49,7 +49,6 @@ def said(margins: Sequence[Margin]) -> list[tuple[int, bool, float, float, float
 
 @pytest.mark.parametrize("walking", [True, False])
 def test_the_nearest_on_both_sides_since_it_was_asked_last(walking: bool) -> None:
-    """Module and engine record them for constants, but not in loops or `when`, nor for `==` or known results."""
     monitors = started(NEAR)
     assert (monitors.lane("/t") is not None) is True
     give(monitors, "<i", 1, 9, 5, walking=walking)
@@ -77,7 +76,6 @@ def test_answers_are_those_of_the_text_as_it_is() -> None:
 
 
 def test_a_message_that_faults_is_noted_as_far_as_it_came() -> None:
-    """The module leaves such a message to the engine: it is not recorded twice, and states are as without margins."""
     text = """s() { int n = 0; event e(int x) /t std_msgs/Int32 '{data:x}' {
         n = n + 1;
         if (x > 10) { x = 1 / (x - 12); }
@@ -100,7 +98,6 @@ def test_a_message_that_faults_is_noted_as_far_as_it_came() -> None:
 
 
 def test_no_more_is_noted_than_is_bounded() -> None:
-    """Comparisons beyond the limit still work, but are not recorded."""
     lines = "\n".join(f"if (x > {number}) {{ n = n + 1; }}" for number in range(MOST_NOTED + 9))
     text = f"s() {{ int n = 0; event e(int x) /t std_msgs/Int32 '{{data:x}}' {{\n{lines}\n}} }}"
     monitors = started(text)

@@ -204,7 +204,6 @@ def check(programs: Programs, count: int, directory: Path | None) -> BothWays:
 @pytest.mark.parametrize(("kind", "taken"), [("numbers", 60), ("vectors", 10), ("others", 10)])
 @pytest.mark.parametrize("seed", range(examples(12)))
 def test_effects_are_in_the_order_of_the_compiler(seed: int, kind: Kind, taken: int, tmp_path: Path) -> None:
-    """The interpreter has this order; the module has it for every statement that it does not leave to the engine."""
     fed = check(Programs(seed, kind), 60, tmp_path)
     assert fed.came["together"] >= taken
 
@@ -212,5 +211,4 @@ def test_effects_are_in_the_order_of_the_compiler(seed: int, kind: Kind, taken: 
 @pytest.mark.parametrize("kind", ["numbers", "vectors", "others"])
 @pytest.mark.parametrize("seed", range(2))
 def test_unspecified_orders_of_cpp_are_the_same_in_module_and_interpreter(seed: int, kind: Kind) -> None:
-    """Interpreter and module also agree where C++ leaves the result open."""
     check(Programs(seed, kind, orders=False), 60, None)

@@ -75,7 +75,6 @@ def _holds(
 
 
 def test_a_message_may_refer_to_earlier_ones_of_its_own_topic() -> None:
-    """A sequence number that goes back is found, and dropping it keeps the greatest one."""
     both = BothWays(
         "s() { event a(double x) /plain own/Plain '{x:x}' { }"
         " pattern: globally: a as A forbids a {x <= @A.x} @violation { DROP; } }"
@@ -84,7 +83,6 @@ def test_a_message_may_refer_to_earlier_ones_of_its_own_topic() -> None:
 
 
 def test_the_module_takes_these_messages_and_the_text_is_loadable() -> None:
-    """Without `within`, no message needs the engine for the reference."""
     text = f"s() {{ {EVENTS} pattern: globally: a as A forbids b {{x < @A.x}} @violation {{ }} }}"
     compiled = compiled_from({"x.rv": text}, definitions())
     require_loadable(encoded(compiled))

@@ -17,7 +17,6 @@ TABLES = Path(__file__).parent
 
 @table(TABLES / "findings.txt")
 def test_the_check_reports_these_findings_at_these_places(case: Case) -> None:
-    """The row lists all errors and warnings of a source with line, column and text; `accepted` if there are none."""
     try:
         found = MonitorSet.of(compiled_from({"x.rv": case.text}, definitions())).warnings
     except SpecificationError as error:
@@ -28,7 +27,6 @@ def test_the_check_reports_these_findings_at_these_places(case: Case) -> None:
 
 @table(TABLES / "values.txt")
 def test_an_action_prints_what_cpp_prints(case: Case) -> None:
-    """The interpreter prints the lines of C++ or the text of the fault; the module has the same output."""
     outcome = act(case.text, before=case.beside)
     lines = " ".join(line.text for line in outcome.log)
     fault = "".join(f"fault: {one.text}" for one in outcome.faults)
@@ -48,7 +46,6 @@ def unfolded(case: Case) -> str:
 
 @table(TABLES / "messages.txt")
 def test_an_event_reads_and_changes_its_message(case: Case) -> None:
-    """Messages are given by fields, as another library reads them, with outcomes (`rosmop/tests/stories.py`)."""
     for line in case.expected:
         given, _, expected = line.partition(" -> ")
         step = Step(f"0s /t {given}".replace(" (zero)", ""), "", ())
@@ -58,6 +55,5 @@ def test_an_event_reads_and_changes_its_message(case: Case) -> None:
 
 @table(TABLES / "enforcement.txt")
 def test_the_line_about_enforcement_says_how_or_what_it_would_take(case: Case) -> None:
-    """`check` prints this line for each property."""
     [monitor] = load(case.text).monitors
     assert (monitor.properties[0].code.enforcement,) == case.expected

@@ -56,7 +56,6 @@ def exercised(*recordings: Recorded) -> dict[str, int]:
 
 
 def test_each_thing_has_its_line_and_its_count() -> None:
-    """The recording opens twice and shuts once; parts that never happened have count 0."""
     counts = exercised(recorded("a", [("/open", 7), ("/open", 0), ("/shut", 0)]))
     assert counts == {
         "3 function big": 2,
@@ -99,7 +98,6 @@ def test_recordings_add_up() -> None:
 
 
 def test_a_timeout_is_a_transition() -> None:
-    """The end of a deadline moves the machine and is counted."""
     text = """quiet() {
     event a() /a std_msgs/Int32 '{}' { }
     event b() /b std_msgs/Int32 '{}' { }
@@ -118,14 +116,12 @@ def test_a_timeout_is_a_transition() -> None:
 
 
 def test_an_error_is_that_of_the_text() -> None:
-    """An error in a specification has the positions and names of the original text."""
     with pytest.raises(SpecificationError) as caught:
         counted(TEXT.replace("n--", "m--"), [recorded("a", [])])
     assert str(caught.value.findings[0]).startswith("gate.rv:7:28: error: unknown variable `m`")
 
 
 def test_slices_are_counted_together() -> None:
-    """A parametric specification counts the parts that any slice exercised."""
     text = """gate(int id) {
     event open(int id) /open std_msgs/Int32 '{data:id}' { }
     event shut(int id) /shut std_msgs/Int32 '{data:id}' { if (id == 2) ROS_INFO("2"); }

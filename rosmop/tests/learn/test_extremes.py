@@ -8,7 +8,6 @@ from rosmop.learn.extremes import FEWEST_WINDOWS, upper
 
 
 def test_a_bound_holds_on_ten_times_as_many_windows() -> None:
-    """At most two of fifty learnt bounds on noise are exceeded in ten times as many windows."""
     chance = random.Random(1)  # noqa: S311  no secret
     passed = 0
     for _ in range(50):
@@ -20,7 +19,6 @@ def test_a_bound_holds_on_ten_times_as_many_windows() -> None:
 
 
 def test_a_bound_is_not_far_beyond_what_is_possible() -> None:
-    """For uniform noise between 0 and 1, the bounds exclude 1.5 and -0.5."""
     chance = random.Random(2)  # noqa: S311  no secret
     windows = [[chance.random() for _ in range(50)] for _ in range(24)]
     above, below = upper(map(max, windows), 1e6), upper((-min(window) for window in windows), 1e6)
@@ -29,7 +27,6 @@ def test_a_bound_is_not_far_beyond_what_is_possible() -> None:
 
 
 def test_a_value_reached_exactly_by_several_windows_is_the_bound() -> None:
-    """The bound on a joint that stops at 0.6 has no margin."""
     highs = [0.1, 0.3, 0.6, 0.2, 0.6, 0.5, 0.6, 0.4]
     assert upper(highs, 1e6, stops=True) == 0.6
     margin = upper(highs, 1e6)
@@ -38,5 +35,4 @@ def test_a_value_reached_exactly_by_several_windows_is_the_bound() -> None:
 
 @pytest.mark.parametrize("count", [0, 1, FEWEST_WINDOWS - 1])
 def test_too_few_windows_give_no_bound(count: int) -> None:
-    """The extremes of a few windows do not predict the next window."""
     assert upper([float(number) for number in range(count)], 100) is None

@@ -101,12 +101,10 @@ def warnings(learnt: LearningResult, rows: Sequence[Row]) -> list[str]:
 
 
 def test_a_new_drive_gives_no_alarm(learnt: LearningResult) -> None:
-    """Other drives of the same kind give no warning, and no message is dropped or changed."""
     assert [warnings(learnt, drive(seed).rows) for seed in (20, 21)] == [[], []]
 
 
 def test_the_recordings_are_split_and_named(learnt: LearningResult) -> None:
-    """The comment at the head names the recordings for learning and for testing."""
     assert {part.name for part in learnt.held_out}.isdisjoint(part.name for part in learnt.trained)
     assert len(learnt.held_out) == 2
     head = learnt.text.split("\n\n", maxsplit=1)[0]
@@ -153,12 +151,10 @@ def faulty(kind: str) -> list[Row]:
     ],
 )
 def test_a_fault_is_warned_of(learnt: LearningResult, kind: str, says: str) -> None:
-    """Each kind of fault gives the warning that names the fault."""
     assert any(text.startswith(says) for text in warnings(learnt, faulty(kind)))
 
 
 def test_contradictions_of_held_out_recordings_are_listed() -> None:
-    """A bound that is exceeded there is widened, a set with a new value there is omitted; both list their alarms."""
     odd = [drive(seed) for seed in range(1, 5)]
     rows = [(topic, time, number(50.0) if place == 600 else data) if topic == "/speed" else (topic, time, data)
             for place, (topic, time, data) in enumerate(odd[2].rows)]  # fmt: skip
@@ -178,7 +174,6 @@ def test_contradictions_of_held_out_recordings_are_listed() -> None:
 
 
 def test_a_recording_alone_is_divided_in_time() -> None:
-    """The end of a single recording tests the conditions learnt from its beginning."""
     learnt = learnt_from([drive(1, 200.0)], 0.3)
     (trained,), (held_out,) = learnt.trained, learnt.held_out
     assert trained.ended < held_out.began
@@ -186,7 +181,6 @@ def test_a_recording_alone_is_divided_in_time() -> None:
 
 
 def test_nothing_to_learn_from_is_an_error() -> None:
-    """Recordings that disagree about a type, or have no message on the topics, are refused with the reason."""
     other = replace(DRIVES[1], topics={**TYPES, "/speed": "std_msgs/Float32"})
     with pytest.raises(
         LearningError, match="/speed carries std_msgs/Float64 in one recording and std_msgs/Float32"
@@ -219,7 +213,6 @@ def test_omitted_conditions_are_listed() -> None:
 
 
 def test_numbers_of_any_size_give_a_valid_specification() -> None:
-    """Bounds stay within the type of the field; values near the largest number give none; names may be keywords."""
     chance = random.Random(1)  # noqa: S311  no secret
     topics: dict[str, tuple[str, Callable[[], float]]] = {
         "/unsigned": ("std_msgs/UInt64", lambda: chance.getrandbits(64)),

@@ -56,7 +56,6 @@ def test_minimal_and_equivalent() -> None:
 
 
 def test_a_long_chain_is_minimised_in_time() -> None:
-    """Ten thousand states that can only be distinguished one after the other do not take quadratic time."""
     size = 10_000
     table = tuple((min(state + 1, size - 1),) for state in range(size))
     verdicts = tuple(("v",) if state == size - 1 else () for state in range(size))
@@ -70,7 +69,6 @@ def test_exploring_stops_at_the_limit() -> None:
 
 
 def test_events_that_are_not_named_are_one_class() -> None:
-    """Classes are numbered by their first event; unnamed events have class -1."""
     assert letter_classes(("x", "a", "y", "b"), ("b", "a")) == ([0, 1, 0, 2], [-1, 1, 0])
 
 

@@ -194,7 +194,6 @@ def test_against_another_monitor() -> None:
 
 
 def test_no_verdict_is_taken_back() -> None:
-    """The verdict for an event is the final value of the formula there, however the trace continues."""
     random = seeded(43)
     for _ in range(300):
         tree = with_bounds(draw(random, 3, (*PAST, *FUTURE), ARITY, ("a", "b")), random)
@@ -208,7 +207,6 @@ def test_no_verdict_is_taken_back() -> None:
 
 
 def test_only_needed_values_are_kept() -> None:
-    """A decided event leaves no deadline behind."""
     run = compiled("mtl", "eventually[0,9ns] a or eventually[0,1s] (b and next[0,1s] b)").start(0)
     run.step(ABC.index("c"), 0)
     waiting = run.deadline
@@ -241,8 +239,6 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 @pytest.mark.parametrize("events", ["a", "ab", "b"])
 def test_the_cost_of_a_step_does_not_grow_with_waiting_events(text: str, events: str) -> None:
-    """A decision about one event decides others without visiting each of them."""
-
     def lines_run(each_second: int) -> float:
         run, counted = compiled("mtl", text).start(0), 0
 
@@ -266,7 +262,6 @@ def test_the_cost_of_a_step_does_not_grow_with_waiting_events(text: str, events:
 
 
 def test_deadlines_bring_no_verdict_that_may_drop() -> None:
-    """Handlers may not drop for verdicts that a deadline of a random formula can cause."""
     random = seeded(44)
     for _ in range(600):
         tree = with_bounds(draw(random, 3, (*PAST, *FUTURE), ARITY, ("a", "b")), random)
@@ -279,7 +274,6 @@ def test_deadlines_bring_no_verdict_that_may_drop() -> None:
 
 
 def test_an_undecided_part_that_is_not_needed_is_forgotten() -> None:
-    """In the same step, the part may still receive the value that it waited for."""
     text = (
         "next[0ns,1ns] previously[0ns,inf] (b -> a)"
         " or historically[0ns,inf] eventually[0ns,1ns] false and next[1ns,4ns] eventually[0ns,2ns] true"

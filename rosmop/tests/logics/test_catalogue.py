@@ -37,7 +37,6 @@ ROWS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
 
 @pytest.mark.parametrize("logic", LOGICS)
 def test_every_logic_in_any_case(logic: str) -> None:
-    """Each logic is found by its name in any case, and names its categories."""
     for name in (logic, logic.upper(), logic.title()):
         assert compile_property(name, ROWS[logic][0], ABC, ORIGIN).categories == ROWS[logic][1]
 
@@ -59,7 +58,6 @@ def test_every_logic_in_any_case(logic: str) -> None:
 def test_every_property_can_be_rebuilt_from_data(
     logic: str, formula: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its arguments can be encoded and decoded in another process, and give the same verdicts."""
     given: list[Any] = []
 
     def noting(begin: Callable[..., None]) -> Callable[..., None]:
@@ -91,7 +89,6 @@ def test_every_property_can_be_rebuilt_from_data(
 
 @pytest.mark.parametrize("logic", LOGICS)
 def test_categories_that_may_block(logic: str) -> None:
-    """A category may block if its verdict comes with the message; a verdict by timeout may not."""
     monitor = compiled(logic, ROWS[logic][0])
     refused = {category for category in monitor.categories if monitor.blocking_refused(category)}
     assert refused == ({"timeout"} if logic == "tfsm" else set())
@@ -109,7 +106,6 @@ def test_the_documented_example_compiles(logic: str) -> None:
 
 
 def test_a_logic_may_have_no_signs() -> None:
-    """A formula of names and numbers only is read; every sign is refused."""
     reader = TokenReader(Source("plain", "3 a // b", ABC, ORIGIN), ())
     assert [reader.take().text for _ in range(3)] == ["3", "a", ""]
     with pytest.raises(FormulaError, match="`%` has no meaning in plain"):
@@ -117,21 +113,18 @@ def test_a_logic_may_have_no_signs() -> None:
 
 
 def test_an_unknown_logic_has_the_position_of_its_name() -> None:
-    """The nearest logic is offered."""
     with pytest.raises(FormulaError) as refused:
         compile_property("ptlt", "a", ABC, ORIGIN, Position("test.rv", 7, 1))
     assert str(refused.value) == "test.rv:7:1: error: unknown logic `ptlt`; did you mean `ptltl`?"
 
 
 def test_differential_dynamic_logic_is_refused_by_name() -> None:
-    """The error says which logics to use instead."""
     with pytest.raises(FormulaError, match=r"`dL` .* is not supported: .* as `mtl` or `pattern`"):
         compile_property("dL", "x", ("a",), ORIGIN)
 
 
 @pytest.mark.parametrize("logic", LOGICS)
 def test_an_empty_formula_is_refused(logic: str) -> None:
-    """The error for an empty formula says what is expected."""
     assert "expected" in refusal(logic, "  ")[0]
 
 
@@ -144,7 +137,6 @@ def test_comments_and_lines(logic: str) -> None:
 
 @pytest.mark.parametrize("logic", LOGICS)
 def test_a_megabyte_is_refused(logic: str) -> None:
-    """A formula of a million characters is refused for its length."""
     assert refusal(logic, "a" * 1_000_000) == [
         "7:11: a formula of more than 100000 characters; split it into several properties"
     ]
@@ -163,7 +155,6 @@ WORDS = [
 @settings(max_examples=examples(300), derandomize=True, suppress_health_check=list(HealthCheck))
 @given(words=st.lists(st.sampled_from(WORDS), max_size=14), tail=st.text(max_size=3))
 def test_any_text_is_compiled_or_refused(logic: str, words: list[str], tail: str) -> None:
-    """Any text gives a property, or findings inside the text, and no other error."""
     formula = " ".join(words) + tail
     try:
         monitor = compile_property(logic, formula, ABC, ORIGIN)
@@ -219,7 +210,6 @@ except (FormulaError, RunFaultError) as error:
     ("logic", "number"), [(logic, i) for logic, texts in HOSTILE.items() for i in range(len(texts))]
 )
 def test_hostile_formulas_stay_within_bounds(logic: str, number: int) -> None:
-    """A formula made to exhaust the compiler is compiled or refused within a gigabyte and twenty CPU seconds."""
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM],
         input=json.dumps([logic, HOSTILE[logic][number]]),

@@ -126,7 +126,6 @@ def _walk(monitor: object, random: Random) -> tuple[str, ...]:
 
 
 def test_left_and_right_recursive_grammars_agree_on_long_traces() -> None:
-    """The same language, written in four ways, has the same verdicts on random traces of three hundred events."""
     ways = [
         "S -> S a S b | epsilon",
         "S -> a S b S | epsilon",
@@ -147,7 +146,6 @@ def test_left_and_right_recursive_grammars_agree_on_long_traces() -> None:
 
 
 def test_regular_grammars_become_tables() -> None:
-    """A grammar that is visibly regular is stepped by a table."""
     for text in (
         "S -> a S | b",
         "S -> S a | b",
@@ -158,7 +156,6 @@ def test_regular_grammars_become_tables() -> None:
 
 
 def test_flat_traces_take_no_memory() -> None:
-    """After ten thousand balanced pairs, right recursion has stored nothing but the end of the trace."""
     run = compiled("cfg", "S -> a S b S | epsilon", ("a", "b")).start(0)
     assert isinstance(run, GrammarRun)
     for _ in range(10_000):
@@ -179,7 +176,6 @@ def test_deep_traces() -> None:
 
 
 def test_a_run_that_would_grow_too_far_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beyond the limits of nesting and ambiguity a step is a fault, and the run keeps its state."""
     nested, ambiguous = compiled("cfg", "S -> a S b | c"), compiled("cfg", "S -> a S a | a")
     monkeypatch.setattr(parsing, "MAX_DEPTH", 50)
     run = nested.start(0)
@@ -200,6 +196,5 @@ def test_a_run_that_would_grow_too_far_is_a_fault(monkeypatch: pytest.MonkeyPatc
 
 
 def test_long_grammars_are_rejected_once() -> None:
-    """Other errors are in `formulas.txt`."""
     assert len(refusal("cfg", "S -> " + "(" * 5000)) == 1
     assert len(refusal("cfg", "S -> " + "a " * 45_000)) == 1

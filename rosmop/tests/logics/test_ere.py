@@ -118,7 +118,6 @@ def other_library(tree: Tree) -> Fsm:  # noqa: PLR0911  # one per operator
 
 
 def test_match_and_fail_against_another_library() -> None:
-    """Monitor and library agree in every pair of states on a match, and on whether a match is still possible."""
     random = seeded(4)
     for _ in range(500):
         tree = draw(random, 3)

@@ -23,13 +23,11 @@ UNITS = {"s": 10**9, "ms": 10**6, "ns": 1}
 
 @table(TABLES / "formulas.txt")
 def test_a_formula_gives_these_verdicts_or_is_rejected(case: Case) -> None:
-    """Examples of each logic, and its errors with line and column."""
     assert judged(case) == case.expected
 
 
 @table(TABLES / "facts.txt")
 def test_these_facts_are_known_of_a_formula_before_it_runs(case: Case) -> None:
-    """Facts about its verdicts, and the shortest traces that lead to them."""
     assert facts_of(case) == case.expected
 
 

@@ -13,7 +13,6 @@ from rosmop.tests.logics.test_mtl import ARITY, PRINTER, TEMPORAL, bounded
 
 
 def test_violated_at_once_shows_a_trace() -> None:
-    """The fact names a shortest trace that shows it."""
     facts = analyse(compiled("ltl", "false"), ())
     assert facts == [
         PropertyFact(
@@ -26,7 +25,6 @@ def test_violated_at_once_shows_a_trace() -> None:
 
 
 def test_shortest_traces_are_shortest() -> None:
-    """The given trace reaches the category, and no shorter trace does."""
     random = seeded(17)
     formulas = ["[](a => o (b U c))", "<>(a and o (b and o c))", "(a U b) or [] c", "[](a => o o !a)"]
     for formula in [*formulas, *(f"o {random.choice(formulas)}" for _ in range(4))]:
@@ -43,7 +41,6 @@ def test_shortest_traces_are_shortest() -> None:
 
 
 def test_shortest_traces_of_bounded_past_formulas_lead_to_the_category() -> None:
-    """The definition confirms the trace and the time that passes; if none is given, no trace reaches the category."""
     random, clocked, none = seeded(18), 0, 0
     while clocked < 200:
         tree = bounded(draw(random, 3, TEMPORAL, ARITY, ("a", "b")), random, 3)
@@ -101,7 +98,6 @@ def test_picture() -> None:
     ],
 )
 def test_pictures_of_timed_and_untimed_properties(logic: str, formula: str) -> None:
-    """Every finite monitor has a picture; braces and quotes are balanced."""
     picture = to_dot(compiled(logic, formula))
     assert picture is not None
     assert picture.count("{") == picture.count("}") == 1
@@ -109,5 +105,4 @@ def test_pictures_of_timed_and_untimed_properties(logic: str, formula: str) -> N
 
 
 def test_no_picture_of_a_stack() -> None:
-    """A grammar that needs a stack has no picture."""
     assert to_dot(compiled("cfg", "S -> a S b | epsilon")) is None

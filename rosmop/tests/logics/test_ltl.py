@@ -127,7 +127,6 @@ def has(tree: Tree, operators: tuple[str, ...]) -> bool:
 
 
 def test_many_operators_about_the_past() -> None:
-    """A formula that is only about the past costs no more than its memory."""
     monitor = compiled("ltl", "[](a => " + "(*) " * 7 + "b)", AB)
     assert told(monitor, "bbbbbbbab")[-2:] == [(), ()]
     assert told(monitor, "abbbbbbaa") == [("violation",)] * 9
@@ -135,7 +134,6 @@ def test_many_operators_about_the_past() -> None:
 
 
 def test_long_traces_of_random_formulas() -> None:
-    """On a long prefix, a verdict equals that of looping forever, and it is final."""
     random = seeded(6)
     for _ in range(400):
         tree = draw(random, 4, TEMPORAL, UNARY, ("a", "b", "c"))
@@ -151,7 +149,6 @@ def test_long_traces_of_random_formulas() -> None:
 
 
 def test_a_formula_with_too_many_operators_about_the_past_is_rejected() -> None:
-    """Other errors are in `formulas.txt`."""
     assert "10 different past operators" in refusal("ltl", "[](a => " + "(*) " * 10 + "b)")[0]
 
 

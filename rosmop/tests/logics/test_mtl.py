@@ -163,7 +163,6 @@ def test_against_another_monitor() -> None:
 
 
 def test_a_formula_without_bounds_becomes_a_table() -> None:
-    """A formula without time bounds is compiled to a finite automaton."""
     assert isinstance(compiled("mtl", "a since !b"), FiniteProperty)
 
 
@@ -177,7 +176,6 @@ def test_a_formula_without_bounds_becomes_a_table() -> None:
     ],
 )
 def test_a_formula_with_one_bound_becomes_tables_and_a_clock(text: str) -> None:
-    """If the bound begins at once or has no end, a module can step the formula, with the verdicts of the windows."""
     one, other = compiled("mtl", text), compiled("mtl", f"({text}) or once[1ns,1ns] false")
     assert isinstance(one, ClockedProperty)
     assert isinstance(other, PastProperty)
@@ -188,7 +186,6 @@ def test_a_formula_with_one_bound_becomes_tables_and_a_clock(text: str) -> None:
 
 
 def test_a_copy_of_a_run_is_independent() -> None:
-    """Steps of one copy do not change the other."""
     random = seeded(12)
     for _ in range(300):
         tree = bounded(draw(random, 3, TEMPORAL, ARITY, ("a", "b")), random, 6)
@@ -206,7 +203,6 @@ def test_a_copy_of_a_run_is_independent() -> None:
 
 
 def test_memory_of_values_that_are_not_needed_is_bounded() -> None:
-    """If the formula holds anyway, no window grows, however many events happen."""
     run = compiled("mtl", "a => once[1s,2s] b or previously[1s,2s] b").start(0)
     assert isinstance(run, PastRun)
     for second in range(0, 3_000, 3):
@@ -215,7 +211,6 @@ def test_memory_of_values_that_are_not_needed_is_bounded() -> None:
 
 
 def test_memory_of_a_window_is_bounded_by_its_bounds() -> None:
-    """For any number of events, `since[l,u]` stores about l/(u-l) intervals."""
     window = SinceWindow(1000, 1100)
     longest = 0
     for now in range(0, 200_000, 3):
@@ -225,5 +220,4 @@ def test_memory_of_a_window_is_bounded_by_its_bounds() -> None:
 
 
 def test_a_bound_of_thousands_of_digits_is_rejected() -> None:
-    """Other errors are in `formulas.txt`."""
     assert "digits" in refusal("mtl", f"once[0,{'9' * 5000}] a")[0]

@@ -149,7 +149,6 @@ def _deadline(meaning: Meaning, seen: Timed, instant: int) -> tuple[str, ...]:
 
 
 def test_a_published_remedy_counts_as_the_answer() -> None:
-    """With the remedies inserted as answers, the pattern without remedies has the same verdicts on all short traces."""
     for scope, closes in (("globally", ""), ("after c", ""), ("until c", "c"), ("after c until b", "b")):
         for body in ("some a", "b causes a", "some b", "a causes b"):
             if body[-1] == closes:

@@ -76,7 +76,6 @@ def verdicts(tree: Tree, trace: Sequence[str]) -> list[tuple[str, ...]]:
 
 
 def test_a_copy_of_a_run_is_independent() -> None:
-    """Steps of one copy, including calls and returns, do not change the other."""
     random = seeded(13)
     for _ in range(200):
         tree = draw(random, 3, TEMPORAL, UNARY, EVENTS)
@@ -112,7 +111,6 @@ DERIVED: list[tuple[str, Tree]] = [
 
 @pytest.mark.parametrize(("text", "tree"), DERIVED)
 def test_derived_operators(text: str, tree: Tree) -> None:
-    """Other spellings have the same meaning."""
     random = seeded(12)
     for _ in range(100):
         trace = [random.choice(EVENTS) for _ in range(12)]
@@ -132,14 +130,12 @@ BEHIND = {"": [], "@violation { } @c { }": ["violation", "c"], "// why\n@c /* {}
 @pytest.mark.parametrize("text", IN_A_FILE)
 @pytest.mark.parametrize("behind", BEHIND)
 def test_a_formula_needs_no_escapes_in_a_file(text: str, behind: str) -> None:
-    """The formula's `@` begins no handler, and a handler's `@` is not part of a formula."""
     (found,) = parse(f"s() {{ ptcaret: {text}\n{behind} }}", "x.rv").specifications[0].properties
     assert found.formula.removesuffix("// why").rstrip() == text
     assert [handler.category for handler in found.handlers] == BEHIND[behind]
 
 
 def test_too_many_open_calls_are_a_fault_and_change_nothing() -> None:
-    """The next event is judged as if the refused `begin` had not been."""
     run = compiled("ptcaret", "<*a> a", EVENTS).start(0)
     for _ in range(MAX_DEPTH):
         run.step(0, 0)

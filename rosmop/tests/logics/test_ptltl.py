@@ -67,7 +67,6 @@ def holds(tree: Tree, trace: tuple[str, ...], i: int) -> bool:  # noqa: PLR0911,
 
 @pytest.mark.parametrize("folded", [past_monitors.MAX_FOLDED, 0])
 def test_table_and_folded_program_agree(folded: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A formula too large for a table is computed at each event, with the same verdicts."""
     monkeypatch.setattr(past_monitors, "MAX_FOLDED", folded)
     random = seeded(8)
     for _ in range(examples(40)):
@@ -83,7 +82,6 @@ def test_table_and_folded_program_agree(folded: int, monkeypatch: pytest.MonkeyP
 
 
 def test_since_groups_leftwards_and_binds_tighter_than_and() -> None:
-    """`a S b S c` is `(a S b) S c`; `a S b and c` is `(a S b) and c`."""
     for word in traces(ABC, 4):
         assert told(compiled("ptltl", "a S b S c"), word) == told(compiled("ptltl", "(a S b) S c"), word)
         assert told(compiled("ptltl", "a or b S c and !a"), word) == told(
@@ -92,6 +90,5 @@ def test_since_groups_leftwards_and_binds_tighter_than_and() -> None:
 
 
 def test_a_wide_formula_is_accepted() -> None:
-    """A formula with ten thousand operands is accepted."""
     text = " xor ".join(["<*> a", *["b"] * 10_000])
     assert told(compiled("ptltl", text), "ab") == [("validation",), ("validation",)]

@@ -57,7 +57,6 @@ def rewritten(rules: list[Rule], string: list[str]) -> tuple[list[str], tuple[st
 
 
 def test_endless_rewriting_is_a_fault_and_changes_nothing() -> None:
-    """A rule that grows and a cyclic rule are faults; the run continues with the next event."""
     for rules in ("a -> a a .", "a -> X . X -> a ."):
         run = compiled("srs", f"{rules} b b -> #fail .").start(0)
         assert run.step(1, 0) == ()
@@ -84,7 +83,6 @@ def test_comparing_long_rules_is_charged() -> None:
 
 
 def test_a_string_that_grows_for_ever_is_a_fault() -> None:
-    """Each event adds one symbol until there are too many."""
     run = compiled("srs", "a b -> #fail .").start(0)
     assert isinstance(run, RewritingRun)
     run.string = [0] * MAX_STRING

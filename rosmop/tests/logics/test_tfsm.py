@@ -53,14 +53,12 @@ class Ticking:
 
 
 def test_a_run_refuses_to_step_past_its_deadline() -> None:
-    """A caller that forgets to expire the run gets an error instead of a wrong verdict."""
     run = compiled("tfsm", "s0 [ timeout 1s -> s0, a -> s0 ]", AB).start(0)
     with pytest.raises(ValueError, match="expire the run first"):
         run.step(0, 2 * 10**9)
 
 
 def test_time_does_not_run_backwards() -> None:
-    """An event with an earlier time gets the latest time seen."""
     run = compiled("tfsm", "s0 [ timeout 1s -> s0, a -> s0 ]", AB).start(0)
     run.step(0, 500_000_000)
     run.step(0, 400_000_000)

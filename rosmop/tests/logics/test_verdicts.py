@@ -15,7 +15,6 @@ SHORT = {"fsm": 120, "ere": 120, "cfg": 39, "ltl": 39, "pattern": 5}
 
 @pytest.mark.parametrize("logic", PROPERTIES)
 def test_verdicts_of_random_properties_are_those_of_the_definition(logic: str) -> None:
-    """This holds on short traces and longer random ones, after each event and at each deadline."""
     judged = [*differing(logic, 2 * PROPERTIES[logic], seed=11, each=2, short=SHORT.get(logic, 20))]
     assert [difference for _, difference in judged if difference] == []
 
@@ -23,7 +22,6 @@ def test_verdicts_of_random_properties_are_those_of_the_definition(logic: str) -
 def test_formulas_too_large_to_simplify_at_each_event_have_the_same_verdicts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Small formulas are simplified to save time; in this test no formula is."""
     monkeypatch.setattr(past_monitors, "MAX_FOLDED", 0)
     for logic in ("mtl", "ptltl"):
         judged = differing(logic, 2 * PROPERTIES[logic], seed=12, each=2, short=5)

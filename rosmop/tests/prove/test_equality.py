@@ -48,7 +48,6 @@ def test_shipped_specifications(name: str) -> None:
 
 
 def test_no_shipped_specification_is_left_out() -> None:
-    """A newly shipped specification must also be proved."""
     assert {path.stem for path in MONITORS.glob("*.rv")} == set(SHIPPED)
 
 
@@ -104,7 +103,6 @@ PROVED = {
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", PROVED)
 def test_the_language_without_loops_is_proved(name: str) -> None:
-    """The proof covers all messages and states, more than any test can try."""
     assert answers(PROVED[name]) == {"s.e": EQUAL}
 
 
@@ -122,12 +120,10 @@ UNPROVED = {
 @pytest.mark.nightly
 @pytest.mark.parametrize("answer", UNPROVED)
 def test_an_unproved_answer_says_why(answer: str) -> None:
-    """The answer is never `equal` without a proof."""
     assert answers(UNPROVED[answer]) == {"s.e": answer}
 
 
 def test_without_time_nothing_is_proved() -> None:
-    """An undecided event is reported as undecided."""
     clock = itertools.count(0.0, 1000.0)
     (found,) = findings_of(compiled(PROVED["conversions at the limits"]), lambda: next(clock), patience=0)
     assert (found.answer, found.differs) == ("not decided in time", False)

@@ -39,7 +39,6 @@ def refusal(path: Path) -> str:
 
 
 def test_messages_are_in_the_order_of_time(tmp_path: Path) -> None:
-    """Chunks whose times overlap are merged; messages of one time keep the order of the file."""
     chance = random.Random(1)  # noqa: S311  no secret
     rows = [(number // 20 * 10 + chance.randrange(40), str(number).encode()) for number in range(500)]
     found = list(RecordedFile(make_mcap(tmp_path / "x.mcap", rows), ["*"]).messages())
@@ -50,7 +49,6 @@ def test_messages_are_in_the_order_of_time(tmp_path: Path) -> None:
 def test_a_chunk_is_unpacked_up_to_a_limit(
     compression: CompressionType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A file that unpacks to more than the limit is rejected before it is unpacked whole."""
     path = make_mcap(tmp_path / "x.mcap", [(1, bytes(100_000))], chunk=200_000, compression=compression)
     assert len(next(RecordedFile(path, ["*"]).messages())[2]) == 100_000
     monkeypatch.setattr(regular_files, "LARGEST_CHUNK", 50_000)
@@ -59,7 +57,6 @@ def test_a_chunk_is_unpacked_up_to_a_limit(
 
 
 def test_chunks_of_one_time_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file all of whose chunks overlap does not fill the memory."""
     rows = [(time, bytes(1000)) for _chunk in range(40) for time in (1, 1000)]
     path = make_mcap(tmp_path / "x.mcap", rows, chunk=1500)
     monkeypatch.setattr(regular_files, "LARGEST_CHUNK", 20_000)
@@ -67,7 +64,6 @@ def test_chunks_of_one_time_are_bounded(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_repeated_reading_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The work is at most a multiple of the size of the file."""
     rows = [(time, bytes(10_000)) for time in range(50)]
     path = make_mcap(tmp_path / "x.mcap", rows, chunk=20_000, compression=CompressionType.ZSTD)
     monkeypatch.setattr(regular_files, "LARGEST_CHUNK", 50_000)
@@ -86,7 +82,6 @@ def test_other_files_are_named(tmp_path: Path) -> None:
 
 
 def test_damage_gives_messages_or_the_reason(tmp_path: Path) -> None:
-    """No change of bytes gives another exception."""
     rows = [(time, bytes([time]) * 30) for time in range(60)]
     chance, ended = random.Random(5), 0  # noqa: S311  the same each time
     for compression in CompressionType:

@@ -17,7 +17,6 @@ LIBRARY = ctypes.CDLL(None)
 
 @given(st.floats())
 def test_a_float_is_what_c_makes_of_a_double(value: float) -> None:
-    """Covers rounding to 32 bits, overflow to infinity, and NaN."""
     expected = ctypes.c_float(value).value
     result = numbers.f32(value)
     assert struct.pack("d", result) == struct.pack("d", expected) or (
@@ -27,7 +26,6 @@ def test_a_float_is_what_c_makes_of_a_double(value: float) -> None:
 
 @given(st.integers(-(2**63), 2**64 - 1))
 def test_an_integer_becomes_the_nearest_float(value: int) -> None:
-    """It is rounded once, not to a double first."""
     result = numbers.f32_of_integer(value)
     assert numbers.f32(result) == result
     step = max(2.0 ** (abs(value).bit_length() - 24), 1.0)
@@ -39,7 +37,6 @@ def test_an_integer_becomes_the_nearest_float(value: int) -> None:
 
 @given(st.integers(), st.sampled_from([8, 16, 32, 64]), st.booleans())
 def test_wrapping_keeps_the_low_bits(value: int, bits: int, signed: bool) -> None:
-    """The result is in range and differs by a multiple of the modulus."""
     result = numbers.wrap(value, bits, signed)
     assert (value - result) % (1 << bits) == 0
     assert -(1 << bits - 1) * signed <= result < 1 << (bits - signed)

@@ -8,7 +8,6 @@ from rosmop.runtime.wire import WireMessage
 
 
 def test_a_message_written_back_is_unchanged() -> None:
-    """A message is changed if its bytes differ at the end, whatever was written on the way."""
     message = WireMessage(bytearray(b"abcdef"), 0)
     found = [message.changed]
     message.patch(1, b"xy")
@@ -21,7 +20,6 @@ def test_a_message_written_back_is_unchanged() -> None:
 
 
 def test_writing_equal_bytes_touches_nothing() -> None:
-    """`touched` is set when different bytes are written, in place or of another length, until it is cleared."""
     message = WireMessage(bytearray(b"abcdef"), 0)
     found = []
     for start, end, new in ((1, 3, b"bc"), (1, 3, b"bx"), (0, 2, b"abc"), (0, 3, b"abc"), (0, 1, b"z")):
@@ -32,7 +30,6 @@ def test_writing_equal_bytes_touches_nothing() -> None:
 
 
 def test_a_received_buffer_that_cannot_be_written_is_left_alone() -> None:
-    """Bytes and read-only views are copied before the first change."""
     received = b"abcdef"
     for buffer in (received, memoryview(received)):
         message = WireMessage(buffer, 0)
@@ -42,7 +39,6 @@ def test_a_received_buffer_that_cannot_be_written_is_left_alone() -> None:
 
 
 def test_only_what_is_overwritten_is_kept_of_a_large_message() -> None:
-    """Changing a number does not copy the picture after it."""
     message = WireMessage(memoryview(bytearray(1 << 20)), 0)
     message.patch(8, b"\x01")
     message.patch(100, b"\x01\x02")
@@ -52,7 +48,6 @@ def test_only_what_is_overwritten_is_kept_of_a_large_message() -> None:
 
 @pytest.mark.parametrize("seed", range(200))
 def test_patches_and_splices_agree_with_a_copy(seed: int) -> None:
-    """Random edits give the same bytes, and the same `changed`, as a plain copy that is compared."""
     random = Random(seed)  # noqa: S311  draws examples, not keys
     received = bytes(random.choices(b"ab", k=12))
     message, copy = WireMessage(bytearray(received), 0), bytearray(received)

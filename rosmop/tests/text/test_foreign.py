@@ -22,13 +22,11 @@ def refused(text: str) -> tuple[int, str]:
 
 
 def test_an_open_brace_is_named() -> None:
-    """If a file ends too early, the error names the open brace; braces in strings and comments do not count."""
     place, told = refused('s() {\nvoid f() { if (x) { "}"; // }\n')
     assert told.endswith("the `{` at 2:19 has no `}`"), (place, told)
 
 
 def test_a_place_behind_very_many_comments_is_found() -> None:
-    """Any number of comment lines, with any quotes in them, may separate the valid text from the error."""
     place, told = refused("s() { int x" + " // it's\n" * 5000 + "/* ' */ }")
     assert (place, told) == (11, "expected `;` after this, found `}` in line 5001")
 
@@ -44,7 +42,6 @@ def test_a_place_behind_very_many_comments_is_found() -> None:
 )
 @pytest.mark.parametrize("between", [" ", "\n", " // what follows\n"])
 def test_a_property_without_handlers_ends_where_the_next_begins(behind: str, between: str) -> None:
-    """As in MOP, a property's text ends at its handlers; here it also ends at the next property or event."""
     [found] = parse(f"s() {{ {EVENT} }} ere: e e*{between}{behind} }}", "x.rv").specifications
     assert found.properties[0].formula.split("//")[0].strip() == "e e*"
     assert len(found.properties) + len(found.events) == 3

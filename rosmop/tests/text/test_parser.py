@@ -31,7 +31,6 @@ def refusal(text: str) -> tuple[int, int, str]:
 
 
 def test_each_rule_of_the_grammar_has_a_method() -> None:
-    """lark finds the methods of the builder by the names of the rules, and builds nothing of a rule without one."""
     rules = {str(rule.alias or rule.origin.name): rule for rule in _parser().rules}
     methods = {name for name in vars(TreeBuilder) if not name.startswith("_")} - {"at", "refuse"}
     assert methods - rules.keys() == set()
@@ -58,20 +57,17 @@ HEADS = [
 
 @pytest.mark.parametrize(("head", "name", "modifiers"), HEADS)
 def test_the_head_of_a_specification(head: str, name: str, modifiers: tuple[str, ...]) -> None:
-    """Covers modifiers, optional parentheses, and a C++ preamble and comments before the specification."""
     found = parsed(f"{head} event e() /t std_msgs/Empty '{{}}' {{ }} }}")
     assert found.name == name
     assert tuple(modifier.parts[0] for modifier in found.modifiers) == modifiers
 
 
 def test_several_specifications_in_a_file() -> None:
-    """A file may have any number of specifications, in order, with stray semicolons."""
     text = "a() { event e() /t std_msgs/Empty '{}' { }; };\nb { event e() /t std_msgs/Empty '{}' { } }"
     assert [found.name for found in parse(text, "x.rv").specifications] == ["a", "b"]
 
 
 def test_functions_and_declarations_may_stand_anywhere() -> None:
-    """Declarations, init, events and functions may be mixed, as in the samples of ROSRV."""
     found = parsed("""s() {
         int a = 10; double b, c = 2.5; std::string const t = "x"; char d[20]; std::vector<std::vector<double>> v;
         init() { a = 1; }
@@ -136,7 +132,6 @@ def test_durations(text: str, nanoseconds: int) -> None:
 
 
 def test_a_comma_may_end_a_pattern() -> None:
-    """`'{data:v,}'` is accepted as in ROSMOP, also inside nested patterns."""
     paths = []
     for comma in (",", ""):
         pattern = f"'{{a:x, b:{{c:y{comma}}}{comma}}}'"
@@ -163,7 +158,6 @@ def test_patterns_are_paths() -> None:
 
 
 def test_the_older_brackets_of_actions() -> None:
-    """`<< … >>` may surround an action, as in the oldest samples."""
     found = parsed("s() { event e() /t std_msgs/Empty '{}' << int a = 1 << 2; >> }").events[0]
     assert len(found.action.statements) == 1
 
@@ -201,7 +195,6 @@ NAMES = ["event", "init", "service", "every", "when", "request", "response", "ho
 
 @pytest.mark.parametrize("name", NAMES)
 def test_words_of_the_language_are_names_where_they_mean_nothing(name: str) -> None:
-    """A variable in an action may have the name of a keyword of specifications."""
     assert len(event(f"int {name} = 1; {name} = {name} + 1;").action.statements) == 2
 
 
@@ -224,7 +217,6 @@ STATEMENTS = [
 
 @pytest.mark.parametrize("statement", STATEMENTS)
 def test_a_statement_is_read(statement: str) -> None:
-    """The statements are those of C++ that specifications use."""
     assert event(statement).action.statements
 
 
@@ -239,19 +231,16 @@ REFUSALS = [
 def test_an_error_in_an_empty_or_long_text_has_a_position(
     text: str, line: int, column: int, reason: str
 ) -> None:
-    """Other errors of the syntax are in `rosmop/tests/check/findings.txt`."""
     found = refusal(text)
     assert found[:2] == (line, column)
     assert reason in found[2]
 
 
 def test_a_file_has_a_limit() -> None:
-    """A file beyond the limit is refused before it is read."""
     assert "split it into several" in refusal("a" * (MAX_CHARACTERS + 1))[2]
 
 
 def test_trees_at_different_places_are_equal() -> None:
-    """A specification that was only moved in its file counts as the same."""
     text = "s() { int a = 1; event e(int x) /t p/T '{a.b[1]:x, c:2}' when (x) { a++; } ere: e @match { } }"
     assert parsed(text) == parsed("\n\n  " + text.replace(" when", "\n   when"))
     assert parsed(text) != parsed(text.replace("a = 1", "a = 2"))

@@ -37,7 +37,6 @@ FILES: list[tuple[str, Callable[[Path], object], str]] = [
 def test_other_files_are_usage_errors(
     command: str, make: Callable[[Path], object], reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The command neither blocks nor fills the memory; it exits with status 2 and the reason."""
     monkeypatch.chdir(tmp_path)
     Path("m.rv").write_text(SPECIFICATION)
     make(Path("given"))
@@ -49,7 +48,6 @@ def test_other_files_are_usage_errors(
 def test_an_unreadable_folder_of_definitions_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It does not count as an empty one."""
     monkeypatch.chdir(tmp_path)
     Path("m.rv").write_text(SPECIFICATION)
     Path("own/package").mkdir(parents=True)

@@ -75,7 +75,6 @@ def test_the_wheel_is_complete(environment: Path) -> None:
 
 
 def test_shipped_specifications_are_valid(environment: Path) -> None:
-    """`check` accepts every specification in `monitors/`."""
     done = run(environment / "bin/rosmop", "check", *MONITORS)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith(f"{len(MONITORS)} specifications OK\n")
@@ -94,7 +93,6 @@ def test_errors_name_the_command(environment: Path, tmp_path: Path) -> None:
 
 
 def test_why_slow_says_that_nothing_is_compiled_here(environment: Path, tmp_path: Path) -> None:
-    """Without wasmtime every message is interpreted, also of specifications that could be compiled."""
     (tmp_path / "a.rv").write_text(
         "a() { event e(int n) /n std_msgs/UInt8 '{data:n}' { if (n == 2) return; } }"
     )
@@ -105,14 +103,12 @@ def test_why_slow_says_that_nothing_is_compiled_here(environment: Path, tmp_path
 
 
 def test_the_readme_links_to_files() -> None:
-    """The links of the README work in a checkout."""
     links = re.findall(r"\]\(([^)]+)\)", (FOLDER / "README.md").read_text())
     assert links
     assert [link for link in links if not (FOLDER / link).is_file()] == []
 
 
 def test_the_readme_shows_real_output(environment: Path, tmp_path: Path) -> None:
-    """The README's files and commands are used in order; the written bag and learnt specification are valid input."""
     blocks = dict(re.findall(r"```(\w+)\n(.*?)```", (FOLDER / "README.md").read_text(), re.DOTALL))
     (tmp_path / "limit.rv").write_text(blocks["cpp"])
     (tmp_path / "record.py").write_text(blocks["python"])

@@ -20,12 +20,10 @@ COMMON = [
 
 @pytest.mark.parametrize(("left", "right", "result"), COMMON)
 def test_the_common_type_of_two_numbers(left: Type, right: Type, result: Type) -> None:
-    """The common type is that of C++, in either order."""
     assert value_types.common(left, right) == value_types.common(right, left) == result
 
 
 def test_integers_of_one_width_and_sign_are_one_type() -> None:
-    """`int` and `int32_t` are two names of the same type; `char` and `uint8_t` are different types."""
     assert value_types.IntegerType(32, True, "int32_t") == value_types.INT
     assert value_types.CHAR != value_types.UINT8
     assert len({value_types.IntegerType(8, True, "x"), value_types.CHAR, value_types.INT8}) == 1
@@ -50,7 +48,6 @@ CONVERTIBLE = [
 
 @pytest.mark.parametrize(("source", "target", "possible"), CONVERTIBLE)
 def test_types_that_can_be_assigned(source: Type, target: Type, possible: bool) -> None:
-    """Numbers convert to numbers and strings to strings; vectors need the same elements, messages the same type."""
     assert value_types.convertible(source, target) is possible
 
 
@@ -65,5 +62,4 @@ def test_types_that_can_be_assigned(source: Type, target: Type, possible: bool) 
     ],
 )
 def test_a_type_is_written_as_in_cpp(kind: Type, text: str) -> None:
-    """Error messages use the names of C++."""
     assert str(kind) == text

@@ -12,7 +12,6 @@ def test_the_nearest_name() -> None:
 
 
 def test_thousands_of_names_and_mistakes_cost_little() -> None:
-    """A file full of names and mistakes takes no longer than many short files."""
     known = [f"function{number}" for number in range(100_000)]
     began = time.process_time()
     for number in range(5):

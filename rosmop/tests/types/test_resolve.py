@@ -43,7 +43,6 @@ SPELLINGS = [
 
 @pytest.mark.parametrize(("words", "kind"), SPELLINGS)
 def test_a_spelling(words: str, kind: Type) -> None:
-    """Each spelling is its type."""
     assert resolve(tree.TypeName(HERE, tuple(words.split())), MessageTypes(definitions())) == kind
 
 

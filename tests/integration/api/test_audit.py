@@ -33,7 +33,6 @@ def publish(appliance: Appliance, topic: str) -> Any:
 
 
 def test_followers_get_a_denial_live(appliance: Appliance, rest: Rest) -> None:
-    """A client that follows denials gets each one at once, with rule and reason, and nothing else."""
     events = rest.events("/v1/audit/stream?decision=deny&category=publish")
     next(events)
     publish(appliance, "/allowed")

@@ -39,7 +39,6 @@ def completed(words: str, state: str, shell: str = "bash") -> list[str]:
 
 
 def test_names_of_the_running_appliance(appliance: Appliance) -> None:
-    """Monitors and tokens are completed from their first letters; a name already on the line is not offered again."""
     state = str(appliance.state)
     assert completed("rosrv monitor disable wo", state) == ["words"]
     assert completed("rosrv monitor disable x", state) == []
@@ -49,11 +48,9 @@ def test_names_of_the_running_appliance(appliance: Appliance) -> None:
 
 @pytest.mark.parametrize("shell", ["zsh", "fish"])
 def test_names_in_other_shells(appliance: Appliance, shell: str) -> None:
-    """zsh and fish complete the names of the running appliance as well."""
     offered = " ".join(completed("rosrv monitor disable wo", str(appliance.state), shell))
     assert re.findall(r"\bwords\b", offered) == ["words"]
 
 
 def test_nothing_where_no_appliance_runs(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Without an appliance there are no names, and no error text inside the command line."""
     assert completed("rosrv monitor disable ", str(tmp_path_factory.mktemp("nobody"))) == []

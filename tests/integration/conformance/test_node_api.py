@@ -65,7 +65,6 @@ def asked(pair: tuple[str, str], step: tuple[Any, ...]) -> Answers:
 
 @pytest.mark.parametrize("title", _CONVERSATIONS)
 def test_answers_are_those_of_rospy(pair: tuple[str, str], title: str) -> None:
-    """rospy's texts about protocols are errors of Python; the appliance names the parameter, or what it relays."""
     for line in _CONVERSATIONS[title].splitlines():
         if " of /voice" not in line:
             continue

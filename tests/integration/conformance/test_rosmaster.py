@@ -38,7 +38,6 @@ def of_fake_nodes(name: Any, value: Any) -> Any:
 
 @pytest.mark.parametrize("title", _CONVERSATIONS)
 def test_answers_are_those_of_rosmaster(both: BothMasters, title: str) -> None:
-    """Both masters answer every call alike, and have the same state after it."""
     for line in filter(str.strip, _CONVERSATIONS[title].splitlines()):
         if line.startswith(" "):
             continue

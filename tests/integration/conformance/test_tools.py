@@ -54,7 +54,6 @@ def test_rostopic_echo_of_a_bag_and_of_a_field(ros: RosSession, tmp_path: Path) 
 
 
 def test_rosnode_of_a_killed_node(ros: RosSession) -> None:
-    """After a crash `ping -a` and `info` work; `cleanup` (or the appliance before it) removes the node."""
     voice = ros.talker("rospy", "/chatter", name="voice")
     ros.listener("roscpp", "/chatter", name="ear")
     voice.kill()
@@ -114,7 +113,6 @@ def test_rosservice_find_args_uri(ros: RosSession) -> None:
 
 
 def test_graph_as_rqt_graph_reads_it(local: Site, ros: RosSession) -> None:
-    """The library behind `rqt_graph` finds the nodes, the topics and the connections, and no bad node."""
     ros.talker("rospy", "/chatter", name="voice")
     ros.listener("roscpp", "/chatter", name="ear").wait_for(event="received")
     found = ros.run(PYTHON, "-c", GRAPH).stdout
@@ -145,7 +143,6 @@ def test_rosbag_play_with_a_clock(ros: RosSession, tmp_path: Path) -> None:
 @pytest.mark.parametrize("local", ["appliance"], indirect=True)  # not reached behind a plain master
 @pytest.mark.parametrize(("how", "value"), [("ROS_HOSTNAME", "nowhere.invalid"), ("ROS_IP", "192.0.2.7")])
 def test_node_with_an_unreachable_address(local: Site, tmp_path: Path, how: str, value: str) -> None:
-    """A node with an unresolvable or wrong address is reached at the source address of its call."""
     with RosSession(local.master_uri, tmp_path) as ros:
         odd = rospy_node(ros, "orders", "odd", **{"ROS_IP": "", how: value})
         order(odd, "advertise", topic="/odd", latch=True)

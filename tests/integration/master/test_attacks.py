@@ -100,7 +100,6 @@ def test_rosout_receives_every_nodes_log(field: Field) -> None:
 
 
 def test_uri_of_a_third_machine(field: Field) -> None:
-    """A URI that names a third machine causes no call there: the caller's own address is called."""
     with Impostor(field.unknown_host, answering([1, "", 0])) as third:
         home = field.attacker.run(lambda: socket.create_server(("10.77.0.66", third.port)))
         with home:
@@ -221,7 +220,6 @@ def test_permission_of_another_host(field: Field) -> None:
 
 
 def test_host_that_no_rule_names(field: Field) -> None:
-    """An unknown host gets a fault with the reason, and its request is recorded."""
     answer = field.call(field.unknown_host, "getPid", "/unknown")
     assert "no rule of the policy names 10.77.0.99" in answer.faultString
     record = field.recorded(host="10.77.0.99", decision="deny", resource="getPid", caller_id="/unknown")

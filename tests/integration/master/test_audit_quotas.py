@@ -42,7 +42,6 @@ def reads(prefix: str) -> list[dict[str, Any]]:
 
 
 def test_reads_with_long_keys_do_not_fill_the_disk(siege: Siege) -> None:
-    """A guest that reads without end gets its quota of the log and is then refused with a reason; the robot is not."""
     guest, before = siege.crowd.guests[0], log_bytes(siege)
     denied = siege.crowd.call(guest, "setParam", "/flooder", "/limits/speed", 1)
     assert denied[0] == 0

@@ -20,7 +20,6 @@ NOBODY = "http://10.77.0.10:1/"
 def test_the_monitors_publisher_behind_the_firewall_is_not_lost(
     lab: Lab, robot: Host, tmp_path: Path
 ) -> None:
-    """A node whose port refuses connections is lost; the appliance's own publisher, hidden by the firewall, is not."""
     middle, settings = lab.host("appliance", "10.77.0.2/24"), "liveness: {interval: 0.1}\n"
     options = ("--monitors", str(MONITORS), "--api", "off")
     with Appliance(middle, settings=settings, options=options) as appliance:

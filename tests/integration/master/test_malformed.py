@@ -22,7 +22,6 @@ def post(body: str) -> bytes:
 
 @pytest.mark.parametrize("node", ["", "/voice"])
 def test_a_malformed_request_is_refused_and_recorded(field: Field, node: str) -> None:
-    """RVMaster's port and a node's endpoint are equally strict."""
     uri = field.rogue("lookupNode", "/looker", node)[2] if node else field.master
     port = int(uri.rstrip("/").rpartition(":")[2])
     assert field.raw(b"GET / HTTP/1.1\r\n\r\n", port=port).split()[1] == b"405"

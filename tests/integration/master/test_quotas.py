@@ -57,7 +57,6 @@ def close_connections_first(siege: Siege) -> Iterator[None]:
 
 
 def test_connections_of_two_hundred_addresses(siege: Siege) -> None:
-    """Guests and unknown hosts open more idle connections to RVMaster than there are slots; twelve use a full quota."""
     crowd = siege.crowd
 
     def attack() -> None:
@@ -70,7 +69,6 @@ def test_connections_of_two_hundred_addresses(siege: Siege) -> None:
 
 
 def test_requests_of_two_hundred_addresses(siege: Siege) -> None:
-    """Every guest sends requests on three connections, twice and without reading, and begins endless bodies."""
     crowd = siege.crowd
     ask = http_request("getSystemState", "/guest/asker")
     begun = b"POST / HTTP/1.1\r\nContent-Length: 8000000\r\n\r\n" + bytes(60_000)
@@ -122,7 +120,6 @@ def test_handshakes_with_rest(siege: Siege) -> None:
 
 
 def test_parameters_of_two_hundred_addresses(siege: Siege) -> None:
-    """Guests repeatedly set and read as many parameters as they can: the robot can still set, overwrite and read."""
     crowd, ending, trees = siege.crowd, threading.Event(), list[int]()
     large, small = "x" * (1 << 18), {f"p{number}": number for number in range(2750)}
 

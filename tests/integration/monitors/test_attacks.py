@@ -98,7 +98,6 @@ def change(appliance: Appliance, number: int) -> None:
 def test_monitor_changes_under_a_flood_lose_only_counted_messages(
     appliance: Appliance, ros: RosSession
 ) -> None:
-    """Fast listeners get everything in order; for other listeners, the missing messages equal the counted drops."""
     ros.talker("roscpp", "/map", "--latch", name="map")
     early = ros.listener("roscpp", "/map")
     early.wait_for(event="received", data="hello 1")
@@ -142,7 +141,6 @@ def test_monitor_changes_under_a_flood_lose_only_counted_messages(
 
 
 def test_a_relay_killed_while_specifications_are_loaded(appliance: Appliance, ros: RosSession) -> None:
-    """The load succeeds or fails as a whole: afterwards the reported specifications are in force on both relays."""
     talker = ros.node("rospy", "flood_talker", "/flood", "--rate", "100", "--bytes", "10", name="flood")
     listener = ros.node("rospy", "counting_listener", "/flood", name="ear")
     load(appliance, tag=tag(1))

@@ -87,7 +87,6 @@ DEATHS: dict[str, Callable[[Appliance], object]] = {
 
 @pytest.mark.parametrize("death", DEATHS)
 def test_a_latched_stop_stays(stopped: Appliance, common_robot: Host, tmp_path: Path, death: str) -> None:
-    """After the stop, all messages are dropped until it is released."""
     numbers = itertools.count()
 
     def session() -> RosSession:

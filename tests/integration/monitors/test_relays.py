@@ -80,7 +80,6 @@ def relay_of(appliance: Appliance, number: int) -> int:
 
 
 def test_the_death_of_a_relay_does_not_affect_the_other(appliance: Appliance, ros: RosSession) -> None:
-    """Topics of the dead relay continue as after any restart; the monitors of both keep their state."""
     left, right = ros.listener("rospy", "/left"), ros.listener("roscpp", "/right")
     alarms = [ros.listener("rospy", f"/{one}/alarm") for one in ("left", "right")]
     for alarm in alarms:
@@ -110,7 +109,6 @@ def test_the_death_of_a_relay_does_not_affect_the_other(appliance: Appliance, ro
 def test_loading_a_specification_across_relays_moves_only_one_monitor(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """Only the monitor that moves is reset, which raises an alarm; nodes get the new address and reconnect."""
     listeners = {
         (one, client): ros.listener(client, f"/{one}")
         for one in ("left", "right")
@@ -148,7 +146,6 @@ def test_loading_a_specification_across_relays_moves_only_one_monitor(
 def test_services_use_the_relay_of_their_monitor(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """Services use it before and after the load, and after the death of control; stored state stays in place."""
     ros.service_server("rospy", "/mode")
     ros.service_server("roscpp", "/other_mode")
     clients = [ros.service_client("roscpp", "/mode"), ros.service_client("rospy", "/other_mode")]
@@ -200,7 +197,6 @@ def test_one_message_after_waiting_for_a_subscriber_is_not_lost_to_the_monitor(
 def test_a_new_subscriber_gets_no_old_messages(
     request: pytest.FixtureRequest, masters: Masters, tmp_path: Path, client: Client, master: str
 ) -> None:
-    """A new subscriber gets only messages sent after its start, as on a plain master."""
     with ExitStack() as stack:
         if master == "plain":
             uri = stack.enter_context(masters.lend("plain", "loopback")).master_uri

@@ -88,7 +88,6 @@ ROWS: dict[str, tuple[Callable[[Appliance, RosSession], object], bool]] = {
 def test_the_base_gets_stops_and_nothing_else(
     guarded: Appliance, common_robot: Host, tmp_path: Path, row: str
 ) -> None:
-    """Also after the relay is killed, until an operator or the sensor releases the base."""
     disturb, holds = ROWS[row]
     with RosSession(guarded.master_uri, tmp_path, common_robot) as ros:
         base = ros.listener("roscpp", "/chatter")

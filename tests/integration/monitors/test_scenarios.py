@@ -54,7 +54,6 @@ def replayed(bag: Path, *files: Path, output: Path | None = None) -> list[Record
 
 
 def test_the_mission_fails_without_monitors(unguarded: Drive) -> None:
-    """Without monitors the robot drives through the obstacle, leaves the zone, and shoots at itself."""
     assert unguarded.nearest(OBSTACLE) < 0
     assert unguarded.farthest() > 24
     assert [shot.fired for shot in unguarded.shots] == [True, True, True]
@@ -98,7 +97,6 @@ def test_obstacle_avoidance() -> None:
 @pytest.mark.parametrize("forward", [0.3, 1.0, 2.0])
 @pytest.mark.parametrize("start", [0.0, 0.4])
 def test_no_speed_and_no_course_touches_the_obstacle(forward: float, start: float) -> None:
-    """The required distance grows with the speed."""
     mission = (
         Part(start / 0.4 if start else 0.1, turn=0.1 if start else 0.0),
         Part(30 / forward / 2, forward=forward),
@@ -109,7 +107,6 @@ def test_no_speed_and_no_course_touches_the_obstacle(forward: float, start: floa
 
 
 def test_a_blind_laser_is_an_obstacle() -> None:
-    """Before the first scan, and when scans cease, the robot is not driven forward."""
     simulation = Simulation(specification("obstacle_avoidance"))
     simulation.laser_works = False
     simulation.run((Part(3.0, forward=1.0),))
@@ -137,7 +134,6 @@ def test_all_monitors_together(unguarded: Drive) -> None:
 def test_a_recording_gives_the_same_verdicts_as_the_drive(
     bag: Path, unguarded: Drive, tmp_path: Path
 ) -> None:
-    """`rosrv monitor run` drops the same messages as the monitors, and writes the remaining ones."""
     output = tmp_path / "guarded.bag"
     records = replayed(bag, *SHIPPED, output=output)
     messages = [one for one in records if "topic" in one]
@@ -157,7 +153,6 @@ def test_a_recording_gives_the_same_verdicts_as_the_drive(
 
 
 def test_a_recording_gives_the_same_records_every_time(bag: Path) -> None:
-    """Ticks, throttled lines and silence follow the clock of the recording."""
     assert replayed(bag, *SHIPPED) == replayed(bag, *SHIPPED)
 
 
@@ -198,7 +193,6 @@ def fires(robot: RosSession, shots: int) -> None:
 
 
 def test_the_running_robot_shoots_only_in_a_safe_pose(appliance: Appliance, robot: RosSession) -> None:
-    """The second of three shots is dropped, and the drop is recorded in the audit log."""
     for tilt, shots in ((0.2, 1), (-0.7, 1), (0.3, 2)):
         assert told(robot, "aim", "0", str(tilt))["tilt"] == pytest.approx(tilt, abs=0.02)
         fires(robot, shots)
@@ -208,7 +202,6 @@ def test_the_running_robot_shoots_only_in_a_safe_pose(appliance: Appliance, robo
 
 
 def test_the_running_robot_stops_before_the_obstacle(appliance: Appliance, robot: RosSession) -> None:
-    """With an obstacle 7 m ahead, the robot is ordered twice to drive 10 m at 2 m/s, and does not reach it."""
     alarm = robot.start(["/usr/bin/rostopic", "echo", "-n", "1", "/landshark/obstacle_alarm"])
     there = told(robot, "drive", "2.0", "0", "5")
     assert 3 < there["x"] < 6.9
@@ -221,7 +214,6 @@ def test_the_running_robot_stops_before_the_obstacle(appliance: Appliance, robot
 
 
 def test_a_verdict_is_a_record(appliance: Appliance, robot: RosSession, tmp_path: Path) -> None:
-    """With the tutorial's lock loaded into the running robot, the warning, the lock and every verdict are recorded."""
     page = (ROOT / "docs" / "monitors-tutorial.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"```cpp\n(gunPose\(.*?)```", page, re.DOTALL)
     (tmp_path / "gun.rv").write_text(text)

@@ -74,7 +74,6 @@ def test_ping_reaches_every_node(ros: RosSession) -> None:
 
 
 def test_info_of_the_monitors_node(ros: RosSession) -> None:
-    """`rosnode info /rosrv` shows its topic, its process and its subscribers."""
     ros.talker("roscpp", "/chatter", name="voice")
     ros.listener("rospy", "/alarm", name="ear").wait_for(event="received")
     info = ros.run("rosnode", "info", "/rosrv").stdout
@@ -84,7 +83,6 @@ def test_info_of_the_monitors_node(ros: RosSession) -> None:
 
 
 def test_the_graph_has_no_bad_node(ros: RosSession) -> None:
-    """The library behind rqt_graph can query every node of the graph."""
     ros.talker("roscpp", "/chatter", name="voice")
     ros.listener("rospy", "/alarm", name="ear").wait_for(event="received")
     graph = json.loads(ros.run(PYTHON, "-c", GRAPH).stdout)
@@ -92,7 +90,6 @@ def test_the_graph_has_no_bad_node(ros: RosSession) -> None:
 
 
 def test_a_tool_cannot_kill_the_monitors_node(ros: RosSession) -> None:
-    """`shutdown` is denied with an alternative; after `rosnode kill /rosrv` the node still publishes."""
     uri = call_on(ros.host, ros.master_uri, "lookupNode", "/tool", "/rosrv")[2]
     code, why, _ = call_on(ros.host, uri, "shutdown", "/tool", "now")
     assert code == 0
@@ -104,7 +101,6 @@ def test_a_tool_cannot_kill_the_monitors_node(ros: RosSession) -> None:
 
 @pytest.mark.parametrize("name", ["/rosrv", "/rosout", "/voice", "/cpp_voice"])
 def test_every_node_answers_the_calls_of_tools(ros: RosSession, name: str) -> None:
-    """Each reading call of the node API is answered with code 1, on every node."""
     ros.talker("rospy", "/chatter", name="voice")
     ros.talker("roscpp", "/chatter", name="cpp_voice")
     uri = call_on(ros.host, ros.master_uri, "lookupNode", "/tool", name)[2]
@@ -113,7 +109,6 @@ def test_every_node_answers_the_calls_of_tools(ros: RosSession, name: str) -> No
 
 
 def test_own_nodes_are_reachable_without_mediation(lab: Lab, robot: Host, tmp_path: Path) -> None:
-    """With `relaying` and `mediation` limited to monitored topics, the appliance's own nodes still have its address."""
     middle = lab.host("appliance", "10.77.0.2/24")
     options = ("--relay", "monitored", "--mediation", "monitored", "--api", "off")
     with (
@@ -131,7 +126,6 @@ def test_own_nodes_are_reachable_without_mediation(lab: Lab, robot: Host, tmp_pa
 
 
 def test_a_hanging_node_does_not_stop_a_tool(ros: RosSession) -> None:
-    """`rosnode ping -a` reports the hanging node as unreachable and continues; cleanup removes it."""
     voice = ros.talker("rospy", "/chatter", name="voice")
     voice.popen.send_signal(signal.SIGSTOP)
     try:

@@ -9,7 +9,6 @@ from tests.support.requirements import needs
 
 
 def test_a_topic_is_withheld_from_one_host(common_lab: Lab, common_robot: Host, tmp_path: Path) -> None:
-    """The robot's own node gets every message."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     tablet = common_lab.host("tablet", "10.77.0.11/24")
     for name in ("robot", "tablet"):

@@ -30,7 +30,6 @@ def refuses(port: int) -> bool:
 
 
 def test_it_reports_that_it_is_ready_and_its_congestion_control(relay: RelayProcess) -> None:
-    """The relay reports the congestion control of its sockets and its limit of connections."""
     assert relay.ready.detail["index"] == 0
     assert relay.ready.detail["congestion"] in {"cubic", "reno"}
     assert (
@@ -40,7 +39,6 @@ def test_it_reports_that_it_is_ready_and_its_congestion_control(relay: RelayProc
 
 
 def test_it_answers_pings_from_its_main_loop(relay: RelayProcess) -> None:
-    """The relay answers pings, also after it was stopped for a while."""
     relay.ping(1)
     relay.process.send_signal(signal.SIGSTOP)
     relay.process.send_signal(signal.SIGCONT)
@@ -48,18 +46,15 @@ def test_it_answers_pings_from_its_main_loop(relay: RelayProcess) -> None:
 
 
 def test_stop_ends_it_cleanly(relay: RelayProcess) -> None:
-    """On `Stop` the relay ends with status 0."""
     assert relay.stop() == 0
 
 
 def test_the_end_of_the_lifeline_ends_it(relay: RelayProcess) -> None:
-    """When its supervisor dies, the relay ends."""
     relay.lifeline.close()
     assert relay.process.wait(LIMIT) == 0
 
 
 def test_a_control_with_an_invalid_message_is_dropped_and_the_next_is_served(relay: RelayProcess) -> None:
-    """An invalid message ends the link, not the relay, which serves the next control."""
     first = relay.open_link()
     relay.ping(1)
     first.send_bytes(b"\0\0\0\5wrong")
@@ -73,7 +68,6 @@ def test_a_control_with_an_invalid_message_is_dropped_and_the_next_is_served(rel
 
 
 def test_a_port_is_open_until_its_node_is_withdrawn(relay: RelayProcess) -> None:
-    """The relay listens on the given socket, across a change of control, until the node is withdrawn."""
     listening = socket.create_server((LOOPBACK, 0))
     port = listening.getsockname()[1]
     link = relay.open_link()

@@ -57,7 +57,6 @@ def test_calls_are_answered(
 
 @pytest.mark.parametrize("server", BOTH)
 def test_the_stock_tools_find_type_and_call(driver: RelayDriver, ros: RosSession, server: Client) -> None:
-    """rosservice probes the service for its type before it calls."""
     ros.service_server(server, "/mode", name="server")
     assert ros.run("/usr/bin/rosservice", "type", "/mode").stdout.strip() == "std_srvs/SetBool"
     assert "negated" in ros.run("/usr/bin/rosservice", "call", "/mode", "data: true").stdout
@@ -67,7 +66,6 @@ def test_the_stock_tools_find_type_and_call(driver: RelayDriver, ros: RosSession
 def test_a_probe_is_answered_with_the_services_header(
     driver: RelayDriver, ros: RosSession, server: Client
 ) -> None:
-    """The relay accepts a probe with any md5sum, as a client sends it while it waits for a service."""
     ros.service_server(server, "/mode", name="server")
     fields = {"callerid": "/probe", "service": "/mode", "md5sum": "*", "probe": "1"}
     header = ask_header(driver.faces["/server"], fields)
@@ -78,14 +76,12 @@ def test_a_probe_is_answered_with_the_services_header(
 def test_a_service_of_another_type_answers_with_its_own_error(
     driver: RelayDriver, ros: RosSession, server: Client
 ) -> None:
-    """The caller receives the service's own error header."""
     ros.service_server(server, "/mode", name="server")
     fields = {"callerid": "/client", "service": "/mode", "md5sum": "0" * 32}
     assert "md5sum" in ask_header(driver.faces["/server"], fields)["error"]
 
 
 def test_a_failed_call_returns_the_services_error(driver: RelayDriver, ros: RosSession) -> None:
-    """If a service raises an exception, its error reply reaches the caller."""
     program = (
         "import rospy\n"
         "from std_srvs.srv import SetBool\n"
@@ -102,7 +98,6 @@ def test_a_failed_call_returns_the_services_error(driver: RelayDriver, ros: RosS
 
 
 def test_a_client_without_a_grant_is_refused(driver: RelayDriver, ros: RosSession) -> None:
-    """The client gets an error header, and control a report; a missing service is handled the same way."""
     ros.service_server("rospy", "/mode", name="server")
     face = driver.faces["/server"]
     driver.link.send(ClientRevoked(face.key, "/mode", LOOPBACK, "/client"))
@@ -113,7 +108,6 @@ def test_a_client_without_a_grant_is_refused(driver: RelayDriver, ros: RosSessio
 
 
 def test_a_revoked_client_loses_its_persistent_connection(driver: RelayDriver, ros: RosSession) -> None:
-    """The client's next call fails, and the service sees the end of the connection."""
     ros.service_server("rospy", "/mode", name="server")
     client = ros.service_client("rospy", "/mode", "--persistent", name="client")
     client.send("true")
@@ -127,7 +121,6 @@ def test_a_revoked_client_loses_its_persistent_connection(driver: RelayDriver, r
 
 
 def test_a_service_that_never_answers_blocks_only_its_client(driver: RelayDriver, ros: RosSession) -> None:
-    """Other clients of the same service are answered, and a caller that gives up frees all resources."""
     program = (
         "import rospy, threading\n"
         "from std_srvs.srv import SetBool, SetBoolResponse\n"
@@ -152,7 +145,6 @@ def test_a_service_that_never_answers_blocks_only_its_client(driver: RelayDriver
 
 
 def test_a_call_of_a_dead_service_fails_at_once(driver: RelayDriver, ros: RosSession) -> None:
-    """The caller gets an error at once."""
     server = ros.service_server("rospy", "/mode", name="server")
     server.kill()
     client = ros.service_client("rospy", "/mode")

@@ -64,7 +64,6 @@ def read_frame(stream: BinaryIO) -> bytes:
 def test_messages_arrive_with_the_publishers_name(
     driver: RelayDriver, ros: RosSession, publisher: Client, subscriber: Client
 ) -> None:
-    """Every pair of client libraries communicates as without a relay, and no message is dropped."""
     ros.talker(publisher, "/chatter", name="talker")
     listener = ros.listener(subscriber, "/chatter", name="listener")
     events = listener.wait_for_count(5, event="received")
@@ -81,7 +80,6 @@ def test_messages_arrive_with_the_publishers_name(
 def test_a_latched_message_reaches_early_and_late_subscribers_once(
     driver: RelayDriver, ros: RosSession, publisher: Client
 ) -> None:
-    """The first subscriber gets it from the publisher, later ones from the relay's memory."""
     talker = ros.talker(publisher, "/map", "--latch")
     first = ros.listener("rospy", "/map")
     first.wait_for(event="received")
@@ -129,7 +127,6 @@ def test_a_stopped_subscriber_neither_delays_others_nor_grows_memory(
 
 
 def test_a_message_of_ten_megabytes_arrives_whole(driver: RelayDriver, ros: RosSession) -> None:
-    """A large message between small ones arrives, in both directions."""
     program = (
         "import rospy, sys\n"
         "from std_msgs.msg import String\n"
@@ -155,7 +152,6 @@ def test_a_message_of_ten_megabytes_arrives_whole(driver: RelayDriver, ros: RosS
 
 
 def test_a_subscriber_without_a_permission_is_not_served(driver: RelayDriver, ros: RosSession) -> None:
-    """A request with another caller_id or topic gets an error header, and control gets a report."""
     ros.talker("rospy", "/chatter", name="talker")
     face = driver.faces["/talker"]
     driver.link.send(GrantInstalled(face.key, "/chatter", LOOPBACK, "/listener"))
@@ -174,7 +170,6 @@ def test_a_subscriber_without_a_permission_is_not_served(driver: RelayDriver, ro
 
 
 def test_a_subscriber_of_another_type_gets_an_error(driver: RelayDriver, ros: RosSession) -> None:
-    """The error header names both types, as from a ROS publisher."""
     ros.talker("rospy", "/chatter", name="talker")
     face = driver.faces["/talker"]
     driver.link.send(GrantInstalled(face.key, "/chatter", LOOPBACK, "/listener"))
@@ -185,7 +180,6 @@ def test_a_subscriber_of_another_type_gets_an_error(driver: RelayDriver, ros: Ro
 
 
 def test_a_connection_is_for_one_topic(driver: RelayDriver, ros: RosSession) -> None:
-    """A served subscriber that sends a header for another topic is disconnected."""
     ros.talker("rospy", "/chatter", name="talker")
     face = driver.faces["/talker"]
     driver.link.send(GrantInstalled(face.key, "/chatter", LOOPBACK, "/listener"))
@@ -200,7 +194,6 @@ def test_a_connection_is_for_one_topic(driver: RelayDriver, ros: RosSession) -> 
 
 
 def test_traffic_continues_while_control_restarts(driver: RelayDriver, ros: RosSession) -> None:
-    """When control dies, no connection is interrupted; the next control gets a report of each."""
     ros.talker("roscpp", "/chatter", "--rate", "50")
     listener = ros.listener("roscpp", "/chatter", name="listener")
     listener.wait_for(event="received")
@@ -217,7 +210,6 @@ def test_traffic_continues_while_control_restarts(driver: RelayDriver, ros: RosS
 def test_a_connection_that_a_new_control_does_not_restate_is_closed(
     driver: RelayDriver, ros: RosSession
 ) -> None:
-    """A permission that is missing after the restatement ends its connection; other connections stay."""
     ros.talker("rospy", "/chatter")
     out, stays = (
         ros.listener("rospy", "/chatter", name="out"),
@@ -236,7 +228,6 @@ def test_a_connection_that_a_new_control_does_not_restate_is_closed(
 
 
 def test_a_revocation_closes_its_connection(driver: RelayDriver, ros: RosSession) -> None:
-    """A revocation ends only its own connection."""
     ros.talker("rospy", "/chatter", name="talker")
     face = driver.faces["/talker"]
     ros.listener("roscpp", "/chatter", name="listener").wait_for(event="received")
@@ -246,7 +237,6 @@ def test_a_revocation_closes_its_connection(driver: RelayDriver, ros: RosSession
 
 
 def test_a_republished_topic_is_served_again(driver: RelayDriver, ros: RosSession) -> None:
-    """A killed and restarted publisher is a new incarnation; its old subscribers are disconnected."""
     first = ros.talker("rospy", "/chatter", name="talker")
     listener = ros.listener("rospy", "/chatter", name="listener")
     listener.wait_for(event="received")
@@ -257,6 +247,5 @@ def test_a_republished_topic_is_served_again(driver: RelayDriver, ros: RosSessio
 
 
 def test_the_stock_tools_read_through_the_relay(driver: RelayDriver, ros: RosSession) -> None:
-    """rostopic echo and rostopic hz need no permission beyond requestTopic's."""
     ros.talker("roscpp", "/chatter")
     assert "hello" in ros.run("/usr/bin/rostopic", "echo", "-n", "2", "/chatter").stdout

@@ -55,7 +55,6 @@ def looked(host: Host | Forking, command: list[str], environment: Mapping[str, s
 @pytest.mark.parametrize("place", ["this machine", "a host"])
 @pytest.mark.parametrize("form", ["-c", "file"])
 def test_a_fork_looks_like_a_new_process(lab: Lab, tmp_path: Path, place: str, form: str) -> None:
-    """Arguments, environment, folder, descriptors, names and exit status are the same."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     host = ThisMachine() if place == "this machine" else lab.host("robot", "10.77.0.10/24")
     file = tmp_path / "look.py"
@@ -69,7 +68,6 @@ def test_a_fork_looks_like_a_new_process(lab: Lab, tmp_path: Path, place: str, f
 
 
 def test_a_fork_ends_as_a_process_does(tmp_path: Path) -> None:
-    """Before and after the end, by a signal and by a time limit, a fork and a process report the same."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     host, program = ThisMachine(), "import signal; print('here'); signal.pause()"
     environment = RosSession("", tmp_path, host).environment(host)

@@ -24,7 +24,6 @@ def appliance() -> Iterator[Appliance]:
 
 
 def test_the_state_of_the_clock_is_reported(appliance: Appliance) -> None:
-    """Status and metrics show a wrong clock, and the log reports it once; nodes are served in any case."""
     known = clock_is_synchronised()
     status = json.loads(appliance.rosrv("status", "--json").stdout)
     assert status["clock"] == {"synchronised": known, "behind_seconds": 0.0, "before_program_seconds": 0.0}
@@ -39,7 +38,6 @@ def test_the_state_of_the_clock_is_reported(appliance: Appliance) -> None:
 
 
 def test_a_clock_that_was_set_back_while_the_appliance_was_off(appliance: Appliance) -> None:
-    """A log that ends an hour in the future, as after a boot with a wrong clock, is reported, and everything works."""
     assert appliance.stop() == 0
     path = appliance.state / "control" / "audit.db"
     owner = path.stat()

@@ -34,7 +34,6 @@ def loaded(pid: int) -> set[str]:
 
 
 def test_idle_processes_load_only_their_libraries() -> None:
-    """Each process has only its own libraries, before and after a REST call."""
     with Appliance() as appliance:
         rows = {role: row["pid"] for role, row in appliance.processes().items()}
         assert {role: loaded(rows[role]) - may for role, may in MAY_HAVE.items()} == {

@@ -66,7 +66,6 @@ def reachable(host: Host, port: int) -> bool:
 def test_an_isolated_port_is_hidden_until_the_end(
     host: Host, isolation: ContainerIsolation, hidden: int
 ) -> None:
-    """The port is open before, closed during the isolation (even to root), and open afterwards; the probe agrees."""
     assert "can be reached" in str(isolation.probe())
     assert reachable(host, hidden)
     isolation.build()
@@ -79,7 +78,6 @@ def test_an_isolated_port_is_hidden_until_the_end(
 def test_the_master_side_endpoint_is_closed_once_it_is_known(
     host: Host, isolation: ContainerIsolation
 ) -> None:
-    """Control's master-side endpoint is open until control reports it, and then open to rosmaster only."""
     isolation.build()
     with host.run(lambda: socket.create_server(("127.0.0.1", 0))) as inner:
         port = inner.getsockname()[1]
@@ -160,7 +158,6 @@ def test_a_check_does_not_restore_rules_after_the_end(
 def test_the_end_does_not_wait_for_a_hanging_check(
     host: Host, isolation: ContainerIsolation, hidden: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The rules are removed while a check hangs, and the check restores nothing when it continues."""
     monkeypatch.setattr("appliance.supervisor.isolation_lifecycle._PATIENCE_SECONDS", 0.1)
     isolation.build()
     firewall = isolation.firewall
@@ -185,7 +182,6 @@ def test_the_end_does_not_wait_for_a_hanging_check(
 
 
 def test_rules_on_the_host_are_restored(host: Host, tmp_path: Path) -> None:
-    """When a bare host's firewall is reloaded without the appliance's rule, the next check restores it."""
     forwarded = IsolationSettings(
         ports=(PortRange.one(11311),), name=f"renc{os.getpid()}", directory=tmp_path
     )
@@ -202,7 +198,6 @@ def test_rules_on_the_host_are_restored(host: Host, tmp_path: Path) -> None:
 
 
 def test_rules_of_other_programs_for_forwarding_are_reported(host: Host, tmp_path: Path) -> None:
-    """Docker's rules on the host are in the report; the namespace accepts only the machine's own packets."""
     need_program("iptables-legacy-restore", "iptables")
     load(host.namespace, TRANSLATORS[0].form, TRANSLATORS[0].rules)
     forwarded = IsolationSettings(
@@ -224,7 +219,6 @@ def test_rules_of_other_programs_for_forwarding_are_reported(host: Host, tmp_pat
 
 
 def test_a_listener_beyond_loopback_is_not_hidden(host: Host, isolation: ContainerIsolation) -> None:
-    """A port on every address is a finding, even while the firewall hides it."""
     isolation.build()
     with host.run(lambda: socket.create_server(("0.0.0.0", 0))) as listener:
         isolation.control_ready(listener.getsockname()[1], 1)

@@ -173,7 +173,6 @@ class Place:
 
 @pytest.mark.parametrize("name", sorted(MAY.keys() & {role.name for role in ROLES}))
 def test_the_sandbox_denies_forbidden_calls(place: Place, name: str) -> None:
-    """The sandbox denies each role every call that it does not need, whatever its privileges, and allows the rest."""
     role = place.roles[name]
     account = account_of(role.user, role.group)
     families, listens, connects = MAY[name]
@@ -226,7 +225,6 @@ def test_the_sandbox_denies_forbidden_calls(place: Place, name: str) -> None:
 
 
 def test_a_relay_runs_modules_in_its_sandbox(place: Place) -> None:
-    """A later module also runs: its code is in memory that is executable and not writable, and it starts no thread."""
     found, said = place.inside(place.roles["relay"], "run_modules")
     assert said == Walled("listed", landlock.version(), [])
     assert (found["results"], found["traps"]) == ([7, 7], ["integer division by zero"] * 2)
@@ -271,7 +269,6 @@ def test_status_shows_the_relays_congestion_control(appliance: Appliance) -> Non
 
 
 def test_an_incomplete_installation_names_the_remedy(place: Place) -> None:
-    """A process without one of its modules says how to get it."""
     done, reports = place.start(place.roles["relay"], "appliance.relay.transport.absent:main")
     assert done.returncode == 1
     assert isinstance(reports[-1], Failed)

@@ -41,7 +41,6 @@ def appliance() -> Iterator[Appliance]:
 
 @pytest.mark.parametrize("role", READS)
 def test_a_process_reads_only_its_own_files(appliance: Appliance, role: str) -> None:
-    """A compromised process finds no key or token of another process, and can write only its own files."""
     user, group = 65534, 65534
     if role != "nobody":
         name = USERS.get(role, f"rosrv-{role}")
@@ -70,7 +69,6 @@ def test_the_hidden_files_exist(appliance: Appliance) -> None:
 
 
 def test_the_order_of_oom_kills(appliance: Appliance) -> None:
-    """Processes that can be flooded and are not essential are killed first; the supervisor and the signer last."""
     scores = {
         role: int(Path(f"/proc/{row['pid']}/oom_score_adj").read_text())
         for role, row in appliance.processes().items()
@@ -105,7 +103,6 @@ def test_a_relay_has_short_turns(appliance: Appliance) -> None:
 
 
 def test_planted_code_is_not_loaded_at_the_next_start(appliance: Appliance) -> None:
-    """Code that a compromised process, or a backup, puts into Python's user folders is never loaded."""
     version = f"python{sys.version_info.major}.{sys.version_info.minor}"
     parts = [path for path in appliance.state.iterdir() if path.is_dir() and path.name != "run"]
     assert {path.name for path in parts} >= {"rosmaster", "control", "signer", "relay", "api"}

@@ -155,7 +155,6 @@ def common() -> Iterator[Running]:
 
 @pytest.mark.parametrize("role", ALL)
 def test_a_killed_process_is_back_within_a_second(common: Running, role: str) -> None:
-    """A process is restarted within a second of its first death, and control gets the id of the new one."""
     old, restarts = common.living(role), common.restarts(role)
     killed = time.monotonic()
     os.kill(old, signal.SIGKILL)
@@ -169,7 +168,6 @@ def test_a_killed_process_is_back_within_a_second(common: Running, role: str) ->
 
 @pytest.mark.parametrize("role", ["control", "rosmaster"])
 def test_a_hanging_process_is_replaced(common: Running, role: str) -> None:
-    """An unresponsive process is killed after five seconds and restarted."""
     hanging = common.living(role)
     os.kill(hanging, signal.SIGSTOP)
     stopped = time.monotonic()
@@ -181,7 +179,6 @@ def test_a_hanging_process_is_replaced(common: Running, role: str) -> None:
 
 
 def test_a_port_of_control_stays_open_while_control_is_dead(common: Running) -> None:
-    """A node that connects while control is dead waits in the queue, and the next control serves it."""
     old = common.living("control")
     os.kill(old, signal.SIGKILL)
     answered = common.echo()
@@ -191,7 +188,6 @@ def test_a_port_of_control_stays_open_while_control_is_dead(common: Running) -> 
 
 
 def test_every_port_of_a_large_robot_survives_control(start: Any) -> None:
-    """All ports, two for each of a thousand nodes, are handed to the next control at once."""
     running = start("control=crowded").until_ready()
     os.kill(running.pid("control"), signal.SIGKILL)
     began = time.monotonic()
@@ -202,7 +198,6 @@ def test_every_port_of_a_large_robot_survives_control(start: Any) -> None:
 
 
 def test_the_admin_socket_survives_control(common: Running) -> None:
-    """Every new control listens on the same socket in the state directory."""
     old = common.living("control")
     os.kill(old, signal.SIGKILL)
     with socket.socket(socket.AF_UNIX) as connection:
@@ -212,7 +207,6 @@ def test_the_admin_socket_survives_control(common: Running) -> None:
 
 @pytest.mark.parametrize("role", ["relay", "control"])
 def test_a_restarted_end_gets_a_fresh_link(common: Running, role: str) -> None:
-    """After the death of either end, control and relay can communicate again."""
     old, relay = common.living(role), common.living("relay")
     common.process.wait_for(actor="relay", pid=relay, link="control", said="StateBegan")
     mark = common.process.mark()
@@ -224,7 +218,6 @@ def test_a_restarted_end_gets_a_fresh_link(common: Running, role: str) -> None:
 
 @pytest.mark.parametrize("role", ["relay", "control"])
 def test_a_process_with_a_forbidden_message_is_replaced(common: Running, role: str) -> None:
-    """If a relay asks to keep sockets, or control sends a message of the supervisor, the process is killed."""
     old = common.living(role)  # control handles signals before its first message
     os.kill(old, signal.SIGUSR1)
     common.process.wait_for(event="process is killed", role=role, pid=old)
@@ -233,7 +226,6 @@ def test_a_process_with_a_forbidden_message_is_replaced(common: Running, role: s
 
 
 def test_nothing_outlives_a_killed_supervisor(start: Any) -> None:
-    """SIGKILL of the supervisor ends all its processes, and a new start is not obstructed."""
     running = start().until_ready()
     os.kill(running.living("relay"), signal.SIGSTOP)  # not even a process that cannot see its lifeline end
     os.kill(running.process.pid, signal.SIGKILL)
@@ -243,7 +235,6 @@ def test_nothing_outlives_a_killed_supervisor(start: Any) -> None:
 
 
 def test_a_clean_end_leaves_nothing(start: Any, state: Path) -> None:
-    """After SIGTERM: exit status 0 in less than five seconds, and no process, socket, lock or complaint is left."""
     running = start().until_ready()
     began = time.monotonic()
     assert running.process.stop(with_signal=signal.SIGTERM) == 0
@@ -266,7 +257,6 @@ def test_a_clean_end_leaves_nothing(start: Any, state: Path) -> None:
 
 
 def test_an_end_during_the_build_removes_the_surroundings(start: Any, state: Path) -> None:
-    """SIGTERM, Ctrl-C or a closed terminal before the first process starts gives a clean end without leftovers."""
     running = start("interrupted=build")
     assert running.process.wait() == 0
     assert [one["event"] for one in running.process.seen() if one.get("event") in {"built", "removed"}] == [
@@ -279,7 +269,6 @@ def test_an_end_during_the_build_removes_the_surroundings(start: Any, state: Pat
 
 
 def test_a_second_end_does_not_interrupt_the_first(start: Any, state: Path) -> None:
-    """After Ctrl-C twice the surroundings are still removed, with exit status 0."""
     running = start("interrupted=remove").until_ready()
     assert running.process.stop(with_signal=signal.SIGTERM) == 0
     assert running.process.seen(event="removed")
@@ -287,7 +276,6 @@ def test_a_second_end_does_not_interrupt_the_first(start: Any, state: Path) -> N
 
 
 def test_control_may_end_the_appliance(start: Any) -> None:
-    """The `shutdown` call of the Master API, if granted, ends it as SIGTERM does."""
     running = start().until_ready()
     os.kill(running.pid("control"), signal.SIGUSR2)
     assert running.process.wait() == 0
@@ -295,7 +283,6 @@ def test_control_may_end_the_appliance(start: Any) -> None:
 
 
 def test_a_stubborn_process_does_not_hold_up_the_end(start: Any) -> None:
-    """A process that ends neither on request nor by SIGTERM is killed; the end still takes less than five seconds."""
     running = start("relay=stubborn").until_ready()
     began = time.monotonic()
     assert running.process.stop(with_signal=signal.SIGTERM) == 0
@@ -304,7 +291,6 @@ def test_a_stubborn_process_does_not_hold_up_the_end(start: Any) -> None:
 
 
 def test_a_second_appliance_on_the_same_state_is_refused(common: Running) -> None:
-    """The second start names the process that uses the state directory, and the first one is not affected."""
     second = Running(common.state)
     assert second.process.wait() == 1
     reason = second.process.wait_for(event="refused")["reason"]
@@ -314,7 +300,6 @@ def test_a_second_appliance_on_the_same_state_is_refused(common: Running) -> Non
 
 
 def test_the_user_sees_why_control_cannot_serve(start: Any) -> None:
-    """Every finding of an invalid policy is printed to the user, and no process remains."""
     running = start("control=failing")
     assert running.process.wait() == 1
     reason = running.process.wait_for(event="refused")["reason"]
@@ -323,7 +308,6 @@ def test_the_user_sees_why_control_cannot_serve(start: Any) -> None:
 
 
 def test_a_control_that_fails_later_is_retried(start: Any) -> None:
-    """With nodes connected, a control that finds the disk full is restarted until it succeeds; the reason is logged."""
     running = start("control=failing_again").until_ready()
     os.kill(running.pid("control"), signal.SIGKILL)
     for restarts in (1, 2, 3):
@@ -336,14 +320,12 @@ def test_a_control_that_fails_later_is_retried(start: Any) -> None:
 
 
 def test_a_control_that_never_lives_is_an_error(start: Any) -> None:
-    """When control dies repeatedly before nodes could connect, the start fails with an error."""
     running = start("control=dying")
     assert running.process.wait() == 1
     assert "control died 5 times (exit status 3)" in running.process.wait_for(event="refused")["reason"]
 
 
 def test_no_service_while_the_hidden_master_is_reachable(start: Any) -> None:
-    """If the probe can connect at the start, the start fails, names the open port, and admits no node."""
     running = start("leaky")
     assert running.process.wait() == 1
     assert running.process.wait_for(event="refused")["reason"] == "ROSMaster can be reached by another user"
@@ -351,7 +333,6 @@ def test_no_service_while_the_hidden_master_is_reachable(start: Any) -> None:
 
 
 def test_each_process_has_a_user_of_its_own_and_no_privilege(common: Running) -> None:
-    """As root: each process has the ids of the design, no groups, no capability in any set, and no way to gain one."""
     need_root()
     users = {"control": "rosrv", "relay": "rosrv-relay", "signer": "rosrv-signer", "rosmaster": "rosmaster"}
     ids = {role: _status(common.living(role))["Uid"].split() for role in users}
@@ -367,7 +348,6 @@ def test_each_process_has_a_user_of_its_own_and_no_privilege(common: Running) ->
 
 
 def test_the_supervisor_keeps_few_capabilities(common: Running) -> None:
-    """As root: the supervisor lacks unneeded capabilities (kernel modules, raw memory, clock …)."""
     need_root()
     allowed = sum(1 << number for number in SUPERVISOR_CAPABILITIES.values())
     status = _status(common.process.pid)
@@ -376,7 +356,6 @@ def test_the_supervisor_keeps_few_capabilities(common: Running) -> None:
 
 
 def test_the_signer_has_no_network(common: Running) -> None:
-    """As root: the signer is alone in a network namespace."""
     need_root()
     own = Path(f"/proc/{os.getpid()}/ns/net").readlink()
     assert Path(f"/proc/{common.living('signer')}/ns/net").readlink() != own
@@ -384,7 +363,6 @@ def test_the_signer_has_no_network(common: Running) -> None:
 
 
 def test_each_part_of_the_state_is_private(common: Running) -> None:
-    """No role can list the state directory, and each part is closed to the other roles."""
     assert stat.S_IMODE(common.state.stat().st_mode) == 0o711
     for part in ("control", "relay", "signer", "rosmaster"):
         found = (common.state / part).stat()
@@ -395,7 +373,6 @@ def test_each_part_of_the_state_is_private(common: Running) -> None:
 
 
 def test_a_child_has_only_the_files_it_was_given(common: Running) -> None:
-    """A relay and the supervisor share one file, the state of the relay's monitors, which no other role has open."""
     memory = [str(path) for path in (common.state / "monitors").glob("*/relay-0")]
     supervisors = _open_files(common.process.pid)
     relays = supervisors & _open_files(common.living("relay")) - {"/dev/null"}
@@ -404,7 +381,6 @@ def test_a_child_has_only_the_files_it_was_given(common: Running) -> None:
 
 
 def test_the_hidden_master_listens_on_loopback_only(common: Running) -> None:
-    """No other address of the machine can reach rosmaster's port."""
     port = json.loads((common.state / "run" / "config.json").read_text())["rosmaster_port"]
     listening = Path(f"/proc/{common.living('rosmaster')}/net/tcp").read_text().splitlines()
     addresses = {row.split()[1] for row in listening[1:] if row.split()[3] == "0A"}

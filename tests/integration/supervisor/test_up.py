@@ -112,7 +112,6 @@ def test_it_says_when_nodes_may_connect_and_ends_cleanly_in_time(directory: Path
 
 
 def test_a_signal_before_it_is_ready_ends_it_as_well(directory: Path) -> None:
-    """Ctrl-C works while the processes are still starting."""
     with up(directory, "--json") as running:
         running.wait_for_error("process started")
         began = time.monotonic()
@@ -121,7 +120,6 @@ def test_a_signal_before_it_is_ready_ends_it_as_well(directory: Path) -> None:
 
 
 def test_a_port_in_use_is_reported_with_its_owner(directory: Path) -> None:
-    """For RVMaster's and for rosmaster's port, the message names the port and the process that uses it."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         for flags in (("--listen", f"127.0.0.1:{port}"), ("--rosmaster-port", str(port))):
@@ -130,7 +128,6 @@ def test_a_port_in_use_is_reported_with_its_owner(directory: Path) -> None:
 
 
 def test_invalid_configuration_is_reported_before_the_start(directory: Path) -> None:
-    """A bad flag and a bad variable are both reported; no state directory is made."""
     said = refusal(directory, "--isolation", "vm", "--listen", "nowhere")
     assert "--isolation: " in said
     assert "--listen: " in said
@@ -208,7 +205,6 @@ def test_in_a_namespace_of_its_own_it_is_reached_through_the_host(directory: Pat
 def test_input_files_are_checked_before_the_state_is_made(
     directory: Path, policy: str | None, monitors: str | None, said: list[str]
 ) -> None:
-    """For an invalid policy or a missing file or folder: exit status 1, each position once, and no state directory."""
     (directory / "policy.ini").unlink()
     if policy is not None:
         (directory / "policy.ini").write_bytes(policy.encode("latin-1"))
@@ -220,7 +216,6 @@ def test_input_files_are_checked_before_the_state_is_made(
 
 @pytest.mark.real
 def test_a_policy_that_was_loaded_outlasts_its_file(directory: Path) -> None:
-    """The appliance starts with the policy that was in force, even if its file is gone; without one it does not."""
     state = str(directory / "state")
     with up(directory, "--json") as running:
         running.wait_for(event="ready", timeout=2 * LIMIT)

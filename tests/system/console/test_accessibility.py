@@ -57,7 +57,6 @@ def test_axe_finds_nothing(theme: str, width: int, opened: Callable[..., Reader]
 
 
 def test_words_of_the_navigation_have_room(opened: Callable[..., Reader]) -> None:
-    """No word touches its neighbour or the edge of the window, not even on a telephone."""
     reader = opened(width=390)
     page = reader.go("now")
     reader.settle()
@@ -121,7 +120,6 @@ def test_it_goes_by_keys(opened: Callable[..., Reader]) -> None:
 
 
 def test_single_keys_can_be_turned_off(opened: Callable[..., Reader]) -> None:
-    """Turned off in the list of keys, they do nothing, also after a reload; the button opens the list again."""
     page = opened().go("audit?decision=deny")
     page.keyboard.press("?")
     switch = page.get_by_role("dialog", name="Keys").get_by_label("Keys without Ctrl or Alt")
@@ -153,7 +151,6 @@ def test_single_keys_can_be_turned_off(opened: Callable[..., Reader]) -> None:
 
 
 def test_the_theme_is_the_systems_until_the_reader_chooses(opened: Callable[..., Reader]) -> None:
-    """The page follows the system's theme; the switch overrides it, also after a reload."""
     reader = opened(theme="dark")
     page = reader.go("now")
     assert page.evaluate("document.documentElement.dataset.theme") == "dark"

@@ -33,7 +33,6 @@ def refuse(appliance: Appliance, attempt: Callable[..., Any]) -> Callable[[str],
 def test_a_record_leads_to_the_line_that_decided(
     opened: Callable[..., Reader], refuse: Callable[[str], None]
 ) -> None:
-    """The list leads to the record, its rule with the lines around it, and that line in the policy."""
     refuse("/follow_me")
     reader = opened()
     page = reader.go("audit?decision=deny")
@@ -49,7 +48,6 @@ def test_a_record_leads_to_the_line_that_decided(
 def test_records_come_while_it_is_followed(
     opened: Callable[..., Reader], refuse: Callable[[str], None], appliance: Appliance
 ) -> None:
-    """With `Follow live`, new records that match the filter appear at the top."""
     reader = opened()
     page = reader.go("audit?decision=deny&caller_id=/live_*")
     expect(page.get_by_text("No record matches")).to_be_visible()
@@ -71,7 +69,6 @@ def test_records_come_while_it_is_followed(
 def test_pages_go_back_to_the_beginning(
     opened: Callable[..., Reader], attempt: Callable[..., Any], appliance: Appliance
 ) -> None:
-    """A page has a hundred records; `Older records` continues after it without a gap or a repetition."""
     callers = [f"/reader_{number}" for number in range(120)]
     for caller in callers:
         attempt("getParam", caller, "/nothing")
@@ -87,7 +84,6 @@ def test_pages_go_back_to_the_beginning(
 
 
 def test_records_dropped_from_the_list_can_be_fetched(opened: Callable[..., Reader]) -> None:
-    """A list that is followed for long drops its oldest records; `Older records` continues after the last one shown."""
     page = opened().go("audit")
     added = """async (state) => {
       const { added } = await import("/console/static/js/audit/records.js");
@@ -103,7 +99,6 @@ def test_records_dropped_from_the_list_can_be_fetched(opened: Callable[..., Read
 
 
 def test_numbers_of_records_are_shown_in_full(opened: Callable[..., Reader]) -> None:
-    """Numbers of records are never rounded."""
     page = opened().go("audit")
     answer = {
         "ok": True, "log": "ab" * 16, "records": 1_234_567, "first": 400_001, "last": 1_634_567, "removed": 400_000,
@@ -118,7 +113,6 @@ def test_numbers_of_records_are_shown_in_full(opened: Callable[..., Reader]) -> 
 
 
 def test_the_log_is_proven_and_exported(opened: Callable[..., Reader], refuse: Callable[[str], None]) -> None:
-    """Verify reports that the chain is complete; Export saves the records that match the filter as JSON lines."""
     refuse("/exported")
     reader = opened()
     page = reader.go("audit?decision=deny&caller_id=/exported")
@@ -136,7 +130,6 @@ def test_the_log_is_proven_and_exported(opened: Callable[..., Reader], refuse: C
 
 
 def test_evidence_of_a_time_is_exported(opened: Callable[..., Reader], refuse: Callable[[str], None]) -> None:
-    """Once a time is chosen, the export is an evidence bundle for it."""
     refuse("/evident")
     reader = opened()
     page = reader.go("audit")
@@ -153,7 +146,6 @@ def test_evidence_of_a_time_is_exported(opened: Callable[..., Reader], refuse: C
 def test_a_narrow_list_shows_rule_and_reason(
     opened: Callable[..., Reader], refuse: Callable[[str], None], appliance: Appliance
 ) -> None:
-    """At the width of a telephone, a card has rule and reason; a record without a rule has no such line."""
     refuse("/narrow")
     reason = appliance.recorded("--deny", caller_id="/narrow")[0]["reason"]
     reader = opened(width=390, height=844)
@@ -171,21 +163,18 @@ def test_a_narrow_list_shows_rule_and_reason(
 
 
 def test_an_unknown_record_shows_an_error(opened: Callable[..., Reader]) -> None:
-    """A URL with an unknown record shows the appliance's error, and the list beside it."""
     page = opened().go("audit/ffffffffffffffffffff")
     expect(page.get_by_role("alert")).to_contain_text("there is no record")
     expect(page.locator("tbody tr").first).to_be_visible()
 
 
 def test_times_are_the_readers_and_utc_on_hover(appliance: Appliance, opened: Callable[..., Reader]) -> None:
-    """A time is shown in the reader's zone; its title is UTC to the nanosecond."""
     page = opened().go("audit")
     moment = page.locator("tbody time").first
     expect(moment).to_have_attribute("title", re.compile(r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{9} UTC$"))
 
 
 def test_the_list_goes_by_keys(opened: Callable[..., Reader], refuse: Callable[[str], None]) -> None:
-    """j and k open the next and the previous record, Escape closes it, / goes to the search."""
     refuse("/keys_1")
     refuse("/keys_2")
     page = opened().go("audit?caller_id=/keys_*&event=decision")
@@ -205,7 +194,6 @@ def test_the_list_goes_by_keys(opened: Callable[..., Reader], refuse: Callable[[
 def test_the_readers_own_looks_are_not_what_is_shown_first(
     opened: Callable[..., Reader], refuse: Callable[[str], None]
 ) -> None:
-    """The newest record shown is of a host; the records of the console's own queries appear only on request."""
     reader = opened()
     refuse("/before_the_looks")
     for view in ("monitors", "hosts", "policy"):
@@ -220,7 +208,6 @@ def test_the_readers_own_looks_are_not_what_is_shown_first(
 
 
 def test_short_names_are_not_broken(opened: Callable[..., Reader], refuse: Callable[[str], None]) -> None:
-    """On a wide screen no column breaks a name of a dozen letters, whatever the others contain."""
     refuse("/a_dozen_let")
     reader = opened()
     page = reader.go("audit")
@@ -240,7 +227,6 @@ def test_it_opens_on_what_matters(
     refuse: Callable[[str], None],
     appliance: Appliance,
 ) -> None:
-    """Denials are shown, lookups are not. Buttons show all records, or changes by people; a search can be saved."""
     refuse("/matters")
     refuse("/matters_too")  # the time line has marks from the first to the last
     attempt("getParam", "/matters_not", "/nothing")
@@ -275,7 +261,6 @@ def test_changes_by_people(opened: Callable[..., Reader], appliance: Appliance) 
 def test_grant_this_leads_to_the_editor(
     opened: Callable[..., Reader], attempt: Callable[..., Any], appliance: Appliance
 ) -> None:
-    """The smallest change is shown beside the record; a click puts it into the editor and loads nothing."""
     attempt("registerPublisher", "/eager", "/guarded", "std_msgs/String", "http://127.0.0.1:4002/")
     [record, *_] = appliance.recorded(
         "--event", "decision", "--deny", resource="/guarded", caller_id="/eager"
@@ -294,7 +279,6 @@ def test_grant_this_leads_to_the_editor(
 def test_grant_this_does_not_take_the_place_of_a_text_that_is_written(
     opened: Callable[..., Reader], attempt: Callable[..., Any], appliance: Appliance
 ) -> None:
-    """The text in the editor stays until the person agrees to discard it."""
     attempt("registerPublisher", "/hasty", "/guarded", "std_msgs/String", "http://127.0.0.1:4002/")
     appliance.recorded("--event", "decision", "--deny", resource="/guarded", caller_id="/hasty")
     reader = opened()
@@ -340,7 +324,6 @@ def page_of(entries: list[LogEntry]) -> dict[str, Any]:
 
 
 def test_rows_are_those_of_the_command(opened: Callable[..., Reader]) -> None:
-    """The console and `rosrv audit search` make the same rows of the same records, in either order."""
     page = opened().go("audit")
     rows = """async (page) => {
       const { compared, grouped } = await import("/console/static/js/audit/rows.js");
@@ -389,7 +372,6 @@ def test_a_host_that_makes_several_calls_in_turn_is_a_few_rows(opened: Callable[
 
 
 def test_equal_records_are_one_row_that_opens(opened: Callable[..., Reader]) -> None:
-    """A row has count, times and last value, and opens the newest full record; its button shows each."""
     drops = [drop(2), drop(3, "7 more in the same second", count=7), drop(4)]
     reader = opened()
     reader.page.route(

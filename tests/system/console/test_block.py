@@ -40,7 +40,6 @@ def test_a_denied_host_can_be_blocked_from_its_record(
 def test_a_blocked_host_is_listed_until_it_is_unblocked(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """The view Hosts lists the block with its note, *Now* has a warning that leads there, and Unblock ends it."""
     reader = opened()
     page = reader.go("hosts")
     page.get_by_role("button", name="Block a host").press("Enter")

@@ -11,7 +11,6 @@ from tests.system.console.reader import Reader
 def test_a_wrong_token_stays_outside_and_a_right_one_shows_its_role(
     browser: Browser, appliance: Appliance, token: Callable[..., str]
 ) -> None:
-    """The sign-in page says what is wrong with a token; a valid one is accepted, and its name and role are shown."""
     with Reader(browser, str(appliance.ready["api"])) as reader:
         page = reader.page
         page.goto(reader.url)
@@ -53,7 +52,6 @@ def test_the_token_is_forgotten(browser: Browser, appliance: Appliance) -> None:
 def test_a_revoked_token_ends_the_session_at_once(
     appliance: Appliance, token: Callable[..., str], opened: Callable[..., Reader]
 ) -> None:
-    """If the token is revoked while the page is open, the sign-in page appears automatically, with the reason."""
     reader = opened(token("operator", "leaver"))
     reader.go("now")
     expect(reader.page.locator("[data-standing=live]")).to_be_visible()
@@ -64,7 +62,6 @@ def test_a_revoked_token_ends_the_session_at_once(
 
 
 def test_an_expired_token_ends_the_session(token: Callable[..., str], opened: Callable[..., Reader]) -> None:
-    """If the token expires while the page is open, the sign-in page appears and says what to do."""
     reader = opened(token("viewer", "short", "12h"))
     reader.page.clock.install()
     reader.go("now")
@@ -77,7 +74,6 @@ def test_an_expired_token_ends_the_session(token: Callable[..., str], opened: Ca
 def test_an_unused_page_is_locked_and_loses_nothing(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """A locked page forgets the token, shows and requests nothing, and ignores keys; the same token restores it."""
     reader = opened()
     reader.page.clock.install()
     page = reader.go("policy")
@@ -109,7 +105,6 @@ def test_an_unused_page_is_locked_and_loses_nothing(
 
 
 def test_a_stored_token_waits_for_the_appliance(appliance: Appliance, opened: Callable[..., Reader]) -> None:
-    """While the appliance starts or does not answer, a reloaded page says so, keeps the token and tries again."""
     reader = opened()
     answers: list[Callable[[Route], None]] = [
         lambda route: route.fulfill(
@@ -136,7 +131,6 @@ def test_a_stored_token_waits_for_the_appliance(appliance: Appliance, opened: Ca
 
 
 def test_a_person_who_waits_can_sign_out(opened: Callable[..., Reader]) -> None:
-    """The page that waits is accessible; its button forgets the token and ends the wait."""
     reader = opened()
     page = reader.page
     page.clock.install()
@@ -157,7 +151,6 @@ def test_a_person_who_waits_can_sign_out(opened: Callable[..., Reader]) -> None:
 def test_a_stored_token_that_was_revoked_is_not_tried_again(
     browser: Browser, appliance: Appliance, token: Callable[..., str]
 ) -> None:
-    """The sign-in page appears at once, with the reason."""
     revoked = token("viewer", "gone")
     appliance.rosrv("token", "revoke", "gone")
     with Reader(browser, str(appliance.ready["api"]), revoked) as reader:
@@ -171,7 +164,6 @@ def test_a_stored_token_that_was_revoked_is_not_tried_again(
 
 
 def test_a_tab_reloaded_after_hours_asks_for_the_token(opened: Callable[..., Reader]) -> None:
-    """The time in which the browser had unloaded a tab counts as time without input."""
     reader = opened()
     page = reader.go("now")
     expect(page.locator("[data-standing=live]")).to_be_visible()
@@ -185,7 +177,6 @@ def test_a_tab_reloaded_after_hours_asks_for_the_token(opened: Callable[..., Rea
 def test_a_locked_page_shows_another_user_none_of_its_drafts(
     appliance: Appliance, token: Callable[..., str], opened: Callable[..., Reader]
 ) -> None:
-    """After a sign-in with another token, no draft written under the first token is shown."""
     reader = opened()
     reader.page.clock.install()
     page = reader.go("policy")
@@ -202,7 +193,6 @@ def test_a_locked_page_shows_another_user_none_of_its_drafts(
 def test_a_viewer_sees_disabled_buttons_with_the_required_role(
     appliance: Appliance, token: Callable[..., str], opened: Callable[..., Reader]
 ) -> None:
-    """For a viewer, buttons that change something are disabled and name the required role; REST also denies them."""
     viewer = token("viewer")
     reader = opened(viewer)
     page = reader.go("policy")

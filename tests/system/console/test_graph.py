@@ -39,7 +39,6 @@ def node_api() -> Iterator[str]:
 def test_a_refused_attempt_is_red_and_leads_to_its_rule(
     opened: Callable[..., Reader], attempt: Callable[..., Any], node_api: str
 ) -> None:
-    """Nodes and topics are drawn, relayed ones marked; a denied attempt appears in red, and a click names the line."""
     assert attempt("registerPublisher", "/talker", "/chatter", "std_msgs/String", node_api)[0] == 1
     assert attempt("registerSubscriber", "/listener", "/chatter", "std_msgs/String", node_api)[0] == 1
     reader = opened()
@@ -60,7 +59,6 @@ def test_a_refused_attempt_is_red_and_leads_to_its_rule(
 
 
 def test_the_self_test_is_not_an_attempt(opened: Callable[..., Reader]) -> None:
-    """Only the self-test's own topic is hidden: a node that takes its name and tries another topic is shown."""
     page = opened().go("graph")
     attempts = """async (denials) => {
       const { attempts } = await import("/console/static/js/graph/model.js");
@@ -72,7 +70,6 @@ def test_the_self_test_is_not_an_attempt(opened: Callable[..., Reader]) -> None:
 
 
 def test_a_host_that_uses_names_of_another_host_is_shown_as_that(opened: Callable[..., Reader]) -> None:
-    """Its attempts are one red item with its address, and lead to the nodes whose names it used."""
     page = opened().go("graph")
     drawn = """async ({ graph, denials }) => {
       const { modelOf } = await import("/console/static/js/graph/model.js");
@@ -115,7 +112,6 @@ def test_a_host_that_uses_names_of_another_host_is_shown_as_that(opened: Callabl
 
 
 def test_a_long_chain_fills_the_frame(opened: Callable[..., Reader]) -> None:
-    """A chain of forty nodes is folded into bands, and items without lines fill rows: little of the frame is empty."""
     page = opened(width=1600, height=1000).go("graph")
     shape = """async ({ chain, alone }) => {
       const { afresh, extent, loadLayout } = await import("/console/static/js/graph/arrange.js");
@@ -133,7 +129,6 @@ def test_a_long_chain_fills_the_frame(opened: Callable[..., Reader]) -> None:
 
 
 def test_names_lose_their_first_namespaces_first(opened: Callable[..., Reader]) -> None:
-    """A name that does not fit loses whole namespaces, which the second line then has, and never its first letters."""
     page = opened().go("graph")
     shown = """async (cases) => {
       const { label } = await import("/console/static/js/graph/drawing.js");

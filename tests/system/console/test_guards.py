@@ -24,7 +24,6 @@ def appliance() -> Iterator[Appliance]:
 def test_a_fence_is_drawn_changed_and_enforced(
     appliance: Appliance, opened: Callable[..., Reader], token: Callable[..., str], tmp_path: Path
 ) -> None:
-    """The map and the margins show a robot half a metre from the edge; values are tried on what it did, then set."""
     types = ("--type", "command=geometry_msgs/Twist", "--type", "by=nav_msgs/Odometry")
     made = appliance.rosrv("guard", "new", "fence", "/cmd_vel", "--by", "/odom", "--shadow", *types)
     assert made.returncode == 0, made.stderr

@@ -58,7 +58,6 @@ def test_invisible_characters_are_shown(opened: Callable[..., Reader]) -> None:
 
 
 def test_the_record_itself_is_harmless(opened: Callable[..., Reader]) -> None:
-    """A hostile record is only text, also when its details and its JSON are open."""
     reader = opened()
     page = reader.go("audit?text=onerror")
     page.locator("tbody tr").first.click()

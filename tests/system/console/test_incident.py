@@ -191,7 +191,6 @@ def test_a_denial_is_granted_by_keys(
 def test_the_time_line_moves_by_keys(
     recording: dict[str, Any], opened: Callable[..., Reader], token: Callable[..., str]
 ) -> None:
-    """The arrows move the selected time, + and 0 zoom; the messages of one topic are read alone."""
     page = opened(token("investigator", "dora")).go(f"recordings/{recording['id']}", heading="Recording")
     slider = page.get_by_role("slider", name="Moment")
     before = slider.get_attribute("aria-valuenow")
@@ -208,7 +207,6 @@ def test_the_time_line_moves_by_keys(
 def test_a_viewer_sees_which_role_may_read_messages(
     recording: dict[str, Any], opened: Callable[..., Reader], token: Callable[..., str]
 ) -> None:
-    """A viewer sees the list, the time line, and the role that may read messages; nothing is wider than the window."""
     reader = opened(token("viewer"), width=390, height=844)
     page = reader.go("recordings")
     press(page.locator(f'tbody a[href$="{recording["id"]}"]'))

@@ -28,7 +28,6 @@ MODULES = {
 
 
 def test_a_first_visit_is_small(browser: Browser, appliance: Appliance) -> None:
-    """The sign-in page makes fewer than 10 requests, and with the first view fewer than 220 kB are sent."""
     with Reader(browser, str(appliance.ready["api"])) as reader:
         network = reader.context.new_cdp_session(reader.page)
         received: list[int] = []
@@ -47,7 +46,6 @@ def test_a_first_visit_is_small(browser: Browser, appliance: Appliance) -> None:
 
 
 def test_joined_modules_run_as_they_would_alone(browser: Browser) -> None:
-    """Private names stay apart, a module that is imported twice runs once, and renamed imports work."""
     page = browser.new_page()
     said: list[str] = []
     page.on("console", lambda message: said.append(message.text))

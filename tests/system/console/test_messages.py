@@ -23,7 +23,6 @@ def ros(appliance: Appliance, tmp_path: Path) -> Iterator[RosSession]:
 def test_the_last_message_is_shown_and_the_look_recorded(
     appliance: Appliance, opened: Callable[..., Reader], token: Callable[..., str], ros: RosSession
 ) -> None:
-    """The view works by keyboard; messages are only text; a viewer sees the required role; the record has the name."""
     ros.talker("rospy", "/chatter", "--text", "<b>said</b>", name="voice").wait_for(event="ready")
     reader = opened(token("operator", "olga"))
     page = reader.go("graph")

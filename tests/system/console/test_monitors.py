@@ -45,7 +45,6 @@ def test_a_monitor_is_switched(appliance: Appliance, opened: Callable[..., Reade
 
 @pytest.mark.parametrize("width", [390, 1280, 1920])
 def test_a_name_is_broken_between_its_words_only(opened: Callable[..., Reader], width: int) -> None:
-    """Names of monitors, files, events and types break after a slash or underscore, never inside a word."""
     reader = opened(width=width, height=800)
     for view, heading in (("monitors", None), ("monitors/obstacleAvoidance", "obstacleAvoidance")):
         page = reader.go(view, heading=heading)
@@ -62,7 +61,6 @@ def test_a_name_is_broken_between_its_words_only(opened: Callable[..., Reader], 
 
 
 def test_two_clicks_at_once_are_both_made(appliance: Appliance, opened: Callable[..., Reader]) -> None:
-    """Both clicks take effect, although the page does not have the first one's ETag at the second."""
     page = opened().go("monitors")
     names = ("safeZone", "safeTrigger")
     switches = [page.get_by_role("switch", name=f"{name} enabled") for name in names]
@@ -85,7 +83,6 @@ def test_two_clicks_at_once_are_both_made(appliance: Appliance, opened: Callable
 def test_a_switch_changed_by_another_user_is_not_overwritten(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """A change that the page has not shown yet is not overwritten; then the page shows it."""
     reader = opened()
     deaf = threading.Event()  # the page gets no changes by others, and no answers to its earlier requests
 
@@ -117,7 +114,6 @@ def test_a_switch_changed_by_another_user_is_not_overwritten(
 def test_a_specification_is_loaded_replaced_and_removed(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """An error is shown at its line and loads nothing; the corrected text is loaded, replaced, and removed."""
     reader = opened()
     page = reader.go("monitors")
     page.get_by_role("button", name="Load a specification").click()

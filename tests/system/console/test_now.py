@@ -12,7 +12,6 @@ from tests.system.console.reader import LIMIT, Reader
 
 
 def test_a_refusal_is_seen_live(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
-    """A node that the policy denies appears under `Recently denied` without a reload, and leads to its record."""
     reader = opened()
     page = reader.go("now")
     refused = page.get_by_role("region", name="Recently denied")
@@ -30,7 +29,6 @@ def test_a_refusal_is_seen_live(opened: Callable[..., Reader], attempt: Callable
 
 
 def test_health_says_what_the_appliance_says(appliance: Appliance, opened: Callable[..., Reader]) -> None:
-    """The figures are those of `rosrv status`; every process that stays has its row."""
     page = opened().go("now")
     expect(page.get_by_role("region", name="Health")).to_contain_text("In service")
     expect(page.get_by_role("region", name="Health")).to_contain_text("Revision 1")
@@ -54,7 +52,6 @@ def test_several_relays_are_numbered(opened: Callable[..., Reader]) -> None:
 
 
 def test_rates_are_of_more_than_a_moment(opened: Callable[..., Reader]) -> None:
-    """Samples may come five times a second, the relay's counts once: a steady flow shows neither zeros nor spikes."""
     page = opened().go("now")
     growth = """async (samples) => {
       const { growth } = await import("/console/static/js/numbers.js");
@@ -68,7 +65,6 @@ def test_rates_are_of_more_than_a_moment(opened: Callable[..., Reader]) -> None:
 
 
 def test_times_in_alarms_are_the_readers(opened: Callable[..., Reader]) -> None:
-    """The appliance writes them in UTC; everything else in the text stays."""
     page = opened().go("now")
     shown = """async (text) => {
       const { inOwnZone } = await import("/console/static/js/moments.js");
@@ -81,7 +77,6 @@ def test_times_in_alarms_are_the_readers(opened: Callable[..., Reader]) -> None:
 def test_many_denials_turn_the_state_to_a_warning(
     appliance: Appliance, opened: Callable[..., Reader], attempt: Callable[..., Any]
 ) -> None:
-    """The first card gives the reason and leads to the denials; `rosrv status` has the same warning."""
     page = opened().go("now")
     for number in range(12):
         attempt(
@@ -99,7 +94,6 @@ def test_many_denials_turn_the_state_to_a_warning(
 def test_the_page_says_that_it_is_not_live_and_comes_back(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """When the api process dies, the page reports it at once, reconnects automatically, and is live again."""
     reader = opened()
     page = reader.go("now")
     expect(page.locator("[data-standing=live]")).to_be_visible()
@@ -114,7 +108,6 @@ def test_the_page_says_that_it_is_not_live_and_comes_back(
 def test_an_alarm_is_open_until_its_cause_is_gone(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """A policy that waits for confirmation is an open alarm with a link to it; confirmed, it is not."""
     page = opened().go("now")
     alarms = page.get_by_role("region", name="Open alarms")
     expect(alarms).not_to_contain_text("unless confirmed")
@@ -130,7 +123,6 @@ def test_an_alarm_is_open_until_its_cause_is_gone(
 
 
 def test_changes_of_the_appliance_are_not_shown_as_those_of_a_person(opened: Callable[..., Reader]) -> None:
-    """The names are those of `appliance.base.actors`, which no token can have."""
     page = opened().go("now")
     shown = """async (authors) => {
       const { actor } = await import("/console/static/js/parts/given.js");

@@ -63,7 +63,6 @@ def revision(appliance: Appliance) -> int:
 def test_an_error_is_shown_at_its_line_and_changes_nothing(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """The error of a wrong line appears at the line while it is typed, with a mark in the margin; nothing is loaded."""
     before = revision(appliance)
     reader = opened()
     page = reader.go("policy")
@@ -87,7 +86,6 @@ def test_an_error_is_shown_at_its_line_and_changes_nothing(
 
 
 def test_the_editor_has_exactly_the_typed_text(opened: Callable[..., Reader]) -> None:
-    """After quick typing over several lines, undo and redo, the text is exactly what was typed."""
     reader = opened()
     page = reader.go("policy")
     first = reader.editor().inner_text()
@@ -105,7 +103,6 @@ def test_the_editor_has_exactly_the_typed_text(opened: Callable[..., Reader]) ->
 
 
 def test_text_that_is_typed_at_once_stays(opened: Callable[..., Reader]) -> None:
-    """The editor takes text from the time it is there, also before the page has finished to draw it."""
     reader = opened()
     reader.context.add_init_script(_TYPE_AT_ONCE)
     page = reader.go("policy")
@@ -116,7 +113,6 @@ def test_text_that_is_typed_at_once_stays(opened: Callable[..., Reader]) -> None
 
 
 def test_the_editor_completes_by_keys(appliance: Appliance, opened: Callable[..., Reader]) -> None:
-    """Sections, live topics, groups of the text and live hosts are proposed while typing; arrows and Enter choose."""
     address = min(MACHINES)
     with Robot(appliance.master_uri):
         reader = opened()
@@ -160,7 +156,6 @@ def test_the_editor_completes_by_keys(appliance: Appliance, opened: Callable[...
 
 
 def test_the_first_view_does_not_load_the_editor(opened: Callable[..., Reader]) -> None:
-    """The editor is fetched with the first view that has one, and the graph with the first name to complete."""
     reader = opened()
     page = reader.go("now")
     reader.settle()
@@ -172,7 +167,6 @@ def test_the_first_view_does_not_load_the_editor(opened: Callable[..., Reader]) 
 
 
 def test_a_page_that_is_older_than_the_appliance_says_so(opened: Callable[..., Reader]) -> None:
-    """After an upgrade the files of an open page are gone: the views that need one name the remedy, which helps."""
     reader = opened()
     page = reader.go("now")
     for view, file in (("policy", "codemirror"), ("graph", "dagre")):
@@ -188,7 +182,6 @@ def test_a_page_that_is_older_than_the_appliance_says_so(opened: Callable[..., R
 
 
 def test_a_right_text_is_loaded_with_its_comment(appliance: Appliance, opened: Callable[..., Reader]) -> None:
-    """A dry run shows the changes and the diff; loading makes a new revision with author and comment."""
     before = revision(appliance)
     reader = opened()
     page = reader.go("policy")
@@ -219,7 +212,6 @@ def publish(master: str, address: str, topic: str) -> None:
 
 
 def test_a_dry_run_groups_what_would_end_by_host(appliance: Appliance, opened: Callable[..., Reader]) -> None:
-    """Each host has one line with the number of its connections, the most first; the line opens to list them."""
     for address, topics in (("127.0.0.2", ["/wheel"]), ("127.0.0.3", ["/arm", "/hand", "/head"])):
         for topic in topics:
             publish(appliance.master_uri, address, topic)
@@ -240,7 +232,6 @@ def test_a_dry_run_groups_what_would_end_by_host(appliance: Appliance, opened: C
 def test_commit_confirm_keeps_or_rolls_back_a_policy(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """With commit-confirm the page shows the time left; one click rolls back to the old text."""
     reader = opened()
     page = reader.go("policy")
     first = appliance.rest().get("/v1/policy").json["text"]
@@ -258,7 +249,6 @@ def test_commit_confirm_keeps_or_rolls_back_a_policy(
 def test_a_policy_that_ends_connections_rolls_back_unless_confirmed(
     appliance: Appliance, opened: Callable[..., Reader], attempt: Callable[..., Any]
 ) -> None:
-    """The dialog preselects five minutes, also for a person who does not wait for the dry run."""
     assert attempt("registerPublisher", "/loud", "/free", "std_msgs/String", "http://127.0.0.1:1/")[0] == 1
     reader = opened()
     page = reader.go("policy")
@@ -286,7 +276,6 @@ def page_with_an_outdated_draft(appliance: Appliance, reader: Reader) -> Page:
 def test_two_engineers_do_not_overwrite_each_other(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """A text based on an older revision is rejected with the reason; the author can then load it over the new one."""
     page = page_with_an_outdated_draft(appliance, opened())
     page.get_by_role("button", name="Load", exact=True).click()
     page.get_by_role("dialog").get_by_role("button", name="Load the policy").click()
@@ -301,7 +290,6 @@ def test_two_engineers_do_not_overwrite_each_other(
 def test_a_late_dry_run_does_not_clear_the_error_of_a_load(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """A dry run that is answered after a rejected load changes nothing: the rejection stays in the dialog."""
     page = page_with_an_outdated_draft(appliance, opened())
     held: list[Route] = []
 
@@ -322,7 +310,6 @@ def test_a_late_dry_run_does_not_clear_the_error_of_a_load(
 
 
 def test_it_explains_and_leads_to_the_line(opened: Callable[..., Reader]) -> None:
-    """An explanation shows the rule that denies a request, its line, and the right to the node's name."""
     reader = opened()
     page = reader.go("policy?tab=explain")
     page.get_by_label("Host").fill("10.0.0.9")
@@ -337,7 +324,6 @@ def test_it_explains_and_leads_to_the_line(opened: Callable[..., Reader]) -> Non
 
 
 def test_the_tests_of_the_policy_are_run_on_the_draft(opened: Callable[..., Reader]) -> None:
-    """All cases pass on the policy in force; for a draft that fails one, the case and its expectation are shown."""
     reader = opened()
     page = reader.go("policy?tab=tests")
     page.get_by_role("button", name="Run the tests").click()
@@ -349,7 +335,6 @@ def test_the_tests_of_the_policy_are_run_on_the_draft(opened: Callable[..., Read
 
 
 def test_an_older_revision_comes_back(appliance: Appliance, opened: Callable[..., Reader]) -> None:
-    """The list of revisions shows the differences before a rollback, which becomes a new revision."""
     rest = appliance.rest()
     assert rest.post("/v1/policy", POLICY + "\n# to be undone\n", match="*").status == 200
     before = revision(appliance)

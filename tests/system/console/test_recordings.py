@@ -33,7 +33,6 @@ def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
 def test_an_investigator_takes_a_recording_from_its_record(
     appliance: Appliance, opened: Callable[..., Reader], token: Callable[..., str]
 ) -> None:
-    """The bag and the bundle are downloaded as files; an admin sees which role they are for."""
     order = appliance.rosrv("record", "now", "--before", "1s", "--after", "1s", "--json")
     recording = json.loads(order.stdout)["id"]
     [record] = appliance.recorded("--event", "recording closed")
@@ -54,7 +53,6 @@ def test_an_investigator_takes_a_recording_from_its_record(
 
 
 def test_recordings_are_listed_by_their_trigger(opened: Callable[..., Reader]) -> None:
-    """A row begins with monitor, topic and node; equal ones in a row are one, whose button shows each by keyboard."""
     shown = copy.deepcopy(EXAMPLES["Recordings"]) | {"in_progress": []}
     [recording] = shown["recordings"]
     trigger = recording["triggers"][0] | {"monitor": "censor", "resource": "/rude", "caller_id": "/lout"}
@@ -82,7 +80,6 @@ def test_recordings_are_listed_by_their_trigger(opened: Callable[..., Reader]) -
 def test_the_messages_of_a_record_that_is_not_listed(
     opened: Callable[..., Reader], token: Callable[..., str]
 ) -> None:
-    """Among more events than are listed, the selected record's own message is read, not another topic's."""
     [row] = copy.deepcopy(EXAMPLES["Recordings"]["recordings"])
     line = copy.deepcopy(EXAMPLES["Timeline"]) | {"id": row["id"], "more_events": 700}
     [trigger] = row["triggers"]
@@ -116,7 +113,6 @@ def test_the_messages_of_a_record_that_is_not_listed(
 
 
 def test_a_recording_that_is_being_made_is_listed(opened: Callable[..., Reader]) -> None:
-    """Before the first recording ends, the list has it with its earliest end."""
     shown = copy.deepcopy(EXAMPLES["Recordings"]) | {"recordings": []}
     reader = opened()
     reader.page.route(re.compile("/v1/recordings$"), lambda route: route.fulfill(json=shown))

@@ -55,7 +55,6 @@ def robot(appliance: Appliance) -> Iterator[Robot]:
 @pytest.mark.usefixtures("robot")
 @pytest.mark.parametrize("size", [WIDE, NARROW])
 def test_all_of_it_is_in_the_picture(opened: Callable[..., Reader], size: tuple[int, int]) -> None:
-    """Ten namespaces are shown: none is cut off or overlaps another, and every name is complete and readable."""
     page = _graph(opened(width=size[0], height=size[1]))
     expect(page.locator('[data-key="gnode:/arm/*"]')).to_contain_text("/arm")
     wait_until(page, _ALL_IN_FRAME)  # it is fitted once it is drawn
@@ -71,7 +70,6 @@ def test_all_of_it_is_in_the_picture(opened: Callable[..., Reader], size: tuple[
 
 @pytest.mark.usefixtures("robot")
 def test_a_group_opens_where_it_stands(opened: Callable[..., Reader]) -> None:
-    """The parts of /arm replace it without overlaps, and the boxes above it have not moved."""
     page = _graph(opened(width=WIDE[0], height=WIDE[1]))
     group = page.locator('[data-key="gnode:/arm/*"]')
     at = _corner(group)
@@ -101,7 +99,6 @@ def test_groups_by_host(opened: Callable[..., Reader]) -> None:
 
 @pytest.mark.usefixtures("robot")
 def test_publishers_and_subscribers_of_the_arm(opened: Callable[..., Reader]) -> None:
-    """A topic's name and Enter show its publishers and subscribers, and a denied attempt on it."""
     page = opened(width=WIDE[0], height=WIDE[1]).go("graph")
     search = page.get_by_label("Search the graph")
     search.fill("/arm/command")

@@ -30,7 +30,6 @@ def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
 def test_the_notice_of_the_site_is_shown_before_a_token_is_given(
     browser: Browser, appliance: Appliance
 ) -> None:
-    """The notice is shown as written, line by line; markup in it is only text."""
     with Reader(browser, str(appliance.ready["api"])) as reader:
         reader.page.goto(reader.url)
         notice = reader.page.get_by_role("note", name="Site notice")
@@ -43,7 +42,6 @@ def test_the_notice_of_the_site_is_shown_before_a_token_is_given(
 def test_a_policy_is_loaded_with_its_signature_only(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
-    """Without a signature the dialog says what is missing and stays open; with it the policy is loaded."""
     text = POLICY + "# another\n"
     reader = opened()
     page = reader.go("policy")
@@ -61,7 +59,6 @@ def test_a_policy_is_loaded_with_its_signature_only(
 def test_a_specification_is_loaded_with_its_signature_only(
     appliance: Appliance, opened: Callable[..., Reader], tmp_path: Path
 ) -> None:
-    """File and signature are chosen together; one without the other is rejected."""
     file, beside = tmp_path / "count.rv", tmp_path / "count.rv.sig"
     file.write_text(SPECIFICATION)
     beside.write_text(signed(SPECIFICATION))

@@ -146,7 +146,6 @@ def test_both_appliances_are_shown(pair: PairConsoles, theme: str, width: int) -
 
 
 def test_a_silent_witness_is_a_banner_on_every_view(pair: PairConsoles) -> None:
-    """The banner and the open alarm give the reason and the next step; they end when the witness answers."""
     page = pair.open("a", "viewer").go("graph")
     banner = page.locator(".banner").filter(has_text="the witness on the robot")
     expect(page.locator("[data-standing=live]")).to_be_visible()
@@ -163,7 +162,6 @@ def test_a_silent_witness_is_a_banner_on_every_view(pair: PairConsoles) -> None:
 
 
 def test_a_standby_that_could_not_start_is_shown_on_both(pair: PairConsoles) -> None:
-    """Another program has its port: banner, panel and the disabled switchover give the reason until it ends."""
     page = pair.open("a", "admin").go("now")
     other = pair.open("b", "viewer").go("now", heading="Standby")
     row, button = (

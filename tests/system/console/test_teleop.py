@@ -61,7 +61,6 @@ def reader(browser: object, appliance: Appliance) -> Iterator[Callable[..., Read
 def test_a_person_sees_and_drives_the_robot_through_their_own_door(
     appliance: Appliance, common_robot: Host, reader: Callable[..., Reader], tmp_path: Path
 ) -> None:
-    """Add the door, see its picture within a minute, plot a field, drive; whatever ends the hold stops the robot."""
     with RosSession(appliance.master_uri, tmp_path, common_robot) as ros, reader() as console:
         image = f"{{format: png, data: {[*PNG]}}}"
         ros.start(["rostopic", "pub", "-r", "5", "/camera/compressed", "sensor_msgs/CompressedImage", image])

@@ -59,7 +59,6 @@ def reaches(where: Namespace, address: str, port: int, family: int = socket.AF_I
 
 
 def test_unmodified_nodes_work_through_the_appliance(demo: Compose) -> None:
-    """The operator in its container connects, drives, aims and fires; five rospy nodes and a roscpp node obey."""
     for event in ('"connected"', '"drove"', '"aimed"', '"fired"'):
         demo.wait_for_log("ocu", event, timeout=120)
     status = demo.status()
@@ -69,7 +68,6 @@ def test_unmodified_nodes_work_through_the_appliance(demo: Compose) -> None:
 
 
 def test_nodes_have_no_setting_but_the_master(demo: Compose) -> None:
-    """ROS_MASTER_URI is the only setting of a node's container that refers to the appliance."""
     for service in ("landshark", "ocu"):
         told = demo.engine.inspect(demo.container(service))["Config"]["Env"]
         assert [one for one in told if one.startswith(("ROS_", "ROSRV"))] == [
@@ -79,7 +77,6 @@ def test_nodes_have_no_setting_but_the_master(demo: Compose) -> None:
 
 
 def test_denials_of_the_visitor_name_the_rule(attacks: dict[str, dict[str, Any]], demo: Compose) -> None:
-    """Only the visitor's attempts that the policy grants succeed; each denial is recorded with its rule."""
     succeeded = {name for name, one in attacks.items() if one["succeeded"]}
     assert succeeded == {"watch the battery"}
     assert len(attacks) >= 12
@@ -97,7 +94,6 @@ def test_denials_of_the_visitor_name_the_rule(attacks: dict[str, dict[str, Any]]
 def test_the_story_ends_with_the_denials_and_the_console(
     attacks: dict[str, dict[str, Any]], demo: Compose
 ) -> None:
-    """Its last lines are the visitor's denials with their rules, and the console's address and token."""
     assert attacks
     demo.wait_for_log("story", "Explore:", timeout=120)
     said = demo("logs", "--no-color", "story").stdout
@@ -132,7 +128,6 @@ def test_source_addresses_are_preserved(attacks: dict[str, dict[str, Any]], demo
 
 
 def test_only_documented_ports_are_published(site: Site, demo: Compose) -> None:
-    """The engine publishes IKE and, on this machine, the console; for the robot's containers nothing."""
     published = {}
     for service in ("appliance", "landshark", "ocu"):
         ports = demo.engine.inspect(demo.container(service))["NetworkSettings"]["Ports"]
@@ -165,7 +160,6 @@ def test_this_machine_reaches_the_console_and_the_laptop_does_not(
 
 
 def test_an_operator_reaches_the_appliance_only(attacks: dict[str, dict[str, Any]], demo: Compose) -> None:
-    """The operators' network reaches RVMaster and the proxy endpoints, but no console, no `rosmaster`, no robot."""
     assert attacks
     here = namespace_of(demo.engine, demo.container("ocu"))
     found = ports_open(here, OPERATOR_SIDE, range(1, 65536))
@@ -179,7 +173,6 @@ def test_an_operator_reaches_the_appliance_only(attacks: dict[str, dict[str, Any
 
 
 def test_an_unknown_container_reaches_nothing(demo: Compose) -> None:
-    """Another container beside the appliance reaches neither REST nor `rosmaster`."""
     name = demo.engine.docker(
         "run", "--detach", "--rm", "--network", "demo_outside", "--entrypoint", "sleep", "rosrv/demo", "300"
     ).stdout.strip()
@@ -206,7 +199,6 @@ def documented_rights() -> dict[str, tuple[str, frozenset[str]]]:
 
 
 def test_every_process_has_the_documented_rights(demo: Compose) -> None:
-    """User and capabilities of each process match the table, and there is no other process."""
     numbers = {"NET_ADMIN": 12, "NET_BIND_SERVICE": 10, "SETUID": 7, "SETGID": 6, "KILL": 5, "CHOWN": 0}
     documented = documented_rights()
 
@@ -242,7 +234,6 @@ def test_every_process_has_the_documented_rights(demo: Compose) -> None:
 
 
 def test_the_root_file_system_is_read_only(demo: Compose) -> None:
-    """Only the volume, /tmp and /run are writable, and the latter two do not allow execution."""
     mounts = demo.exec("appliance", "cat", "/proc/mounts").stdout.splitlines()
     kinds = {line.split()[1]: line.split()[2:4] for line in mounts}
     assert "ro" in kinds["/"][1].split(",")
@@ -261,12 +252,10 @@ def test_the_root_file_system_is_read_only(demo: Compose) -> None:
 
 
 def test_packets_are_not_forwarded_between_networks(demo: Compose) -> None:
-    """The appliance does not forward: an operator's packet for the robot ends there."""
     assert demo.exec("appliance", "cat", "/proc/sys/net/ipv4/ip_forward").stdout.strip() == "0"
 
 
 def test_a_policy_is_changed_while_the_robot_runs(demo: Compose) -> None:
-    """After an edit of policies/ on the machine and a reload through `docker compose exec`, lost rights are revoked."""
     file = demo.directory / "policies" / "containers.ini"
     before = file.read_text()
     file.write_text(before.replace("/landshark/gps ", "/landshark/odom = vehicle\n/landshark/gps ", 1))

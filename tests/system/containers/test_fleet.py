@@ -218,7 +218,6 @@ def _prepared(folder: Path, lab: Lab, engine: Engine) -> Walk:
 
 
 def test_the_page_leads_to_twenty_robots(walk: Walk) -> None:
-    """After the page's four steps, twenty robots are enrolled, collected, searchable and proven."""
     assert len(BLOCKS) == 4
     assert BLOCKS[0].startswith(f"{BUILD}\n")
     names = {f"arm{number}" for number in range(1, 21)}
@@ -241,7 +240,6 @@ def test_the_page_leads_to_twenty_robots(walk: Walk) -> None:
 
 
 def test_the_containers_have_no_rights_and_no_secrets(walk: Walk) -> None:
-    """Both are healthy, with a read-only root, no capability and users of their own; no password exists."""
     for service, user in (("collector", 61030), ("postgres", 61031)):
         walk.wait_healthy(service)
         found = walk.compose.engine.inspect(walk.compose.container(service))
@@ -262,8 +260,6 @@ def test_the_containers_have_no_rights_and_no_secrets(walk: Walk) -> None:
 
 
 def test_only_the_collectors_user_reaches_the_database(walk: Walk) -> None:
-    """PostgreSQL knows the collector by its user: other users and other roles are refused."""
-
     def tried(user: str, role: str) -> str:
         container = walk.compose.container("collector")
         python = ("/opt/fleet/bin/python", "-P", "-c", PEER, role)
@@ -275,7 +271,6 @@ def test_only_the_collectors_user_reaches_the_database(walk: Walk) -> None:
 
 
 def test_an_appliance_in_a_container_joins(walk: Walk) -> None:
-    """With an invitation as a file and the page's commands, the appliance of compose.yaml is collected and proven."""
     folder = walk.folder / "arm21"
     folder.mkdir()
     compose = walk.compose.engine.compose(project(folder), folder.name)
@@ -295,7 +290,6 @@ def test_an_appliance_in_a_container_joins(walk: Walk) -> None:
 
 
 def test_a_bundle_reaches_a_robot_in_a_container(walk: Walk) -> None:
-    """With the commands and files of docs/fleet-bundles.md; after a restart, the robot still has the bundle."""
     arms, compose = walk.folder / "arms", walk.contained["arm21"]
     arms.mkdir()
     shutil.copy(ROOT / "policies" / "containers.ini", arms / "policy.ini")
@@ -339,7 +333,6 @@ def test_a_bundle_reaches_a_robot_in_a_container(walk: Walk) -> None:
 
 
 def test_a_robot_is_added_with_its_files(walk: Walk) -> None:
-    """The page's commands bring the files into the container, and enrol the robot."""
     robot = FleetRobot(SimpleNamespace(folder=walk.folder), "arm22", enrolled=False)  # type: ignore[arg-type]  # only its folder is used
     robot.close()
     shutil.copy(robot.folder / "audit.pub.pem", walk.folder / "audit.pub")
@@ -355,7 +348,6 @@ def test_prometheus_reads_the_metrics(walk: Walk) -> None:
 
 
 def test_a_backup_restores_the_collector(walk: Walk) -> None:
-    """On a new machine, the page's commands restore all; robots continue, and send the newer segments again."""
     robots, tokens = walk.fleet("robot", "list"), walk.fleet("token", "list")
     walk.run(NAMED["backs up"])
     assert stat.S_IMODE((walk.folder / "collector.tar").stat().st_mode) == 0o600
@@ -395,7 +387,6 @@ def test_both_containers_are_killed(walk: Walk) -> None:
 
 
 def test_a_new_image_continues_with_the_volumes(walk: Walk) -> None:
-    """After an upgrade of both images, robots, tokens, segments and the index are as before."""
     walk.fleet("token", "add", "upgrader")
     images = {
         service: f"rosrv/{name}" for service, name in (("collector", "fleet"), ("postgres", "fleet-postgres"))
@@ -437,7 +428,6 @@ def test_retention_removes_old_segments(walk: Walk) -> None:
 
 
 def test_a_robot_in_a_container_leaves(walk: Walk) -> None:
-    """After the page's commands, the appliance pushes nothing; the collector keeps and proves its segments."""
     compose = walk.contained.pop("arm21")
     (compose.directory / "compose.override.yaml").unlink()
     compose("up", "--detach", "--no-build", "appliance")
@@ -453,7 +443,6 @@ def test_a_robot_in_a_container_leaves(walk: Walk) -> None:
 
 
 def test_the_image_has_no_key_and_no_tool_to_fetch_programs(walk: Walk) -> None:
-    """Keys are made by `init`, in the volume; the image has no pip, compiler or download tool."""
     options = ("run", "--rm", "--entrypoint", "sh", "rosrv/fleet", "-c")
     tools = "command -v pip pip3 gcc curl wget git; ls /opt/fleet/bin; ls -A /var/lib/rosrv-fleet"
     listed = walk.compose.engine.docker(*options, tools, check=False).stdout.split()

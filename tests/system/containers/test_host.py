@@ -34,7 +34,6 @@ def beside(site: Site, tmp_path: Path) -> Iterator[Compose]:
 def test_nodes_of_the_machine_work_and_its_ports_are_closed(
     site: Site, beside: Compose, tmp_path: Path
 ) -> None:
-    """After the three commands in the head of the file, nodes communicate; unknown hosts see no port of the machine."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     rules = beside.exec("appliance", "rosrv", "protect", "--appliance", APPLIANCE).stdout
 
@@ -64,7 +63,6 @@ def test_nodes_of_the_machine_work_and_its_ports_are_closed(
 
 
 def test_without_the_machines_own_rule_every_host_is_denied(site: Site, beside: Compose) -> None:
-    """The policy of this topology names the machine only: the operator's network of compose.yaml has no rights."""
     assert beside.status()["policy"]["file"] == "/etc/rosrv/policies/default.ini"
     said = beside.exec(
         "appliance", "rosrv", "policy", "explain", "policies/default.ini", "--robot", MACHINE,

@@ -56,14 +56,12 @@ def run(site: Site, *command: str, image: str = APPLIANCE) -> str:
 
 
 def test_the_base_image_is_pinned_by_digest() -> None:
-    """Builds of the image always begin with the same bytes."""
     bases = re.findall(r"^FROM (\S+)", DOCKERFILE, re.MULTILINE)
     assert set(bases) == {"${BASE}", "appliance"}
     assert re.search(r"^ARG BASE=debian:12-slim@sha256:[0-9a-f]{64}$", DOCKERFILE, re.MULTILINE)
 
 
 def test_debian_packages_are_those_of_the_list() -> None:
-    """The image's Debian packages are in packages.txt, except those for containers only."""
     text = DOCKERFILE.partition("AS appliance\n")[2].partition("&& apt-get clean")[0]
     taken = set(re.findall(r"^ {8}([a-z0-9.+-]+) \\$", text, re.MULTILINE))
     assert len(taken) > 5
@@ -74,7 +72,6 @@ def test_debian_packages_are_those_of_the_list() -> None:
 def test_there_is_no_compiler_and_no_way_to_fetch_programs(
     contents: list[tuple[str, tarfile.TarInfo, bool]],
 ) -> None:
-    """No layer of the image has a compiler, pip, or a download tool (except apt, which Debian needs)."""
     tools = [
         path for path, entry, _ in contents if entry.isfile() and entry.mode & 0o111 and TOOLS.search(path)
     ]
@@ -85,7 +82,6 @@ def test_there_is_no_compiler_and_no_way_to_fetch_programs(
 def test_it_has_the_compiled_module_but_no_cython(
     contents: list[tuple[str, tarfile.TarInfo, bool]], site: Site
 ) -> None:
-    """The image has the relay's module, built from this checkout's source, and not what builds it."""
     tools = re.compile(r"/(Cython|cython)[^/]*/|/distribution/|/pump\.c$")
     assert [path for path, _entry, _secret in contents if tools.search(path)] == []
     load = "from appliance.relay.transport import pump; print(pump.__file__)"
@@ -96,7 +92,6 @@ def test_it_has_the_compiled_module_but_no_cython(
 
 
 def test_nothing_of_the_build_is_left(contents: list[tuple[str, tarfile.TarInfo, bool]]) -> None:
-    """The image has no package lists or caches, and only those parts of the checkout that run."""
     left = [path for path, entry, _ in contents if entry.isfile() and entry.size and path.startswith(CACHES)]
     assert left == []
     ours = [path for path, _, _ in contents if re.search(r"/(tests|\.git|requirements\.lock)(/|$)", path)]
@@ -104,7 +99,6 @@ def test_nothing_of_the_build_is_left(contents: list[tuple[str, tarfile.TarInfo,
 
 
 def test_there_is_no_private_key(contents: list[tuple[str, tarfile.TarInfo, bool]]) -> None:
-    """Keys are made at the first start, in the volume: no two appliances have the same."""
     assert [path for path, _, secret in contents if secret] == []
     assert not any(
         path.startswith("/var/lib/rosrv/") and path != "/var/lib/rosrv/" for path, _, _ in contents
@@ -120,7 +114,6 @@ def test_no_program_raises_privileges(site: Site) -> None:
 def test_only_root_can_change_files(
     contents: list[tuple[str, tarfile.TarInfo, bool]],
 ) -> None:
-    """Every file belongs to root and is writable for root only."""
     open_to_others = [
         path
         for path, entry, _ in contents
@@ -131,7 +124,6 @@ def test_only_root_can_change_files(
 
 
 def test_every_process_finds_its_user(site: Site) -> None:
-    """The users of the processes have their fixed numbers, and none can log in."""
     lines = run(site, "getent", "passwd").splitlines()
     users = {fields[0]: fields for fields in (line.split(":") for line in lines)}
     assert {name: int(users[name][2]) for name in NUMERIC_IDS} == NUMERIC_IDS
@@ -139,27 +131,23 @@ def test_every_process_finds_its_user(site: Site) -> None:
 
 
 def test_the_configuration_of_the_image_is_right(site: Site) -> None:
-    """The file in the image is valid and has the isolation `container`."""
     shown = run(site, "rosrv", "config", "show")
     assert "isolation: container" in shown
     run(site, "rosrv", "config", "check", "/etc/rosrv/appliance.yaml")
 
 
 def test_the_demonstration_contains_no_part_of_the_appliance(site: Site) -> None:
-    """The robot's image has unmodified ROS nodes only, and the appliance's image none of them."""
     assert run(site, "find", "/opt", "/usr", "-name", "appliance*", image=DEMO) == ""
     assert "rospy" in run(site, "/usr/bin/python3", "-c", "import rospy; print(rospy.__name__)", image=DEMO)
     assert run(site, "find", "/opt", "/usr", "-name", "rospy") == ""
 
 
 def test_the_image_stays_small(site: Site) -> None:
-    """The documented size is not exceeded."""
     whole, base = (int(site.engine.inspect(name)["Size"]) for name in (APPLIANCE, BASE))
     assert whole - base < MOST_MEGABYTES * 1e6
 
 
 def test_the_machines_own_network_is_refused(site: Site) -> None:
-    """In a container on the machine's own network the start fails with the reason, and leaves no rule."""
     rights = (
         "--cap-drop",
         "ALL",
@@ -177,7 +165,6 @@ def test_the_machines_own_network_is_refused(site: Site) -> None:
 
 
 def test_too_few_rights_are_named(site: Site) -> None:
-    """A start without capabilities, as a newcomer's first attempt, names the missing ones."""
     done = site.engine.docker("run", "--rm", APPLIANCE, check=False, timeout=60)
     assert done.returncode == 1
     assert "NET_ADMIN" in done.stderr

@@ -74,7 +74,6 @@ def log_of_a_stop(alone: Compose) -> str:
 
 
 def test_nodes_go_on_after_stop_start_and_kill(talking: Compose) -> None:
-    """After a stop and start, and after a kill and restart by the engine, running nodes go on."""
     container = talking.container("appliance")
     talking("stop", "appliance")
     talking("start", "appliance")
@@ -89,8 +88,6 @@ def test_nodes_go_on_after_stop_start_and_kill(talking: Compose) -> None:
 
 
 def test_a_recreated_container_keeps_its_certificate(site: Site, alone: Compose) -> None:
-    """As at each upgrade: the container has another id, and pinned clients of REST still know it."""
-
     def certificate() -> str:
         return site.machine.run(lambda: ssl.get_server_certificate(("127.0.0.1", 8443), timeout=30))
 
@@ -138,7 +135,6 @@ def test_down_leaves_nothing(site: Site, tmp_path: Path) -> None:
 
 
 def test_backup_and_restore_as_documented(alone: Compose, tmp_path: Path) -> None:
-    """With the commands of docs/operating.md, a backup of the running appliance is restored into a new volume."""
     container, entry = alone.container("appliance"), ("--entrypoint", "rosrv", APPLIANCE)
     folder = ("--volume", f"{tmp_path}:/backup")
     backup = ("--cap-add", "DAC_OVERRIDE", "--volumes-from", container, *folder, *entry, "backup")
@@ -170,7 +166,6 @@ def rights(compose: Compose) -> list[str]:
 
 @pytest.mark.parametrize("right", ["NET_ADMIN", "SETUID", "SETGID", "CHOWN"])
 def test_no_start_without_a_required_capability(right: str, site: Site) -> None:
-    """A start without any one of the required capabilities fails with a reason."""
     given = [f"--cap-add={one}" for one in ("NET_ADMIN", "SETUID", "SETGID", "CHOWN", "KILL") if one != right]
     done = site.engine.docker(
         "run",
@@ -203,7 +198,6 @@ def hung_relay_ends(compose: Compose, seconds: float) -> bool:
 
 
 def test_a_hanging_process_is_ended_with_the_kill_capability(alone: Compose) -> None:
-    """Processes of other users can be killed only with KILL: without it a hanging relay is not replaced."""
     assert hung_relay_ends(alone, 30)
     without(alone, "KILL")
     alone.wait_healthy()

@@ -27,7 +27,6 @@ def pair(site: Site, tmp_path: Path) -> Iterator[Compose]:
 
 
 def test_the_standby_takes_over_from_a_killed_container(pair: Compose) -> None:
-    """The operator loses the robot for a moment; every node goes on in its container."""
     pair.wait_for_log("ocu", '"position"', timeout=180)
     eventually(lambda: pair.row("standby", "status", service="a")["other"]["in_sync"], pair.story)
     nodes = {name: pair.container(name) for name in ("landshark", "ocu")}

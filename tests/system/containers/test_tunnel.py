@@ -52,7 +52,6 @@ def enrolled_as_documented(alone: Compose, kit: Path) -> Path:
 
 
 def test_a_laptop_joins_publishes_and_is_revoked(site: Site, alone: Compose, tmp_path: Path) -> None:
-    """With its kit a laptop on the machine's network has a tunnel through the published ports, until it is revoked."""
     need_strongswan()
     kit = enrolled_as_documented(alone, tmp_path / "laptop.tar.gz")
     (alone.directory / "policies" / "containers.ini").write_text(POLICY)
@@ -87,7 +86,6 @@ def test_a_laptop_joins_publishes_and_is_revoked(site: Site, alone: Compose, tmp
 
 
 def test_no_token_is_made_that_no_host_can_use(alone: Compose) -> None:
-    """REST is published for this machine only: the command says that no host could use a token, and adds no host."""
     add = ("rosrv", "host", "add", "laptop", "--appliance", MACHINE)
     done = alone.exec("appliance", *add, "--token", "--output", "-", check=False)
     assert done.returncode == 1

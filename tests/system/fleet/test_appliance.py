@@ -51,7 +51,6 @@ def work(appliance: Appliance, count: int) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="the appliance's processes have users of their own")
 def test_an_appliance_pushes_its_log(site: FleetSite) -> None:
-    """After enrolment every record is collected and proven, also through kills of the process and the collector."""
     appliance = Appliance()
     (appliance.directory / "appliance.yaml").write_text(
         json.dumps(
@@ -92,7 +91,6 @@ def test_an_appliance_pushes_its_log(site: FleetSite) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="the appliance's processes have users of their own")
 def test_a_collector_that_never_answers_holds_nothing_up() -> None:
-    """While both clients wait for their answer, calls are decided and recorded, and the appliance stops soon."""
     appliance = Appliance()
     fleet = BundleSite(appliance.directory / "fleet")
     certificate, key = fleet.authority.issue(ROBOT)

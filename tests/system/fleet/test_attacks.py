@@ -47,7 +47,6 @@ def put(
 
 
 def test_a_robot_cannot_push_the_log_of_another(site: FleetSite, make_robot: MakeRobot) -> None:
-    """With the certificate of one robot, segments of another are refused: its key is pinned."""
     victim, thief = make_robot("victim"), make_robot("thief")
     victim.record(10)
     summary, body = segment(victim, 1)
@@ -58,7 +57,6 @@ def test_a_robot_cannot_push_the_log_of_another(site: FleetSite, make_robot: Mak
 
 
 def test_a_stolen_certificate_forges_nothing(site: FleetSite, make_robot: MakeRobot) -> None:
-    """An attacker with a robot's certificate, but without its signer's key, can push only what the robot sealed."""
     victim = make_robot("victim")
     victim.record(10)
     forger = FleetRobot(site, "forger", enrolled=False)
@@ -75,7 +73,6 @@ def test_a_stolen_certificate_forges_nothing(site: FleetSite, make_robot: MakeRo
 def test_an_unknown_certificate_does_not_connect(
     site: FleetSite, make_robot: MakeRobot, tmp_path: Path
 ) -> None:
-    """A certificate that no robot has is refused by TLS, even if the authority of a robot signed it; none gets 403."""
     robot = make_robot("arm1")
     robot.record(5)
     summary, body = segment(robot, 1)
@@ -86,7 +83,6 @@ def test_an_unknown_certificate_does_not_connect(
 
 
 def test_a_removed_robot_is_refused_at_once(site: FleetSite, make_robot: MakeRobot) -> None:
-    """After `robot remove`, the certificate is refused; `robot renew` accepts only the new one."""
     robot = make_robot("arm1")
     robot.record(5)
     summary, body = segment(robot, 1)
@@ -106,7 +102,6 @@ def test_a_removed_robot_is_refused_at_once(site: FleetSite, make_robot: MakeRob
 
 
 def test_a_replayed_segment_is_stored_once(site: FleetSite, make_robot: MakeRobot) -> None:
-    """A repeated segment gets a receipt again, is stored once, and is found once."""
     robot = make_robot("arm1")
     robot.record(5)
     robot.push()
@@ -119,7 +114,6 @@ def test_a_replayed_segment_is_stored_once(site: FleetSite, make_robot: MakeRobo
 
 
 def test_a_swapped_segment_is_refused(site: FleetSite, make_robot: MakeRobot) -> None:
-    """A valid segment under the name or number of another is refused."""
     robot = make_robot("arm1")
     robot.record(30)
     (first, _), (second, body) = segment(robot, 1), segment(robot, 2)
@@ -131,7 +125,6 @@ def test_a_swapped_segment_is_refused(site: FleetSite, make_robot: MakeRobot) ->
 
 
 def test_a_withheld_segment_is_a_gap(site: FleetSite, make_robot: MakeRobot) -> None:
-    """If a segment is missing, health and `verify` report it until it arrives."""
     robot = make_robot("arm1")
     robot.record(30)
     for number in (1, 3):
@@ -147,7 +140,6 @@ def test_a_withheld_segment_is_a_gap(site: FleetSite, make_robot: MakeRobot) -> 
 
 
 def test_a_second_history_is_reported(site: FleetSite, make_robot: MakeRobot) -> None:
-    """If the robot's key seals another history, both are stored, and reported as a fork."""
     robot = make_robot("arm1")
     robot.record(5)
     robot.record(5, reason="first history")
@@ -166,7 +158,6 @@ def test_a_second_history_is_reported(site: FleetSite, make_robot: MakeRobot) ->
 def test_a_client_with_another_history_continues_from_the_common_part(
     site: FleetSite, make_robot: MakeRobot
 ) -> None:
-    """If the log was restored from a copy, the client pushes the new history after a common checkpoint."""
     robot = make_robot("arm1")
     for _ in range(4):
         robot.record(10)
@@ -197,7 +188,6 @@ def hasty(database: str, tmp_path: Path) -> Iterator[FleetSite]:
 
 
 def test_a_huge_segment_is_refused(strict: FleetSite) -> None:
-    """Neither a large upload nor one that grows when it is decompressed is stored, and no rest of it stays."""
     robot = FleetRobot(strict, "arm1", every=2000)
     robot.record(1000)
     summary, body = segment(robot, 1)
@@ -217,7 +207,6 @@ def test_a_huge_segment_is_refused(strict: FleetSite) -> None:
 
 
 def test_a_slow_robot_is_cut_off(hasty: FleetSite) -> None:
-    """An upload that takes too long is ended, and so is a connection without a request; other robots go on."""
     slow, other = FleetRobot(hasty, "slow"), FleetRobot(hasty, "other")
     other.record(5)
     context = ssl.create_default_context(cafile=hasty.server.ca)
@@ -244,7 +233,6 @@ def test_a_slow_robot_is_cut_off(hasty: FleetSite) -> None:
 
 
 def test_a_robot_has_one_upload_at_a_time(site: FleetSite) -> None:
-    """A second upload of the same robot is asked to wait."""
     robot = FleetRobot(site, "arm1")
     robot.record(5)
     context = ssl.create_default_context(cafile=site.server.ca)
@@ -264,7 +252,6 @@ def test_a_robot_has_one_upload_at_a_time(site: FleetSite) -> None:
 
 
 def test_a_full_disk_refuses_and_recovers(database: str, tmp_path: Path) -> None:
-    """On a full disk uploads are refused with 503, never receipted; they are accepted when there is room again."""
     with small_disk(tmp_path / "disk", "2m") as disk:
         limits = {"reserve_bytes": 500_000}
         with running(FleetSite(tmp_path / "site", database, limits, disk / "data")) as site:
@@ -287,7 +274,6 @@ def test_a_full_disk_refuses_and_recovers(database: str, tmp_path: Path) -> None
 
 
 def test_a_collector_with_another_key_is_not_believed(site: FleetSite, make_robot: MakeRobot) -> None:
-    """A receipt that another key signed does not count."""
     robot = make_robot("arm1")
     robot.record(10)
     pusher = robot.pusher()
@@ -307,7 +293,6 @@ class _Busy(CollectorConnection):
 
 
 def test_the_pause_grows_and_obeys_the_collector(site: FleetSite, make_robot: MakeRobot) -> None:
-    """After failures the client waits longer each time, at most a minute, or as long as the collector asks for."""
     robot = make_robot("arm1")
     robot.record(10)
     pusher = robot.pusher()

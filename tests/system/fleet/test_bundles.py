@@ -112,7 +112,6 @@ def make_appliance(site: FleetSite, operator: Operator) -> Appliance:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="the appliance's processes have users of their own")
 def test_an_appliance_pushes_its_log_and_takes_a_bundle(site: FleetSite, tmp_path: Path) -> None:
-    """A rolled-out bundle comes into force; the fleet sees its version, and the proven record that says so."""
     operator = Operator(site, tmp_path / "operator")
     serve_bundles(site, operator)
     with make_appliance(site, operator) as appliance:
@@ -149,7 +148,6 @@ def test_an_appliance_pushes_its_log_and_takes_a_bundle(site: FleetSite, tmp_pat
 
 
 def test_only_enrolled_robots_get_bundles(site: FleetSite, tmp_path: Path) -> None:
-    """Without the certificate of an enrolled robot, metadata, targets and selections are refused, also with a token."""
     operator = Operator(site, tmp_path / "operator")
     assert "without the section `bundles`" in operator.rollout("status", status=1)
     serve_bundles(site, operator)

@@ -15,7 +15,6 @@ MakeRobot = Callable[..., FleetRobot]
 
 
 def test_records_are_pushed_proven_and_found(site: FleetSite, make_robot: MakeRobot) -> None:
-    """Two robots push; one search finds the records of both, and no record is missing by chain proof."""
     for name in ("arm1", "arm2"):
         robot = make_robot(name)
         robot.record(35, reason=f"because of {name}")
@@ -36,7 +35,6 @@ def test_records_are_pushed_proven_and_found(site: FleetSite, make_robot: MakeRo
 
 
 def test_each_segment_has_a_signed_receipt_on_the_robot(site: FleetSite, make_robot: MakeRobot) -> None:
-    """Receipts are in the robot's folder, signed by the collector, one for each segment, without a hole."""
     robot = make_robot("arm1")
     robot.record(35)
     robot.push()
@@ -49,7 +47,6 @@ def test_each_segment_has_a_signed_receipt_on_the_robot(site: FleetSite, make_ro
 
 
 def test_a_restarted_client_continues_where_the_collector_is(site: FleetSite, make_robot: MakeRobot) -> None:
-    """A client without memory asks the collector, and sends nothing again."""
     robot = make_robot("arm1")
     robot.record(35)
     first = robot.push()
@@ -60,7 +57,6 @@ def test_a_restarted_client_continues_where_the_collector_is(site: FleetSite, ma
 
 
 def test_a_restored_collector_gets_the_newer_segments_again(site: FleetSite, make_robot: MakeRobot) -> None:
-    """A robot that was idle while the collector was restored from a backup sends all segments since the backup."""
     robot = make_robot("arm1")
     pusher = robot.pusher()
     robot.record(20)
@@ -89,7 +85,6 @@ def test_a_restored_collector_gets_the_newer_segments_again(site: FleetSite, mak
 
 
 def test_a_search_continues_with_its_cursor(site: FleetSite, make_robot: MakeRobot) -> None:
-    """Pages are disjoint, in order, and complete."""
     robot = make_robot("arm1")
     robot.record(50)
     robot.push()
@@ -120,7 +115,6 @@ def test_a_search_continues_with_its_cursor(site: FleetSite, make_robot: MakeRob
     ],
 )  # fmt: skip
 def test_the_words_of_a_search(shared: FleetSite, words: dict[str, str], count: int) -> None:
-    """The words are those of `rosrv audit search`, with the same meaning."""
     assert len(shared.search(limit=1000, **words)) == count
 
 
@@ -136,14 +130,12 @@ def test_the_words_of_a_search(shared: FleetSite, words: dict[str, str], count: 
     ],
 )
 def test_a_wrong_search_is_refused(shared: FleetSite, words: dict[str, str]) -> None:
-    """A search that is not understood is refused with the reason."""
     answer = shared.get("/v1/search", **words)
     assert answer.status_code == 422, answer.text
     assert answer.json()["detail"]
 
 
 def test_a_search_needs_a_token(shared: FleetSite) -> None:
-    """Without a token, or with an unknown one, nothing is shown; a removed token is refused at once."""
     for path in ("/v1/search", "/v1/health", "/metrics"):
         assert shared.get(path, token=None).status_code == 401
         assert shared.get(path, token="wrong").status_code == 401  # noqa: S106  not a secret
@@ -166,7 +158,6 @@ def test_the_command_line_searches(shared: FleetSite) -> None:
 
 
 def test_the_index_is_rebuilt_from_segments(site: FleetSite, make_robot: MakeRobot) -> None:
-    """After `reindex`, the search finds the same records as before."""
     robot = make_robot("arm1")
     robot.record(25, reason="a\0b", caller_id="/x\u202e")
     robot.push()
@@ -178,7 +169,6 @@ def test_the_index_is_rebuilt_from_segments(site: FleetSite, make_robot: MakeRob
 
 
 def test_a_damaged_segment_does_not_stop_reindex(site: FleetSite, make_robot: MakeRobot) -> None:
-    """`reindex` names a damaged segment, indexes all others, and exits with status 1."""
     damaged, other = make_robot("arm1"), make_robot("arm2")
     for robot in (damaged, other):
         robot.record(20)
@@ -193,7 +183,6 @@ def test_a_damaged_segment_does_not_stop_reindex(site: FleetSite, make_robot: Ma
 
 
 def test_a_silent_robot_is_reported(site: FleetSite, make_robot: MakeRobot) -> None:
-    """Health and metrics show which robots are silent."""
     make_robot("arm1").record(5)
     site.stop()
     site.write_config(silent_seconds=0.1)

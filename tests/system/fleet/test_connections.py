@@ -61,7 +61,6 @@ def _is_healthy(site: FleetSite) -> bool:
 
 @pytest.mark.parametrize("narrow", [10.0], indirect=True)
 def test_an_address_has_a_limit_of_connections(narrow: FleetSite) -> None:
-    """Connections before their TLS handshake count for the address; other addresses, and later ones, are served."""
     context = ssl.create_default_context(cafile=narrow.server.ca)
     with ExitStack() as stack:
         many = [stack.enter_context(_connect(narrow)) for _ in range(10)]
@@ -77,7 +76,6 @@ def test_an_address_has_a_limit_of_connections(narrow: FleetSite) -> None:
 
 @pytest.mark.parametrize("narrow", [120.0], indirect=True)
 def test_a_robot_has_a_limit_of_connections(narrow: FleetSite) -> None:
-    """A robot's connections count for its certificate: neither its address nor other robots behind it lose any."""
     bad, good = FleetRobot(narrow, "bad"), FleetRobot(narrow, "good")
     context = ssl.create_default_context(cafile=narrow.server.ca)
     context.load_cert_chain(bad.certificates.certificate, bad.certificates.key)
@@ -96,7 +94,6 @@ def test_a_robot_has_a_limit_of_connections(narrow: FleetSite) -> None:
 
 
 def test_the_limit_of_open_files_bounds_connections(database: str, tmp_path: Path) -> None:
-    """The collector raises the limit of open files; if that is too small, it says so and serves fewer connections."""
     site = FleetSite(tmp_path / "site", database, {"connections": 4000})
     wrapped = ["prlimit", "--nofile=300:400", *site.command("serve")]
     site.command = lambda *_arguments: wrapped  # type: ignore[method-assign]  # the same, with a smaller limit
@@ -109,7 +106,6 @@ def test_the_limit_of_open_files_bounds_connections(database: str, tmp_path: Pat
 
 
 def test_slow_searches_delay_no_other_work(site: FleetSite, make_robot: MakeRobot) -> None:
-    """While a viewer's searches hang, the viewer gets no more of them; robots, health and other viewers are served."""
     other = site.run("token", "add", "other").stdout.strip()
     robot = make_robot("arm1")
     robot.record(5)

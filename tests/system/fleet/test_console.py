@@ -100,7 +100,6 @@ def _look_around(site: FleetSite, page: Page) -> None:
 
 
 def test_a_wrong_token_is_refused(site: FleetSite) -> None:
-    """The form refuses an unknown token; the page forbids scripts, frames and other origins."""
     with site.client() as client:
         answer = client.post("/login", data={"token": "wrong"})
         assert answer.status_code == 401
@@ -175,7 +174,6 @@ def _follow(page: Page, name: str) -> None:
 
 
 def test_an_operator_stops_a_rollout_with_the_keyboard(rollouts: RolloutSite) -> None:
-    """Keyboard only: log in, open the group, stop its rollout after a confirmation; the history has the name."""
     with opened_page() as page:
         log_in(page, rollouts.site, rollouts.token)
         for name in ("Rollouts", PLACE, "Stop…"):
@@ -192,7 +190,6 @@ def test_an_operator_stops_a_rollout_with_the_keyboard(rollouts: RolloutSite) ->
 
 
 def test_only_an_operator_on_this_site_stops_a_rollout(rollouts: RolloutSite) -> None:
-    """A viewer sees no button and gets 403; so does a form of another site; an order about another rollout gets 409."""
     viewer = rollouts.site.token
     own = f"https://127.0.0.1:{rollouts.site.port}"
     with opened_page() as page:
@@ -275,7 +272,6 @@ def _axe(page: Page) -> list[str]:
 
 
 def test_hundreds_of_robots_are_usable(site: FleetSite) -> None:
-    """With 250 robots, those with problems come first, a filter finds some, and each page has a hundred."""
     assert site.data is not None
     certificate, now = site.server.certificate.read_text(), time.time_ns()
     today = datetime.datetime.now(datetime.UTC)

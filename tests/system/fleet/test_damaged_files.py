@@ -14,7 +14,6 @@ MakeRobot = Callable[..., FleetRobot]
 
 
 def test_the_file_of_a_robot(site: FleetSite, make_robot: MakeRobot) -> None:
-    """All robots push, also the one with the damaged file; a robot that is enrolled after the repair is trusted."""
     bad, good = make_robot("bad"), make_robot("good")
     assert site.data is not None
     file = site.data / "robots" / "bad.json"
@@ -31,7 +30,6 @@ def test_the_file_of_a_robot(site: FleetSite, make_robot: MakeRobot) -> None:
 
 
 def test_the_file_of_a_robot_at_the_start(site: FleetSite, make_robot: MakeRobot) -> None:
-    """The robot is rejected until the repair, the other one pushes, and the collector starts."""
     bad, good = make_robot("bad"), make_robot("good")
     for robot in (bad, good):
         robot.record(20)
@@ -97,7 +95,6 @@ def test_a_segment_before_others(site: FleetSite, make_robot: MakeRobot) -> None
 
 
 def test_the_note_of_the_newest_segment(site: FleetSite, make_robot: MakeRobot) -> None:
-    """The next segment replaces it."""
     robot = make_robot("arm1")
     robot.record(20)
     robot.push()

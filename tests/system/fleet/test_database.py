@@ -8,14 +8,12 @@ from rosrv_fleet.database import MIGRATIONS, IndexDatabase, migrate
 
 
 def test_migrations_run_once_and_in_order(database: str) -> None:
-    """An empty database gets every migration; a second run applies none."""
     with psycopg.connect(database) as connection:
         assert migrate(connection) == sorted(file.stem for file in MIGRATIONS.glob("*.sql"))
         assert migrate(connection) == []
 
 
 def test_a_failed_migration_changes_nothing(database: str, tmp_path: Path) -> None:
-    """If one migration fails, those before it in the same run are rolled back too."""
     (tmp_path / "0001_a.sql").write_text("CREATE TABLE a (x int)")
     (tmp_path / "0002_b.sql").write_text("CREATE TABLE a (x int)")
     with psycopg.connect(database) as connection:
@@ -25,7 +23,6 @@ def test_a_failed_migration_changes_nothing(database: str, tmp_path: Path) -> No
 
 
 def test_a_reading_transaction_is_limited_and_cannot_write(database: str) -> None:
-    """A search that takes too long is cancelled, and its transaction writes nothing."""
     for seconds, statement, error in (
         (0.2, "SELECT pg_sleep(60)", psycopg.errors.QueryCanceled),
         (30.0, "CREATE TABLE t (x int)", psycopg.errors.ReadOnlySqlTransaction),

@@ -68,7 +68,6 @@ def carrier(site: FleetSite) -> Carrier:
 def test_a_bundle_is_added_listed_and_returned(
     site: FleetSite, make_robot: MakeRobot, tmp_path: Path
 ) -> None:
-    """The same bytes return, with the checkpoints that were collected; a second addition changes nothing."""
     operator, robot = Operator(site, tmp_path / "operator"), make_robot("arm1")
     bundle = incident(robot, tmp_path / "incident.zip", secrets.token_bytes(500_000))
     robot.push()
@@ -120,7 +119,6 @@ def test_removed_evidence_makes_room(site: FleetSite, make_robot: MakeRobot, tmp
 def test_the_console_links_records_to_their_bundle(
     site: FleetSite, carrier: Carrier, make_robot: MakeRobot, tmp_path: Path
 ) -> None:
-    """A record of the bundle's time links to the bundle; only operators get a link to its content."""
     robot = make_robot("arm1")
     bundle = incident(robot, tmp_path / "incident.zip")
     robot.record(3, reason="after the bundle")
@@ -144,7 +142,6 @@ def test_the_console_links_records_to_their_bundle(
 def test_viewers_and_robots_neither_add_nor_get(
     site: FleetSite, carrier: Carrier, make_robot: MakeRobot, tmp_path: Path
 ) -> None:
-    """They need the role operator: bundles may contain the messages of a recording."""
     robot = make_robot("arm1")
     bundle = incident(robot, tmp_path / "incident.zip").read_bytes()
     assert carrier.add(bundle, token=site.token).status_code == 403
@@ -194,7 +191,6 @@ def test_a_changed_bundle_is_refused(
     change: Callable[[Members], None],
     finding: str,
 ) -> None:
-    """The answer names the changed part; nothing is stored."""
     members = members_of(incident(make_robot("arm1"), tmp_path / "incident.zip"))
     change(members)
     answer = carrier.add(written(members, tmp_path / "changed.zip").read_bytes())
@@ -208,7 +204,6 @@ def test_a_changed_bundle_is_refused(
 def test_changed_bytes_and_other_files_are_refused(
     carrier: Carrier, make_robot: MakeRobot, tmp_path: Path
 ) -> None:
-    """Bytes behind a bundle, a part of a bundle, and other files are refused; then the bundle itself is accepted."""
     bundle = incident(make_robot("arm1"), tmp_path / "incident.zip").read_bytes()
     middle = len(bundle) // 2
     flipped = bundle[:middle] + bytes([bundle[middle] ^ 1]) + bundle[middle + 1 :]
@@ -222,7 +217,6 @@ def test_changed_bytes_and_other_files_are_refused(
 def test_a_bundle_of_another_robot_is_refused(
     site: FleetSite, carrier: Carrier, make_robot: MakeRobot, tmp_path: Path
 ) -> None:
-    """The answer names the robot whose key sealed the bundle, or the key if no robot has it."""
     robot, _other = make_robot("arm1"), make_robot("arm2")
     bundle = incident(robot, tmp_path / "incident.zip").read_bytes()
     answer = carrier.add(bundle, "arm2")
@@ -291,7 +285,6 @@ def _begin_upload(carrier: Carrier) -> ssl.SSLSocket:
 def test_a_kill_leaves_nothing_half_stored(
     site: FleetSite, carrier: Carrier, make_robot: MakeRobot, tmp_path: Path
 ) -> None:
-    """A killed collector, and a client that goes away, leave no part of a bundle."""
     bundle = incident(make_robot("arm1"), tmp_path / "incident.zip").read_bytes()
     with _begin_upload(carrier):
         site.kill()
@@ -310,7 +303,6 @@ def test_a_kill_leaves_nothing_half_stored(
 
 
 def test_a_full_disk_refuses_evidence_before_segments(database: str, tmp_path: Path) -> None:
-    """Evidence leaves the last space of the disk to segments; when there is room again, it is accepted."""
     with (
         small_disk(tmp_path / "disk", "4m") as disk,
         running(FleetSite(tmp_path / "site", database, {"reserve_bytes": 500_000}, disk / "data")) as site,

@@ -85,7 +85,6 @@ def _found(site: FleetSite, robot: str, sequence: int) -> bool:
 def test_others_are_served_while_robots_push_large_segments(
     site: FleetSite, make_robot: MakeRobot, *, valid: bool
 ) -> None:
-    """While several robots push segments that take long, another one gets receipts and is searchable at once."""
     attackers = [make_robot(f"bad{number}") for number in range(_ATTACKERS)]
     victim = make_robot("arm1")
     victim.record(5)
@@ -97,7 +96,6 @@ def test_others_are_served_while_robots_push_large_segments(
 
 
 def test_refused_bytes_are_charged_and_survive_a_restart(database: str, tmp_path: Path) -> None:
-    """Refused segments use up the robot's quota of a day, which a restart does not renew; others have their own."""
     limits = {"robot_unpacked_bytes_per_day": 150_000}
     with running(FleetSite(tmp_path / "site", database, limits)) as site:
         bad, good = FleetRobot(site, "bad"), FleetRobot(site, "good")
@@ -117,7 +115,6 @@ def test_refused_bytes_are_charged_and_survive_a_restart(database: str, tmp_path
 
 
 def test_a_segment_has_a_limit_of_processor_time(database: str, tmp_path: Path) -> None:
-    """A segment whose check takes too long is refused; empty parts of a gzip file are such a segment."""
     with running(FleetSite(tmp_path / "site", database, {"check_seconds": 0.5})) as site:
         bad = FleetRobot(site, "bad")
         summary, body = forged(bad, 10)
@@ -128,7 +125,6 @@ def test_a_segment_has_a_limit_of_processor_time(database: str, tmp_path: Path) 
 
 
 def test_workers_end_with_the_collector(site: FleetSite, make_robot: MakeRobot) -> None:
-    """Killed or stopped, the collector leaves no process behind."""
     robot = make_robot("arm1")
     for end in (site.kill, site.stop):
         robot.record(5)
@@ -150,7 +146,6 @@ def _descendants(process: int) -> list[int]:
 
 
 def test_no_content_of_a_segment_stops_the_index(site: FleetSite, make_robot: MakeRobot) -> None:
-    """Names longer than an index of PostgreSQL takes are searchable by their beginning; other robots go on."""
     bad, good = make_robot("bad"), make_robot("good")
     name = "/" + "".join(secrets.choice("abcdefghijklmnopqrstuvwxyz0123456789ÄÖ漢") for _ in range(4000))
     fields: dict[str, Any] = {
@@ -172,7 +167,6 @@ def test_no_content_of_a_segment_stops_the_index(site: FleetSite, make_robot: Ma
 
 
 def test_a_damaged_segment_stops_no_other(site: FleetSite, make_robot: MakeRobot) -> None:
-    """A stored segment that the disk has damaged is reported, and indexed after its repair without a restart."""
     bad, good = make_robot("bad"), make_robot("good")
     bad.record(5)
     bad.push()
@@ -212,7 +206,6 @@ def every_hour(site: FleetSite) -> None:
 
 
 def test_a_robot_hides_no_gap_of_another(site: FleetSite, make_robot: MakeRobot) -> None:
-    """Forks and gaps of a robot are counted for it alone; one number has at most 16 segments."""
     bad, good = make_robot("bad"), make_robot("good")
     log = secrets.token_hex(16)
     answers = []

@@ -92,7 +92,6 @@ def post(site: FleetSite, request: dict[str, str]) -> httpx.Response:
 
 
 def test_a_robot_joins_and_pushes(inviting: FleetSite, make_robot: MakeRobot, tmp_path: Path) -> None:
-    """After a join the robot's whole log is collected; its key stays on the robot, for the pushing users only."""
     robot = make_robot("arm7", enrolled=False)
     assert (
         "is not SITE/GROUP" in inviting.run("robot", "invite", "arm7", "--group", "site-a", status=2).stderr
@@ -123,7 +122,6 @@ def test_a_robot_joins_and_pushes(inviting: FleetSite, make_robot: MakeRobot, tm
 
 
 def test_an_invitation_is_valid_once(inviting: FleetSite, make_robot: MakeRobot, tmp_path: Path) -> None:
-    """A used, expired, replaced or invented token gets one and the same answer, and enrols no robot."""
     first, second = make_robot("arm1", enrolled=False), make_robot("arm2", enrolled=False)
     used = invite(inviting, "arm1", tmp_path / "used.json")
     join(first, used)
@@ -143,7 +141,6 @@ def test_an_invitation_is_valid_once(inviting: FleetSite, make_robot: MakeRobot,
 
 
 def test_an_expired_invitation_is_refused(inviting: FleetSite, make_robot: MakeRobot) -> None:
-    """After its time a token is worth nothing."""
     robot = make_robot("arm1", enrolled=False)
     assert inviting.data is not None
     _pending, token = Invitations(inviting.data / "invitations").add("arm1", "", -1.0)
@@ -172,7 +169,6 @@ def test_one_of_two_wins(inviting: FleetSite, make_robot: MakeRobot, tmp_path: P
 
 
 def test_twenty_repetitions_are_one_join(inviting: FleetSite, make_robot: MakeRobot, tmp_path: Path) -> None:
-    """Twenty equal requests at the same time get the same answer, and one act is recorded."""
     robot = make_robot("arm1", enrolled=False)
     request = request_of(robot, invite(inviting, "arm1", tmp_path / "arm1.json"))
     begin = threading.Barrier(20)
@@ -236,7 +232,6 @@ def without_answers(port: int, answered: Callable[[], bool]) -> Iterator[int]:
 def test_a_lost_answer_needs_no_new_invitation(
     inviting: FleetSite, make_robot: MakeRobot, tmp_path: Path
 ) -> None:
-    """If the answer is lost, the same command with the same invitation succeeds, with the same key."""
     robot, other = make_robot("arm1", enrolled=False), make_robot("arm2", enrolled=False)
     file = invite(inviting, "arm1", tmp_path / "arm1.json")
 
@@ -264,7 +259,6 @@ def test_a_lost_answer_needs_no_new_invitation(
 
 
 def test_a_repeated_join_undoes_nothing(inviting: FleetSite, make_robot: MakeRobot, tmp_path: Path) -> None:
-    """After `robot renew`, the request of an earlier join does not bring its certificate back."""
     robot = make_robot("arm1", enrolled=False)
     request = request_of(robot, invite(inviting, "arm1", tmp_path / "arm1.json"))
     assert post(inviting, request).status_code == 201
@@ -276,7 +270,6 @@ def test_a_repeated_join_undoes_nothing(inviting: FleetSite, make_robot: MakeRob
 
 @pytest.mark.parametrize("body", [b"", b"{}", b'{"token":"\xff"}'], ids=["empty", "no fields", "no UTF-8"])
 def test_a_malformed_request_is_refused(body: bytes, inviting: FleetSite) -> None:
-    """The answer has the reason."""
     with inviting.client() as client:
         answer = client.post(JOIN_PATH, content=body)
     assert answer.status_code == 422
@@ -309,7 +302,6 @@ def test_a_second_join_renews(inviting: FleetSite, make_robot: MakeRobot, tmp_pa
 def test_a_certificate_without_its_key_is_refused(
     inviting: FleetSite, make_robot: MakeRobot, tmp_path: Path
 ) -> None:
-    """A certificate that another key signed proves nothing about its sender; the invitation stays valid."""
     robot = make_robot("arm1", enrolled=False)
     request = request_of(robot, invite(inviting, "arm1", tmp_path / "arm1.json"))
     foreign = robot.certificates.certificate.read_text()
@@ -319,7 +311,6 @@ def test_a_certificate_without_its_key_is_refused(
 
 
 def test_a_robot_asks_only_its_collector(inviting: FleetSite, make_robot: MakeRobot, tmp_path: Path) -> None:
-    """A server with another certificate gets no token, and the robot does not join."""
     robot = make_robot("arm1", enrolled=False)
     invitation = json.loads(invite(inviting, "arm1", tmp_path / "arm1.json").read_text())
     invitation["authority"] = make_own_certificate("rosrv-fleet", 1, "127.0.0.1")[1].decode()
@@ -332,7 +323,6 @@ def test_a_robot_asks_only_its_collector(inviting: FleetSite, make_robot: MakeRo
 def test_health_shows_when_certificates_end(
     inviting: FleetSite, make_robot: MakeRobot, tmp_path: Path
 ) -> None:
-    """The end of each certificate is a metric, and the console marks those that end within 30 days."""
     robot = make_robot("arm1", enrolled=False)
     join(robot, invite(inviting, "arm1", tmp_path / "arm1.json"))
     (state,) = inviting.health()["robots"]

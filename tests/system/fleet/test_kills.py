@@ -50,7 +50,6 @@ def _work(robot: FleetRobot, ended: threading.Event) -> int:
 
 
 def test_nothing_is_missing_after_kills(own_cluster: PostgresCluster, tmp_path: Path) -> None:
-    """After kills of the collector and of PostgreSQL in turn, all records are stored, proven, and indexed once."""
     database = own_cluster.create(f"test_{secrets.token_hex(6)}")
     with ExitStack() as stack:
         site = stack.enter_context(running(FleetSite(tmp_path / "site", database)))
@@ -99,7 +98,6 @@ def _check_receipts(site: FleetSite, robot: FleetRobot) -> None:
 
 
 def test_segments_are_accepted_without_a_database(own_cluster: PostgresCluster, tmp_path: Path) -> None:
-    """While PostgreSQL is down, segments get receipts; they are indexed when it returns, also after a restart."""
     database = own_cluster.create(f"test_{secrets.token_hex(6)}")
     with running(FleetSite(tmp_path / "site", database)) as site:
         robot = FleetRobot(site, "arm1")

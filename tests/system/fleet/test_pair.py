@@ -59,7 +59,6 @@ def pair(tmp_path: Path) -> Iterator[tuple[Lab, StandbySite]]:
 def test_both_join_and_a_takeover_goes_on(
     pair: tuple[Lab, StandbySite], database: str, tmp_path: Path
 ) -> None:
-    """Both join as the same robot while `a` is active; each pushes its log, also as the standby after a takeover."""
     lab, site = pair
     host = lab.host("collector", f"{COLLECTOR}/24")
     fleet = Fleet(tmp_path / "fleet", database, address=COLLECTOR, popen=host.popen)

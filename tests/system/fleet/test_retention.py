@@ -70,7 +70,6 @@ def _days(database: str) -> int:
 def test_retention_removes_the_beginning_and_verify_proves_the_rest(
     site: FleetSite, make_robot: MakeRobot
 ) -> None:
-    """Old days leave the index, and old segments the disk; `verify` says so, and proves the rest."""
     robot = make_robot("arm1")
     _aged(site, robot, [50, 40, 20, 0])
     assert _days(site.database) > 1
@@ -98,7 +97,6 @@ def test_retention_removes_the_beginning_and_verify_proves_the_rest(
 
 
 def test_a_segment_that_is_missing_without_a_note_is_found(site: FleetSite, make_robot: MakeRobot) -> None:
-    """After retention, a segment that someone else removed is missing, and so are all if the note is gone."""
     robot = make_robot("arm1")
     _aged(site, robot, [50, 40, 1, 1, 0])
     _restart_with_retention(site)
@@ -116,7 +114,6 @@ def test_a_segment_that_is_missing_without_a_note_is_found(site: FleetSite, make
 
 
 def test_an_unfinished_removal_is_finished(site: FleetSite, make_robot: MakeRobot) -> None:
-    """After a kill between the note and the removal, `verify` proves the rest, and the next run removes."""
     robot = make_robot("arm1")
     _aged(site, robot, [50, 40, 35, 0])
     saved = site.folder / "saved"
@@ -149,8 +146,6 @@ def test_a_removed_segment_is_not_accepted_again(site: FleetSite, make_robot: Ma
 
 
 def test_a_gap_and_a_fork_are_counted_when_they_are_removed(site: FleetSite, make_robot: MakeRobot) -> None:
-    """Markers of removed segments go with them: health and `verify` agree, and the note counts them."""
-
     robot = make_robot("arm1")
     for _ in range(5):
         robot.record(5)
@@ -179,7 +174,6 @@ def _opened(database: str) -> IndexDatabase:
 def test_a_day_that_is_dropped_while_its_segment_is_indexed(
     ended: bool, site: FleetSite, make_robot: MakeRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At midnight, the segment is kept without an index, at once; within retention, a missing partition is an error."""
     robot = make_robot("arm1")
     robot.record(5)
     robot.push()
@@ -212,7 +206,6 @@ def test_a_day_that_is_dropped_while_its_segment_is_indexed(
 
 
 def test_a_day_whose_segments_were_not_indexed_is_dropped(database: str) -> None:
-    """A partition without a segment leaves the index with its day."""
     today = datetime.now(UTC).date()
     with psycopg.connect(database) as connection:
         migrate(connection)
@@ -224,7 +217,6 @@ def test_a_day_whose_segments_were_not_indexed_is_dropped(database: str) -> None
 
 
 def test_the_first_segments_of_a_day_are_indexed_at_the_same_time(database: str) -> None:
-    """If eight indexers make the partition of a new day at the same time, none fails."""
     with psycopg.connect(database) as connection:
         migrate(connection)
     begin, today = threading.Barrier(8), datetime.now(UTC).date()
@@ -253,7 +245,6 @@ def own_cluster() -> Iterator[PostgresCluster]:
 
 
 def test_a_full_disk_of_postgresql_loses_nothing(own_cluster: PostgresCluster, tmp_path: Path) -> None:
-    """While PostgreSQL's disk is full, segments get receipts, and the trouble is reported; later all are indexed."""
     with small_disk(own_cluster.folder / "small", "24m", "mode=777") as disk:
         shutil.chown(disk, "postgres", "postgres")
         database = own_cluster.create(f"test_{secrets.token_hex(6)}")

@@ -161,7 +161,6 @@ def fleet(tmp_path: Path, database: str) -> Iterator[Fleet]:
 
 
 def test_a_rollout_reaches_all_robots_ring_by_ring(fleet: Fleet) -> None:
-    """With 54 robots: the canaries get the bundle first, then half of the robots, then all."""
     fleet.add(54)
     path = fleet.publish(*RINGS)
     eventually(lambda: fleet.collector.service.timestamp is not None, "a timestamp")
@@ -175,7 +174,6 @@ def test_a_rollout_reaches_all_robots_ring_by_ring(fleet: Fleet) -> None:
 
 
 def test_a_bad_canary_stops_the_rollout(fleet: Fleet) -> None:
-    """If the canaries refuse the bundle, the rollout stops automatically, and no other robot ever gets it."""
     fleet.add(52)
     fleet.robots["r-0"].judge = lambda _bundle: "policy.ini:3:1: error: <script>"
     path = fleet.publish(*RINGS)
@@ -194,7 +192,6 @@ def test_a_bad_canary_stops_the_rollout(fleet: Fleet) -> None:
 
 
 def test_denials_three_times_as_frequent_stop_the_rollout(fleet: Fleet) -> None:
-    """Canaries whose denials multiply under the new bundle stop the rollout; revert brings the former bundle back."""
     fleet.add(8)
     first = fleet.publish(Ring("all", [], 100))
     eventually(lambda: fleet.collector.service.timestamp is not None, "a timestamp")
@@ -216,7 +213,6 @@ def test_denials_three_times_as_frequent_stop_the_rollout(fleet: Fleet) -> None:
 
 
 def test_a_robot_speaks_for_itself_only(fleet: Fleet) -> None:
-    """A report has the name of the certificate, a robot is not an operator, and clients without one get no answer."""
     fleet.add(1)
     fleet.poll()
     eventually(
@@ -231,7 +227,6 @@ def test_a_robot_speaks_for_itself_only(fleet: Fleet) -> None:
 
 
 def test_an_event_wakes_the_robot(fleet: Fleet) -> None:
-    """The collector sends an event to a robot whose selection changes."""
     fleet.add(1)
     path = fleet.publish(Ring("all", [], 100))
     eventually(lambda: fleet.collector.service.timestamp is not None, "a timestamp")
@@ -257,7 +252,6 @@ def test_an_event_wakes_the_robot(fleet: Fleet) -> None:
 
 
 def test_a_stream_ends_that_opens_while_the_collector_stops(fleet: Fleet) -> None:
-    """A request that began before the stop may open its stream afterwards; the stop need not wait for it."""
     fleet.add(1)
     fleet.collector.service.end_streams()
     connection = fleet.site.connection(fleet.collector.url, "r-0")
@@ -266,7 +260,6 @@ def test_a_stream_ends_that_opens_while_the_collector_stops(fleet: Fleet) -> Non
 
 
 def test_half_of_a_publication_is_not_served(fleet: Fleet) -> None:
-    """While the files of a snapshot are missing or damaged, the collector signs no timestamp for it and says why."""
     service = fleet.collector.service
     fleet.publish(Ring("all", [], 100))
     eventually(lambda: service.timestamp is not None and not service.trouble, "a timestamp")
@@ -293,7 +286,6 @@ def _put(fleet: Fleet, name: str, **changes: Any) -> httpx.Response:
 
 
 def test_a_robot_of_another_group_has_no_part_in_a_rollout(fleet: Fleet) -> None:
-    """Reports, selections, bundles and events for another group than the enrolled one get 403; the rollout goes on."""
     fleet.add(2)
     other = RobotGroup(SITE, "legs")
     fleet.collector.enrol(other, "liar")
@@ -318,7 +310,6 @@ def test_a_robot_of_another_group_has_no_part_in_a_rollout(fleet: Fleet) -> None
 
 
 def test_enrolled_robots_that_never_reported_are_visible(fleet: Fleet) -> None:
-    """A robot that is enrolled and never reported is in its group as never seen, and holds up nothing."""
     fleet.add(2)
     fleet.collector.enrol(RobotGroup(SITE, GROUP), "absent")
     path = fleet.publish(Ring("all", [], 100))
@@ -343,7 +334,6 @@ def test_enrolled_robots_that_never_reported_are_visible(fleet: Fleet) -> None:
     ],
 )
 def test_an_impossible_report_is_rejected(fleet: Fleet, lie: dict[str, Any], reason: str) -> None:
-    """A report that no robot writes is rejected with the reason, and changes nothing."""
     fleet.add(1)
     answer = _put(fleet, "r-0", **lie)
     assert answer.status_code == 422
@@ -371,7 +361,6 @@ def test_a_reason_with_a_null_character_stops_only_its_rollout(fleet: Fleet) -> 
 
 
 def test_removed_robots_do_not_count(fleet: Fleet) -> None:
-    """A robot that is removed during a rollout counts no more; a ring that loses all its robots stops the rollout."""
     fleet.add(4)
     path = fleet.publish(*RINGS)
     fleet.poll()
@@ -387,7 +376,6 @@ def test_removed_robots_do_not_count(fleet: Fleet) -> None:
 
 
 def test_a_restarted_collector_does_not_take_its_own_absence_for_silence(fleet: Fleet, database: str) -> None:
-    """After an hour without a collector a rollout goes on: robots are not silent, and the healthy time begins again."""
     fleet.add(54)
     path = fleet.publish(*RINGS)
     fleet.poll()
@@ -414,7 +402,6 @@ def test_a_restarted_collector_does_not_take_its_own_absence_for_silence(fleet: 
 
 
 def test_a_rollout_survives_a_restart_of_postgresql(fleet: Fleet, cluster: PostgresCluster) -> None:
-    """While PostgreSQL is down, robots get their selections and orders get 503; afterwards the rollout ends."""
     fleet.add(4)
     path = fleet.publish(*RINGS)
     fleet.poll()
@@ -431,7 +418,6 @@ def test_a_rollout_survives_a_restart_of_postgresql(fleet: Fleet, cluster: Postg
 
 
 def test_a_withdrawn_bundle_stops_its_rollout(fleet: Fleet) -> None:
-    """Withdrawing a bundle during its rollout stops it; no robot is asked to take a bundle that is not signed."""
     fleet.add(4)
     first = fleet.publish(Ring("all", [], 100))
     fleet.poll()
@@ -448,7 +434,6 @@ def test_a_withdrawn_bundle_stops_its_rollout(fleet: Fleet) -> None:
 
 
 def test_a_bundle_that_is_signed_in_the_future_does_not_start(fleet: Fleet) -> None:
-    """A rollout of a bundle from a machine whose clock is ahead is refused with the remedy."""
     fleet.add(1)
     terms = everywhere(time.time() + 7200, Ring("all", [], 100))
     path = fleet.site.repository.add(SITE, GROUP, bundle_files(), terms)
@@ -462,7 +447,6 @@ def test_a_bundle_that_is_signed_in_the_future_does_not_start(fleet: Fleet) -> N
 
 
 def test_the_history_names_the_operators(fleet: Fleet) -> None:
-    """Start, stop and revert are in the history with the operator's name and the time; of two stops, one counts."""
     fleet.add(2)
     first = fleet.publish(Ring("all", [], 100))
     fleet.poll()
@@ -489,7 +473,6 @@ def test_the_history_names_the_operators(fleet: Fleet) -> None:
 
 
 def test_a_start_and_a_revert_at_the_same_time_exclude_each_other(fleet: Fleet) -> None:
-    """A start that was decided on a state which a revert has changed since is refused."""
     fleet.add(2)
     paths = [
         fleet.publish(Ring("all", [], 100), policy_dot_ini=f"[Nodes]\n# {number}\n") for number in (1, 2)

@@ -170,7 +170,6 @@ def test_replayed_packets_are_refused(site: TunnelSite, kit: Path, datagrams: Da
 
 
 def test_only_ike_and_esp_are_on_the_wire(site: TunnelSite, kit: Path) -> None:
-    """Outside the tunnel only UDP 500 and 4500 of the host are visible, and no part of its messages."""
     with (
         Capture(site.ocu.namespace) as wire,
         site.joined(kit) as joined,
@@ -193,7 +192,6 @@ def test_only_ike_and_esp_are_on_the_wire(site: TunnelSite, kit: Path) -> None:
 def test_a_host_in_a_tunnel_cannot_send_as_another(
     site: TunnelSite, kit: Path, other: Host, others_kit: Path, datagrams: Datagrams
 ) -> None:
-    """Packets with another host's address, sealed with the keys of the own tunnel, do not arrive."""
     with site.joined(kit) as trusted, site.joined(others_kit, other, log="chd = 4") as dishonest:
         assert dishonest.charon is not None
         keys = initiators_keys(dishonest.charon)
@@ -220,7 +218,6 @@ def test_a_host_in_a_tunnel_cannot_send_as_another(
 def test_a_host_cannot_request_anothers_address(
     site: TunnelSite, kit: Path, other: Host, others_kit: Path
 ) -> None:
-    """A host that requests another's virtual address gets its own; with narrow selectors it gets no tunnel."""
     insisting = site.join(others_kit, other)
     conf = insisting.folder / "swanctl" / "swanctl.conf"
     theirs = site.join(kit).address
@@ -241,7 +238,6 @@ def test_a_host_cannot_request_anothers_address(
 def test_the_name_must_match_the_certificate(
     site: TunnelSite, kit: Path, other: Host, others_kit: Path
 ) -> None:
-    """The own certificate under another name is refused, and the log says so."""
     thief = site.join(others_kit, other)
     conf = thief.folder / "swanctl" / "swanctl.conf"
     conf.write_text(conf.read_text().replace("id = fqdn:ocu-2", "id = fqdn:ocu-1"))
@@ -312,7 +308,6 @@ def _ask(host: Host, source: str, target: str, *, user: int | None = None, free:
 
 
 def test_a_local_program_is_not_a_tunnelled_host(site: TunnelSite, kit: Path) -> None:
-    """On the appliance's machine an address of the tunnels gives no rights, neither to another user nor to root."""
     host = lab_host(site)
     with site.joined(kit) as joined:
         assert _ask(host, MIDDLE, MIDDLE, user=OTHER_USER) == "answered", "the destination is reachable"
@@ -324,7 +319,6 @@ def test_a_local_program_is_not_a_tunnelled_host(site: TunnelSite, kit: Path) ->
 
 
 def test_two_hosts_with_one_certificate(site: TunnelSite, kit: Path) -> None:
-    """A copied kit replaces its owner's tunnel, never adds one; the log has both addresses."""
     with site.joined(kit) as owner:
         mark = site.mark
         thief = site.join(kit, site.attacker)
@@ -345,7 +339,6 @@ def _up_from(remote: str) -> Callable[[Event], bool]:
 
 
 def test_an_expired_certificate_ends_its_tunnel(site: TunnelSite, other: Host) -> None:
-    """At the end of its certificate a host's tunnel is closed, and new ones are refused; the log has the reason."""
     mark, seconds = site.mark, allowed(20)
     expiring = site.kit("add", "visitor", "--days", str(seconds / 86400))
     with site.join(expiring, other) as visitor:
@@ -372,7 +365,6 @@ def kilobytes(pid: int) -> int:
 
 
 def test_garbage_on_the_ports_of_ike(site: TunnelSite, kit: Path, other: Host, others_kit: Path) -> None:
-    """After garbage, huge packets and a flood of half-open handshakes charon runs without growth, and tunnels work."""
     with (
         Capture(lab_host(site).namespace) as wire,
         site.joined(kit) as joined,

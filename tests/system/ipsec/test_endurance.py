@@ -138,7 +138,6 @@ def test_both_ends_restart(site: TunnelSite, how: int) -> None:
 
 
 def test_a_clean_stop_leaves_nothing(site: TunnelSite) -> None:
-    """After a clean stop with a tunnel up, no rule, route, interface or address remains."""
     host = site.appliance.host
     assert isinstance(host, Host)
     with site.join(site.kit()) as joined:

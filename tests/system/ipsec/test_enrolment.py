@@ -76,7 +76,6 @@ def row(site: TunnelSite, name: str) -> dict[str, Any]:
 
 
 def test_a_laptop_joins_renews_and_leaves(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
-    """The script makes the key on the laptop; nodes communicate, the certificate is renewed, and leaving cleans up."""
     script = tmp_path / "join.sh"
     before = laptop.files()
     token = awaited(site, "laptop", script)
@@ -221,7 +220,6 @@ def commands(laptop: ScriptHost) -> list[bytes]:
 
 
 def test_a_man_in_the_middle_gets_nothing(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
-    """A server with another key is refused before the token is sent, and so is another authority's answer."""
     script = tmp_path / "join.sh"
     token = awaited(site, "other", script)
     text = script.read_text()
@@ -282,7 +280,6 @@ def join_kit(laptop: ScriptHost, folder: Path, kit: bytes) -> None:
 
 
 def test_through_the_tunnel_rest_only_renews(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
-    """In its tunnel a host reaches neither console nor API, even with a valid token: only renewal and lists."""
     script = tmp_path / "join.sh"
     laptop.run("sh", str(script), awaited(site, "narrow", script))
     curl = ("curl", "--silent", "--insecure", "-o", "/dev/null", "-w", "%{http_code}")
@@ -301,7 +298,6 @@ def test_through_the_tunnel_rest_only_renews(site: TunnelSite, laptop: ScriptHos
 def test_a_short_lived_certificate_is_renewed_in_time(
     site: TunnelSite, laptop: ScriptHost, tmp_path: Path
 ) -> None:
-    """A certificate of a minute and a half causes a warning, is renewed without --now when due, and works."""
     script = tmp_path / "join.sh"
     mark = site.mark
     laptop.run("sh", str(script), awaited(site, "brief", script, "--days", str(90 / 86_400)))
@@ -323,7 +319,6 @@ def test_a_short_lived_certificate_is_renewed_in_time(
 
 
 def test_two_hundred_hosts_beside_a_tunnel(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
-    """With two hundred enrolled hosts, a new tunnel still gets its own address."""
     rest, ask = site.rest(), site.attacker.run
     request = signing_request(make_key(), "many").decode()
 

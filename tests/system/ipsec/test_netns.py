@@ -28,7 +28,6 @@ default = trusted
 
 
 def test_the_host_forwards_the_tunnel(tmp_path: Path) -> None:
-    """Nodes behind the tunnel and in clear text hear each other; traffic to the tunnelled one is in the tunnel."""
     need_root()
     need_strongswan()
     with Lab("rosrv-ipsecn") as lab:
@@ -60,7 +59,6 @@ mount --make-rprivate / && mount -t tmpfs tmpfs /dev/net && mknod -m 600 /dev/ne
 
 
 def test_a_device_that_only_root_may_open_carries_the_tunnel() -> None:
-    """Without udev `/dev/net/tun` has mode 0600: charon's user gets access, and the tunnel works as well."""
     need_root()
     need_strongswan()
     mine = f"{Path(__file__).resolve()}::{test_the_host_forwards_the_tunnel.__name__}"
@@ -93,7 +91,6 @@ def authority_seen_from(joined: JoinedHost) -> str:
 
 
 def test_a_host_enrols_itself_through_the_forwarding(tmp_path: Path) -> None:
-    """A host enrols from a named network at the bare host's own address; from other networks REST is unreachable."""
     need_root()
     need_strongswan()
     config = tmp_path / "appliance.yaml"

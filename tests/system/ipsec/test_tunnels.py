@@ -47,7 +47,6 @@ def joined(site: TunnelSite, kit: Path) -> Iterator[JoinedHost]:
 
 
 def test_without_a_host_there_is_no_tunnel(site: TunnelSite) -> None:
-    """Before the first enrolment charon does not run and IKE ports are closed; `host:` matches no host."""
     status = site.appliance.status()
     assert "charon" not in [row["role"] for row in status["processes"]]
     assert status["ipsec"]["esp"] is None
@@ -56,7 +55,6 @@ def test_without_a_host_there_is_no_tunnel(site: TunnelSite) -> None:
 
 @pytest.mark.real
 def test_nodes_talk_through_the_tunnel(site: TunnelSite, joined: JoinedHost) -> None:
-    """Nodes of both sides find and hear each other; the host has its virtual address in list, status and log."""
     assert joined.master == f"http://{OWN}:11311"
     with (
         RosSession(MASTER, site.home, site.robot) as on_robot,
@@ -82,7 +80,6 @@ def test_nodes_talk_through_the_tunnel(site: TunnelSite, joined: JoinedHost) -> 
 
 @pytest.mark.real
 def test_a_host_is_blocked_by_its_name_while_its_tunnel_stays(site: TunnelSite, joined: JoinedHost) -> None:
-    """Its messages stop and return; the answer names the machine's other address, whose block alone changes nothing."""
     with site.talking(joined) as (_talker, listener):
         said = site.appliance.rosrv("host", "block", OCU).stdout
         assert f"the same machine also has the address {joined.address}, which is not blocked" in said
@@ -103,7 +100,6 @@ def test_a_host_is_blocked_by_its_name_while_its_tunnel_stays(site: TunnelSite, 
 
 
 def test_a_forged_address_gets_nowhere(site: TunnelSite, kit: Path) -> None:
-    """Packets in clear text from the trusted address are dropped, with or without a tunnel."""
     forged = "10.113.11.2"
     interfaces.add_address(site.attacker.namespace, INTERFACE, f"{forged}/32")
     interfaces.add_route(site.attacker.namespace, f"{OWN}/32", MIDDLE)
@@ -167,7 +163,6 @@ def test_an_interrupted_tunnel_recovers(site: TunnelSite, joined: JoinedHost) ->
 
 
 def test_a_dead_charon_is_restarted(site: TunnelSite, joined: JoinedHost) -> None:
-    """After a kill it restarts with every tunnel, and its predecessor leaves no process."""
     mark = site.mark
     before = site.appliance.kill("charon")
     site.recorded(mark, event="tunnel down")
@@ -177,7 +172,6 @@ def test_a_dead_charon_is_restarted(site: TunnelSite, joined: JoinedHost) -> Non
 
 
 def test_a_replaced_certificate_is_revoked(site: TunnelSite, kit: Path, joined: JoinedHost) -> None:
-    """`host kit` issues a new certificate; the old one is on the revocation list and opens no tunnel."""
     mark = site.mark
     new = site.kit("kit")
     site.recorded(mark, event="tunnel down")
@@ -223,7 +217,6 @@ def _seconds(record: Event) -> float:
 
 
 def test_the_shell_accepts_the_scripts_of_a_kit(site: TunnelSite, kit: Path) -> None:
-    """The shell accepts join.sh, leave.sh and keep.sh, and a kit is readable for its owner only."""
     assert kit.stat().st_mode & 0o777 == 0o600
     folder = site.join(kit).folder
     for script in ("join.sh", "leave.sh", "keep.sh"):

@@ -24,7 +24,6 @@ def test_the_default_route_decides_between_addresses(lab: Lab) -> None:
 
 
 def test_without_a_default_route_the_only_address_is_taken(lab: Lab) -> None:
-    """Loopback and excluded interfaces do not count; IPv4 is preferred to IPv6."""
     host = lab.host("alone", "10.78.0.4/24", "fd78::4/64").namespace
     interfaces.add_address(host, "lo", "10.113.11.1/32")
     assert (
@@ -39,7 +38,6 @@ def test_without_a_default_route_the_only_address_is_taken(lab: Lab) -> None:
 
 
 def test_several_addresses_are_an_error(lab: Lab) -> None:
-    """The error lists all addresses, or says that there is none."""
     host = lab.host("two", "10.78.0.5/24", "10.79.0.5/24", gateway="10.78.0.1").namespace
     with pytest.raises(NetworkError, match=r"10\.78\.0\.5, 10\.79\.0\.5"):
         only_address(host, without=LO)

@@ -108,7 +108,6 @@ def ruleset(host: Host) -> str:
 def test_only_control_opens_connections_to_rosmaster(
     protected: Host, attacker: Host, backend: BackendChoice
 ) -> None:
-    """rosmaster's port is closed to other users, root included, and to other hosts, on both families."""
     firewall = Firewall(protected.namespace, backend)
     own = (protected.address, protected.address6)
     with listening(protected) as port:
@@ -127,7 +126,6 @@ def test_only_control_opens_connections_to_rosmaster(
 def test_only_rosmaster_reaches_the_master_side_endpoint(
     protected: Host, attacker: Host, backend: BackendChoice
 ) -> None:
-    """The master-side endpoint, known only later, is added by an update; then rosmaster alone may connect."""
     firewall = Firewall(protected.namespace, backend)
     with listening(protected) as port, listening(protected) as inner:
         firewall.install(settings(port))
@@ -143,7 +141,6 @@ def test_only_rosmaster_reaches_the_master_side_endpoint(
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_open_connections_and_other_ports_stay_usable(protected: Host, backend: BackendChoice) -> None:
-    """A connection from before the rules still carries data, and unlisted ports stay reachable."""
     firewall = Firewall(protected.namespace, backend)
     with protected.entered():
         server = socket.create_server(("127.0.0.1", 0))
@@ -160,7 +157,6 @@ def test_open_connections_and_other_ports_stay_usable(protected: Host, backend: 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_port_opened_by_notrack_rules_stays_closed(protected: Host, backend: BackendChoice) -> None:
-    """A foreign rule that exempts loopback from connection tracking does not open rosmaster's port."""
     run_in(protected, "iptables-legacy -t raw -A OUTPUT -o lo -j NOTRACK")
     run_in(protected, "iptables-legacy -t raw -A PREROUTING -i lo -j NOTRACK")
     firewall = Firewall(protected.namespace, backend)
@@ -177,7 +173,6 @@ def run_in(host: Host, command: str) -> None:
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_foreign_rules_are_not_touched(protected: Host, backend: BackendChoice) -> None:
-    """A second installation leaves one set; the removal leaves exactly the earlier rules."""
     run_in(protected, "iptables-legacy -A INPUT -p tcp --dport 9 -m comment --comment foreign -j DROP")
     run_in(protected, "ip6tables-legacy -A OUTPUT -p udp --dport 9 -m length --length 1:50 -j DROP")
     run_in(protected, "nft add table inet foreign")
@@ -200,7 +195,6 @@ def test_foreign_rules_are_not_touched(protected: Host, backend: BackendChoice) 
 def test_leftovers_of_the_other_back_end_are_replaced(
     protected: Host, earlier: BackendChoice, later: BackendChoice
 ) -> None:
-    """After a crash with one back end, a start with the other leaves no rule of the first."""
     before = ruleset(protected)
     Firewall(protected.namespace, earlier).install(settings(11312))
     firewall = Firewall(protected.namespace, later)
@@ -214,7 +208,6 @@ def test_leftovers_of_the_other_back_end_are_replaced(
 def test_only_management_networks_reach_the_rest_port(
     lab: Lab, protected: Host, backend: BackendChoice
 ) -> None:
-    """Loopback and the management networks reach the REST port; other hosts are refused."""
     manager = lab.host("manager", "10.77.0.5/24", "fd77::5/64")
     unknown = lab.host("unknown", "10.77.0.6/24", "fd77::6/64")
     firewall = Firewall(protected.namespace, backend)
@@ -250,7 +243,6 @@ def test_clear_text_packets_of_a_tunnelled_host_are_dropped(
 def test_only_the_flooding_host_is_slowed_down(
     lab: Lab, protected: Host, attacker: Host, backend: BackendChoice
 ) -> None:
-    """Above the limit new connections of a host are delayed on all ports together; those of another get through."""
     honest = lab.host("honest", "10.77.0.10/24", "fd77::10/64")
     firewall = Firewall(protected.namespace, backend)
     limit = RateLimit(per_second=1, burst=5)
@@ -269,7 +261,6 @@ def test_only_the_flooding_host_is_slowed_down(
 def test_hosts_without_a_bucket_have_one_common_limit(
     lab: Lab, protected: Host, attacker: Host, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With nft, further hosts share one bucket when all others are in use; a host with a bucket keeps it."""
     monkeypatch.setattr("appliance.network.firewall.nft._METER_SIZE", 1)
     others = [lab.host(f"other{number}", f"10.77.0.{number}/24", f"fd77::{number}/64") for number in (11, 12)]
     firewall = Firewall(protected.namespace, "nft")
@@ -310,7 +301,6 @@ def waiting(server: socket.socket, host: Host) -> int:
 def test_legacy_xtables_are_in_force_on_a_kernel_without_ipv6(
     protected: Host, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With one address family, the report is intact until a rule is removed."""
     monkeypatch.setattr("appliance.network.firewall.iptables._families", lambda: (4,))
     protected.namespace.sysctl("net.ipv6.conf.all.disable_ipv6", "1")  # no listener can use IPv6 either
     firewall = Firewall(protected.namespace, "iptables")
@@ -323,7 +313,6 @@ def test_legacy_xtables_are_in_force_on_a_kernel_without_ipv6(
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_the_report_counts_packets_and_misses_removed_rules(protected: Host, backend: BackendChoice) -> None:
-    """The report names the rules with their packets, and is not intact once they are flushed."""
     firewall = Firewall(protected.namespace, backend)
     assert firewall.report().backend is None
     with listening(protected) as port:
@@ -348,7 +337,6 @@ def test_the_report_counts_packets_and_misses_removed_rules(protected: Host, bac
 def test_auto_selects_a_back_end_that_the_kernel_enforces(
     protected: Host, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A back end that accepts every rule and enforces none is not used, and the report says why."""
     assert Firewall(protected.namespace).install(settings(11312)) == "nft"
     pretender = tmp_path / "nft"
     pretender.write_text("#!/bin/sh\ncat >/dev/null\necho '{\"nftables\": []}'\n")
@@ -367,7 +355,6 @@ def test_auto_selects_a_back_end_that_the_kernel_enforces(
 def test_auto_selects_a_back_end_that_accepts_every_rule(
     protected: Host, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A back end that passes the trial but lacks a required feature is skipped without leftovers."""
     real = need_program("nft", "nftables")
     partial = tmp_path / "nft"
     partial.write_text(
@@ -412,7 +399,6 @@ except NetworkError as error:
 def test_the_firewall_needs_only_few_capabilities(
     protected: Host, backend: str, capabilities: str, words: str
 ) -> None:
-    """The firewall and the probe work with few capabilities; without them the error names the missing one."""
     need_program("setpriv", "util-linux")
     with listening(protected) as port:
         process = protected.popen(
@@ -428,7 +414,6 @@ def test_the_firewall_needs_only_few_capabilities(
 
 
 def test_without_any_back_end_there_is_no_firewall(protected: Host, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without nft and iptc, installing fails and names the packages."""
     monkeypatch.setenv("PATH", "/nonexistent")
     monkeypatch.setitem(sys.modules, "iptc", None)
     with pytest.raises(FirewallError, match=r"apt install nftables.*package python-iptables"):
@@ -444,7 +429,6 @@ def test_the_proof_leaves_nothing(protected: Host, kind: type[NftBackend] | type
 
 
 def test_a_rejected_transaction_keeps_the_old_rules(protected: Host) -> None:
-    """When nft rejects new rules, the earlier ones stay in force."""
     backend = NftBackend(protected.namespace)
     firewall = Firewall(protected.namespace, "nft")
     firewall.install(settings(11312))
@@ -460,7 +444,6 @@ def broken_rule() -> PacketRule:
 
 
 def test_the_probe_reports_closed_and_open_ports(protected: Host) -> None:
-    """Another local user is refused while the rules are in force, and connects without; the probe reports both."""
     firewall = Firewall(protected.namespace)
     with listening(protected) as port:
         firewall.install(settings(port))
@@ -480,7 +463,6 @@ def test_the_probe_reports_closed_and_open_ports(protected: Host) -> None:
 
 
 def test_the_probe_runs_as_its_user(protected: Host) -> None:
-    """The probe is refused where only root may connect, and connects where its own user may."""
     firewall = Firewall(protected.namespace)
     with listening(protected) as port:
         for uid, closed in ((0, True), (PROBE_UID, False)):
@@ -489,20 +471,17 @@ def test_the_probe_runs_as_its_user(protected: Host) -> None:
 
 
 def test_the_probe_refuses_to_be_root(protected: Host) -> None:
-    """A probe as root proves nothing and is an error."""
     with pytest.raises(ValueError, match="unprivileged"):
         probe_port(protected.namespace, 11312, uid=0)
 
 
 def test_iptables_rejects_rules_for_address_translation(protected: Host) -> None:
-    """A rule for address translation in the iptables back end is an error, and not ignored."""
     rule = PacketRule(chain=Chain.NAT, purpose="forward", verdict=PacketVerdict.DNAT, to="10.1.1.1")
     with pytest.raises(BackendMissingError, match="forward"):
         IptablesBackend(protected.namespace).install((rule,))
 
 
 def test_namespaces_do_not_share_rules(lab: Lab, protected: Host) -> None:
-    """Rules are in the namespace they were made for and in no other."""
     other = lab.host("other", "10.77.0.20/24")
     Firewall(protected.namespace, "iptables").install(settings(11312))
     Firewall(other.namespace, "iptables").install(settings(11313))

@@ -107,7 +107,6 @@ def silent(request: pytest.FixtureRequest, robot: Host) -> bool:
 def test_the_named_host_is_served(
     protected: Host, robot: Host, attacker: Host, backend: BackendChoice
 ) -> None:
-    """On the ports of RVMaster, nodes, relay and REST, 3,000 forged SYNs a second have no effect."""
     Firewall(protected.namespace, backend).install(
         FirewallSettings(
             control_uid=61011,
@@ -123,6 +122,5 @@ def test_the_named_host_is_served(
 
 @pytest.mark.usefixtures("silent")
 def test_the_appliance_reaches_protected_ports(protected: Host, robot: Host, attacker: Host) -> None:
-    """The same holds on a machine of nodes under `rosrv protect`, with rospy's small backlog."""
     close(protected, robot)
     unharmed(robot, attacker, protected, (40007,), backlog=5)

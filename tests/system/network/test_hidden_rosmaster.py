@@ -96,7 +96,6 @@ def ask(host: Host, uid: int, uri: str) -> str:
 def test_control_alone_talks_to_the_real_rosmaster(
     host: Host, master: "subprocess.Popen[str]", backend: BackendChoice
 ) -> None:
-    """rosmaster answers control; root, its own user and others are refused; the probe finds it closed."""
     loopback = f"http://127.0.0.1:{PORT}/"
     answer = f"[1, '', {master.pid}]"
     assert ask(host, OTHER, loopback) == answer, "before the firewall"

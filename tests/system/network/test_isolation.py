@@ -93,7 +93,6 @@ def state(host: Host) -> tuple[str, ...]:
 
 
 def test_source_addresses_are_preserved_in_the_namespace(bare: Host, node: Host, tmp_path: Path) -> None:
-    """A connection to the host's address arrives in the namespace with its source address, on both families."""
     with isolated(bare, tmp_path) as isolation, serving(isolation.namespace, MASTER) as server:
         assert source_seen(server, node, bare.address, MASTER) == node.address
         assert source_seen(server, node, bare.address6, MASTER) == node.address6
@@ -150,7 +149,6 @@ def test_a_continuous_tunnel_follows_the_rules(bare: Host, node: Host, tmp_path:
 
 
 def test_the_appliance_reaches_nodes(bare: Host, node: Host, tmp_path: Path) -> None:
-    """The appliance reaches nodes on the host and on the network; the network sees the host's address."""
     with isolated(bare, tmp_path) as isolation, serving(bare.namespace, 34567) as local:
         inside = Host("inside", isolation.namespace, "", (isolation.ends[4].appliance + "/30",))
         assert source_seen(local, inside, bare.address, 34567) == isolation.ends[4].appliance
@@ -161,7 +159,6 @@ def test_the_appliance_reaches_nodes(bare: Host, node: Host, tmp_path: Path) -> 
 
 
 def test_the_hosts_own_processes_reach_the_appliance(bare: Host, tmp_path: Path) -> None:
-    """Programs on the host reach it at the host's address, with their own, and at loopback."""
     with isolated(bare, tmp_path) as isolation, serving(isolation.namespace, MASTER) as server:
         assert source_seen(server, bare, bare.address, MASTER) == bare.address
         assert source_seen(server, bare, bare.address6, MASTER) == bare.address6
@@ -173,7 +170,6 @@ def test_the_hosts_own_processes_reach_the_appliance(bare: Host, tmp_path: Path)
 
 
 def test_the_host_forwards_nothing_else(lab: Lab, bare: Host, node: Host, tmp_path: Path) -> None:
-    """A host with its own route to the namespace reaches no port of it, and the host forwards no other packets."""
     far = lab.host("far", "10.99.0.1/24", gateway="10.99.0.2")
     interfaces.add_address(bare.namespace, "eth0", "10.99.0.2/24")
     with isolated(bare, tmp_path) as isolation:
@@ -191,7 +187,6 @@ def test_the_host_forwards_nothing_else(lab: Lab, bare: Host, node: Host, tmp_pa
 
 
 def test_the_appliance_does_not_reach_the_hosts_loopback(bare: Host, tmp_path: Path) -> None:
-    """The host drops a packet from the namespace to 127.0.0.1 over the veth."""
     with isolated(bare, tmp_path) as isolation, serving(bare.namespace, 34567):
         inside = isolation.namespace
         inside.sysctl("net.ipv4.conf.eth0.route_localnet", "1")
@@ -226,7 +221,6 @@ def test_the_end_restores_everything(bare: Host, tmp_path: Path) -> None:
 
 
 def test_a_router_stays_a_router(lab: Lab, bare: Host, node: Host, tmp_path: Path) -> None:
-    """A forwarding host continues to forward for others while the appliance runs and afterwards."""
     far = lab.host("far", "10.99.0.1/24", gateway="10.99.0.2")
     interfaces.add_address(bare.namespace, "eth0", "10.99.0.2/24")
     interfaces.add_route(node.namespace, "10.99.0.0/24", bare.address)
@@ -252,7 +246,6 @@ signal.pause()
 
 
 def test_a_crash_leaves_one_set_after_the_next_start(bare: Host, node: Host, tmp_path: Path) -> None:
-    """After SIGKILL the next start leaves one set, ends old processes, and its end restores everything."""
     before = state(bare)
     wanted = settings(tmp_path)
     crashed = subprocess.Popen(
@@ -277,7 +270,6 @@ def test_a_crash_leaves_one_set_after_the_next_start(bare: Host, node: Host, tmp
 
 
 def test_the_subnet_conflicts_with_no_route(bare: Host, tmp_path: Path) -> None:
-    """The first subnet of the pool without a route is chosen."""
     interfaces.add_address(bare.namespace, "eth0", "10.111.0.9/26")
     with isolated(bare, tmp_path) as isolation:
         assert isolation.ends[4].network == "10.111.0.64/30"
@@ -303,7 +295,6 @@ def test_a_foreign_namespace_or_interface_is_not_taken(bare: Host, tmp_path: Pat
 
 
 def test_a_port_in_use_on_the_host_is_named(bare: Host, tmp_path: Path) -> None:
-    """With a roscore still listening on the host, the error names its port, and nothing is changed."""
     before = state(bare)
     with serving(bare.namespace, MASTER), pytest.raises(NetworkError, match=r"TCP 11311.*roscore"):
         Isolation(bare.namespace, settings(tmp_path)).up()
@@ -312,7 +303,6 @@ def test_a_port_in_use_on_the_host_is_named(bare: Host, tmp_path: Path) -> None:
 
 
 def test_a_chain_that_would_drop_forwarded_packets_is_named(bare: Host, tmp_path: Path) -> None:
-    """A foreign chain with policy drop, as of container engines, is named with the required exceptions."""
     with isolated(bare, tmp_path) as isolation:
         assert isolation.obstacles() == ()
         run_in = ["nft", "add table ip engine; add chain ip engine FORWARD"]
@@ -324,7 +314,6 @@ def test_a_chain_that_would_drop_forwarded_packets_is_named(bare: Host, tmp_path
 
 
 def test_an_unreadable_record_is_named(bare: Host, tmp_path: Path) -> None:
-    """A damaged record is an error that names the file, and is not guessed around."""
     wanted = settings(tmp_path)
     record = tmp_path / "isolation.json"
     record.write_text(json.dumps({"link": "eth0"}), encoding="utf-8")

@@ -24,7 +24,6 @@ def _root() -> None:
 
 
 def test_hosts_reach_each_other_over_both_families() -> None:
-    """A program on one host accepts a connection from another host, over IPv4 and IPv6."""
     with Lab("rosrv-lab") as lab:
         robot = lab.host("robot", "10.77.0.10/24", "fd77::10/64")
         operator = lab.host("operator", "10.77.0.11/24", "fd77::11/64")
@@ -38,7 +37,6 @@ def test_hosts_reach_each_other_over_both_families() -> None:
 
 
 def test_popen_runs_the_program_itself_on_the_host() -> None:
-    """The process started on a host sees that host's address, and its pid is the program's own."""
     with Lab("rosrv-lab") as lab:
         robot = lab.host("robot", "10.77.0.10/24")
         process = robot.popen(
@@ -51,7 +49,6 @@ def test_popen_runs_the_program_itself_on_the_host() -> None:
 
 
 def test_a_thread_in_a_namespace_does_not_move_others() -> None:
-    """After work inside a namespace the calling thread is back in its own, even when the work fails."""
     before = Path("/proc/thread-self/ns/net").readlink()
     with Lab("rosrv-lab") as lab:
         robot = lab.host("robot", "10.77.0.10/24")
@@ -65,8 +62,6 @@ def test_a_thread_in_a_namespace_does_not_move_others() -> None:
 
 
 def test_works_under_a_running_event_loop() -> None:
-    """A lab can be made and used by a coroutine."""
-
     async def main() -> list[str]:
         with Lab("rosrv-lab") as lab:
             return interfaces.links(lab.host("robot", "10.77.0.10/24").namespace)
@@ -76,7 +71,6 @@ def test_works_under_a_running_event_loop() -> None:
 
 
 def test_closing_ends_every_process_and_leaves_nothing() -> None:
-    """Leaving the block ends processes on its hosts, stubborn ones too, and deletes every namespace."""
     stubborn = (
         "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
         "print('up', flush=True); signal.pause()"
@@ -92,7 +86,6 @@ def test_closing_ends_every_process_and_leaves_nothing() -> None:
 
 
 def test_leftovers_of_a_crashed_lab_are_removed() -> None:
-    """The next lab of the same prefix ends the processes and deletes the namespaces of a killed one."""
     program = (
         "import sys; from examples.landshark.lab import Lab\n"
         "lab = Lab('rosrv-labcrash').__enter__()\n"
@@ -120,7 +113,6 @@ def test_leftovers_of_a_crashed_lab_are_removed() -> None:
 
 
 def test_an_unplugged_host_is_unreachable() -> None:
-    """An unplugged host loses packets; plugging it in restores the connection."""
     with Lab("rosrv-lab") as lab:
         robot = lab.host("robot", "10.77.0.10/24")
         operator = lab.host("operator", "10.77.0.11/24")
@@ -137,7 +129,6 @@ def test_an_unplugged_host_is_unreachable() -> None:
 
 
 def test_a_namespace_is_made_once_and_deleted_for_good() -> None:
-    """Making a second one of the same name is an error that names it; deleting twice is not an error."""
     space = Namespace(f"rosrv-once.{os.getpid()}")
     space.create()
     try:

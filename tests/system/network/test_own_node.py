@@ -89,7 +89,6 @@ def rosout(host: Host, port: int) -> Iterator[int]:
 def test_only_control_calls_it_and_only_the_relay_gets_its_messages(
     host: Host, backend: BackendChoice
 ) -> None:
-    """With either back end other users, root and rosmaster's included, get no answer at any address."""
     node = OwnNodeAccess(uid=ROSOUT, relay_uid=RELAY, address=ADDRESS, ports=PORTS)
     with rosout(host, PORTS.first) as api:
         everywhere = [(ADDRESS, api), ("127.0.0.1", api), (host.address, api), ("127.0.0.1", PORTS.first)]
@@ -105,7 +104,6 @@ def test_only_control_calls_it_and_only_the_relay_gets_its_messages(
 
 
 def test_a_compromised_rosout_or_rosmaster_reaches_nothing() -> None:
-    """rosout's user can act as `/rosout` only, rosmaster's user as no node; neither reaches another port."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with Lab("rosrv-own") as lab:

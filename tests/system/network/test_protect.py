@@ -81,7 +81,6 @@ def rules(host: Host) -> str:
 
 
 def test_only_the_appliance_reaches_the_ports(robot: Host, gateway: Host, attacker: Host) -> None:
-    """Node ports are closed to other machines; to the appliance and the machine itself they stay open."""
     with listening(robot, INSIDE, KEPT, OUTSIDE):
         assert reaches(attacker, robot.address, INSIDE)
         close(robot, gateway, "--open", f"tcp/{KEPT}")
@@ -99,7 +98,6 @@ def test_only_the_appliance_reaches_the_ports(robot: Host, gateway: Host, attack
 def test_a_container_behind_the_machine_is_not_taken_for_it(
     lab: Lab, robot: Host, gateway: Host, attacker: Host
 ) -> None:
-    """A container's packets appear to come from the robot; with the protection they do not arrive at all."""
     need_program("iptables-legacy-restore", "iptables")
     behind = lab.host("container", "10.76.0.2/24")
     interfaces.delete_link(behind.namespace, "eth0")
@@ -120,7 +118,6 @@ def test_a_container_behind_the_machine_is_not_taken_for_it(
 
 
 def test_missing_syn_cookies_are_reported(robot: Host, gateway: Host) -> None:
-    """Without SYN cookies half-open connections block the appliance; --apply warns about it."""
     robot.namespace.sysctl("net.ipv4.tcp_syncookies", "0")
     command = [sys.executable, "-c", COMMAND, "--appliance", gateway.address, "--ports", FEW, "--apply"]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
@@ -131,7 +128,6 @@ def test_missing_syn_cookies_are_reported(robot: Host, gateway: Host) -> None:
 
 
 def test_the_check_from_outside_finds_open_ports(robot: Host, gateway: Host, attacker: Host) -> None:
-    """The scan finds the listeners before --apply and none after; its exit status and JSON say so."""
     arguments = ("--check", robot.address, "--ports", FEW, "--json")
     with listening(robot, INSIDE, KEPT):
         before = json.loads(protect(attacker, *arguments, status=1))
@@ -145,7 +141,6 @@ def test_the_check_from_outside_finds_open_ports(robot: Host, gateway: Host, att
 
 
 def test_the_whole_local_port_range_is_closed_and_checked(robot: Host, gateway: Host, attacker: Host) -> None:
-    """By default the range is the kernel's, and a full scan of it from outside finds nothing."""
     first, last = (int(word) for word in robot.namespace.sysctl("net.ipv4.ip_local_port_range").split())
     with listening(robot, first, last):
         before = json.loads(protect(attacker, "--check", robot.address, "--json", status=1))
@@ -156,7 +151,6 @@ def test_the_whole_local_port_range_is_closed_and_checked(robot: Host, gateway: 
 
 
 def test_own_connections_of_the_machine_work(robot: Host, gateway: Host, attacker: Host) -> None:
-    """Open and outgoing connections and answers to its own UDP requests pass; new UDP does not."""
     with robot.entered():
         server = socket.create_server((robot.address, INSIDE))
         node = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -184,7 +178,6 @@ def test_own_connections_of_the_machine_work(robot: Host, gateway: Host, attacke
 
 
 def test_applying_and_removing_can_be_repeated(robot: Host, gateway: Host) -> None:
-    """A second --apply replaces the first; --remove leaves exactly the foreign rules, also when repeated."""
     robot.popen(["nft", "add", "table", "inet", "filter"]).wait(timeout=20)
     before = rules(robot)
     close(robot, gateway)
@@ -199,7 +192,6 @@ def test_applying_and_removing_can_be_repeated(robot: Host, gateway: Host) -> No
 
 
 def test_the_printed_file_can_be_loaded(robot: Host, gateway: Host, tmp_path: Path) -> None:
-    """Without a verb the file is only printed; `nft -f` on it has the effect of --apply, also repeatedly."""
     text = protect(robot, "--appliance", gateway.address, "--ports", FEW)
     assert rules(robot) == ""
     file = tmp_path / "rosrv-protect.nft"
@@ -212,7 +204,6 @@ def test_the_printed_file_can_be_loaded(robot: Host, gateway: Host, tmp_path: Pa
 
 
 def test_a_silent_machine_is_not_reported_as_closed(lab: Lab, robot: Host, attacker: Host) -> None:
-    """Without any answer, the check reports that it does not know, with another exit status."""
     lab.unplug(robot)
     arguments = ("--check", robot.address, "--ports", "40000-40010", "--seconds", "0.2")
     assert "may be open" in protect(attacker, *arguments, status=2)
@@ -221,7 +212,6 @@ def test_a_silent_machine_is_not_reported_as_closed(lab: Lab, robot: Host, attac
 
 @pytest.mark.parametrize("address", ["192.0.2.7", "2001:db8::7"])
 def test_an_unroutable_network_is_not_reported_as_open(attacker: Host, address: str) -> None:
-    """Without a route nothing is tried: the result is neither open nor closed, with the reason."""
     arguments = ("--check", address, "--ports", "40000-40010", "--json")
     report = json.loads(protect(attacker, *arguments, status=2))
     (seen,) = report["addresses"]
@@ -252,19 +242,16 @@ def test_a_machine_cannot_check_itself(robot: Host) -> None:
     ],
 )
 def test_wrong_arguments_are_named(robot: Host, arguments: tuple[str, ...], words: str) -> None:
-    """Each wrong argument is an error that names it, and nothing is changed."""
     assert words in protect(robot, *arguments, status=2)
     assert rules(robot) == ""
 
 
 def test_without_nft_the_error_names_the_package(robot: Host) -> None:
-    """On a machine without nftables, --apply names the package to install."""
     words = protect(robot, "--appliance", "10.77.0.2", "--apply", status=2, PATH="/nonexistent")
     assert "sudo apt install nftables" in words
 
 
 def test_without_root_the_error_says_so(robot: Host) -> None:
-    """As an ordinary user, --apply changes nothing and says that root is needed."""
     program = (
         "import os; os.setgroups([]); os.setgid(61099); os.setuid(61099)\n"
         "from appliance.network.namespaces import NetworkError\n"

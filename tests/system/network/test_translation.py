@@ -52,7 +52,6 @@ def behind(lab: Lab) -> Namespace:
 def test_a_guest_keeps_its_address(
     machine: Host, behind: Namespace, tmp_path: Path, translator: Translator
 ) -> None:
-    """Behind the rules of each program, a guest has its own address, and the machine's nodes have theirs."""
     guest = guest_behind(machine.namespace, behind, translator)
     with isolated(machine, tmp_path) as isolation, serving(isolation.namespace, MASTER) as server:
         for address in (f"{translator.network}.1", machine.address):
@@ -71,7 +70,6 @@ def test_a_guest_keeps_its_address(
 def test_a_guest_of_the_real_docker_keeps_its_address(
     machine: Host, behind: Namespace, tmp_path: Path, legacy: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With the rules and bridge of a running engine, the documented line lets the appliance's link pass."""
     if legacy:
         for program in ("iptables", "ip6tables"):
             (tmp_path / program).symlink_to(need_program(f"{program}-legacy", "iptables"))
@@ -94,7 +92,6 @@ def test_a_guest_of_the_real_docker_keeps_its_address(
 def test_an_earlier_chain_cannot_give_a_guest_the_machines_address(
     machine: Host, behind: Namespace, tmp_path: Path
 ) -> None:
-    """A connection that was given an address of the machine before the appliance's chain is dropped, and counted."""
     guest = guest_behind(machine.namespace, behind, DOCKER)
     early = "table ip early {{ chain first {{ type nat hook postrouting priority -199; ip saddr {} masquerade; }}\n}}\n"
     with isolated(machine, tmp_path) as isolation, serving(isolation.namespace, MASTER) as server:
@@ -110,7 +107,6 @@ def test_an_earlier_chain_cannot_give_a_guest_the_machines_address(
 def test_without_rules_the_machines_own_packets_are_recognized(
     machine: Host, behind: Namespace, tmp_path: Path, backend: BackendChoice
 ) -> None:
-    """Without any rule on the host a guest is translated into the machine, but its packets have passed a router."""
     guest = guest_behind(machine.namespace, behind, DOCKER)
     with isolated(machine, tmp_path) as isolation, serving(isolation.namespace, MASTER) as server:
         own = isolation.ends[4]

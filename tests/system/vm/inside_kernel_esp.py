@@ -92,7 +92,6 @@ def test_a_forged_address_gets_nowhere(site: TunnelSite, joined: JoinedHost) -> 
 
 
 def test_charon_that_dies_leaves_nothing_behind(site: TunnelSite, joined: JoinedHost) -> None:
-    """After a kill of charon, its kernel states and keys are removed, and the tunnel returns."""
     assert joined.charon is not None
     mark, before = joined.charon.mark(), set(_spis(middle(site)))
     site.appliance.kill("charon")

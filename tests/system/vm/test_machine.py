@@ -47,17 +47,14 @@ def test_the_kernels_esp(machine: Machine) -> None:
 
 
 def test_the_appliance_on_a_machine(machine: Machine) -> None:
-    """Run isolation netns and container on the machine itself, from the start until the machine is restored."""
     passes(machine, f"{HERE}/inside_whole_machine.py", "-k", "appliance")
 
 
 def test_the_kit_on_a_machine(machine: Machine) -> None:
-    """Run join.sh and leave.sh of a kit on a Debian with systemd."""
     passes(machine, f"{HERE}/inside_whole_machine.py", "-k", "joins")
 
 
 def test_the_firewall_in_debians_kernel(machine: Machine) -> None:
-    """In this kernel too, both back ends hide rosmaster and drop forged tunnel addresses."""
     passes(machine, "tests/system/network/test_firewall.py", "-k", "tunnelled_host or only_control")
 
 

@@ -53,7 +53,6 @@ def machine(tmp_path: Path) -> Iterator[Machine]:
 
 
 def test_it_follows_a_right_clock(machine: Machine) -> None:
-    """The clock of ages follows while the machine runs, and while it is off overnight or over a long weekend."""
     for hours in (16, 16, 71, 16):
         machine.run(8 * HOUR)
         machine.off(hours * HOUR)
@@ -61,7 +60,6 @@ def test_it_follows_a_right_clock(machine: Machine) -> None:
 
 
 def test_a_change_while_running_is_ignored(machine: Machine) -> None:
-    """The change may last; time before and after the change counts, and so does time off."""
     for wrong in (YEAR, 0, -YEAR, 0, 20 * YEAR, 0):
         machine.wrong = wrong
         machine.run(30 * HOUR)
@@ -70,7 +68,6 @@ def test_a_change_while_running_is_ignored(machine: Machine) -> None:
 
 
 def test_a_wrong_clock_corrected_within_a_day_is_ignored(machine: Machine) -> None:
-    """This holds even when the clock is corrected while the appliance is off."""
     for wrong in (YEAR, 7 * DAY, -YEAR):
         machine.wrong = wrong
         machine.off(16 * HOUR)
@@ -83,7 +80,6 @@ def test_a_wrong_clock_corrected_within_a_day_is_ignored(machine: Machine) -> No
 
 
 def test_repeated_wrong_time_zones_do_not_add_up(machine: Machine) -> None:
-    """At each start the hardware clock has local time, which is soon corrected."""
     for _ in range(100):
         machine.wrong = 2 * HOUR
         machine.off(16 * HOUR)
@@ -94,7 +90,6 @@ def test_repeated_wrong_time_zones_do_not_add_up(machine: Machine) -> None:
 
 
 def test_a_new_robot_with_a_corrected_date(machine: Machine) -> None:
-    """The robot ran for weeks in 1970 before it found a time service: none of its data becomes fifty years old."""
     machine.path.unlink()
     machine.wrong = 60 * DAY - machine.true
     machine.begin()
@@ -106,7 +101,6 @@ def test_a_new_robot_with_a_corrected_date(machine: Machine) -> None:
 
 
 def test_starting_in_the_past_is_ignored(machine: Machine) -> None:
-    """Without a battery, each of twenty starts begins in 1970 until a time service corrects the clock."""
     for _ in range(20):
         machine.off(16 * HOUR)
         machine.wrong = -machine.true
@@ -117,7 +111,6 @@ def test_starting_in_the_past_is_ignored(machine: Machine) -> None:
 
 
 def test_a_long_time_off_counts_after_a_day(machine: Machine) -> None:
-    """Time off looks like a wrong clock; the clock is believed after a day of running."""
     machine.off(90 * DAY)
     assert machine.run(20 * HOUR) < BEGIN + 2 * DAY
     machine.off(2 * HOUR)
@@ -125,7 +118,6 @@ def test_a_long_time_off_counts_after_a_day(machine: Machine) -> None:
 
 
 def test_the_smallest_of_varying_steps_counts(machine: Machine) -> None:
-    """If the clock jumps, only the smallest step that it showed all day is believed."""
     machine.wrong = YEAR
     machine.off(10 * DAY)
     for wrong in (YEAR, 9 * YEAR, 2 * YEAR, 0):
@@ -135,7 +127,6 @@ def test_the_smallest_of_varying_steps_counts(machine: Machine) -> None:
 
 
 def test_it_never_runs_backwards(machine: Machine) -> None:
-    """The age never decreases, for any change of the clock and over restarts."""
     last = machine.age()
     for wrong in (-YEAR, 0, -20 * YEAR, 0, HOUR):
         machine.wrong = wrong
@@ -147,7 +138,6 @@ def test_it_never_runs_backwards(machine: Machine) -> None:
 
 @pytest.mark.parametrize("left", [b"", b"{", b'{"lived":"x"}'])
 def test_a_damaged_file_starts_from_known_time(tmp_path: Path, left: bytes) -> None:
-    """After a power cut, counting continues from the last certain time, not from a clock that may be wrong."""
     path = tmp_path / "age"
     path.write_bytes(left)
     assert abs(AgeClock(path, lambda: BEGIN, wall=lambda: BEGIN + YEAR, monotonic=lambda: 7)() - BEGIN) < HOUR

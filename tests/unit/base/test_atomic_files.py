@@ -24,7 +24,6 @@ from tests.support.small_disk import small_disk
 
 
 def test_a_file_is_replaced_with_the_given_mode(tmp_path: Path) -> None:
-    """The umask is ignored, and no temporary file is left."""
     path = tmp_path / "key.pem"
     path.write_text("before")
     mask = os.umask(0o077)
@@ -37,7 +36,6 @@ def test_a_file_is_replaced_with_the_given_mode(tmp_path: Path) -> None:
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
-    """A target that is not a file stays unchanged, and no temporary file is left."""
     path = tmp_path / "position"
     path.mkdir()
     with pytest.raises(IsADirectoryError, match=r"/position'$"):
@@ -46,7 +44,6 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
 
 
 def test_concurrent_writers_do_not_mix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each writer completes its own temporary file before the rename; no writer uses another's file."""
     path = tmp_path / "policy.ini"
     rename = Path.rename
 
@@ -65,7 +62,6 @@ def test_concurrent_writers_do_not_mix(tmp_path: Path, monkeypatch: pytest.Monke
 def test_a_failed_sync_of_the_folder_is_reported_as_such(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The file is replaced, and the error says that a power cut may undo it."""
     path = tmp_path / "policy.ini"
     fsync = os.fsync
 
@@ -84,7 +80,6 @@ def test_a_failed_sync_of_the_folder_is_reported_as_such(
 
 
 def test_a_written_file_survives_a_power_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The contents are synced before the rename, and the rename before the function returns."""
     synced: list[tuple[str, list[str]]] = []
     fsync = os.fsync
 
@@ -101,14 +96,12 @@ def test_a_written_file_survives_a_power_cut(tmp_path: Path, monkeypatch: pytest
 
 
 def test_leftovers_of_other_writers_do_not_block() -> None:
-    """Temporary names are unique: an old `FILE.part` is not in the way."""
     sources = {path: path.read_text() for path in Path(appliance.__file__).parent.rglob("*.py")}
     fixed = re.compile(r'with_name\(f"\{\w+\.name\}\.(new|part|tmp)"')
     assert [path.name for path, text in sources.items() if fixed.search(text)] == []
 
 
 def test_only_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:
-    """Also in subfolders, only files with a writer's temporary name are removed, and links are not followed."""
     there, elsewhere = tmp_path / "state" / "control", tmp_path / "elsewhere"
     for folder in (there, elsewhere):
         folder.mkdir(parents=True)
@@ -136,7 +129,6 @@ def test_only_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_a_full_disk_error_names_the_file(tmp_path: Path) -> None:
-    """The system's error names no file; our error names the place where space is needed."""
     with small_disk(tmp_path, "4k"):
         with pytest.raises(OSError, match=r"No space left.*audit\.pub"):
             write_whole(tmp_path / "audit.pub", bytes(8192), 0o644)
@@ -144,7 +136,6 @@ def test_a_full_disk_error_names_the_file(tmp_path: Path) -> None:
 
 
 def test_links_and_pipes_are_written_through(tmp_path: Path) -> None:
-    """A link, pipe or device is written to and not replaced; a linked file keeps its mode."""
     file, link, pipe = tmp_path / "file", tmp_path / "link", tmp_path / "pipe"
     file.write_text("before")
     file.chmod(0o640)
@@ -166,7 +157,6 @@ def test_links_and_pipes_are_written_through(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_writing_to_standard_output_keeps_the_order(tmp_path: Path) -> None:
-    """`verb --write /dev/stdout >> file` keeps the file's contents, and the verb's output before and after."""
     file = tmp_path / "file"
     file.write_text("before\n")
     program = (

@@ -12,7 +12,6 @@ pytestmark = pytest.mark.anyio
 
 
 async def test_work_starts_again_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each error is logged with its traceback; an error in one work does not end another."""
     monkeypatch.setattr(background, "_AGAIN_SECONDS", 0.0)
     errors = [RuntimeError("first"), OSError("second")]
     others = 0
@@ -40,7 +39,6 @@ async def test_work_starts_again_after_an_error(monkeypatch: pytest.MonkeyPatch)
 
 
 async def test_work_can_be_cancelled() -> None:
-    """A cancellation is not an error."""
     began = asyncio.Event()
 
     async def work() -> None:

@@ -12,7 +12,6 @@ from tests.support.virtual_clock import ShiftedClock, VirtualClock
 
 
 def test_the_default_clocks_are_those_of_the_operating_system(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The time since the boot is that of the clock which counts while the machine is suspended."""
     asked: list[int] = []
     monkeypatch.setattr(time, "clock_gettime_ns", asked.append)
     source = contextvars.Context().run(clock.source)
@@ -23,7 +22,6 @@ def test_the_default_clocks_are_those_of_the_operating_system(monkeypatch: pytes
 
 
 def test_a_replaced_clock_ends_with_its_block() -> None:
-    """The inner of two blocks counts; an exception also ends a block."""
     outer, inner = VirtualClock(now=1.0), VirtualClock(now=2.0)
     with clock.using(outer):
         try:
@@ -37,7 +35,6 @@ def test_a_replaced_clock_ends_with_its_block() -> None:
 
 @pytest.mark.anyio
 async def test_a_task_keeps_the_clock_of_its_creator() -> None:
-    """Two machines of a simulation share a loop, and each has its own clocks, also in its timers."""
     read: list[float] = []
 
     async def machine(now: float) -> None:
@@ -52,7 +49,6 @@ async def test_a_task_keeps_the_clock_of_its_creator() -> None:
 
 
 def test_a_virtual_clock_moves_only_by_hand() -> None:
-    """Time moves all clocks; people set the system time alone; sleep does not count as running time."""
     machine = VirtualClock(wall=5000, now=10)
     with clock.using(machine):
         machine.advance(1.5)
@@ -68,7 +64,6 @@ def test_a_virtual_clock_moves_only_by_hand() -> None:
 
 
 def test_a_shifted_clock_goes_on() -> None:
-    """Only the system time is shifted."""
     machine = VirtualClock(wall=5000, now=10)
     with clock.using(machine), clock.using(ShiftedClock(3600)):
         machine.advance(1)

@@ -6,7 +6,6 @@ from tests.support.virtual_clock import VirtualClock
 
 
 def test_a_step_back_of_the_clock_postpones_no_end() -> None:
-    """Neither before the end nor after it; a sleeping machine counts, and a step forward ends at once."""
     machine = VirtualClock(wall=10_000.0)
     with clock.using(machine):
         ends = Deadlines()

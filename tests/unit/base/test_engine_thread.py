@@ -34,7 +34,6 @@ class Engine:
 
 
 def test_the_first_turn_is_over_when_the_thread_is_made() -> None:
-    """An owner that opens its file in the first turn knows the result at once."""
     engine = Engine()
     thread = EngineThread("engine", engine.turn, 0.0)
     assert engine.turns.qsize() == 1
@@ -43,7 +42,6 @@ def test_the_first_turn_is_over_when_the_thread_is_made() -> None:
 
 
 def test_turns_are_called_when_they_are_due() -> None:
-    """No turn comes early."""
     engine = Engine(0.0, 0.05)
     thread = EngineThread("engine", engine.turn, 0.0)
     times = [engine.turns.get(timeout=_LIMIT) for _ in range(3)]
@@ -52,7 +50,6 @@ def test_turns_are_called_when_they_are_due() -> None:
 
 
 def test_new_work_is_gathered_until_a_caller_waits() -> None:
-    """`wake` calls a turn after the time for gathering, `hurry` at once."""
     engine = Engine()
     thread = EngineThread("engine", engine.turn, 600.0)
     engine.turns.get(timeout=_LIMIT)
@@ -71,7 +68,6 @@ def test_new_work_is_gathered_until_a_caller_waits() -> None:
 
 
 def test_the_end_of_a_turn_that_lasts_is_not_awaited_for_long() -> None:
-    """`end` returns that the engine still works."""
     working = threading.Event()
 
     def turn(_now: float) -> float | None:
@@ -89,7 +85,6 @@ def test_the_end_of_a_turn_that_lasts_is_not_awaited_for_long() -> None:
 
 
 def test_a_defect_ends_the_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its traceback is printed, also if the first turn has it; `end` does not wait."""
     printed: list[threading.ExceptHookArgs] = []
     monkeypatch.setattr(threading, "excepthook", printed.append)
 

@@ -87,7 +87,6 @@ def logs() -> Iterator[None]:
 def test_no_file_makes_a_verb_hang_or_crash(
     verb: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Each verb with each bad file ends with status 1 or 2 and a message, or accepts the file."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ROSRV_TOKEN", "x" * 43)
     Path("policy.ini").write_text(POLICY)
@@ -112,7 +111,6 @@ def test_no_file_makes_a_verb_hang_or_crash(
 def test_a_bad_certificate_file_is_an_error(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`--api-ca` follows the same rules; an empty file does not select the system's authorities."""
     monkeypatch.chdir(tmp_path)
     KINDS[kind](Path("given"))
     with pytest.raises(ValueError, match="--api-ca given: "):
@@ -121,7 +119,6 @@ def test_a_bad_certificate_file_is_an_error(
 
 @pytest.mark.nightly
 def test_a_pipe_of_the_shell_is_read(tmp_path: Path) -> None:
-    """`rosrv policy check <(command)` reads the command's output: that pipe has a writer."""
     script = (
         "import sys; from pathlib import Path; from appliance.base import input_files;"
         " print(input_files.read_given(Path(sys.argv[1])))"

@@ -42,7 +42,6 @@ def test_times(text: str, moment: int) -> None:
     [("0001-01-01", -(1 << 63)), ("999999999w", -(1 << 63)), ("9999-12-31T23:59:59.9Z", (1 << 63) - 1)],
 )
 def test_a_time_out_of_range_is_clamped(text: str, moment: int) -> None:
-    """The result always fits in 64 bits, as the times of records do."""
     assert parse_timestamp(text, _NOW) == moment
 
 
@@ -63,6 +62,5 @@ def test_a_time_out_of_range_is_clamped(text: str, moment: int) -> None:
     ],
 )
 def test_an_invalid_time_is_an_error(text: str) -> None:
-    """The error shows valid examples."""
     with pytest.raises(TimestampError, match="1h, 2d"):
         parse_timestamp(text, _NOW)

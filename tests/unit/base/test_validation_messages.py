@@ -29,7 +29,6 @@ LIBRARY = re.compile(
 
 
 def test_the_command_line_explains_valid_values() -> None:
-    """Covers each option and argument of every verb that is a number or a choice."""
     told = []
     for verb, command in commands():
         for one in command.params:
@@ -79,7 +78,6 @@ def test_rest_explains_valid_bodies(app: FastAPI) -> None:  # noqa: F811  the fi
 
 @pytest.mark.filterwarnings("ignore:__int__ returned non-int")  # ipaddress makes a network of `true`
 def test_the_configuration_explains_valid_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Covers each key of each section."""
     monkeypatch.chdir(tmp_path)
     told: set[str] = set()
     for path in _keys(dataclasses.asdict(Settings())):
@@ -139,7 +137,6 @@ def _keys(values: dict[str, Any]) -> Iterator[tuple[str, ...]]:
     ],
 )
 def test_invalid_yaml_is_reported_with_a_hint(tmp_path: Path, text: str, do: str) -> None:
-    """The hint follows the position and the parser's message."""
     file = tmp_path / "appliance.yaml"
     file.write_text(text)
     with pytest.raises(ConfigError, match=rf"^{re.escape(str(file))}:\d+: is not YAML: .*; {re.escape(do)}$"):

@@ -9,7 +9,6 @@ from tests.support import autojump
 
 
 def test_an_order_of_a_disconnected_client_does_not_take_effect() -> None:
-    """An order can be withdrawn until it takes effect, and not afterwards."""
     gone = False
     with awaited(lambda: gone):
         require_awaited()

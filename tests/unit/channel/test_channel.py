@@ -46,7 +46,6 @@ def _copies_of(descriptor: int) -> int:
 
 
 def test_messages_arrive_in_order_with_their_descriptors(pair: Pair) -> None:
-    """Each descriptor arrives with its message, also between messages without one."""
     here, there = pair
     with socket.create_server(("127.0.0.1", 0)) as first, socket.create_server(("127.0.0.1", 0)) as second:
         here.send(Ping(1))
@@ -65,7 +64,6 @@ def test_messages_arrive_in_order_with_their_descriptors(pair: Pair) -> None:
 
 
 async def test_delayed_messages_are_sent_together(pair: Pair) -> None:
-    """A delayed message waits for the next immediate one, at most some milliseconds; order and descriptors stay."""
     here, there = pair
     here.attach(asyncio.get_running_loop(), lambda _message, _descriptors: None, lambda: None)
 
@@ -90,7 +88,6 @@ async def test_delayed_messages_are_sent_together(pair: Pair) -> None:
 
 
 def test_a_message_must_come_with_its_descriptors(pair: Pair) -> None:
-    """A sender with too many or too few descriptors gets an error; a receiver with too few closes the link."""
     here, there = pair
     with pytest.raises(ValueError, match="travels with 1"):
         here.send(SocketKept("nothing"))
@@ -120,7 +117,6 @@ def test_foreign_data_is_rejected(pair: Pair) -> None:
 
 
 def test_a_peer_that_does_not_read_is_bounded(pair: Pair) -> None:
-    """Past the limit `send` raises; messages queued before still arrive."""
     here, there = pair
     sent = 0
     with pytest.raises(ChannelFullError):
@@ -135,7 +131,6 @@ def test_a_peer_that_does_not_read_is_bounded(pair: Pair) -> None:
 
 
 def test_the_end_of_the_peer_follows_its_last_messages(pair: Pair) -> None:
-    """Messages sent before the other end closed are delivered first."""
     here, there = pair
     here.send(Pong(7))
     here.close()
@@ -145,7 +140,6 @@ def test_the_end_of_the_peer_follows_its_last_messages(pair: Pair) -> None:
 
 
 def test_closing_closes_descriptors() -> None:
-    """Unsent and unread descriptors are closed with the channel."""
     one, other = socket.socketpair()
     here, there = Channel(one, Lifeline), Channel(other, Lifeline)
     with socket.create_server(("127.0.0.1", 0)) as listener:
@@ -159,7 +153,6 @@ def test_closing_closes_descriptors() -> None:
 
 
 async def test_an_attached_end_reports_a_dead_peer_once(pair: Pair) -> None:
-    """In an asyncio process a dead peer is one event, in order; `send` after it does nothing."""
     here, there = pair
     told: list[Message | str] = []
     ended = asyncio.Event()
@@ -178,7 +171,6 @@ async def test_an_attached_end_reports_a_dead_peer_once(pair: Pair) -> None:
 
 
 async def test_an_attached_end_rejects_foreign_data(pair: Pair) -> None:
-    """The end is closed with a reason, and the loop continues."""
     here, there = pair
     told: list[str] = []
     refused = asyncio.Event()

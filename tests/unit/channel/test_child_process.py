@@ -79,8 +79,6 @@ def run(work: Callable[[Bench], Coroutine[Any, Any, None]]) -> None:
 
 
 def test_it_answers_pings_and_stops() -> None:
-    """The supervisor gets an answer to its ping; `Stop` ends the child."""
-
     async def work(bench: Bench) -> None:
         bench.lifeline.send(Ping(7))
         assert await bench.heard.get() == Pong(7)
@@ -91,8 +89,6 @@ def test_it_answers_pings_and_stops() -> None:
 
 
 def test_it_ends_with_its_supervisor() -> None:
-    """No child is left when the supervisor dies."""
-
     async def work(bench: Bench) -> None:
         bench.lifeline.close()
         await bench.child.ended.wait()
@@ -101,8 +97,6 @@ def test_it_ends_with_its_supervisor() -> None:
 
 
 def test_a_new_link_replaces_the_old_one() -> None:
-    """A restarted control is served and the old link is closed; messages sent between the two are dropped."""
-
     async def work(bench: Bench) -> None:
         bench.child.tell(AuthorityStated(0, b""))
         first, came_first = bench.link()
@@ -119,8 +113,6 @@ def test_a_new_link_replaces_the_old_one() -> None:
 
 
 def test_foreign_descriptors_are_closed() -> None:
-    """A link to another process is not kept open."""
-
     async def work(bench: Bench) -> None:
         _channel, came = bench.link("relay")
         assert await came.get() is None

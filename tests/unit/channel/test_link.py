@@ -47,7 +47,6 @@ def world() -> Iterator[World]:
 
 
 async def test_an_answer_has_the_number_of_its_question(world: World) -> None:
-    """Other messages, and answers in another order, do not matter."""
     ear = Heard(other := world.life())
     asked = [asyncio.ensure_future(world.link.ask(Ping, 10)) for _turn in range(2)]
     pings = await ear.until(2)
@@ -59,7 +58,6 @@ async def test_an_answer_has_the_number_of_its_question(world: World) -> None:
 
 
 async def test_a_replaced_peer_is_ignored_and_owes_no_answer(world: World) -> None:
-    """The unread messages of a replaced peer are dropped, and its end is not reported as a loss."""
     before = world.life()
     asked = asyncio.ensure_future(world.link.ask(Ping, 10))
     await asyncio.sleep(0)
@@ -78,7 +76,6 @@ async def test_a_replaced_peer_is_ignored_and_owes_no_answer(world: World) -> No
 
 
 async def test_without_a_peer_messages_and_questions_fail(world: World) -> None:
-    """A question does not wait for a future peer."""
     assert not world.link.send(Ping(1))
     with pytest.raises(ChannelClosedError):
         await world.link.ask(Ping, 10)

@@ -91,7 +91,6 @@ def test_an_order_means_itself(operation: Operation, data: st.DataObject) -> Non
     ],
 )  # fmt: skip
 def test_requests_that_are_not_orders(change: dict[str, Any]) -> None:
-    """A dry run, another route, or a body of another type is neither an order nor an error."""
     good = ClientRequest("10.0.0.1", "POST", "/v1/policy", "*", "text/plain", "", b"[Nodes]\n")
     assert meant(good) == admin.PolicyLoad("[Nodes]\n")
     with pytest.raises(NoOrderError):

@@ -16,7 +16,6 @@ SERVING: dict[str, Any] = {
 
 
 def test_a_serving_appliance_has_no_reason() -> None:
-    """A healthy status has no reason, with and without a probe."""
     assert unserved(example(Status, **SERVING)) is None
     assert unserved(example(Status, **SERVING | {"probe": ""})) is None
     audit = {"failed": "disk full", "on_failure": "allow"}
@@ -37,17 +36,14 @@ def test_a_serving_appliance_has_no_reason() -> None:
     ],
 )
 def test_reasons_for_not_serving_are_named(wrong: dict[str, Any], reason: str) -> None:
-    """Each reason why nodes are not served has its own words."""
     assert reason in str(unserved(example(Status, **SERVING | wrong)))
 
 
 def test_one_missing_relay_is_counted() -> None:
-    """With several relay processes the summary says how many are down."""
     assert no_relay("connected") is None
     assert no_relay("1 of 3 are away") != no_relay("away")
 
 
 def test_processes_of_one_role_are_numbered() -> None:
-    """A single process has the name of its role."""
     rows = [example(ProcessInfo, role=role) for role in ("control", "relay", "api", "relay")]
     assert process_names(rows) == ["control", "relay 0", "api", "relay 1"]

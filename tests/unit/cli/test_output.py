@@ -52,7 +52,6 @@ def test_a_revision_names_its_loader(who: str, shown: str) -> None:
 
 
 def test_a_row_fits_the_terminal(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Parts beyond its width are on a further line; in a pipe a row is one line of any length."""
     row = ["laptop    10.113.11.2", "up", "from 192.168.1.7 for 5 s", "ports closed"]
     say_row(row)
     assert capsys.readouterr().out == "  ".join(row) + "\n"

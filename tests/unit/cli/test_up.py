@@ -76,7 +76,6 @@ def test_a_partial_token_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_a_closed_standard_output_does_not_end_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, as_json: bool
 ) -> None:
-    """Nodes may connect although the line is lost; the token is in its file, also with --json."""
     monkeypatch.setattr(sys, "stdout", Full())
     with capture_logs() as said:
         _announce(READY, Settings(state=tmp_path, api="off"), as_json=as_json)

@@ -57,7 +57,6 @@ def test_the_ports_are_those_of_the_policy_that_comes_into_force(
 def test_a_first_start_is_refused_without_a_usable_policy(
     settings: Settings, content: bytes | None, keys: tuple[str, ...]
 ) -> None:
-    """Nothing starts, and the operator reads why. Later the revision that was in force stays, if it is signed."""
     settings = replace(settings, site_keys=[*keys])
     settings.policy.unlink()
     if content is None:

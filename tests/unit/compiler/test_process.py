@@ -70,7 +70,6 @@ async def conversation(*wanted: messages.Message) -> list[Any]:
 
 
 async def test_it_answers_each_question_and_ends_when_it_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The compiler's findings and errors equal those of `check`."""
     monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)  # the test's own process continues
     bad = GOOD.replace("shared + 1", "shred + 1")
     found, refused = await conversation(
@@ -84,7 +83,6 @@ async def test_it_answers_each_question_and_ends_when_it_is_stopped(monkeypatch:
 
 
 async def test_a_defect_of_the_compiler_is_an_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The question gets an error; later questions are answered."""
     monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)
     monkeypatch.setattr("appliance.specifications.checking._standard", lambda: 1 // 0)
     wanted = messages.ContentsWanted(1, {"a.rv": GOOD}, {})
@@ -94,7 +92,6 @@ async def test_a_defect_of_the_compiler_is_an_answer(monkeypatch: pytest.MonkeyP
 
 
 async def test_it_builds_what_relays_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each relay gets its own build, in the order of the question."""
     monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)
     text = GOOD + GOOD.replace("a()", "c()").replace("b()", "d()").replace("shared", "another")
     compiled = check(Sources({"a.rv": text}, DEFINITIONS), ()).compiled
@@ -133,7 +130,6 @@ def nested_repetitions(count: int) -> str:
     ids=["memory", "time"],
 )
 def test_expensive_texts_stay_within_bounds(text: str, memory: int, seconds: int) -> None:
-    """Within the limits, expensive specifications are rejected, or the kernel ends the process."""
     program = f"""
 import resource, sys
 from pathlib import Path

@@ -28,7 +28,6 @@ def mistakes(
 
 
 def test_later_sources_override_earlier_ones(file: Path) -> None:
-    """Files override defaults, the environment overrides files, flags override all; other keys keep their values."""
     file.write_text("listen: 127.0.0.1:1\nrosmaster_port: 1\nlimits: {nesting: 7, elements: 8}\n")
     environment = {"ROSRV_ROSMASTER_PORT": "2", "ROSRV_LISTEN": "127.0.0.1:2", "ROSRV_LIMITS__NESTING": "9"}
     settings = resolve(file, environment, {"listen": "127.0.0.1:3", "isolation": None})
@@ -39,7 +38,6 @@ def test_later_sources_override_earlier_ones(file: Path) -> None:
 
 
 def test_all_mistakes_are_reported_with_their_positions(file: Path) -> None:
-    """Each mistake has its file and line, variable or flag; for an unknown key the nearest key is suggested."""
     file.write_text(
         "listn: 0.0.0.0:1\nlimits:\n  nesting: deep\n  bodybytes: 1\naudit:\n  durability: sometimes\n"
     )
@@ -56,13 +54,11 @@ def test_all_mistakes_are_reported_with_their_positions(file: Path) -> None:
 
 
 def test_a_key_in_the_wrong_section_names_the_right_one(file: Path) -> None:
-    """The message suggests the section that has this key."""
     file.write_text("queue_messages: 10\n")
     assert mistakes(file) == [f"{file}:1: unknown key queue_messages: did you mean relay.queue_messages?"]
 
 
 def test_a_wrong_entry_of_a_list_has_its_line(file: Path) -> None:
-    """The position is that of the entry, not of the list."""
     file.write_text(
         "advertise:\n- {network: 10.0.0.0/8, address: 10.0.0.1}\n"
         "- network: 10.0.0.0/99\n  address: 10.0.0.1\n  adress: 1\n"
@@ -76,7 +72,6 @@ def test_a_wrong_entry_of_a_list_has_its_line(file: Path) -> None:
     "value", ["perhaps", 5.5, -1, None, [1], {"a": 1}, ["x"], "", 10**30, float("nan"), "5 parsecs"]
 )
 def test_messages_about_values_are_our_own(value: Any) -> None:
-    """No message about a wrong value uses the words of a library or of Python."""
     settings = asdict(Settings())
     given = [{key: value} for key in settings]
     given += [
@@ -99,7 +94,6 @@ def test_messages_about_values_are_our_own(value: Any) -> None:
 
 
 def test_monitors_to_enable_as_a_list(file: Path) -> None:
-    """`enable` accepts a list of names; any other entry is a mistake at the line of `enable`."""
     file.write_text("enable: [speedLimit, zone]\n")
     assert resolve(file, {}, {}).enable == "speedLimit,zone"
     file.write_text("enable:\n  - speedLimit\n  - {zone: 1}\n")
@@ -133,13 +127,11 @@ def test_a_key_given_twice_is_a_mistake(file: Path) -> None:
     ],
 )
 def test_an_unreadable_file_is_an_error(file: Path, text: str, expected: str) -> None:
-    """The error gives the reason and the position."""
     file.write_text(text)
     assert any(expected in one for one in mistakes(file))
 
 
 def test_a_named_file_must_exist(tmp_path: Path) -> None:
-    """Only the default file may be missing."""
     assert "cannot be read: No such file" in mistakes(tmp_path / "missing.yaml")[0]
     assert (
         "cannot be read: No such file" in mistakes(None, {"ROSRV_CONFIG": str(tmp_path / "missing.yaml")})[0]
@@ -147,7 +139,6 @@ def test_a_named_file_must_exist(tmp_path: Path) -> None:
 
 
 def test_a_file_in_the_working_directory_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a name, `./appliance.yaml` is read; without that file, the defaults apply."""
     monkeypatch.chdir(tmp_path)
     assert resolve(None, {}, {}).rosmaster_port == Settings().rosmaster_port
     (tmp_path / "appliance.yaml").write_text("rosmaster_port: 5\n")
@@ -155,7 +146,6 @@ def test_a_file_in_the_working_directory_is_found(tmp_path: Path, monkeypatch: p
 
 
 def test_relative_paths_depend_on_their_source(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With a file, its paths and the defaults are below its folder; all other paths are below the working directory."""
     monkeypatch.chdir("/")
     assert resolve(None, {}, {}).hosts == Path("/ipsec/hosts.yaml")
     file.write_text("policy: policies/a.ini\nstate: /srv/state\n")
@@ -167,13 +157,11 @@ def test_relative_paths_depend_on_their_source(file: Path, monkeypatch: pytest.M
 
 
 def test_an_unknown_variable_is_a_mistake() -> None:
-    """A typing error in the environment is not ignored."""
     assert mistakes(None, {"ROSRV_LISTN": "x"}) == ["ROSRV_LISTN: unknown key listn: did you mean listen?"]
     assert "ROSRV_LISTEN__PORT: " in mistakes(None, {"ROSRV_LISTEN__PORT": "1"})[0]
 
 
 def test_variables_of_other_programs_are_ignored() -> None:
-    """Variables that Kubernetes sets for a service named rosrv, and the token of other verbs, are not configuration."""
     environment = {
         "ROSRV_SERVICE_HOST": "10.0.0.1",
         "ROSRV_SERVICE_PORT_MASTER": "11311",
@@ -185,14 +173,12 @@ def test_variables_of_other_programs_are_ignored() -> None:
 
 
 def test_a_list_in_the_environment_is_yaml() -> None:
-    """A variable can give a structured value."""
     value = "[{network: 10.0.0.0/8, address: 10.1.1.1}]"
     assert str(resolve(None, {"ROSRV_ADVERTISE": value}, {}).advertise[0].address) == "10.1.1.1"
     assert mistakes(None, {"ROSRV_ADVERTISE": "[{"})[0].startswith("ROSRV_ADVERTISE: is not YAML")
 
 
 def test_a_mistake_about_two_keys_names_one_that_was_set() -> None:
-    """`--mediation monitored` without `--relay monitored` is a mistake of that flag, whatever else is set."""
     with pytest.raises(ConfigError) as caught:
         resolve(None, {}, {"policy": Path("/a.ini"), "mediation": "monitored"})
     assert str(caught.value) == "--mediation: monitored needs relaying: monitored (--relay monitored)"

@@ -34,7 +34,6 @@ def anew() -> Iterator[None]:
 
 
 def test_on_debian_it_lists_needed_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The list has the installed packages that the appliance needs; other packages and removed ones are left out."""
     (tmp_path / "status").write_text(STATUS)
     monkeypatch.setattr(inventory, "DPKG", tmp_path)
     found = [(part.name, part.version) for part in inventory.inventory().parts if part.kind == "debian"]
@@ -42,7 +41,6 @@ def test_on_debian_it_lists_needed_packages(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_elsewhere_it_lists_python_packages_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without dpkg's list, the inventory has no Debian packages."""
     monkeypatch.setattr(inventory, "DPKG", tmp_path)
     found = inventory.inventory()
     assert {part.kind for part in found.parts} == {"python"}
@@ -53,7 +51,6 @@ def test_elsewhere_it_lists_python_packages_only(tmp_path: Path, monkeypatch: py
 def test_a_build_has_its_commit_and_the_hash_of_its_list(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The inventory of an image has the commit and the hash of its list; the inventory of a checkout has neither."""
     assert (inventory.inventory().build, inventory.inventory().parts_list) == (None, None)
     inventory.inventory.cache_clear()
     monkeypatch.setattr(inventory, "SHIPPED", tmp_path)

@@ -15,7 +15,6 @@ from appliance.configuration.settings import Settings, load_resolved
 
 
 def test_every_key_has_a_default() -> None:
-    """An empty configuration is complete, with the documented limits."""
     settings = Settings()
     assert settings.listen_address == ("0.0.0.0", 11311)
     assert settings.limits.body_bytes == 16 * 1024 * 1024
@@ -25,7 +24,6 @@ def test_every_key_has_a_default() -> None:
 
 
 def test_children_read_the_supervisors_settings(tmp_path: Path) -> None:
-    """Resolved settings are unchanged after writing and reading the file."""
     settings = read(
         {
             "listen": "[::1]:0",
@@ -49,7 +47,6 @@ def test_children_read_the_supervisors_settings(tmp_path: Path) -> None:
     ],
 )
 def test_an_address_is_host_and_port(text: str, address: tuple[str, int]) -> None:
-    """IPv4, IPv6 in brackets and names are accepted, with any port."""
     assert split_address(text) == address
 
 
@@ -70,21 +67,18 @@ def test_an_address_is_host_and_port(text: str, address: tuple[str, int]) -> Non
     ],
 )
 def test_an_invalid_address_is_rejected(text: str) -> None:
-    """Anything else is an error, not a guess."""
     with pytest.raises(ValidationError):
         read({"listen": text})
 
 
 @pytest.mark.parametrize("value", [0, -1, float("inf"), float("nan"), "soon"])
 def test_a_time_is_a_positive_number(value: object) -> None:
-    """No number, such as zero, disables a limit."""
     with pytest.raises(ValidationError):
         read({"limits": {"header_seconds": value}})
 
 
 @pytest.mark.parametrize("api", ["0.0.0.0:8443", "[::]:8443", "10.0.0.2:8443", "robot:8443"])
 def test_rest_in_clear_text_stays_on_this_machine(api: str) -> None:
-    """Tokens never cross a network without TLS; on loopback they may."""
     with pytest.raises(ValidationError, match="clear text"):
         read({"api": api, "api_tls": False})
     for here in ("127.0.0.1:1", "[::1]:1", "localhost:1", "127.9.9.9:1", "off"):
@@ -107,14 +101,12 @@ def test_rest_can_be_disabled() -> None:
     ],
 )
 def test_an_invalid_pool_of_virtual_addresses_is_rejected(pool: str, said: str) -> None:
-    """The error for an IPv6 pool, or for a pool of a wrong size, describes valid pools."""
     with pytest.raises(ValidationError, match=said):
         read({"ipsec": {"pool": pool}})
 
 
 @pytest.mark.parametrize("endpoint", ["192.168.1.20", "fd00::20", "robot.example.org", "robot"])
 def test_the_endpoint_is_an_address_or_a_name(endpoint: str) -> None:
-    """Kits contain it unchanged."""
     assert read({"ipsec": {"endpoint": endpoint}}).ipsec.endpoint == endpoint
 
 
@@ -139,7 +131,6 @@ def test_an_unreachable_endpoint_is_rejected(endpoint: str, said: str) -> None:
 
 
 def test_an_empty_endpoint_is_unset() -> None:
-    """compose.yaml may pass an empty variable; the endpoint's address is then found automatically."""
     assert read({"ipsec": {"endpoint": ""}}).ipsec.endpoint is None
 
 

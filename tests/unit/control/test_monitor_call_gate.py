@@ -97,7 +97,6 @@ def test_the_client_is_the_address_that_a_relay_connects_from(listen: str, host:
     ],
 )
 def test_another_call_is_not_granted(policy: str, options: dict[str, Any], reason: str) -> None:
-    """The answer has the reason, and a denial its record."""
     control = Control(policy, **options)
     answer = control.answer()
     assert reason in answer.refused

@@ -94,7 +94,6 @@ BUILT = (0, f"extension: built {IN_PLACE.relative_to(ROOT)}\n")
 
 
 def test_it_is_built_when_something_changed(built: Checkout) -> None:
-    """The first build and one after a change write the file, without a warning; another build does nothing."""
     before = built.made.stat()
     assert built.answer() == 1
     assert built.build() == (0, "")
@@ -105,13 +104,11 @@ def test_it_is_built_when_something_changed(built: Checkout) -> None:
 
 
 def test_the_module_compiles_without_a_warning(checkout: Checkout) -> None:
-    """Cython and gcc have nothing to say about the source."""
     checkout.write((ROOT / SOURCE).read_text())
     assert checkout.build() == BUILT
 
 
 def test_a_lost_or_damaged_file_is_replaced(built: Checkout) -> None:
-    """A file that differs from the built one is replaced, without being compiled again."""
     whole = built.made.read_bytes()
     built.made.write_bytes(whole[:100])
     assert (built.build(), built.made.read_bytes()) == (BUILT, whole)
@@ -120,7 +117,6 @@ def test_a_lost_or_damaged_file_is_replaced(built: Checkout) -> None:
 
 
 def test_a_wrong_source_leaves_the_last_module(built: Checkout) -> None:
-    """The message names the line and the command; the last module stays, and the next build tries again."""
     built.write("def answer(:\n")
     for _ in range(2):
         status, output = built.build()
@@ -132,7 +128,6 @@ def test_a_wrong_source_leaves_the_last_module(built: Checkout) -> None:
 
 
 def test_a_missing_compiler_is_named(checkout: Checkout, tmp_path: Path) -> None:
-    """The message has the command that installs what is missing."""
     status, output = checkout.build(path=str(tmp_path))
     assert status == 1
     assert output.startswith("extension: gcc or ")
@@ -149,7 +144,6 @@ def test_many_builds_at_once(checkout: Checkout) -> None:
 
 
 def test_two_folders_have_the_same_module(checkout: Checkout, original: Checkout) -> None:
-    """The file is equal byte by byte wherever it is built, and does not contain the folder."""
     assert checkout.build() == BUILT
     assert checkout.made.read_bytes() == original.made.read_bytes()
     assert str(checkout.folder).encode() not in checkout.made.read_bytes()
@@ -180,6 +174,5 @@ def pins() -> Iterator[str]:
 
 
 def test_all_builds_have_the_same_cython() -> None:
-    """The wheel, the checkout, the package and the image are built with one version."""
     found = [pin for pin in pins() if pin.startswith("cython==")]
     assert (len(found), len(set(found))) == (5, 1)

@@ -69,7 +69,6 @@ def test_changes_are_found(released: Path, name: str) -> None:
 
 
 def test_the_provenance_names_files_and_sources(released: Path) -> None:
-    """It has the digest of each file, the commit, and the lock files."""
     statement = json.loads((released / "provenance.json").read_text())
     assert statement["_type"] == "https://in-toto.io/Statement/v1"
     assert {one["name"]: one["digest"]["sha256"] for one in statement["subject"]} == {
@@ -86,7 +85,6 @@ def test_the_provenance_names_files_and_sources(released: Path) -> None:
 def test_another_kind_of_key_is_rejected(
     released: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A key that cosign does not support is not used."""
     other = tmp_path / "other.pem"
     subprocess.run(
         ["openssl", "genpkey", "-algorithm", "ed25519", "-out", str(other)], check=True, capture_output=True

@@ -21,13 +21,11 @@ def written() -> dict[str, str]:
 
 
 def test_the_role_has_the_packages_defaults(tmp_path: Path) -> None:
-    """Without settings in the inventory the configuration equals the package's."""
     settings = yaml.safe_load((ROLE / "defaults/main.yml").read_text())["rosrv_settings"]
     assert settings == yaml.safe_load((ROOT / "distribution/appliance.yaml").read_text())
 
 
 def test_the_role_checks_before_it_writes() -> None:
-    """An invalid configuration or policy is never installed; a changed one is loaded."""
     tasks = {task["name"]: task for task in yaml.safe_load((ROLE / "tasks/main.yml").read_text())}
     handlers = {handler["name"] for handler in yaml.safe_load((ROLE / "handlers/main.yml").read_text())}
     placed = [task for task in tasks.values() if "/etc/rosrv" in str(task.get("ansible.builtin.copy"))]
@@ -38,7 +36,6 @@ def test_the_role_checks_before_it_writes() -> None:
 
 
 def test_cloud_init_writes_valid_files(tmp_path: Path) -> None:
-    """The policy that cloud-init writes compiles, and its configuration names that policy without a mistake."""
     files = written()
     policy = compile_policy(files["/etc/rosrv/policies/robot.ini"], file="robot.ini")
     assert list(policy.warnings) == []
@@ -48,7 +45,6 @@ def test_cloud_init_writes_valid_files(tmp_path: Path) -> None:
 
 
 def test_cloud_init_checks_the_package() -> None:
-    """The package's checksum is checked before the installation; the shipped example installs nothing."""
     steps = yaml.safe_load(CLOUD.read_text())["runcmd"]
     assert steps[0] == "set -e", "cloud-init makes one script of them"
     order = [
@@ -59,7 +55,6 @@ def test_cloud_init_checks_the_package() -> None:
 
 
 def test_the_lines_of_the_demonstration_can_be_removed() -> None:
-    """The policy of compose.yaml passes its tests with and without the simulated robot's topics."""
     file = ROOT / "policies/containers.ini"
     cases = file.with_name("containers.ini.tests.yaml").read_text()
     own = [line for line in file.read_text().splitlines() if "# demo" not in line]

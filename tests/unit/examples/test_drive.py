@@ -12,19 +12,16 @@ SHORT = (Part(0.5, tilt=0.2), Part(1.0, forward=1.0), Part(0.5, fire=True))
 
 
 def test_two_drives_are_equal() -> None:
-    """The same commands give the same bytes."""
     assert Simulation().run(SHORT).messages == Simulation().run(SHORT).messages
 
 
 def test_the_base_stops_without_commands() -> None:
-    """Each part follows its commands; the last command counts for half a second."""
     drive = Simulation().run(SHORT)
     assert drive.poses[-1].x == pytest.approx(1.0, abs=0.11)
     assert [shot.fired for shot in drive.shots] == [True]
 
 
 def test_the_recording_has_every_message_in_order(tmp_path: Path) -> None:
-    """Each message has its time, topic and bytes, and each type its definition."""
     drive = Simulation().run(SHORT)
     record(drive, tmp_path / "drive.bag")
     with Reader(tmp_path / "drive.bag") as reader:
@@ -37,7 +34,6 @@ def test_the_recording_has_every_message_in_order(tmp_path: Path) -> None:
 
 
 def test_missing_fields_are_zero() -> None:
-    """Fields that were not given are read back as zero, given fields unchanged."""
     messages = Messages()
     data = messages.encode("nav_msgs/Odometry", pose__pose__position={"x": 2.0}, child_frame_id="base_link")
     odometry = messages.decode("nav_msgs/Odometry", data)

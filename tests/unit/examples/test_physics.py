@@ -88,7 +88,6 @@ def test_laser_sees_the_obstacle() -> None:
 
 
 def test_laser_has_a_maximum_range() -> None:
-    """Obstacles beyond the range are not seen."""
     assert physics.scan(physics.Pose(), [0.0], (physics.Obstacle(50, 0, 1),), reach=30.0) == [math.inf]
 
 

@@ -37,7 +37,6 @@ def test_metrics_of_alerts_exist() -> None:
 
 
 def test_every_alert_has_an_explanation_and_advice() -> None:
-    """The person on duty reads the cause and the next step; events that an alert names exist."""
     for rule in rules():
         notes = rule["annotations"]
         assert set(notes) == {"summary", "what_to_do"}, rule["alert"]
@@ -48,12 +47,10 @@ def test_every_alert_has_an_explanation_and_advice() -> None:
 
 
 def test_every_alert_is_tested() -> None:
-    """Each alert has a case in alerts.tests.yaml."""
     cases = (FOLDER / "alerts.tests.yaml").read_text()
     assert [rule["alert"] for rule in rules() if rule["alert"] not in cases] == []
 
 
 def test_the_page_names_every_alert() -> None:
-    """docs/reference/metrics.md lists each alert with its subject."""
     page = (FOLDER.parents[1] / "docs" / "reference" / "metrics.md").read_text()
     assert [rule["alert"] for rule in rules() if rule["alert"] not in page] == []

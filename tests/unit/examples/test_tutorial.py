@@ -41,7 +41,6 @@ def shown(command: str) -> list[str]:
 
 
 def test_the_page_quotes_check(folder: Path) -> None:
-    """The page has the errors first, then the success."""
     (folder / "gun.rv").write_text(FIRST)
     wrong = said("check", "my-monitors/gun.rv")
     (folder / "gun.rv").write_text(RIGHT)
@@ -57,7 +56,6 @@ def test_the_page_quotes_run(folder: Path) -> None:
 
 
 def test_the_second_one_locks_after_two_in_a_row(folder: Path) -> None:
-    """A single shot at the robot does not lock the gun; the joint states always pass."""
     (folder / "gun.rv").write_text(SECOND)
     guarded = Simulation([folder / "gun.rv"]).run()
     assert [one.result for one in guarded.messages if one.topic == TRIGGERED] == [
@@ -69,7 +67,6 @@ def test_the_second_one_locks_after_two_in_a_row(folder: Path) -> None:
 
 
 def test_the_last_one_keeps_the_robot_slow_while_its_gun_is_raised(folder: Path) -> None:
-    """The mission drives at up to two metres a second, and raises the gun before each drive."""
     (folder / "calm.rv").write_text(LAST)
     assert said("check", "my-monitors/calm.rv") == ["1 specification OK"]
     drive = Simulation([folder / "calm.rv"]).run()

@@ -29,13 +29,11 @@ for module in pkgutil.walk_packages(appliance.__path__, "appliance."):
 
 
 def test_each_folder_is_a_row() -> None:
-    """The table lists each folder once, under its name."""
     assert sorted(feature.name for feature in FEATURES) == FOLDERS
 
 
 @pytest.mark.parametrize("name", FOLDERS)
 def test_no_other_test_imports_a_feature(name: str) -> None:
-    """Only the tests of a feature import it, so they go with it."""
     imported = re.compile(rf"\bappliance\.features\.{name}\b")
     knowing = [
         str(path.relative_to(ROOT))
@@ -66,7 +64,6 @@ def without(name: str, copy: Path) -> None:
 @pytest.mark.timeout(1200)
 @pytest.mark.parametrize("name", FOLDERS)
 def test_the_rest_works_without_a_feature(name: str, tmp_path: Path) -> None:
-    """Without the folder and the row, everything can be imported, and contracts and unit tests of the core hold."""
     without(name, tmp_path)
     bin_folder = Path(sys.executable).parent
     tests = [f"tests/unit/{one}" for one in _TESTED]

@@ -46,7 +46,6 @@ BAD: dict[str, tuple[dict[str, Any], list[tuple[str, str]]]] = {
 
 
 def test_the_status_has_the_documented_fields() -> None:
-    """The fields of features are at their documented places, although the core does not name them."""
     assert " ".join(AuditState.__struct_fields__) == AUDIT
     assert " ".join(Status.__struct_fields__) == STATUS
     required = {
@@ -67,7 +66,6 @@ def test_a_feature_without_a_state_is_null() -> None:
 
 @pytest.mark.parametrize("view", STATES, ids=lambda view: view.field)
 def test_each_state_has_its_alarms_metrics_and_line(view: StateView[Any]) -> None:
-    """Each metric of a state has samples, also when clients send the state as JSON."""
     given, alarms = BAD[view.field]
     place = {"audit": {view.field: given}} if view.part == "audit" else {view.field: given}
     status = msgspec.json.decode(msgspec.json.encode(example(Status, **place)), type=Status)

@@ -47,7 +47,6 @@ def desk(tmp_path: Path) -> Desk:
 
 
 def test_a_bundle_from_the_folder_to_the_collector(desk: Desk) -> None:
-    """Add, publish, withdraw and sign again; the collector's folder has a complete publication after each publish."""
     served = desk.folder / "served"
     rings = ["--ring", "canary=arm-1", "--ring", "rest=100%+4h"]
     assert "site-a/arms/1.tar: signed" in desk.good("add", "site-a/arms", str(desk.robot), *rings)
@@ -74,7 +73,6 @@ def test_a_folder_that_may_not_be_read_is_not_signed(desk: Desk, monkeypatch: py
 
 
 def test_a_bundle_with_errors_is_not_signed(desk: Desk) -> None:
-    """Errors of all parts are shown at once, and nothing is signed."""
     (desk.robot / "policy.ini").write_text("[Nodes]\nnonsense\n")
     (desk.robot / "hosts.yaml").write_text("hosts: [{nam: x}]\n")
     (desk.robot / "monitors").mkdir()
@@ -109,7 +107,6 @@ def test_mistakes_are_explained(desk: Desk, words: tuple[str, ...], reason: str)
 
 
 def test_a_wrong_passphrase_signs_nothing(desk: Desk) -> None:
-    """The keys are encrypted: without the passphrase nothing is signed."""
     wrong = desk.folder / "wrong"
     wrong.write_text("another passphrase\n")
     done = desk.run("add", "site-a/arms", str(desk.robot), secret=wrong)

@@ -25,7 +25,6 @@ _DAMAGED = "0" * 32, "1" * 32
 def test_damaged_logs_do_not_stop_the_retention(
     content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A damaged log stays and is reported; old days still leave the index."""
     dropped: list[date] = []
 
     def drop(_database: IndexDatabase, oldest: date) -> list[date]:

@@ -11,14 +11,12 @@ from tests.support.sources import ROOT
 
 
 def test_the_example_is_valid() -> None:
-    """The example has a valid configuration; its certificate is that of `init`."""
     found = load_config(ROOT / "fleet/fleet.example.yaml")
     assert found.certificate == Path("/var/lib/rosrv-fleet/server.pem")
     assert found.address == ("0.0.0.0", 8444)
 
 
 def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
-    """Also the default paths of the certificate and its key, which are in the data folder."""
     file = tmp_path / "fleet.yaml"
     file.write_text("data: here\n")
     assert load_config(file).key == tmp_path / "here/server.key"
@@ -41,7 +39,6 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrong_configuration_is_refused(text: str, why: str, tmp_path: Path) -> None:
-    """The error has the file and the reason."""
     file = tmp_path / "fleet.yaml"
     file.write_text(text)
     with pytest.raises(FleetConfigError, match=why) as error:

@@ -62,8 +62,6 @@ def _in_loop(story: Callable[[], None]) -> None:
 
 
 def test_unproven_addresses_leave_half_of_the_connections(table: ClientConnections) -> None:
-    """Seventeen addresses that take all they can get, leave half; a new operator and robots get in, and stay."""
-
     def story() -> None:
         others = [one for number in range(17) for one in _opened(table, f"203.0.113.{number}", 64)]
         assert sum(not one.cut for one in others) == 200
@@ -81,8 +79,6 @@ def test_unproven_addresses_leave_half_of_the_connections(table: ClientConnectio
 
 
 def test_room_is_made_by_the_address_with_most(table: ClientConnections) -> None:
-    """An address with few connections loses none to one with many, and its handshake that lost its place ends."""
-
     def story() -> None:
         (early,) = _opened(table, "10.0.0.7")
         many = [one for number in range(1, 5) for one in _opened(table, f"203.0.113.{number}", 64)]
@@ -97,8 +93,6 @@ def test_room_is_made_by_the_address_with_most(table: ClientConnections) -> None
 
 
 def test_every_connection_that_ends_makes_room(table: ClientConnections) -> None:
-    """The counts return to nothing: of unproven addresses, of an address that was proven in between, and of robots."""
-
     def story() -> None:
         for _ in range(3):
             opened = [one for number in range(3) for one in _opened(table, f"203.0.113.{number}", 60)]
@@ -112,8 +106,6 @@ def test_every_connection_that_ends_makes_room(table: ClientConnections) -> None
 
 
 def test_handshakes_of_unproven_addresses_have_a_share(table: ClientConnections) -> None:
-    """An address that only shakes hands gets 50 a second, two 25 each, all new ones 200; others are not delayed."""
-
     def handshakes(seconds: int, *addresses: str) -> int:
         done = 0
         for _ in range(seconds * 100):
@@ -155,8 +147,6 @@ async def _status(door: Door, address: str, token: str = "", *, robot: bool = Fa
 
 
 def test_requests_without_a_token_have_a_share(table: ClientConnections, tmp_path: Path) -> None:
-    """Logins, wrong tokens and requests without one are answered 429 beyond it; robots and operators are not."""
-
     async def app(_scope: Any, _receive: Any, send: Any) -> None:
         await send({"type": "http.response.start", "status": 200, "headers": []})
         await send({"type": "http.response.body", "body": json.dumps({}).encode()})

@@ -9,7 +9,6 @@ from rosrv_fleet.stored_files import DamagedFileError
 
 
 def test_a_damaged_description_hides_no_other_bundle(tmp_path: Path) -> None:
-    """The list has the others; the damaged one is an error with its path."""
     store = EvidenceStore(tmp_path / "evidence")
     for letter in "ab":
         about = StoredEvidence(

@@ -74,7 +74,6 @@ def test_the_indexer_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_segment_that_causes_a_defect_is_set_aside(tmp_path: Path) -> None:
-    """So it does not delay the segments of other robots."""
     store = SegmentStore(tmp_path, 0)
     place = SegmentPlace("arm1", "0" * 32, 1, "a" * 64)
     (tmp_path / "pending" / "arm1").mkdir()
@@ -144,7 +143,6 @@ def test_tracebacks_show_no_values(capfd: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_command_on_a_full_disk_says_what_to_do() -> None:
-    """The error names the file and the remedy."""
     error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "data/tokens.json")
     assert cli.reason_of(error) == (
         "data/tokens.json: No space left on device; free space on this disk, and run the command again"

@@ -54,7 +54,6 @@ def _indexer(store: SegmentStore, data: Path, workers: Workers | None = None) ->
 
 
 def test_segments_wait_while_no_worker_can_be_started(store: SegmentStore, tmp_path: Path) -> None:
-    """If the system starts no process, the segment waits."""
     enrolled_robots(tmp_path, "arm1")
     with pytest.raises(BlockingIOError):
         _indexer(store, tmp_path).step("pending")
@@ -63,7 +62,6 @@ def test_segments_wait_while_no_worker_can_be_started(store: SegmentStore, tmp_p
 
 
 def test_segments_wait_while_the_file_of_their_robot_is_damaged(store: SegmentStore, tmp_path: Path) -> None:
-    """They are not set aside, and those of other robots have their turn."""
     enrolled_robots(tmp_path, "arm2")
     (tmp_path / "robots" / "arm1.json").write_bytes(b"damaged")
     indexer = _indexer(store, tmp_path)
@@ -78,7 +76,6 @@ def test_segments_wait_while_the_file_of_their_robot_is_damaged(store: SegmentSt
 
 
 def test_a_segment_that_was_replaced_is_indexed_again(store: SegmentStore, tmp_path: Path) -> None:
-    """The damage of bytes that its robot has replaced since is not reported; that of the present ones is."""
     enrolled_robots(tmp_path, "arm1")
     file = store.path(_PLACE)
     file.parent.mkdir(parents=True)
@@ -95,7 +92,6 @@ def test_a_segment_that_was_replaced_is_indexed_again(store: SegmentStore, tmp_p
 
 
 def test_a_segment_that_is_tried_again_stays_reported(store: SegmentStore, tmp_path: Path) -> None:
-    """A segment of a robot without a file is set aside; until it is indexed, each try counts it once."""
     indexer = _indexer(store, tmp_path)
     for lane in ("pending", "large"):
         assert indexer.step(lane)

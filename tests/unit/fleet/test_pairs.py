@@ -11,7 +11,6 @@ from tests.support.enrolled_robots import JoiningAppliance
 
 
 def test_a_standby_joins_as_the_same_robot(tmp_path: Path) -> None:
-    """Only an invitation for it adds the second appliance; both may renew their certificates, a third may not join."""
     robots, first, second, third = (
         Robots(tmp_path / "robots"),
         JoiningAppliance(),

@@ -27,7 +27,6 @@ def state_of(data: Path, presence: RobotPresence) -> RobotState:
 
 
 def test_a_quiet_robot_is_not_silent(tmp_path: Path) -> None:
-    """It is silent once it was not heard for `silent_seconds`, pushed or not, also after a restart."""
     enrolled_robots(tmp_path, "arm7")
     presence = RobotPresence(tmp_path / "heard")
     let_time_pass(599)
@@ -45,7 +44,6 @@ def test_a_quiet_robot_is_not_silent(tmp_path: Path) -> None:
 
 
 def test_the_time_of_a_stopped_collector_is_not_silence(tmp_path: Path) -> None:
-    """After its start, the collector waits `silent_seconds` for a robot."""
     enrolled_robots(tmp_path, "arm7")
     let_time_pass(86_400)
     presence = RobotPresence(tmp_path / "heard")
@@ -55,7 +53,6 @@ def test_the_time_of_a_stopped_collector_is_not_silence(tmp_path: Path) -> None:
 
 
 def test_each_appliance_of_a_pair_is_heard(tmp_path: Path) -> None:
-    """A standby that is present does not hide an active appliance whose cable is cut."""
     robots = Robots(tmp_path / "robots")
     JoiningAppliance().join(robots)
     JoiningAppliance().join(robots, "b")
@@ -69,7 +66,6 @@ def test_each_appliance_of_a_pair_is_heard(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_makes_no_robot_silent(tmp_path: Path) -> None:
-    """The collector remembers the time until its end."""
     enrolled_robots(tmp_path, "arm7")
     (tmp_path / "heard").write_text("a file, so that no folder can be made")
     presence = RobotPresence(tmp_path / "heard")

@@ -11,7 +11,6 @@ from tests.support.bundle_site import BundleSite
 
 
 def test_a_timestamp_is_signed_only_when_it_lasts_longer(tmp_path: Path) -> None:
-    """Before the metadata expire, and afterwards, the collector does not sign the same expiry every second."""
     site = BundleSite(tmp_path)
     publication = read_publication(site.repository.folder)
     key = load_online_key(site.repository.folder / TIMESTAMP_KEY)

@@ -38,7 +38,6 @@ def quotas(folder: Path, clock: _Clock) -> RobotQuotas:
 def test_used_bytes_survive_a_restart_and_return_evenly(
     used: tuple[int, int], clock: _Clock, tmp_path: Path
 ) -> None:
-    """Compressed and uncompressed bytes count for a day, also after a restart; the error has the time to wait."""
     found = quotas(tmp_path, clock)
     found.check("arm1")
     found.charge("arm1", 2 * used[0], 2 * used[1])
@@ -53,7 +52,6 @@ def test_used_bytes_survive_a_restart_and_return_evenly(
 
 
 def test_a_robot_that_was_off_sends_its_backlog_faster(clock: _Clock, tmp_path: Path) -> None:
-    """It has saved the quota of its last week, and not more; a new robot has saved none."""
     found = quotas(tmp_path, clock)
     found.charge("arm1", 65_536, 65_536)
     clock.now += 30 * _DAY
@@ -88,7 +86,6 @@ def machine() -> Iterator[VirtualClock]:
 def test_the_pause_grows_with_refusals_and_processor_time(
     clock: _Clock, tmp_path: Path, machine: VirtualClock
 ) -> None:
-    """After refused uploads a robot pauses longer each time, at most ten minutes; a stored one shortens the next."""
     found = quotas(tmp_path, clock)
 
     def pause() -> float:
@@ -114,7 +111,6 @@ def test_the_pause_grows_with_refusals_and_processor_time(
 
 
 def test_a_damaged_file_begins_again(clock: _Clock, tmp_path: Path) -> None:
-    """After a power cut the file of a robot may be damaged: the robot can push, and is limited again."""
     (tmp_path / "arm1.json").write_bytes(b"")
     found = quotas(tmp_path, clock)
     found.check("arm1")

@@ -65,7 +65,6 @@ def _run(data: Path, *words: str) -> str:
 
 
 def test_a_group_is_pinned_and_changed(data: Path, tmp_path: Path) -> None:
-    """`robot add --group` and `robot group` set the group, `robot list` shows it; a removed robot is in no group."""
     key, certificate = map(str, _files(tmp_path, "arm7"))
     _run(data, "robot", "add", "arm7", "--key", key, "--certificate", certificate, "--group", "site-a/arms")
     assert "arm7  enrolled  site-a/arms" in _run(data, "robot", "list")
@@ -78,7 +77,6 @@ def test_a_group_is_pinned_and_changed(data: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("group", ["arms", "site-a/", "/arms", "Site/arms", "a/b/c", "site-a/arms\n"])
 def test_a_wrong_group_enrols_nothing(group: str, data: Path, tmp_path: Path) -> None:
-    """A group that is not SITE/GROUP is rejected with an example, and the robot is not enrolled."""
     key, certificate = _files(tmp_path, "arm7")
     robots = Robots(data / "robots")
     with pytest.raises(EnrolmentError, match="such as site-a/arms"):
@@ -115,7 +113,6 @@ def test_a_changed_robot_has_no_invitation(act: str, used: bool, data: Path, tmp
 
 
 def test_an_invitation_that_ended_stays_ended(tmp_path: Path) -> None:
-    """A clock that is set back does not make it valid again; a folder among the files affects no other."""
     invitations, machine = Invitations(tmp_path / "invitations"), VirtualClock()
     with using(machine):
         _pending, token = invitations.add("arm7", "", 60.0)
@@ -131,7 +128,6 @@ def test_an_invitation_that_ended_stays_ended(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("error", [OSError("the disk is full"), SystemExit()], ids=["failure", "end"])
 def test_an_interrupted_request_can_only_be_repeated(error: BaseException, tmp_path: Path) -> None:
-    """If the collector fails while it enrols the robot, the same request is valid again, and no other is."""
     invitations = Invitations(tmp_path / "invitations")
     _pending, token = invitations.add("arm7", "", 60.0)
     with pytest.raises(type(error)), invitations.using(token, b"request") as first:
@@ -143,7 +139,6 @@ def test_an_interrupted_request_can_only_be_repeated(error: BaseException, tmp_p
 
 
 def test_a_repeated_request_changes_nothing(data: Path, tmp_path: Path) -> None:
-    """A robot that repeats its request keeps its present group, and the act is recorded once."""
     key, certificate = (file.read_bytes() for file in _files(tmp_path, "arm7"))
     robots = Robots(data / "robots")
     robots.join("arm7", key, certificate, "site-a/arms")
@@ -155,7 +150,6 @@ def test_a_repeated_request_changes_nothing(data: Path, tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_two_robots_cannot_join_with_one_key(data: Path, tmp_path: Path) -> None:
-    """If eight robots with one log key and one certificate join at the same time, one is enrolled."""
     key, certificate = (file.read_bytes() for file in _files(tmp_path, "arm7"))
     begin, refused = threading.Barrier(8), list[str]()
 
@@ -245,8 +239,6 @@ def test_no_act_takes_effect_unrecorded(data: Path, tmp_path: Path) -> None:
 def test_an_act_that_fails_is_recorded_as_failed(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If the change fails after the record, a second line has the reason."""
-
     def fail(file: Path, _data: bytes, _mode: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device", str(file))
 
@@ -262,7 +254,6 @@ def test_an_act_that_fails_is_recorded_as_failed(
 
 @pytest.mark.nightly
 def test_a_kill_between_the_record_and_the_change(data: Path, tmp_path: Path) -> None:
-    """A command that is killed before the change leaves an act without a result; later acts have their own lines."""
     key, certificate = map(str, _files(tmp_path, "arm7"))
     words = ["robot", "add", "arm7", "--key", key, "--certificate", certificate]
     words += ["--config", str(tmp_path / "fleet.yaml")]
@@ -287,7 +278,6 @@ def test_a_kill_between_the_record_and_the_change(data: Path, tmp_path: Path) ->
 
 @pytest.mark.nightly
 def test_two_changes_of_tokens_do_not_undo_each_other(tmp_path: Path) -> None:
-    """Tokens that are added at the same time are all there afterwards."""
     tokens = OperatorTokens(tmp_path / "tokens.json")
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda number: tokens.add(f"operator{number}", FleetRole.VIEWER), range(40)))
@@ -306,7 +296,6 @@ def test_an_unreadable_folder_is_not_an_empty_one(tmp_path: Path, monkeypatch: p
 def test_a_change_while_the_folder_is_read_is_noticed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A second change within the clock's step is noticed, also if the reading takes long."""
     enrolled_robots(tmp_path, "arm1", "arm2")
     folder, machine = tmp_path / "robots", VirtualClock()
     now = machine.wall_ns()
@@ -341,7 +330,6 @@ def test_a_change_while_the_folder_is_read_is_noticed(
     ids=["name", "certificate", "key", "group", "no object", "no UTF-8"],
 )
 def test_a_damaged_file_affects_no_other_robot(word: str, damaged: str, tmp_path: Path) -> None:
-    """A running collector continues with the last valid file; after a restart it rejects the robot."""
     robots = enrolled_robots(tmp_path, "arm1", "arm2")
     before = robots.all()
     file = tmp_path / "robots" / "arm1.json"
@@ -365,7 +353,6 @@ def test_a_damaged_file_affects_no_other_robot(word: str, damaged: str, tmp_path
 
 
 def test_a_damaged_file_delays_no_revocation(data: Path) -> None:
-    """A robot can be removed while the file of another one is unreadable, and `robot list` shows all others."""
     enrolled_robots(data, "arm1", "arm2")
     (data / "robots" / "arm1.json").write_text("{")
     _run(data, "robot", "remove", "arm2")
@@ -391,7 +378,6 @@ def test_a_certificate_without_a_time_is_refused(until: bytes, tmp_path: Path) -
 
 
 def test_a_stored_certificate_without_a_time_hides_no_robot(tmp_path: Path) -> None:
-    """If an earlier version enrolled a robot with such a certificate, health has all others, and names its file."""
     before = enrolled_robots(tmp_path, "arm1", "arm2").all()
     bad = msgspec.structs.replace(before["arm1"], certificate=own_certificate_until(_NO_TIMES[0]).decode())
     write_whole(tmp_path / "robots" / "arm1.json", msgspec.json.encode(bad), 0o600)
@@ -402,7 +388,6 @@ def test_a_stored_certificate_without_a_time_hides_no_robot(tmp_path: Path) -> N
 
 
 def test_whatever_certificate_is_accepted_can_be_shown(tmp_path: Path) -> None:
-    """A certificate with any one byte changed is refused, or TLS, health and the list can read it."""
     whole = ssl.PEM_cert_to_DER_cert(make_own_certificate("arm1", 1)[1].decode())
     key, _ = (file.read_bytes() for file in _files(tmp_path, "arm1"))
     robots, accepted = Robots(tmp_path / "robots"), 0

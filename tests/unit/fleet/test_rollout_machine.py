@@ -58,7 +58,6 @@ def all_at(now: float, in_force: str = NEW) -> dict[str, RobotSeen]:
 def test_the_invariants_hold_for_all_reports(
     steps: list[tuple[float, Mapping[str, tuple[RobotSeen, float]]]],
 ) -> None:
-    """Rings open singly, never early, only after healthy ones; a stop is final; a selection is old or new."""
     rollout, now = begun(), 0.0
     robots = {robot: RobotSeen(0.0, OLD) for robot in ROBOTS}
     for passed, news in steps:
@@ -89,7 +88,6 @@ def test_the_invariants_hold_for_all_reports(
 
 
 def test_healthy_robots_finish_a_rollout() -> None:
-    """If all robots take the bundle and stay healthy, every ring opens and the rollout ends."""
     rollout, now = begun(), 0.0
     while rollout.state == "running" and now < 10_000:
         robots = {robot: RobotSeen(now, selected(rollout, robot, None)) for robot in ROBOTS}
@@ -124,14 +122,12 @@ def test_a_bad_canary_stops(sick: RobotSeen, word: str) -> None:
 
 
 def test_more_denials_of_the_old_bundle_do_not_stop() -> None:
-    """A canary that still has the former bundle does not count against the new one."""
     rollout = advanced(begun(), all_at(0, OLD), 0)
     robots = all_at(60, OLD) | {"r0": RobotSeen(60, OLD, denials=90, failing=3)}
     assert advanced(rollout, robots, 60).state == "running"
 
 
 def test_robots_that_were_off_do_not_count() -> None:
-    """A robot that was silent before its ring opened neither stops nor holds up the rollout."""
     robots = all_at(0) | {"r1": RobotSeen(-5000, OLD)}
     rollout = advanced(begun(), robots, 0)
     for now in (10.0, 70.0, 130.0):
@@ -142,7 +138,6 @@ def test_robots_that_were_off_do_not_count() -> None:
 
 
 def test_a_ring_that_is_not_taken_stops_after_its_time() -> None:
-    """If robots neither take nor refuse the bundle, the rollout stops after `ring_seconds`."""
     rollout = advanced(begun(), all_at(0, OLD), 0)
     assert advanced(rollout, all_at(900, OLD), 900).state == "running"
     late = advanced(rollout, all_at(1001, OLD), 1001)
@@ -151,7 +146,6 @@ def test_a_ring_that_is_not_taken_stops_after_its_time() -> None:
 
 
 def test_a_canary_ring_without_robots_stops_after_its_time() -> None:
-    """Without a reporting canary no ring opens; the rollout waits `ring_seconds` in which the collector was there."""
     robots = {"r9": RobotSeen(0, OLD)}
     rollout = advanced(begun(), robots, 0)
     assert rollout.ring == -1
@@ -183,7 +177,6 @@ def test_rings_fit_the_enrolled_robots(rings: list[Ring], fault: str) -> None:
 
 
 def test_a_removed_robot_counts_no_more() -> None:
-    """A canary that has left the group neither stops the rollout nor is waited for; without any canary it stops."""
     rollout = advanced(begun(), all_at(0), 0)
     robots = all_at(10)
     del robots["r1"]
@@ -195,7 +188,6 @@ def test_a_removed_robot_counts_no_more() -> None:
 
 
 def test_a_time_without_a_collector_counts_for_no_gate() -> None:
-    """After `resumed`, neither the time of health nor the time to take the ring includes the collector's absence."""
     rollout = advanced(advanced(begun(), all_at(0), 0), all_at(1), 1)
     assert rollout.healthy == 1
     later = resumed(rollout, 5000)
@@ -217,7 +209,6 @@ def test_a_time_without_a_collector_counts_for_no_gate() -> None:
     ],
 )
 def test_the_condition_is_the_worst_that_applies(seen: RobotSeen, kind: str, why: str) -> None:
-    """The condition of a robot says what is wrong with it first, and why."""
     rollout = advanced(begun(), all_at(0), 0)
     found = conditions(rollout, all_at(1000) | {"r0": seen}, 1000)["r0"]
     assert found.kind == kind
@@ -225,6 +216,5 @@ def test_the_condition_is_the_worst_that_applies(seen: RobotSeen, kind: str, why
 
 
 def test_without_a_rollout_a_robot_is_not_behind() -> None:
-    """In a group without a rollout a robot has no bundle, or still the one of its former group."""
     found = conditions(None, {"r0": RobotSeen(1000), "r1": RobotSeen(1000, OLD), "r2": RobotSeen(5)}, 1000)
     assert [one.kind for one in found.values()] == ["no bundle", "in force", "silent"]

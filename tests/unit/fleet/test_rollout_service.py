@@ -113,7 +113,6 @@ def _run(monkeypatch: pytest.MonkeyPatch, calls: _Calls, work: Coroutine[Any, An
 def test_a_tick_refuses_no_order(
     number: int | None, store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If ticks change the reason or the health several times while an operator stops the rollout, it stops."""
     changes = iter(({"why": "ring canary is open"}, {"healthy": None}, {"healthy": 1001.0}))
     store.meddle = lambda: store.change(**next(changes, {}))
     service = _service(store, tmp_path, [1010.0])
@@ -126,7 +125,6 @@ def test_a_tick_refuses_no_order(
 def test_another_operator_refuses_an_order(
     store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If another operator's order comes first, the later one is refused, and changes nothing."""
     acts = [*_ROLLOUT.acts, OperatorAct(1005.0, "olga", "stop")]
     store.meddle = lambda: store.change(state="stopped", acts=acts)
     service = _service(store, tmp_path, [1010.0])
@@ -138,7 +136,6 @@ def test_another_operator_refuses_an_order(
 def test_a_rollout_that_always_changes_ends_an_order(
     store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An order that never succeeds is refused after several attempts."""
     numbers = iter(range(1000))
     store.meddle = lambda: store.change(healthy=float(next(numbers)))
     service = _service(store, tmp_path, [1010.0])
@@ -150,14 +147,12 @@ def test_a_rollout_that_always_changes_ends_an_order(
 def test_an_older_tick_undoes_no_order(
     store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If a tick has read the rollout before a stop, robots still get the selection of the stopped rollout."""
     service, calls = _service(store, tmp_path, [1010.0]), _Calls("latest")
     _run(monkeypatch, calls, calls.during(service.tick(), service.stop(_GROUP, "otto")))
     assert service.rollouts[_GROUP].rollout.state == "stopped"
 
 
 def test_a_tick_forgets_no_report(store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A report that arrives after a tick has read the reports is not replaced by an older one."""
     store.seen["r-0"] = StoredReport(_GROUP, RobotSeen(1000.0))
     service, calls = _service(store, tmp_path, [1010.0]), _Calls("reports")
     _run(monkeypatch, calls, calls.during(service.tick(), service.report("r-0", _GROUP, _TAKEN)))
@@ -167,7 +162,6 @@ def test_a_tick_forgets_no_report(store: _Memory, tmp_path: Path, monkeypatch: p
 def test_an_absence_is_health_for_no_tick(
     store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """While the first tick after an absence resumes the rollout, a second one opens no ring."""
     now = [1000.0]
     service, calls = _service(store, tmp_path, now), _Calls("replace", answered=False)
 
@@ -183,7 +177,6 @@ def test_an_absence_is_health_for_no_tick(
 def test_a_rollout_with_an_unknown_robot_does_not_start(
     store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A ring with a wrong name is refused before anything changes."""
     service, path = _service(store, tmp_path, [1010.0]), "site-a/arms/3.tar"
     terms = Terms(0, [Ring("canary", ["r-0", "r-zero"]), Ring("rest", [], 100)])
     service.publication = cast(PublishedBundles, SimpleNamespace(bundles={path: terms}))

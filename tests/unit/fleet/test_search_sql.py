@@ -40,7 +40,6 @@ def _filters() -> Iterator[FleetFilter]:
 
 @pytest.mark.parametrize("wanted", list(_filters()))
 def test_input_is_never_part_of_a_statement(wanted: FleetFilter) -> None:
-    """Every value is a parameter, and there are as many parameters as places."""
     statement = search_statement(wanted, SearchCursor(1, _HOSTILE, _HOSTILE), 10, [_HOSTILE])
     assert "DROP" not in statement.text
     assert statement.text.count("%s") == len(statement.values)
@@ -48,7 +47,6 @@ def test_input_is_never_part_of_a_statement(wanted: FleetFilter) -> None:
 
 @pytest.mark.parametrize("text", ["", "x", "!!!!", "W10=", "WzEsMiwzXQ==", "é"])
 def test_a_forged_cursor_is_refused(text: str) -> None:
-    """Only a cursor that a search returned is accepted."""
     with pytest.raises(FilterError):
         parse_cursor(text)
     assert parse_cursor(SearchCursor(5, "arm", "x").text()) == SearchCursor(5, "arm", "x")

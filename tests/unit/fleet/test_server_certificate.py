@@ -19,7 +19,6 @@ def config_in(folder: Path, listen: str = "0.0.0.0:8444") -> FleetConfig:
     ("address", "url"), [("10.0.0.9", "https://10.0.0.9:8444"), ("fd00::9", "https://[fd00::9]:8444")]
 )
 def test_a_certificate_is_made_once(address: str, url: str, tmp_path: Path) -> None:
-    """The first call makes a certificate that names the address and is its own authority; later calls keep it."""
     config = config_in(tmp_path)
     assert make_certificate(config, address)
     made = config.certificate.read_text()
@@ -33,14 +32,12 @@ def test_a_certificate_is_made_once(address: str, url: str, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("address", [None, "collector.example", ""])
 def test_a_certificate_needs_an_address(address: str | None, tmp_path: Path) -> None:
-    """Without an IP address nothing is made, and the error names the option."""
     with pytest.raises(ServerCertificateError, match="give --address"):
         make_certificate(config_in(tmp_path), address)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_certificate_of_an_authority_ends_with_it(tmp_path: Path) -> None:
-    """Robots get the last certificate of the file; without the authority's, the error says to append it."""
     own = make_certificates(tmp_path / "own", "10.0.0.9")
     config = config_in(tmp_path)
     config.certificate.write_bytes(own.certificate.read_bytes())

@@ -28,7 +28,6 @@ def _shown(tls: ServerTls, client: Certificates, server: Certificates) -> bytes 
 
 
 def test_certificates_that_a_robot_signed_count_for_no_robot(tmp_path: Path) -> None:
-    """Connections count for a robot with its own certificate only: with others it could open any number."""
     server = make_certificates(tmp_path / "server")
     robot = make_certificates(tmp_path / "robot", authority="robot")
     robots = Robots(tmp_path / "robots")

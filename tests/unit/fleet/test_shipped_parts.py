@@ -13,7 +13,6 @@ SHIPPED = set(re.findall(r'"appliance/(\w+)"', (ROOT / "fleet/pyproject.toml").r
 
 @pytest.mark.nightly
 def test_the_collector_imports_only_what_is_shipped_with_it() -> None:
-    """`rosrv-fleet` loads only the shipped modules of the appliance, and none of the other products."""
     program = "import rosrv_fleet.cli, sys; print(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT / "fleet"
@@ -25,6 +24,5 @@ def test_the_collector_imports_only_what_is_shipped_with_it() -> None:
 
 
 def test_the_image_has_the_folders_of_the_wheel() -> None:
-    """The Dockerfile copies the same folders."""
     copied = set(re.findall(r"^COPY appliance/(\w+) ", (ROOT / "fleet/Dockerfile").read_text(), re.MULTILINE))
     assert copied == SHIPPED

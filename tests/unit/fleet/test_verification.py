@@ -77,7 +77,6 @@ def _proof(store: SegmentStore, key: Ed25519PrivateKey) -> LogProof:
 
 @pytest.mark.parametrize("listed", [True, False])
 def test_retention_during_a_proof_loses_nothing(listed: bool, store: _Store, key: Ed25519PrivateKey) -> None:
-    """Segments that retention removes while they are verified are neither damaged nor missing."""
     (log,) = store.logs("arm1")
     whole, number = _proof(store, key), len(_places(store))
     assert (whole.findings, whole.segments) == ([], number)
@@ -90,7 +89,6 @@ def test_retention_during_a_proof_loses_nothing(listed: bool, store: _Store, key
 
 @pytest.mark.parametrize("listed", [True, False])
 def test_a_removal_without_a_note_is_a_loss(listed: bool, store: _Store, key: Ed25519PrivateKey) -> None:
-    """A segment that something else removes while the log is verified is missing, also after retention."""
     (log,) = store.logs("arm1")
     places = _places(store)
     os.utime(store.path(places[1]))

@@ -22,7 +22,6 @@ def _hold(file: Path) -> None:
 
 
 def test_a_stopped_collector_has_no_file_open(tmp_path: Path) -> None:
-    """When the workers are closed, none of them is still at work: the data folder can be moved or unmounted."""
     workers, file = Workers(2), tmp_path / "segment"
     file.touch()
     for _one in range(2):

@@ -41,7 +41,6 @@ def member(name: str, kind: bytes = tarfile.REGTYPE, **fields: object) -> tarfil
 
 @given(st.dictionaries(names, texts, max_size=4))
 def test_contents_survive_an_archive(more: dict[str, bytes]) -> None:
-    """Unpacking an archive gives the packed contents, and equal contents have equal archives."""
     files = FILES | more
     if "monitors/a.rv.sig" in files and "monitors/a.rv" not in files:
         del files["monitors/a.rv.sig"]
@@ -80,7 +79,6 @@ def test_other_archives_are_rejected(archive: bytes) -> None:
 
 @given(st.binary(max_size=3000))
 def test_any_bytes_are_an_archive_or_rejected(noise: bytes) -> None:
-    """No bytes raise anything but `BundleArchiveError`, also in place of a part of a real archive."""
     whole = pack(FILES)
     for data in (noise, whole[: len(noise)] + noise, noise[:512] + whole[512:], whole[:512] + noise):
         try:
@@ -108,7 +106,6 @@ def test_wrong_contents_are_rejected(files: dict[str, bytes], word: str) -> None
 
 @given(st.text(min_size=1, max_size=20), st.integers(1, 10**6))
 def test_each_robot_is_in_one_ring(robot: str, version: int) -> None:
-    """Every robot has exactly one ring, and a named robot has the ring that names it."""
     terms = Terms(1000, [Ring("canary", ["arm-1"]), Ring("some", [], 30, 60), Ring("rest", [], 100, 600)])
     path = BundlePath("site-a", "arms", version)
     assert terms.ring_of(robot, path) in (0, 1, 2)
@@ -139,6 +136,5 @@ def test_wrong_rings_are_rejected(rings: list[Ring]) -> None:
 
 @pytest.mark.parametrize("custom", [None, {}, {"rosrv": 1}, {"rosrv": {"signed": "x", "rings": []}}, [], "x"])
 def test_a_target_without_terms_is_rejected(custom: object) -> None:
-    """A signed target without valid terms is rejected."""
     with pytest.raises(TermsError):
         terms_of(custom)

@@ -63,7 +63,6 @@ def written(path: Path, number: int) -> bytes:
 
 
 def test_a_segment_is_proven_with_the_key_alone(segments: list[bytes], public: bytes) -> None:
-    """Consecutive segments are valid, and each begins with the checkpoint that ends the one before."""
     read = [SegmentReader(io.BytesIO(one), (public,), _LARGEST) for one in segments]
     found = [[columns.sequence for columns in one] for one in read]
     summaries = [one.summary() for one in read]
@@ -74,14 +73,12 @@ def test_a_segment_is_proven_with_the_key_alone(segments: list[bytes], public: b
 
 
 def test_its_records_are_the_lines_of_an_export(segments: list[bytes], path: Path) -> None:
-    """After the headers, segments contain what `rosrv audit export` writes without a filter."""
     lines = [line for one in segments for line in one.decode("ascii").splitlines()[1:]]
     exported = [evidence_line(entry, chain) for entry, chain in evidence(path, Filter())]
     assert lines == exported[: len(lines)]
 
 
 def test_an_unsigned_checkpoint_has_no_segment_yet(segments: list[bytes], path: Path) -> None:
-    """A segment needs both signatures; of the checkpoint after it there is nothing."""
     assert (len(segments), signed_checkpoints(path)[-1].number) == (3, 4)
     assert [write_segment(path, number, lambda _line: None) for number in (5, 6)] == [None, None]
 
@@ -127,21 +124,18 @@ def _without_begin(line: bytes) -> bytes:
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", CHANGES)
 def test_a_changed_segment_is_refused(name: str, segments: list[bytes], public: bytes) -> None:
-    """Each change of a segment is found, with its place."""
     change, why = CHANGES[name]
     with pytest.raises(SegmentError, match=why):
         SegmentReader(io.BytesIO(change(segments[1])), (public,), _LARGEST).summary()
 
 
 def test_a_segment_of_another_key_is_refused(segments: list[bytes]) -> None:
-    """A key that did not sign the checkpoints proves nothing."""
     other = Ed25519PrivateKey.generate().public_key().public_bytes_raw()
     with pytest.raises(SegmentError, match="is signed with"):
         SegmentReader(io.BytesIO(segments[0]), (other,), _LARGEST)
 
 
 def test_a_forged_checkpoint_is_refused(segments: list[bytes], public: bytes) -> None:
-    """A checkpoint that names the expected key without its signature is refused."""
     lines = segments[1].splitlines(keepends=True)
     header = json.loads(lines[0])
     end = SignedCheckpoint(**header["end"])
@@ -155,7 +149,6 @@ def test_a_forged_checkpoint_is_refused(segments: list[bytes], public: bytes) ->
 
 
 def test_a_large_segment_is_refused_early(segments: list[bytes], public: bytes) -> None:
-    """No more than the limit is read."""
     file = io.BytesIO(segments[1] + b"x" * _LARGEST)
     with pytest.raises(SegmentError, match="larger than the limit"):
         SegmentReader(file, (public,), len(segments[1]) - 1).summary()
@@ -163,7 +156,6 @@ def test_a_large_segment_is_refused_early(segments: list[bytes], public: bytes) 
 
 
 def test_a_segment_after_removed_records_is_proven(segments: list[bytes], path: Path, public: bytes) -> None:
-    """If retention removed the checkpoint before, the segment names the last removed record, and is proven."""
     second, third = (SegmentReader(io.BytesIO(one), (public,), _LARGEST) for one in segments[1:])
     second.summary()
     removed = second.header.end
@@ -185,7 +177,6 @@ def test_a_segment_after_removed_records_is_proven(segments: list[bytes], path: 
 def test_retention_leaves_a_segment_after_the_removed_records(
     make_log: MakeLog, path: Path, notary: Notary, public: bytes
 ) -> None:
-    """After a removal, the first remaining checkpoint has a segment, which begins after the removed records."""
     make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     log.record(decision(log))

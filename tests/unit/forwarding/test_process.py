@@ -72,7 +72,6 @@ def begin(
 async def test_records_missed_before_the_first_link_are_reported(
     controls: list[Control], reports: ProgressReports
 ) -> None:
-    """A forwarder that missed records before the first control reports them to it."""
     reports.tell(missed(3))
     control = begin(controls, reports, missed(7))
     assert control.gaps == [7]
@@ -86,7 +85,6 @@ async def test_records_missed_before_the_first_link_are_reported(
 async def test_records_missed_between_two_controls_are_reported(
     controls: list[Control], reports: ProgressReports
 ) -> None:
-    """The second control records only the gaps that the first did not record."""
     begin(controls, reports, missed(0))
     reports.tell(missed(5))
     gone = controls.pop()

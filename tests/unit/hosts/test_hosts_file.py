@@ -8,7 +8,6 @@ from appliance.hosts.hosts_file import DeclaredHost, DeclaredHosts, DeclaredHost
 
 
 def test_hosts_with_and_without_an_address(tmp_path: Path) -> None:
-    """Each host is there by its name, with the address kept for it."""
     path = tmp_path / "hosts.yaml"
     path.write_text("hosts:\n  - name: ocu-1\n    address: 10.113.11.20\n  - name: laptop\n")
     assert read_declared(path) == {
@@ -18,7 +17,6 @@ def test_hosts_with_and_without_an_address(tmp_path: Path) -> None:
 
 
 def test_a_missing_or_empty_file_declares_no_host(tmp_path: Path) -> None:
-    """The baseline may be missing."""
     assert read_declared(tmp_path / "none.yaml") == {}
     (tmp_path / "empty.yaml").write_text("# nobody yet\n")
     assert read_declared(tmp_path / "empty.yaml") == {}
@@ -64,7 +62,6 @@ def test_mistakes_are_named(tmp_path: Path, text: str | bytes, said: str) -> Non
 
 
 def test_groups_and_unwanted_tunnels_are_read(tmp_path: Path) -> None:
-    """Hosts are wanted by default; groups are in order, each once."""
     path = tmp_path / "hosts.yaml"
     path.write_text("hosts:\n  - {name: a, groups: [x, y, x], tunnel: false}\n  - name: b\n")
     declared = DeclaredHosts(path)
@@ -73,7 +70,6 @@ def test_groups_and_unwanted_tunnels_are_read(tmp_path: Path) -> None:
 
 
 def test_an_invalid_file_changes_nothing(tmp_path: Path) -> None:
-    """The last valid state stays, and the reason is shown until the file is valid."""
     path = tmp_path / "hosts.yaml"
     path.write_text("hosts:\n  - name: a\n")
     declared = DeclaredHosts(path)
@@ -88,7 +84,6 @@ def test_an_invalid_file_changes_nothing(tmp_path: Path) -> None:
 
 
 def test_an_invalid_file_changes_nothing_at_a_start(tmp_path: Path) -> None:
-    """A tunnel that the last valid file closed stays closed over a restart; a file that is gone declares no host."""
     path = tmp_path / "hosts.yaml"
     path.write_text("hosts:\n  - {name: a, tunnel: false}\n")
     kept = DeclaredHosts(path).text
@@ -103,13 +98,11 @@ def test_an_invalid_file_changes_nothing_at_a_start(tmp_path: Path) -> None:
 
 
 def test_the_shipped_file_is_read() -> None:
-    """ipsec/hosts.yaml declares no host, and its example declares one."""
     path = Path(__file__).parents[3] / "ipsec" / "hosts.yaml"
     assert read_declared(path) == {}
 
 
 def test_the_example_in_the_file_is_right(tmp_path: Path) -> None:
-    """The example in the comments is valid as it is."""
     shipped = (Path(__file__).parents[3] / "ipsec" / "hosts.yaml").read_text()
     example = [line[2:] for line in shipped.splitlines() if line.startswith(("# hosts:", "#   "))]
     path = tmp_path / "hosts.yaml"

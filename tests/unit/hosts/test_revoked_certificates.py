@@ -58,7 +58,6 @@ def test_a_certificate_is_on_the_list_until_it_has_expired(store: StateStore) ->
 
 
 def test_a_clock_that_was_ahead_unrevokes_no_certificate(tmp_path: Path) -> None:
-    """After a wrong year was set and corrected, revoked certificates are still listed, also after a restart."""
     now = time.time()
     store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     RevokedCertificates(store.hosts).add("a", "a1", now + DAY)
@@ -74,7 +73,6 @@ def test_a_clock_that_was_ahead_unrevokes_no_certificate(tmp_path: Path) -> None
 
 
 def test_revoked_certificates_are_kept_over_restarts(tmp_path: Path) -> None:
-    """Long expired ones are dropped; one without a stored expiry is kept as long as it could be valid."""
     now = time.time()
     first = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     revoked = RevokedCertificates(first.hosts)
@@ -96,7 +94,6 @@ def test_revoked_certificates_are_kept_over_restarts(tmp_path: Path) -> None:
 
 
 def test_a_list_of_thousands_is_not_too_long_for_charon(store: StateStore, tmp_path: Path) -> None:
-    """Certificates of names that are not enrolled are dropped first; all that charon could accept stay."""
     revoked = RevokedCertificates(store.hosts)
     expires = time.time() + 90 * DAY
     for serial in serials(2_000):
@@ -111,7 +108,6 @@ def test_a_list_of_thousands_is_not_too_long_for_charon(store: StateStore, tmp_p
 
 
 def test_a_full_list_says_when_it_has_space_again(store: StateStore, tmp_path: Path) -> None:
-    """Certificates are replaced until the list is full; revoked certificates beyond that are counted as missing."""
     revoked = RevokedCertificates(store.hosts)
     expires = time.time() + 90 * DAY
     count = 0

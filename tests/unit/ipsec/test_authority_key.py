@@ -14,7 +14,6 @@ from appliance.ipsec.requests import make_key, signing_request
 
 
 def test_an_ed25519_authority_makes_certificates_and_lists(tmp_path: Path) -> None:
-    """The authority's key can be Ed25519; the kinds of the hosts' keys do not change."""
     authority = CertificateAuthority(tmp_path, "ed25519")
     own = x509.load_pem_x509_certificate(authority.certificate)
     assert isinstance(own.public_key(), ed25519.Ed25519PublicKey)
@@ -28,14 +27,12 @@ def test_an_ed25519_authority_makes_certificates_and_lists(tmp_path: Path) -> No
 
 
 def test_a_kind_that_differs_from_the_existing_key_is_an_error(tmp_path: Path) -> None:
-    """The setting could have no effect; the error says which value is valid."""
     CertificateAuthority(tmp_path)
     with pytest.raises(SignerKeyError, match=r"kind ecdsa, but ipsec\.ca is ed25519: set it to ecdsa"):
         CertificateAuthority(tmp_path, "ed25519")
 
 
 def test_the_key_is_encrypted_by_its_passphrase(tmp_path: Path) -> None:
-    """The right one opens it; a wrong or missing one is an error with advice, and no new key is made."""
     made = CertificateAuthority(tmp_path, passphrase=b"correct horse")
     assert b"ENCRYPTED" in (tmp_path / KEY_FILE).read_bytes()
     assert CertificateAuthority(tmp_path, passphrase=b"correct horse").certificate == made.certificate
@@ -48,7 +45,6 @@ def test_the_key_is_encrypted_by_its_passphrase(tmp_path: Path) -> None:
 
 
 def test_a_clear_key_is_encrypted_once_there_is_a_passphrase(tmp_path: Path) -> None:
-    """The authority stays the same; from then on the file needs the passphrase."""
     made = CertificateAuthority(tmp_path)
     assert CertificateAuthority(tmp_path, passphrase=b"late").certificate == made.certificate
     assert b"ENCRYPTED" in (tmp_path / KEY_FILE).read_bytes()
@@ -62,7 +58,6 @@ def test_a_clear_key_is_encrypted_once_there_is_a_passphrase(tmp_path: Path) -> 
     ("text", "error"), [(b"", "empty"), (b"\nsecond\n", "empty"), (b"x" * 1100, "longer")]
 )
 def test_a_file_without_a_passphrase_is_an_error(tmp_path: Path, text: bytes, error: str) -> None:
-    """The key is never encrypted with an empty passphrase."""
     path = tmp_path / "passphrase"
     path.write_bytes(text)
     with pytest.raises(SignerKeyError, match=error):
@@ -70,7 +65,6 @@ def test_a_file_without_a_passphrase_is_an_error(tmp_path: Path, text: bytes, er
 
 
 def test_the_first_line_is_the_passphrase(tmp_path: Path) -> None:
-    """The line may end as in any editor."""
     path = tmp_path / "passphrase"
     path.write_bytes(b"one two\r\nthree\n")
     assert read_passphrase(os.open(path, os.O_RDONLY)) == b"one two"

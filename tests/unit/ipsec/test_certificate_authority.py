@@ -42,7 +42,6 @@ def request_of(
 
 @pytest.mark.parametrize("kind", ["p384", "ed25519"])
 def test_a_certificate_takes_only_the_key_from_the_request(tmp_path: Path, kind: str) -> None:
-    """The authority sets name, uses and alternative names; a request to be an authority is ignored."""
     authority = CertificateAuthority(tmp_path)
     key = ec.generate_private_key(ec.SECP384R1()) if kind == "p384" else ed25519.Ed25519PrivateKey.generate()
     issued = authority.issue(request_of(key), "ocu-1", 90)
@@ -62,7 +61,6 @@ def test_a_certificate_takes_only_the_key_from_the_request(tmp_path: Path, kind:
 
 
 def test_a_weak_key_is_refused(tmp_path: Path) -> None:
-    """RSA and the shorter curve get no certificate; the error lists the accepted keys."""
     authority = CertificateAuthority(tmp_path)
     for key in (rsa.generate_private_key(65537, 2048), ec.generate_private_key(ec.SECP256R1())):
         with pytest.raises(RequestRefusedError, match="P-384 nor Ed25519"):
@@ -70,7 +68,6 @@ def test_a_weak_key_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_request_without_its_key_is_refused(tmp_path: Path) -> None:
-    """A certificate needs proof of the private key: a changed request is not signed."""
     key = ec.generate_private_key(ec.SECP384R1())
     der = x509.load_pem_x509_csr(request_of(key, "aaaaaaa")).public_bytes(Encoding.DER)
     changed = x509.load_der_x509_csr(der.replace(b"aaaaaaa", b"bbbbbbb")).public_bytes(Encoding.PEM)
@@ -83,7 +80,6 @@ def test_a_request_without_its_key_is_refused(tmp_path: Path) -> None:
     [b"", b"\0" * 100, b"-----BEGIN CERTIFICATE REQUEST-----\nMA==\n-----END CERTIFICATE REQUEST-----\n"],
 )
 def test_an_invalid_request_is_refused(tmp_path: Path, request_text: bytes) -> None:
-    """Rubbish is refused with a reason."""
     with pytest.raises(RequestRefusedError, match="not a signing request"):
         CertificateAuthority(tmp_path).issue(request_text, "ocu-1", 90)
 
@@ -97,7 +93,6 @@ def with_another_version(request: bytes) -> bytes:
 
 
 def test_a_request_of_another_version_is_refused(tmp_path: Path) -> None:
-    """The error says that this is not a signing request."""
     authority = CertificateAuthority(tmp_path)
     request = with_another_version(request_of(ec.generate_private_key(ec.SECP384R1())))
     with pytest.raises(RequestRefusedError, match="not a signing request"):
@@ -119,7 +114,6 @@ def test_limits_of_a_request(tmp_path: Path) -> None:
 
 
 def test_the_list_of_revoked_certificates_is_signed_and_complete(tmp_path: Path) -> None:
-    """It has exactly the serial numbers given, and is signed by the authority."""
     authority = CertificateAuthority(tmp_path)
     root = x509.load_pem_x509_certificate(authority.certificate)
     first = x509.load_pem_x509_crl(authority.revocations([]))
@@ -154,7 +148,6 @@ def test_the_number_of_the_list_grows_whatever_the_clock_does(tmp_path: Path) ->
 
 
 def test_the_authority_is_made_once(tmp_path: Path) -> None:
-    """A second start has the same certificate; the key is for its owner only."""
     first = CertificateAuthority(tmp_path).certificate
     assert CertificateAuthority(tmp_path).certificate == first
     assert stat.S_IMODE((tmp_path / KEY_FILE).stat().st_mode) == 0o600
@@ -163,7 +156,6 @@ def test_the_authority_is_made_once(tmp_path: Path) -> None:
 
 
 def test_a_damaged_authority_is_an_error_and_never_replaced(tmp_path: Path) -> None:
-    """A missing, readable, damaged or foreign half is named, and the files are left as they are."""
     CertificateAuthority(tmp_path)
     other = tmp_path / "other"
     other.mkdir()

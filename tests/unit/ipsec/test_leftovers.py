@@ -39,7 +39,6 @@ src 0.0.0.0/0 dst 0.0.0.0/0\x20
 
 
 def test_only_states_of_charon_are_found() -> None:
-    """ESP in UDP on port 4500, at either end, is charon's; other states belong to other programs."""
     assert state_orders(STATES) == [
         "xfrm state delete src 10.88.0.2 dst 10.88.0.20 proto esp spi 0xcc1b8f7c",
         "xfrm state delete src 10.88.0.20 dst 10.88.0.2 proto esp spi 0x0814b96a",
@@ -48,7 +47,6 @@ def test_only_states_of_charon_are_found() -> None:
 
 
 def test_policies_of_the_tunnels_and_no_others() -> None:
-    """The policies from and to the appliance's own address, in every direction."""
     assert policy_orders(POLICIES, "10.113.11.1") == [
         "xfrm policy delete src 10.113.11.1/32 dst 10.113.11.2/32 dir out",
         "xfrm policy delete src 10.113.11.2/32 dst 10.113.11.1/32 dir fwd",
@@ -58,7 +56,6 @@ def test_policies_of_the_tunnels_and_no_others() -> None:
 
 
 def test_a_remaining_state_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The error names the state that the kernel keeps, and charon is not started beside it."""
     monkeypatch.setattr(leftovers, "_ip", lambda *words, text="": STATES if "state" in words else "")
     with pytest.raises(LeftoversError, match="0xcc1b8f7c"):
         clear_leftovers("10.113.11.1")

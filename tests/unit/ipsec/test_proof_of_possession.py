@@ -20,7 +20,6 @@ def sign(key: bytes, request: bytes) -> bytes:
 
 
 def test_the_present_key_asks_for_the_next(tmp_path: Path) -> None:
-    """Signed by the key of the current certificate, a request for another key is granted."""
     authority, old, new = CertificateAuthority(tmp_path), make_key(), make_key()
     present = authority.issue(signing_request(old, "a"), "a", 1)
     request = signing_request(new, "a")
@@ -29,7 +28,6 @@ def test_the_present_key_asks_for_the_next(tmp_path: Path) -> None:
 
 
 def test_any_other_proof_is_refused(tmp_path: Path) -> None:
-    """Another key, request, name or authority, a missing proof, and an expired certificate are refused."""
     (tmp_path / "mine").mkdir()
     (tmp_path / "foreign").mkdir()
     authority, foreign = CertificateAuthority(tmp_path / "mine"), CertificateAuthority(tmp_path / "foreign")

@@ -47,7 +47,6 @@ class Desk:
 
 
 def test_records_expire_by_the_signers_clock(tmp_path: Path) -> None:
-    """The age of a record counts from its signature, whatever time control wrote into the checkpoint."""
     desk = Desk(tmp_path, RetentionLimits(days=5))
     text = desk.approve(5)
     assert text.startswith("rosrv audit removal 1\n")
@@ -59,14 +58,12 @@ def test_records_expire_by_the_signers_clock(tmp_path: Path) -> None:
 
 
 def test_nothing_goes_that_is_kept_for_ever(tmp_path: Path) -> None:
-    """Without retention in the settings nothing is removed, however old control says it is."""
     desk = Desk(tmp_path, RetentionLimits())
     with pytest.raises(RemovalRefusedError, match="kept forever"):
         desk.approve(1)
 
 
 def test_a_removal_by_size_leaves_enough_records(tmp_path: Path) -> None:
-    """By size only so much goes that what is left can have that size."""
     desk = Desk(tmp_path, RetentionLimits(size=3 * _STEP * LARGEST_RECORD))
     assert desk.approve(7).endswith("bytes\n")
     with pytest.raises(RemovalRefusedError, match="too few came after"):
@@ -74,14 +71,12 @@ def test_a_removal_by_size_leaves_enough_records(tmp_path: Path) -> None:
 
 
 def test_an_unsigned_newest_checkpoint_is_ignored(tmp_path: Path) -> None:
-    """An invented newest checkpoint allows no removal."""
     desk = Desk(tmp_path, RetentionLimits(size=3 * _STEP * LARGEST_RECORD))
     with pytest.raises(RemovalRefusedError, match="too few came after"):
         desk.removals.approve(desk.texts[7], desk.text(removed=0, number=1000))
 
 
 def test_only_signed_checkpoints_allow_a_removal(tmp_path: Path) -> None:
-    """Any other text or checkpoint is refused."""
     desk = Desk(tmp_path, RetentionLimits(days=1))
     forged = desk.texts[2].replace(b"b" * 64, b"c" * 64)
     for text in (forged, desk.text(removed=0), desk.texts[0].replace(LOG.encode(), b"d" * 32)):
@@ -92,7 +87,6 @@ def test_only_signed_checkpoints_allow_a_removal(tmp_path: Path) -> None:
 
 
 def test_a_checkpoint_claims_only_approved_removals(tmp_path: Path) -> None:
-    """Control can neither claim a removal that was not approved, nor leave out the number of removed records."""
     desk = Desk(tmp_path, RetentionLimits(days=5))
     with pytest.raises(CheckpointRefusedError, match="only removal up to 0 was approved"):
         desk.sign(removed=_STEP)
@@ -106,7 +100,6 @@ def test_a_checkpoint_claims_only_approved_removals(tmp_path: Path) -> None:
 
 
 def test_a_log_older_than_signed_removals_goes_on(tmp_path: Path) -> None:
-    """The first checkpoint that states the removed records is accepted; later ones are compared with it."""
     desk = Desk.__new__(Desk)
     desk.now, desk.texts = 1000 * _DAY, []
     desk.signed = CheckpointMemory(tmp_path, clock=lambda: desk.now)

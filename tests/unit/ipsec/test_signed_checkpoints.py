@@ -25,7 +25,6 @@ def digest(text: bytes) -> str:
 
 
 def test_each_follows_the_one_before(tmp_path: Path) -> None:
-    """Checkpoints in order are signed, also after a restart of the signer."""
     previous = _NONE
     for number in range(1, 10):
         text = checkpoint(number, previous)
@@ -80,7 +79,6 @@ def test_logs_are_separate_and_bounded(tmp_path: Path) -> None:
 
 
 def test_cut_by_a_crash(tmp_path: Path) -> None:
-    """A hash that a crash cut short was not approved; the checkpoint can be approved again."""
     first = checkpoint(1)
     second = checkpoint(2, digest(first))
     signed = CheckpointMemory(tmp_path, wall_ns)

@@ -113,13 +113,11 @@ def signer(tmp_path: Path) -> Iterator[SignerProcess]:
 
 
 def test_answers_pings(signer: SignerProcess) -> None:
-    """The signer answers its supervisor."""
     signer.lifeline.send(Ping(7))
     assert hear(signer.lifeline) == Pong(7)
 
 
 def test_key_is_made_once_and_private(tmp_path: Path) -> None:
-    """The key is made at the first start, readable by the signer only, and the same at the next start."""
     keys = []
     for _life in range(2):
         running = SignerProcess(tmp_path)
@@ -153,7 +151,6 @@ def test_signs_nothing_else(signer: SignerProcess) -> None:
 
 
 def test_new_link_replaces_the_old(signer: SignerProcess) -> None:
-    """After control died the signer serves its next link."""
     signer.open_link().close()
     link = signer.open_link()
     link.send(SignatureWanted(1, _TEXT))
@@ -161,7 +158,6 @@ def test_new_link_replaces_the_old(signer: SignerProcess) -> None:
 
 
 def test_garbage_on_the_link_does_not_end_it(signer: SignerProcess) -> None:
-    """Invalid bytes do not end the signer; the next link is served."""
     link = signer.open_link()
     os.write(link.fileno(), b"\xff" * 5000)
     again = signer.open_link()
@@ -233,8 +229,6 @@ def test_log_and_signer_together(signer: SignerProcess, tmp_path: Path) -> None:
 async def test_an_unexpected_parser_error_is_a_refusal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The refusal has a reason, and other requests in the same read are answered."""
-
     class OddError(Exception):
         """An error of an unexpected kind."""
 

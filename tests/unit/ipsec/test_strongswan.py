@@ -20,7 +20,6 @@ STATED = TunnelsStated(1, "kernel", "10.113.11.1", b"A", b"C", b"R", [HOST])
 
 
 def test_a_host_gets_one_address_and_reaches_the_appliance_only() -> None:
-    """The pool has one address; the selectors are it and the appliance's own."""
     assert pool(HOST) == {"host-ocu-1": {"addrs": "10.113.11.2-10.113.11.2"}}
     made = connection(HOST, STATED, Proposals())["host-ocu-1"]
     assert made["pools"] == ["host-ocu-1"]
@@ -45,7 +44,6 @@ def test_nothing_weak_is_offered() -> None:
 
 
 def test_charon_loads_what_it_needs_and_runs_no_programs() -> None:
-    """ESP in user space comes before the kernel's where wanted; plugins for scripts and fetching are not loaded."""
     in_user_space, in_kernel = plugins("user space").split(), plugins("kernel").split()
     assert in_user_space.index("kernel-libipsec") < in_user_space.index("kernel-netlink")
     assert "kernel-libipsec" not in in_kernel
@@ -54,13 +52,11 @@ def test_charon_loads_what_it_needs_and_runs_no_programs() -> None:
 
 
 def test_an_unknown_connection_has_no_host() -> None:
-    """A handshake whose peer is still unknown has no host."""
     assert host_of("host-ocu-1") == "ocu-1"
     assert host_of("(unnamed)") is None
 
 
 def test_ml_kem_is_offered_where_charon_has_it() -> None:
-    """It is the first proposal, beside Curve25519; a charon without it gets the others, and nothing weaker."""
     assert proposals_of(["CURVE_25519", "ECP_384"]).key_exchange == ["x25519", "ecp384"]
     found = proposals_of(["ECP_384", "CURVE_25519", "ML_KEM_768", "MODP_1024"])
     assert found.key_exchange == ["x25519+mlkem768", "x25519", "ecp384"]
@@ -71,7 +67,6 @@ def test_ml_kem_is_offered_where_charon_has_it() -> None:
 
 
 def test_two_hundred_addresses_leave_handshakes_for_hosts() -> None:
-    """Their handshakes, however many, use at most half of those that may be in progress."""
     said = configuration(Path("/state/ipsec"), "kernel")
     limits = dict(line.strip().split(" = ") for line in said.splitlines() if " = " in line)
     each, whole = int(limits["block_threshold"]), int(limits["init_limit_half_open"])

@@ -216,7 +216,6 @@ async def test_no_byte_of_an_order_can_change(
 async def test_another_order_under_a_valid_proof_is_an_alarm(
     order: AdminRequest[Any], world: World, token: str, api: Api
 ) -> None:
-    """The proof is valid for the request but not for another order; only a compromised api sends such a pair."""
     signed = await api.signed(token, REMOVE)
     assert (await api.ask(order, reading_key(token), signed)).trouble == "forbidden"
     bare = msgspec.structs.replace(REMOVE, proof="")

@@ -208,7 +208,6 @@ def granted_by(decision: Decision) -> bool:
 @settings(max_examples=examples(300), suppress_health_check=[HealthCheck.too_slow], deadline=None)
 @given(POLICIES, st.sampled_from(list(ROLES.values())))
 def test_an_action_has_the_answer_of_its_call(rules: dict[str, dict[str, str] | None], host: str) -> None:
-    """Under any policy the gate, `explain`, the cases, `diff` and `grant` agree on each action of each host."""
     sections = {"Groups": ROLES, **{name: lines for name, lines in rules.items() if lines is not None}}
     text = "".join(
         f"[{name}]\n" + "".join(f"{key} = {who}\n" for key, who in lines.items())

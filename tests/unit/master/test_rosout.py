@@ -51,7 +51,6 @@ def test_a_line_is_a_log_message() -> None:
     ],
 )
 def test_reports_have_the_level_of_their_kind(kind: str, detail: dict[str, str], level: int | None) -> None:
-    """Output, verdicts and faults are sent to /rosout; interventions of a monitor only go to the audit log."""
     desk = Desk()
     desk.rosout.reported(msgspec.structs.replace(LINE, kind=kind, detail=detail))
     assert [one["level"] for one in desk.said()] == ([] if level is None else [level])

@@ -15,7 +15,6 @@ RANGE = PortRange(32768, 60999)
 
 
 def test_the_file_closes_the_range_after_all_that_stays_open() -> None:
-    """Loopback, appliances and services are accepted first; then TCP SYN and new UDP are closed, then output."""
     services = parse_services(["tcp/40022,udp/40123", "tcp/41000-41009", "tcp/40022"])
     text = protection(["192.168.1.20", "fd00::20"], RANGE, services)
     rules = [line.strip() for line in text.splitlines() if line.startswith("        ")]
@@ -46,14 +45,12 @@ def test_no_appliance_is_an_error() -> None:
     "text", ["ssh", "tcp", "tcp/", "tcp/0", "tcp/65536", "icmp/1", "tcp/9-3", "tcp/22;", ""]
 )
 def test_a_wrong_service_is_named(text: str) -> None:
-    """The error quotes the invalid service, and none of its text gets into a file."""
     with pytest.raises(ValueError, match=r"--open .* is not a service"):
         parse_services([f"tcp/22,{text}"])
 
 
 @pytest.mark.parametrize("text", ["", "x", "1-x", "0-5", "5-1", "1-70000", "-5"])
 def test_a_wrong_range_is_named(text: str) -> None:
-    """An invalid range of ports is an error."""
     with pytest.raises(ValueError, match="is not a range of ports"):
         parse_ports(text)
 
@@ -62,12 +59,10 @@ def test_a_wrong_range_is_named(text: str) -> None:
     "text", ["0.0.0.0", "::", "127.0.0.1", "::1", "224.0.0.1", "10.0.0.0/8", "10.0.0.1; x"]
 )
 def test_an_address_that_no_appliance_can_have_is_named(text: str) -> None:
-    """Wildcard, multicast and loopback addresses are rejected, and so is text that is nft syntax."""
     with pytest.raises(ValueError, match="appliance"):
         parse_address(text)
 
 
 def test_the_default_range_is_the_kernels() -> None:
-    """The range is read from the running kernel."""
     found = local_port_range()
     assert 1 <= found.first < found.last <= 65535

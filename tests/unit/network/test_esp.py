@@ -29,7 +29,6 @@ def answers(monkeypatch: pytest.MonkeyPatch, status: int) -> list[list[str]]:
 
 
 def test_a_kernel_that_takes_the_cipher_is_used_and_left_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The state that was added as a test is removed again."""
     given = answers(monkeypatch, 0)
     assert esp.choose_esp(Namespace.own()) == "kernel"
     assert [command[3] for command in given] == ["add", "delete"]
@@ -39,7 +38,6 @@ def test_a_kernel_that_takes_the_cipher_is_used_and_left_as_it_was(monkeypatch: 
 
 
 def test_the_device_is_lent_to_one_user(tmp_path: Path) -> None:
-    """A device that only root may open can then be opened by that user and no other; its mode allows no more."""
     need_root()
     place = Path(tempfile.mkdtemp(dir="/dev/shm"))
     try:
@@ -63,7 +61,6 @@ def test_the_device_is_lent_to_one_user(tmp_path: Path) -> None:
 
 
 def test_a_device_that_cannot_be_lent_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Before charon starts, the message says what is missing and what to do."""
     (tmp_path / "tun").touch(0o600)
 
     def refuse(*_arguments: object) -> None:
@@ -93,7 +90,6 @@ def _opens(uid: int, path: Path) -> bool:
 
 
 def test_without_it_esp_runs_in_user_space(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """ESP in user space needs the TUN device."""
     answers(monkeypatch, 2)
     (tmp_path / "tun").touch()
     monkeypatch.setattr(esp, "TUN", tmp_path / "tun")
@@ -101,7 +97,6 @@ def test_without_it_esp_runs_in_user_space(monkeypatch: pytest.MonkeyPatch, tmp_
 
 
 def test_with_neither_the_message_says_what_to_do(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """If neither works, the message has the kernel's error and how to give a container the device."""
     answers(monkeypatch, 2)
     monkeypatch.setattr(esp, "TUN", tmp_path / "none")
     with pytest.raises(NetworkError, match=r"AEAD algorithm not found.*--device"):

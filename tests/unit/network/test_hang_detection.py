@@ -40,14 +40,12 @@ def _short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_busy_program_is_waited_for_with_a_report(caplog: pytest.LogCaptureFixture) -> None:
-    """A program that computes for longer than the hang limit is waited for; it gets its input, whatever the size."""
     with caplog.at_level(logging.WARNING), program(BUSY) as busy:
         assert communicate(busy, "x" * 1_000_000, "a table of rules") == ("1000000", "")
     assert "a table of rules, which has run for" in caplog.text
 
 
 def test_a_hanging_program_is_ended_with_a_report() -> None:
-    """A program that waits for missing input uses no processor time: it is ended, and the error gives this reason."""
     with program("import signal; signal.pause()") as hanging:
         with pytest.raises(TimeoutError, match=r"nft made no progress for \d+ seconds: ended after"):
             communicate(hanging, "", "nft")
@@ -55,14 +53,12 @@ def test_a_hanging_program_is_ended_with_a_report() -> None:
 
 
 def test_an_endless_loop_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Even a busy program is ended after a time limit."""
     monkeypatch.setattr(patience, "LONGEST_SECONDS", 0.5)
     with program("while True: pass") as endless, pytest.raises(TimeoutError, match="nft did not end"):
         communicate(endless, "", "nft")
 
 
 def test_a_stopped_or_ended_process_makes_no_progress() -> None:
-    """A process that was stopped by a signal, or is gone, makes no progress."""
     with program("import sys; sys.stdin.read()") as stopped:
         os.kill(stopped.pid, signal.SIGSTOP)
         os.waitid(os.P_PID, stopped.pid, os.WSTOPPED | os.WNOWAIT)

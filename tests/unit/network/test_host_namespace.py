@@ -6,7 +6,6 @@ from appliance.network.namespaces import bridges, is_contained, lives_on_the_mac
 
 
 def test_only_the_machines_own_network_has_its_settings(tmp_path: Path) -> None:
-    """A network namespace that was made later lacks the settings of the whole machine."""
     settings = tmp_path / "sys/net/core"
     settings.mkdir(parents=True)
     (settings / "somaxconn").touch()
@@ -16,14 +15,12 @@ def test_only_the_machines_own_network_has_its_settings(tmp_path: Path) -> None:
 
 
 def test_a_container_is_known_by_its_engines_mark(tmp_path: Path) -> None:
-    """Docker and Podman each leave a file."""
     assert not is_contained(tmp_path)
     (tmp_path / ".dockerenv").touch()
     assert is_contained(tmp_path)
 
 
 def test_a_container_is_known_by_its_process_ids(tmp_path: Path) -> None:
-    """Containers of Kubernetes have no mark file, but their own process ids."""
     namespaces = tmp_path / "proc/self/ns"
     namespaces.mkdir(parents=True)
     (namespaces / "pid").symlink_to("pid:[4026531836]")
@@ -34,7 +31,6 @@ def test_a_container_is_known_by_its_process_ids(tmp_path: Path) -> None:
 
 
 def test_bridges_differ_from_other_interfaces(tmp_path: Path) -> None:
-    """The machine of a container engine has a bridge; a container has only other interfaces."""
     (tmp_path / "eth0").mkdir()
     assert bridges(tmp_path) == []
     (tmp_path / "docker0" / "bridge").mkdir(parents=True)

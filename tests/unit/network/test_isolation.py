@@ -15,7 +15,6 @@ SETTINGS = IsolationSettings(ports=(PortRange.one(11311), PortRange(20000, 20099
 
 
 def test_each_range_is_forwarded_on_both_families() -> None:
-    """Each range of ports has one DNAT rule for each family, for addresses of the host only."""
     rules = [rule for rule in isolation_rules(SETTINGS, ENDS, ()) if rule.verdict is PacketVerdict.DNAT]
     assert [(str(rule.tcp_ports), rule.to, rule.local_destination) for rule in rules] == [
         ("11311", "10.111.0.2", True),
@@ -26,7 +25,6 @@ def test_each_range_is_forwarded_on_both_families() -> None:
 
 
 def test_tunnels_are_forwarded_on_request() -> None:
-    """On request, UDP ports are forwarded besides the TCP ports, for both families, without TCP of that number."""
     udp = (PortRange.one(500), PortRange.one(4500))
     added = set(isolation_rules(SETTINGS, ENDS, (), udp=udp)) - set(isolation_rules(SETTINGS, ENDS, ()))
     assert {(str(rule.udp_ports), rule.tcp_ports, rule.to) for rule in added} == {
@@ -38,7 +36,6 @@ def test_tunnels_are_forwarded_on_request() -> None:
 
 
 def test_packets_to_the_appliance_keep_their_source() -> None:
-    """Packets on the link keep their source in both families, ahead of any other chain; only loopback is translated."""
     rules = [rule for rule in isolation_rules(SETTINGS, ENDS, ()) if rule.chain is Chain.KEPT_SOURCE]
     kept = [rule.family for rule in rules if rule.verdict is PacketVerdict.KEEP_SOURCE]
     assert kept == [4, 6]
@@ -49,14 +46,12 @@ def test_packets_to_the_appliance_keep_their_source() -> None:
 
 
 def test_a_host_that_routed_before_is_not_cut_off() -> None:
-    """The rule against routing for others is left out for each family in which the host was already a router."""
     purposes = [rule.purpose for rule in isolation_rules(SETTINGS, ENDS, (4,)) if rule.chain is Chain.FORWARD]
     assert "the host is not an IPv6 router" in purposes
     assert "the host is not an IPv4 router" not in purposes
 
 
 def test_a_port_is_needed() -> None:
-    """An isolation that forwards no port is an error."""
     with pytest.raises(ValueError, match="no port"):
         IsolationSettings(ports=())
 

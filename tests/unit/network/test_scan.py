@@ -16,7 +16,6 @@ pytestmark = pytest.mark.nightly
 
 
 def test_open_and_refused_ports_differ() -> None:
-    """A port with a listener is open; a port that is bound but not listening is refused."""
     with socket.create_server(("127.0.0.1", 0)) as server, socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         listening, bound = server.getsockname()[1], closed.getsockname()[1]
@@ -25,7 +24,6 @@ def test_open_and_refused_ports_differ() -> None:
 
 
 def test_few_file_descriptors_make_a_scan_slower_without_an_error() -> None:
-    """If the process may open few more files, the scan uses fewer connections at once."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     with socket.create_server(("127.0.0.1", 0), backlog=500) as server, contextlib.ExitStack() as others:
         for _ in range(50):
@@ -57,7 +55,6 @@ class Stuck(socket.socket):
 def test_a_port_that_could_not_be_tried_is_neither_open_nor_closed(
     monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
-    """Without a route, or with a firewall rule on this machine, the scan reports the reason."""
     monkeypatch.setattr("appliance.network.scan.socket.socket", Stuck)
     monkeypatch.setattr(Stuck, "number", number)
     result = scan("192.0.2.7", [1, 2, 3], seconds=10)
@@ -70,7 +67,6 @@ def test_a_port_that_could_not_be_tried_is_neither_open_nor_closed(
 def test_an_unusable_address_is_an_error_with_the_reason(
     monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
-    """The error names the address, the port and the reason."""
     monkeypatch.setattr("appliance.network.scan.socket.socket", Stuck)
     monkeypatch.setattr(Stuck, "number", number)
     with pytest.raises(NetworkError, match=f"192.0.2.7 port 1: {os.strerror(number)}"):
@@ -78,8 +74,6 @@ def test_an_unusable_address_is_an_error_with_the_reason(
 
 
 def test_a_machine_without_a_family_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without IPv6, both the scan and the check of the address raise a clear error."""
-
     def none_of_it(*_arguments: object) -> socket.socket:
         raise OSError(errno.EAFNOSUPPORT, os.strerror(errno.EAFNOSUPPORT))
 
@@ -98,12 +92,10 @@ def test_a_link_local_address_without_a_zone_is_an_error() -> None:
 
 
 def test_a_scan_of_no_ports_ends() -> None:
-    """A scan of no ports finds nothing."""
     assert not scan("127.0.0.1", [], seconds=10).answered
 
 
 def test_the_machine_itself_is_not_another() -> None:
-    """A check from outside refuses the machine's own addresses."""
     for address in ("127.0.0.1", "::1", "localhost"):
         with pytest.raises(NetworkError, match="is this machine"):
             addresses_of(address)

@@ -28,7 +28,6 @@ def test_an_invalid_address_is_refused(text: str) -> None:
 
 
 def test_hosts_that_are_named_alike() -> None:
-    """Addresses of one network that the policy names share their rights at every call; other addresses do not."""
     table = HostSets()
     table.network(ipaddress.ip_network("10.1.0.0/16"))
     for _ in range(2):

@@ -51,7 +51,6 @@ def verdict(policy: Policy, category: Category, name: str, host: object = AGENT)
 
 
 def test_a_host_behind_ask_passes_only_while_its_approval_lasts() -> None:
-    """Without approvals (checks of a text) nothing passes; in operation the relay holds each call of a service."""
     bare, live = policy(), policy(TEXT, ("10.0.0.7", "publish", "/cmd_vel"))
     for category, name in (
         (Category.PUBLISH, "/cmd_vel"),

@@ -47,7 +47,6 @@ def test_the_word_that_matches_the_host_is_shown() -> None:
 
 
 def test_node_rule_is_part_of_the_answer() -> None:
-    """Publishing under a node name that the host may not use is denied although [Publishers] grants the topic."""
     found = explained("10.0.0.5", Category.PUBLISH, "/arm/cmd", node="/radar")
     assert found.decision.allowed
     assert not found.allowed

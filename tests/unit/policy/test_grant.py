@@ -174,7 +174,6 @@ def test_a_text_keeps_its_line_endings() -> None:
     ],
 )
 def test_a_request_that_no_policy_can_grant(host: str, category: str, resource: str, why: str) -> None:
-    """If no policy can grant a request, the answer has the reason."""
     with pytest.raises(UngrantableError, match=why):
         changed(BASE, category, resource, host)
 
@@ -202,7 +201,6 @@ TOOLS = (
 @pytest.mark.parametrize("file", POLICIES, ids=lambda file: str(file.stem))
 @pytest.mark.parametrize("caller", TOOLS)
 def test_a_stock_tool_gets_all_that_it_needs(file: Path, caller: str) -> None:
-    """One change allows all calls, also those of the next run with another name, and gives no other host a right."""
     tool = stock_tool(caller)
     assert tool is not None
     text, denied = file.read_text(encoding="utf-8"), Request(HOST, caller, Category.SUBSCRIBE, "/speed")

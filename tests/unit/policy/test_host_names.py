@@ -41,7 +41,6 @@ NAMES = HostNames.of(
     ],
 )
 def test_a_name_means_all_its_networks(text: str, networks: str) -> None:
-    """A group has its networks at any depth; an enrolled host of the same name counts as well."""
     assert " ".join(map(str, NAMES.networks(text))) == networks
 
 
@@ -56,13 +55,11 @@ def test_a_name_means_all_its_networks(text: str, networks: str) -> None:
     ],
 )
 def test_an_unknown_name_is_an_error(text: str, said: str) -> None:
-    """It names the nearest name, or those that there are."""
     with pytest.raises(UnknownHostNameError, match=said):
         NAMES.networks(text)
 
 
 def test_an_address_has_the_narrowest_label() -> None:
-    """An enrolled host comes before a group of this address, and no label comes from `*`."""
     labels = NAMES.labels()
     addresses = (
         "10.77.0.66",

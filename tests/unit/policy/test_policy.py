@@ -130,7 +130,6 @@ def test_robot_and_enrolled_hosts_come_from_outside() -> None:
 
 
 def test_a_door_is_a_host_of_a_group() -> None:
-    """A word for a door never means an enrolled host of the same name; a door that is not added matches no host."""
     text = "[Groups]\nalice = door:alice door:gone\n[Nodes]\ndefault = alice\n"
     given: dict[str, Address] = {
         "door:alice": ipaddress.ip_address("198.18.0.2"),

@@ -131,7 +131,6 @@ def test_explain_shows_the_limit_and_its_line() -> None:
     ],
 )
 def test_diff_shows_changed_limits(old: str, new: str, word: str) -> None:
-    """The diff lists changed limits even if no decision changes."""
     request = Request(GUEST, "/lidar", Category.PUBLISH, "/scan")
     [difference] = diff(policy(old), policy(new), [request, request])
     assert (difference.word, difference.count) == (word, 2)

@@ -26,7 +26,6 @@ TRUE = Path("/bin/true")
 
 
 def test_all_quotas_together_fit_the_descriptors() -> None:
-    """Each process may open all connections, all ports of nodes and a call to every node at once."""
     files = {role.name: role.files for role in ROLES}
     ports = NODE_PORTS.bounds.whole
     nodes = ports // 2  # with one relay, which gives the most nodes
@@ -41,7 +40,6 @@ def test_all_quotas_together_fit_the_descriptors() -> None:
 
 
 def test_the_configuration_has_the_tables_bounds() -> None:
-    """The defaults of the configuration equal those in the table of quotas."""
     settings = Settings()
     for given, row in (
         (settings.limits, RVMASTER_CONNECTIONS),

@@ -15,7 +15,6 @@ def pool(quota_classes: dict[str, QuotaClass], bounds: Bounds) -> Pool[str]:
 
 
 def test_unknown_hosts_have_one_quota_together() -> None:
-    """Addresses that no rule names share one quota however many they are; a named host still gets its own."""
     shared = pool({"robot": NAMED}, Bounds(whole=100, host=10, unknown=20, kept=30))
     assert not any(shared.take(f"unknown{n}", 10) for n in range(2))
     assert shared.take("unknown3") == (
@@ -26,7 +25,6 @@ def test_unknown_hosts_have_one_quota_together() -> None:
 
 
 def test_the_reserve_is_for_registered_hosts() -> None:
-    """When other hosts have used the rest, a registered host still gets the reserve, up to the whole pool."""
     quota_classes = {"robot": REGISTERED} | {f"guest{n}": NAMED for n in range(9)}
     shared = pool(quota_classes, Bounds(whole=100, host=40, unknown=0, kept=30))
     assert [shared.take(f"guest{n}", 35) for n in range(2)] == ["", ""]
@@ -39,7 +37,6 @@ def test_the_reserve_is_for_registered_hosts() -> None:
 
 
 def test_a_host_that_registers_frees_the_quota_of_unknown_hosts() -> None:
-    """A host's items count under its present class, even if it took them under another class."""
     quota_classes: dict[str, QuotaClass] = {}
     shared = pool(quota_classes, Bounds(whole=100, host=20, unknown=20, kept=0))
     assert shared.take("new", 20) == ""
@@ -50,7 +47,6 @@ def test_a_host_that_registers_frees_the_quota_of_unknown_hosts() -> None:
 
 
 def test_a_host_cannot_release_more_than_it_has() -> None:
-    """Releasing more than was taken is a mistake of the caller and raises an error."""
     shared = pool({}, Bounds(whole=1, host=1, unknown=1, kept=0))
     with pytest.raises(ValueError, match="returns 1 connections and has 0"):
         shared.give_back("host")
@@ -58,7 +54,6 @@ def test_a_host_cannot_release_more_than_it_has() -> None:
 
 @pytest.mark.parametrize("bounds", [(10, 11, 0, 0), (10, 1, 6, 5), (10, -1, 0, 0)])
 def test_bounds_that_contradict_each_other_are_refused(bounds: tuple[int, int, int, int]) -> None:
-    """A host's quota above the whole pool is a configuration error."""
     with pytest.raises(ValueError, match="Bounds"):
         Bounds(*bounds)
 
@@ -70,7 +65,6 @@ def test_bounds_that_contradict_each_other_are_refused(bounds: tuple[int, int, i
     )
 )
 def test_no_order_of_events_breaks_a_bound(steps: list[tuple[str, int, QuotaClass]]) -> None:
-    """After any takes, releases and class changes, totals are correct and no take exceeded a limit."""
     bounds = Bounds(whole=12, host=5, unknown=6, kept=3)
     quota_classes: dict[str, QuotaClass] = {}
     shared, held = pool(quota_classes, bounds), dict.fromkeys("abcdef", 0)

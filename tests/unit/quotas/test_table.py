@@ -13,12 +13,10 @@ _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def test_the_page_is_up_to_date() -> None:
-    """docs/reference/quotas.md equals the output of `python -m distribution.quotas_page`."""
     assert (ROOT / "docs/reference/quotas.md").read_text() == page()
 
 
 def test_every_row_is_on_the_page() -> None:
-    """`QUOTA_ROWS` has every row that the module defines, once, in the order of its definition."""
     assert tuple(row for row in vars(table).values() if isinstance(row, QuotaRow)) == QUOTA_ROWS
 
 
@@ -34,7 +32,6 @@ def test_each_row_is_attacked_by_a_test_that_exists() -> None:
 
 
 def test_the_reduction_of_a_message_over_budget_is_that_of_the_relay() -> None:
-    """The page names the seconds for which the relay gives a tenth of the time."""
     budget = TimeBudget()
     budget.cut(0)
     seconds = next(second for second in range(60) if budget.part(second * 10**9) == 1)

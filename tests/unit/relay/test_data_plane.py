@@ -87,7 +87,6 @@ def world(request: pytest.FixtureRequest) -> Iterator[World]:
 
 
 def test_a_subscriber_gets_the_publishers_header_and_messages(world: World) -> None:
-    """Control gets reports of the connection, its end, and the traffic."""
     publisher, subscriber = world.subscribed()
     opened = world.hears(ConnectionOpened)
     assert opened == ConnectionOpened(opened.number, "k", "/chatter", "topic", LOOPBACK, "/listener")
@@ -105,7 +104,6 @@ def test_a_subscriber_gets_the_publishers_header_and_messages(world: World) -> N
 
 
 def test_control_gets_confirmations_of_its_orders(world: World) -> None:
-    """At the confirmation, the revoked grant's connection is closed, and its pending data is dropped."""
     publisher, subscriber = world.subscribed()
     publisher.send(encode_frame(b"one"))
     world.gets(subscriber, encode_frame(b"one"))
@@ -117,8 +115,6 @@ def test_control_gets_confirmations_of_its_orders(world: World) -> None:
 
 
 def test_a_grant_costs_the_same_among_thousands() -> None:
-    """Renewing and revoking a grant does not scan other connections."""
-
     def work(many: int) -> int:
         world = World(replace(LIMITS, connections=100, connections_per_host=100))
         try:
@@ -148,7 +144,6 @@ def test_a_grant_costs_the_same_among_thousands() -> None:
 
 
 def test_messages_that_come_with_the_publishers_header_are_not_lost(world: World) -> None:
-    """A latching publisher sends header and messages in one piece."""
     subscriber = world.connect(encode_header(ASK))
     world.hears(UpstreamWanted)
     world.state(UpstreamFound("k", "/chatter", LOOPBACK, world.publisher.getsockname()[1]))
@@ -176,7 +171,6 @@ def test_messages_that_come_with_the_publishers_header_are_not_lost(world: World
 )
 @impatient
 def test_a_denied_peer_gets_the_reason(world: World, fields: dict[str, str], reason: str) -> None:
-    """The peer gets an error header and the end of the connection; control gets a report."""
     peer = world.connect(encode_header(fields))
     assert reason in world.gets_header(peer)["error"]
     world.ends(peer)
@@ -187,7 +181,6 @@ def test_a_denied_peer_gets_the_reason(world: World, fields: dict[str, str], rea
 
 @impatient
 def test_equal_refusals_are_folded(world: World) -> None:
-    """The first refusal is reported at once, equal ones with a count."""
     for peer in [world.connect(encode_header(ASK | {"callerid": "/x"})) for _ in range(5)]:
         world.ends(peer)
     counts = [world.hears(ConnectionRefused).count]
@@ -201,14 +194,12 @@ def test_equal_refusals_are_folded(world: World) -> None:
     "data", [b"GET / HTTP/1.1\r\n\r\n", b"\xff\xff\xff\xff", struct.pack("<II", 8, 99) + b"junk"]
 )
 def test_an_invalid_header_ends_the_connection(world: World, data: bytes) -> None:
-    """For any bytes the connection is closed and reported."""
     world.ends(world.connect(data))
     assert "header" in world.hears(ConnectionRefused).reason
 
 
 @impatient
 def test_a_header_that_never_comes_whole_is_not_waited_for(world: World) -> None:
-    """A silent peer and a slowly dripping peer are both cut off."""
     silent, slow = world.connect(), world.connect(encode_header(ASK)[:7])
     world.ends(silent)
     world.ends(slow)
@@ -216,7 +207,6 @@ def test_a_header_that_never_comes_whole_is_not_waited_for(world: World) -> None
 
 
 def test_connections_have_a_bound_and_places_are_given_back(world: World) -> None:
-    """A flood from one host is refused at its limit; when it ends, the host is served again."""
     flood = [world.connect() for _ in range(LIMITS.connections_per_host + 3)]
     assert "the quota of one host is 15" in world.hears(ConnectionRefused).reason
     for peer in flood:
@@ -226,7 +216,6 @@ def test_connections_have_a_bound_and_places_are_given_back(world: World) -> Non
 
 
 def test_a_peer_that_resets_at_any_point_does_no_harm(world: World) -> None:
-    """The peer resets before, in and after its header, and while it is served."""
     publisher, subscriber = world.subscribed()
     for length in (0, 1, 5, len(encode_header(ASK))):
         world.connect(encode_header(ASK)[:length]).reset()
@@ -237,7 +226,6 @@ def test_a_peer_that_resets_at_any_point_does_no_harm(world: World) -> None:
 
 @impatient
 def test_a_publisher_that_cannot_be_reached_is_asked_for_again(world: World) -> None:
-    """The publisher is refused by control or the kernel, stays silent, or answers with an error."""
     subscriber = world.connect(encode_header(ASK))
     world.hears(UpstreamWanted)
     world.state(UpstreamRefused("k", "/chatter", "not yet"))
@@ -307,7 +295,6 @@ def test_a_publisher_is_only_looked_for_at_an_address(world: World, host: str) -
 
 
 def test_a_message_beyond_the_limit_cuts_the_publisher_not_the_subscriber(world: World) -> None:
-    """The publisher's connection is closed with a report; the subscriber waits for the next publisher."""
     publisher, subscriber = world.subscribed()
     publisher.send(encode_frame(b"one") + struct.pack("<I", LIMITS.message_bytes + 1))
     world.ends(publisher)
@@ -319,7 +306,6 @@ def test_a_message_beyond_the_limit_cuts_the_publisher_not_the_subscriber(world:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_whatever_peers_send_the_relay_serves_on(world: World, seed: int) -> None:
-    """All kinds of peers send random bytes and broken headers; then normal peers are served."""
     chance = random.Random(seed)  # noqa: S311 - a test that can be repeated
     pieces = [encode_header(HEADER), encode_header(ASK), encode_header(CALL), encode_frame(b"x" * 300)]
     world.connect(encode_header(ASK))
@@ -368,7 +354,6 @@ def test_whatever_peers_send_the_relay_serves_on(world: World, seed: int) -> Non
     ids=lambda message: type(message).__name__,
 )
 def test_a_connection_ends_with_its_grant_publication_or_node(world: World, message: Message) -> None:
-    """Withdrawing any of the three closes the connection."""
     _publisher, subscriber = world.subscribed()
     world.hears(ConnectionOpened)
     world.state(message)
@@ -377,7 +362,6 @@ def test_a_connection_ends_with_its_grant_publication_or_node(world: World, mess
 
 
 def test_no_message_of_a_silent_publisher_passes(world: World) -> None:
-    """Its connection is closed at once, is not opened for subscribers or monitors, and returns with the authority."""
     publisher, subscriber = world.subscribed()
     publisher.send(encode_frame(b"before"))
     world.gets(subscriber, encode_frame(b"before"))
@@ -406,7 +390,6 @@ def test_no_message_of_a_silent_publisher_passes(world: World) -> None:
 
 
 def test_a_withdrawn_nodes_port_is_closed(world: World) -> None:
-    """The kernel refuses new connections once no process has the socket."""
     world.state(NodeWithdrawn("k"))
     where = world.port.getsockname()
     world.port.close()
@@ -416,7 +399,6 @@ def test_a_withdrawn_nodes_port_is_closed(world: World) -> None:
 
 
 def test_a_new_control_learns_what_is_open_and_open_questions_are_put_to_it(world: World) -> None:
-    """Everything continues; entries that the new control does not restate are removed at the end of its restatement."""
     publisher, subscriber = world.subscribed()
     first = world.hears(ConnectionOpened)
     world.state(PublicationPlaced("k", "/other", "*"))
@@ -442,7 +424,6 @@ def test_a_new_control_learns_what_is_open_and_open_questions_are_put_to_it(worl
 
 
 def test_a_slow_subscriber_drops_the_oldest_and_delays_no_other(world: World) -> None:
-    """The fast subscriber gets everything in order; the slow one gets whole messages in order, the rest is counted."""
     publisher, slow = world.subscribed()
     quick = world.connect(encode_header(ASK))
     assert world.gets_header(quick) == HEADER
@@ -487,7 +468,6 @@ def test_memory_is_given_back(world: World) -> None:
 
 
 def test_a_publisher_that_stalls_in_a_large_message_is_cut() -> None:
-    """The stalled message's memory is released; a slow publisher that makes progress is not cut."""
     patient = World(replace(LIMITS, stall_seconds=1.0))
     subscriber = patient.connect(encode_header(ASK))
     publisher = patient.upstream()
@@ -516,7 +496,6 @@ def test_a_publisher_that_stalls_in_a_large_message_is_cut() -> None:
 
 
 def test_a_long_header_that_is_never_finished_gives_back_what_it_held() -> None:
-    """Its bytes beyond the first ones count for its host until the connection ends."""
     world = World(replace(LIMITS, header_seconds=30.0))
     unfinished = struct.pack("<I", 60_000) + bytes(20_000)
     first = world.connect(unfinished)
@@ -528,7 +507,6 @@ def test_a_long_header_that_is_never_finished_gives_back_what_it_held() -> None:
 
 
 def test_unknown_hosts_make_room_for_each_other_and_never_fill_the_relay() -> None:
-    """Hosts without a grant share a few places; a newcomer replaces the one that has waited longest."""
     world = World(replace(LIMITS, connections=40, connections_per_host=15, header_seconds=30.0))
     unknown = [world.connect(host=f"127.0.1.{number}") for number in range(1, 31)]
     for peer in unknown[:25]:
@@ -540,7 +518,6 @@ def test_unknown_hosts_make_room_for_each_other_and_never_fill_the_relay() -> No
 
 
 def test_the_host_with_most_makes_room_for_one_with_less() -> None:
-    """If one host's connections take every place, another host with a grant gets in until both have equally many."""
     world = World(replace(LIMITS, connections=10, connections_per_host=10))
     greedy, other = "127.0.0.2", "127.0.0.3"
     for host in (greedy, other):
@@ -563,7 +540,6 @@ def test_the_host_with_most_makes_room_for_one_with_less() -> None:
 def test_limits_are_kept_for_publishers_and_for_each_subscriber_and_change_while_they_run(
     world: World,
 ) -> None:
-    """Each subscriber has its own limit on the stream; drops are reported once a second with the limit."""
     world.state(GrantInstalled("k", "/chatter", LOOPBACK, "/slow", FlowLimit(messages=2)))
     publisher, quick = world.subscribed()
     slow = world.connect(encode_header(ASK | {"callerid": "/slow"}))
@@ -592,7 +568,6 @@ def test_limits_are_kept_for_publishers_and_for_each_subscriber_and_change_while
 
 
 def test_a_limit_counts_hosts_and_not_node_names(world: World) -> None:
-    """Nodes of one host share its limit; each host has its part of a topic's limit, whatever other hosts send."""
     publishers = []
     for key, host, topic in (
         ("g", "10.9.9.9", "/own"),
@@ -620,7 +595,6 @@ def test_a_limit_counts_hosts_and_not_node_names(world: World) -> None:
 
 
 def test_a_flood_beyond_its_limit_delays_no_other_topic(world: World) -> None:
-    """While a publisher floods, the messages of another pass within the time of one turn for each publisher."""
     publisher, subscriber = world.subscribed()
     listening = world.listen()
     world.state(NodePlaced("g", "/guest", "10.9.9.9"), listening)
@@ -659,7 +633,6 @@ def test_a_flood_beyond_its_limit_delays_no_other_topic(world: World) -> None:
 
 @pytest.mark.parametrize("world", [replace(LIMITS, connect_seconds=0.3)], indirect=True)
 def test_a_service_that_is_busy_lets_its_client_wait_as_in_plain_ros(world: World) -> None:
-    """The client waits longer than for a connection: the call reaches the server when the server has time."""
     client = world.connect(encode_header(CALL))
     service = world.accept(world.service)
     later = world.loop.clock() + 1.5 * IMPATIENT.connect_seconds
@@ -673,7 +646,6 @@ def test_a_service_that_is_busy_lets_its_client_wait_as_in_plain_ros(world: Worl
 
 @pytest.mark.parametrize("seed", range(20))
 def test_a_call_reaches_its_server_whatever_overtakes_what(seed: int) -> None:
-    """Service, grant and a restatement arrive before, between and after the client's connection, header and request."""
     world, order = World(), random.Random(seed)  # noqa: S311 - an order, no secret
     peer = Peer(socket.create_connection(world.port.getsockname()))
     world.open.append(peer.sock)
@@ -717,7 +689,6 @@ def test_a_call_reaches_its_server_whatever_overtakes_what(seed: int) -> None:
 
 @pytest.mark.parametrize("reply", [b"\x05abcd", encode_service_reply(b"1") * 2, b"\x01\xff\xff\xff\xff"])
 def test_a_service_that_breaks_the_protocol_loses_its_client(world: World, reply: bytes) -> None:
-    """Both connections are closed, and nothing of them remains."""
     client = world.connect(encode_header(CALL | {"persistent": "1"}))
     service = world.accept(world.service)
     world.gets_header(service)
@@ -733,7 +704,6 @@ def test_a_service_that_breaks_the_protocol_loses_its_client(world: World, reply
 
 
 def test_a_client_that_never_reads_gets_no_second_request_through(world: World) -> None:
-    """Replies that the client does not read delay only that client."""
     client = world.connect(encode_header(CALL | {"persistent": "1"}))
     service = world.accept(world.service)
     world.gets_header(service)
@@ -755,7 +725,6 @@ def test_a_client_that_never_reads_gets_no_second_request_through(world: World) 
 def test_a_topic_with_many_subscribers_is_delivered_a_quantum_at_a_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Some subscribers get a message in later turns of the publisher; each gets all messages in order and once."""
     monkeypatch.setattr(EventLoop, "over", lambda _loop: True)
     world = World(replace(LIMITS, connections=400, connections_per_host=100))
     publisher, first = world.subscribed()
@@ -791,7 +760,6 @@ def test_a_topic_with_many_subscribers_is_delivered_a_quantum_at_a_time(
 def test_subscribers_of_a_topic_that_is_gone_are_cut_a_quantum_at_a_time(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Between the subscribers that are cut, messages of others pass; in the end all connections are closed."""
     _publisher, first = world.subscribed()
     others = [world.connect(encode_header(ASK)) for _ in range(5)]
     for subscriber in others:
@@ -808,7 +776,6 @@ def test_subscribers_of_a_topic_that_is_gone_are_cut_a_quantum_at_a_time(
 def test_a_second_is_reported_although_tidying_up_takes_many_turns(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Thousands of topics are tidied a quantum at a time, and the report of the second still appears."""
     for number in range(50):
         world.state(PublicationPlaced("k", f"/topic{number}", "*"))
     world.subscribed()
@@ -821,7 +788,6 @@ def test_a_second_is_reported_although_tidying_up_takes_many_turns(
 def test_a_grant_is_compared_with_the_waiting_peers_of_its_host(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Hosts that wait for a grant that never arrives do not make other hosts' grants expensive."""
     hosts = ["127.0.0.2", "127.0.0.3"]
     for host in hosts:
         world.connect(encode_header({**ASK, "callerid": "/stranger"}), host=host)

@@ -32,7 +32,6 @@ def stated() -> GrantTable:
 
 
 def test_a_grant_is_for_one_host_one_caller_one_topic_and_one_incarnation() -> None:
-    """A peer that differs from the grant in any field has none."""
     table = stated()
     assert table.grant("k", "/chatter", "10.0.0.2", "/listener")
     assert table.grant("other", "/chatter", "10.0.0.2", "/listener") is None
@@ -44,7 +43,6 @@ def test_a_grant_is_for_one_host_one_caller_one_topic_and_one_incarnation() -> N
 
 
 def test_withdrawn_statements_are_gone() -> None:
-    """Each kind of statement can be withdrawn."""
     table = stated()
     table.withdraw(GrantRevoked("k", "/chatter", "10.0.0.2", "/listener"))
     table.withdraw(ClientRevoked("k", "/add", "10.0.0.2", "/c"))
@@ -58,7 +56,6 @@ def test_withdrawn_statements_are_gone() -> None:
 
 
 def test_a_node_takes_everything_of_its_incarnation_with_it() -> None:
-    """When a node is withdrawn, all its statements go; those of other nodes stay."""
     table = stated()
     table.state(GrantInstalled("other", "/chatter", "10.0.0.2", "/listener"))
     table.withdraw(NodeWithdrawn("k"))
@@ -92,14 +89,12 @@ def test_hosts_that_only_a_star_names_pay_as_one() -> None:
 
 
 def test_the_latest_place_of_a_service_counts() -> None:
-    """A service that is placed again is only at its last place."""
     table = stated()
     table.state(ServicePlaced("k", "/add", "10.0.0.1", 5000))
     assert table.service("k", "/add") == ServiceEndpoint("k", "/add", "10.0.0.1", 5000, "/talker")
 
 
 def test_the_end_of_a_restatement_withdraws_the_rest() -> None:
-    """Existing grants stay until the new control has restated everything."""
     table = stated()
     table.begin(2)
     for message in (NODE, TOPIC):
@@ -112,7 +107,6 @@ def test_the_end_of_a_restatement_withdraws_the_rest() -> None:
 
 
 def test_a_restatement_that_another_control_begins_again_withdraws_nothing() -> None:
-    """If a control dies during its restatement, statements that it had not reached stay."""
     table = stated()
     table.begin(2)
     table.state(NODE)
@@ -125,7 +119,6 @@ def test_a_restatement_that_another_control_begins_again_withdraws_nothing() -> 
 
 
 def test_a_withdrawal_during_a_restatement_stays() -> None:
-    """A withdrawal after the statement wins, also during a restatement."""
     table = stated()
     table.begin(2)
     for message in EVERYTHING:

@@ -20,7 +20,6 @@ def loop() -> Iterator[EventLoop]:
 
 @pytest.mark.nightly
 def test_a_handler_is_not_called_for_what_was_discarded_in_the_same_turn(loop: EventLoop) -> None:
-    """The handler of the first of two ready sockets closes the other; the other's handler never runs."""
     pairs = [socket.socketpair() for _ in range(2)]
     called = []
     for index in range(2):
@@ -40,7 +39,6 @@ def test_a_handler_is_not_called_for_what_was_discarded_in_the_same_turn(loop: E
 
 
 def test_timers_run_in_order_and_cancelled_ones_never(loop: EventLoop) -> None:
-    """Timers run by their time; timers for the same time run in the order they were set."""
     now = 0.0
     loop.clock = lambda: now
     ran: list[str] = []
@@ -57,7 +55,6 @@ def test_timers_run_in_order_and_cancelled_ones_never(loop: EventLoop) -> None:
 
 
 def test_stop_ends_run_after_the_turn(loop: EventLoop) -> None:
-    """Both a timer and a handler can stop the loop."""
     loop.after(0, loop.stop)
     loop.run()
 
@@ -113,7 +110,6 @@ def costs() -> Iterator[Costs]:
 
 @pytest.mark.nightly
 def test_a_host_with_little_to_do_waits_for_one_quantum_of_others(costs: Costs) -> None:
-    """While two hundred hosts always have costly messages, the robot's message waits for only one of them."""
     costs.ready("robot", QUANTUM // 50, 1)
     costs.turns_until(lambda: costs.order)
     for number in range(200):
@@ -129,7 +125,6 @@ def test_a_host_with_little_to_do_waits_for_one_quantum_of_others(costs: Costs) 
 
 @pytest.mark.nightly
 def test_many_new_hosts_do_not_come_before_one_that_used_little(costs: Costs) -> None:
-    """Two hundred hosts that arrive at once with a costly message each delay the robot by only one of them."""
     costs.ready("robot", QUANTUM // 50, 1)
     costs.turns_until(lambda: costs.order)
     costs.ready("guest", QUANTUM)
@@ -146,7 +141,6 @@ def test_many_new_hosts_do_not_come_before_one_that_used_little(costs: Costs) ->
 
 @pytest.mark.nightly
 def test_a_host_with_thousands_of_descriptors_gets_no_more_than_one_with_one(costs: Costs) -> None:
-    """Both hosts are served in turn, however many descriptors are ready."""
     for _ in range(400):
         costs.ready("guest", QUANTUM // 10)
     costs.ready("robot", QUANTUM // 10)
@@ -156,7 +150,6 @@ def test_a_host_with_thousands_of_descriptors_gets_no_more_than_one_with_one(cos
 
 @pytest.mark.nightly
 def test_each_descriptor_of_a_host_has_its_turn(costs: Costs) -> None:
-    """A handler that uses up the quantum each time starves no other descriptor of its host."""
     costs.ready("guest", 2 * QUANTUM)
     later = costs.ready("guest", 1, 1)
     costs.ready("robot", QUANTUM)
@@ -167,7 +160,6 @@ def test_each_descriptor_of_a_host_has_its_turn(costs: Costs) -> None:
 
 @pytest.mark.nightly
 def test_all_unknown_hosts_together_are_one_payer(costs: Costs) -> None:
-    """All unknown hosts together get as much time as the robot alone; the same holds for new connections."""
     for _ in range(200):
         costs.ready(UNKNOWN, QUANTUM)
     costs.ready(ACCEPTING, QUANTUM)
@@ -181,7 +173,6 @@ def test_all_unknown_hosts_together_are_one_payer(costs: Costs) -> None:
 
 @pytest.mark.nightly
 def test_a_host_that_overdraws_waits_for_the_others(costs: Costs) -> None:
-    """A handler that takes twenty quanta is followed by twenty handlers of the other host."""
     costs.ready("guest", 20 * QUANTUM)
     costs.ready("robot", QUANTUM)
     costs.turns_until(lambda: costs.order.count("guest") == 3)
@@ -190,7 +181,6 @@ def test_a_host_that_overdraws_waits_for_the_others(costs: Costs) -> None:
 
 @pytest.mark.nightly
 def test_costly_messages_of_many_hosts_never_come_in_a_row(costs: Costs) -> None:
-    """Between any two of them, a host within its quantum is served, even if it has used more than each of them."""
     for number in range(200):
         costs.ready(f"10.9.0.{number}", 10 * QUANTUM)
     costs.turns_until(lambda: len(costs.order) >= 200)
@@ -204,7 +194,6 @@ def test_costly_messages_of_many_hosts_never_come_in_a_row(costs: Costs) -> None
 
 @pytest.mark.nightly
 def test_hosts_within_their_quantum_do_not_starve_a_costly_one(costs: Costs) -> None:
-    """The costly host gets as much processor time as each of the others."""
     costs.ready("camera", 10 * QUANTUM)
     for number in range(9):
         costs.ready(f"10.9.0.{number}", QUANTUM)
@@ -214,7 +203,6 @@ def test_hosts_within_their_quantum_do_not_starve_a_costly_one(costs: Costs) -> 
 
 @pytest.mark.nightly
 def test_control_and_lifeline_are_served_in_every_turn(costs: Costs) -> None:
-    """However many hosts are ready, the relay's own descriptors come first."""
     for number in range(100):
         costs.ready(f"10.9.0.{number}", 2 * QUANTUM)
     costs.ready(SYSTEM, 1)
@@ -228,7 +216,6 @@ def test_control_and_lifeline_are_served_in_every_turn(costs: Costs) -> None:
 
 @pytest.mark.nightly
 def test_a_host_alone_is_served_without_waiting_and_owes_nothing(costs: Costs) -> None:
-    """Time that a host used while no other host was ready does not count later."""
     costs.ready("guest", 5 * QUANTUM)
     costs.turns_until(lambda: len(costs.order) >= 50)
     costs.ready("robot", QUANTUM)
@@ -238,8 +225,6 @@ def test_a_host_alone_is_served_without_waiting_and_owes_nothing(costs: Costs) -
 
 @pytest.mark.nightly
 def test_postponed_work_takes_turns_with_events_and_other_hosts(costs: Costs) -> None:
-    """Postponed work is charged to its payer, and starves neither the payer's events nor another host."""
-
     def work() -> None:
         costs.used += QUANTUM
         costs.order.append("left")
@@ -256,7 +241,6 @@ def test_postponed_work_takes_turns_with_events_and_other_hosts(costs: Costs) ->
 
 @pytest.mark.nightly
 def test_a_charge_for_a_new_connection_delays_its_host(costs: Costs) -> None:
-    """Work done for a host in another payer's handler counts for that host."""
     costs.ready("guest", QUANTUM)
     costs.ready("robot", QUANTUM)
     costs.loop.turn(0)
@@ -268,8 +252,6 @@ def test_a_charge_for_a_new_connection_delays_its_host(costs: Costs) -> None:
 
 @pytest.mark.nightly
 def test_connections_made_while_alone_leave_no_debt(costs: Costs) -> None:
-    """The robot connected for hours while no other host was active; a new guest still does not come first."""
-
     def accept(_events: int) -> None:
         costs.used += 50_000
         costs.loop.charge("robot", 50_000)
@@ -289,7 +271,6 @@ def test_connections_made_while_alone_leave_no_debt(costs: Costs) -> None:
 
 @pytest.mark.nightly
 def test_timers_that_are_due_together_are_called_a_quantum_at_a_time(costs: Costs) -> None:
-    """Ten thousand timers delay a message by one quantum."""
     called: list[None] = []
 
     def call() -> None:
@@ -305,7 +286,6 @@ def test_timers_that_are_due_together_are_called_a_quantum_at_a_time(costs: Cost
 
 @pytest.mark.nightly
 def test_work_beside_the_loop_is_done_in_a_thread_and_ends_in_the_loop(loop: EventLoop) -> None:
-    """The loop turns while the work is done; then `done` gets the result in the loop's thread."""
     may_end = threading.Event()
     results: list[tuple[int, int]] = []
 
@@ -324,7 +304,6 @@ def test_work_beside_the_loop_is_done_in_a_thread_and_ends_in_the_loop(loop: Eve
 
 @pytest.mark.nightly
 def test_discarded_work_is_not_reported(loop: EventLoop) -> None:
-    """`discard` waits for the thread, and the loop forgets it."""
     results: list[None] = []
     before = threading.active_count()
     loop.beside(lambda: None, results.append).discard()

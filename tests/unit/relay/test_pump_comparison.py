@@ -18,7 +18,6 @@ _COUNTS = "counts() { int n; event e(std::string s) /chatter std_msgs/String '{d
 
 @pytest.mark.timeout(600)
 def test_the_pump_has_the_same_effects_as_python() -> None:
-    """Subscribers get the same bytes, and counts, effects and state of monitors are the same; both paths are used."""
     comparison = PumpComparison(_SEED)
     try:
         comparison.run(examples(18_000))
@@ -31,7 +30,6 @@ def test_the_pump_has_the_same_effects_as_python() -> None:
 
 
 def test_a_quiet_publisher_keeps_no_earlier_module() -> None:
-    """The call of a module is freed when other specifications are in force, before the next message."""
     others, relay = _calls(), ComparedRelay(pumped=True)
     try:
         relay.subscribe("/chatter", "/listener")
@@ -50,7 +48,6 @@ def test_a_quiet_publisher_keeps_no_earlier_module() -> None:
 
 
 def test_counters_that_are_read_between_messages_lose_no_event() -> None:
-    """The pump goes on counting after the counters were read, and an unchanged monitor keeps its counts at a load."""
     relay = ComparedRelay(pumped=True)
     try:
         relay.subscribe("/chatter", "/listener")

@@ -64,7 +64,6 @@ def reporter(control: Control) -> Reporter:
 
 
 def test_equal_refusals_are_one_message_and_a_count(control: Control, reporter: Reporter) -> None:
-    """The first is sent at once, the rest as a count with the next tick."""
     for _ in range(5):
         reporter.refused("k", ("topic", "/chatter"), "10.0.0.2", "/x", "no grant")
     assert control.heard() == [ConnectionRefused("k", "topic", "/chatter", "10.0.0.2", "/x", "no grant", 1)]
@@ -75,7 +74,6 @@ def test_equal_refusals_are_one_message_and_a_count(control: Control, reporter: 
 
 
 def test_many_different_refusals_are_bounded(control: Control, reporter: Reporter) -> None:
-    """Beyond the limit, refusals are counted together, and the count is complete."""
     for number in range(1000):
         reporter.refused("k", ("topic", "/chatter"), "10.0.0.2", f"/x{number}", "no grant")
     reporter.tick(list, {})
@@ -85,14 +83,12 @@ def test_many_different_refusals_are_bounded(control: Control, reporter: Reporte
 
 
 def test_long_claims_are_cut(control: Control, reporter: Reporter) -> None:
-    """Long header fields do not fill the link."""
     reporter.refused("k", ("topic", "/" + "t" * 60_000), "10.0.0.2", "/" + "c" * 60_000, "r" * 60_000)
     (message,) = control.heard()
     assert max(len(message.resource), len(message.caller_id), len(message.reason)) <= 300
 
 
 def test_a_new_control_hears_of_what_is_open_only(control: Control, reporter: Reporter) -> None:
-    """Open connections are reported again, under the numbers they were opened with."""
     first = reporter.opened("k", "/chatter", "topic", "10.0.0.2", "/a")
     second = reporter.opened("k", "/chatter", "topic", "10.0.0.2", "/b")
     reporter.closed(first, "")
@@ -112,14 +108,12 @@ def test_a_new_control_hears_of_what_is_open_only(control: Control, reporter: Re
 
 
 def test_traffic_is_one_message_per_tick(control: Control, reporter: Reporter) -> None:
-    """If there was no traffic, there is no message."""
     reporter.tick(lambda: [ROW, ROW], {})
     reporter.tick(list, {})
     assert control.heard() == [TrafficReported([ROW, ROW])]
 
 
 def test_refusals_without_a_control_reach_the_next_one(control: Control, reporter: Reporter) -> None:
-    """The next control gets the full count of refusals, and the traffic with its number of seconds."""
     reporter.attach(None)
     taken: list[int] = []
     for _ in range(3):
@@ -139,7 +133,6 @@ def test_refusals_without_a_control_reach_the_next_one(control: Control, reporte
 def test_connections_that_ended_without_a_control_are_reported_or_counted(
     control: Control, reporter: Reporter
 ) -> None:
-    """The relay keeps a limited number of ended connections to report one by one, and counts the others."""
     before = reporter.opened("k", "/chatter", "topic", "10.0.0.2", "/a")
     control.heard()
     reporter.attach(None)

@@ -73,7 +73,6 @@ def carries_images(world: World, publisher: Peer, subscriber: Peer) -> None:
 
 
 def test_latched_messages_of_a_guest_stop_no_other_host(world: World) -> None:
-    """Messages beyond the guest's quota are refused with a report; the robot's images pass, and freed memory counts."""
     robot = world.subscribed()
     message = encode_frame(bytes(MIB))
     refused = 0
@@ -97,7 +96,6 @@ def test_latched_messages_of_a_guest_stop_no_other_host(world: World) -> None:
 
 
 def test_latched_messages_of_two_hundred_hosts_leave_room_for_the_robots(world: World) -> None:
-    """Each host takes all that it can get, half of the rest each time; the next host's latch is still kept."""
     for number in range(200):
         size = 6 * MIB if number < 6 else 60_000
         message = encode_frame(bytes(size))
@@ -112,7 +110,6 @@ def test_latched_messages_of_two_hundred_hosts_leave_room_for_the_robots(world: 
 
 
 def test_unfinished_messages_of_a_guest_stop_no_other_host(world: World) -> None:
-    """Forty publishers of one host begin messages and never end them: the host is cut, and images always pass."""
     robot = world.subscribed()
     begun = encode_frame(bytes(8 * MIB))[: 2 * MIB]
     for number in range(40):
@@ -127,7 +124,6 @@ def test_unfinished_messages_of_a_guest_stop_no_other_host(world: World) -> None
 
 
 def test_subscribers_of_a_guest_that_never_read_stop_no_other_host(world: World) -> None:
-    """Subscribers lose messages, and are cut if they are in the middle of one; another host's fast one gets all."""
     publisher, quick = world.subscribed()
     world.state(GrantInstalled("k", "/chatter", "127.0.0.2", "/stuck"))
     stuck = []
@@ -156,7 +152,6 @@ def test_subscribers_of_a_guest_that_never_read_stop_no_other_host(world: World)
 
 
 def test_headers_of_unknown_hosts_leave_room_for_the_robots(world: World) -> None:
-    """A hundred unknown hosts begin headers: together they get a quarter of the memory."""
     unfinished = encode_header({"callerid": "/" + "x" * 30_000})[:-1]
     for number in range(100):
         source = (f"127.0.1.{number + 1}", 0)
@@ -192,7 +187,6 @@ def test_headers_of_publishers_and_servers_count_while_they_are_connected(world:
 
 @pytest.mark.parametrize("asked", [ASK, CALL])
 def test_little_of_a_peers_header_is_kept(world: World, asked: dict[str, str]) -> None:
-    """Only ROS fields are kept, none longer than a name: a host's eight thousand connections use little memory."""
     long = world.connect(encode_header(asked | {"type": "x" * 2000}))
     assert world.gets_header(long)["error"] == "its header has a type of 2000 characters"
     world.connect(encode_header(asked | {"message_definition": "x" * 30_000, "own": "x" * 30_000}))

@@ -47,7 +47,6 @@ def subscribed(world: World) -> tuple[Peer, Peer]:
 
 
 def test_the_next_messages_are_shown_and_no_more(world: World) -> None:
-    """The tap has the requested number of messages, with type, size and fields; subscribers are not affected."""
     publisher, subscriber = subscribed(world)
     world.state(LookWanted(1, "/chatter", 2, latched=True))
     frames = [encode_frame(text(word)) for word in ("one", "two", "three")]
@@ -62,7 +61,6 @@ def test_the_next_messages_are_shown_and_no_more(world: World) -> None:
 
 
 def test_a_topic_without_subscribers_is_tapped(world: World) -> None:
-    """The publisher is connected for the tap, and disconnected after it."""
     world.state(LookWanted(1, "/chatter", MOST_MESSAGES, latched=True))
     publisher = world.upstream(TOLD)
     publisher.send(encode_frame(text("alone")))
@@ -88,7 +86,6 @@ def test_the_latched_message_comes_first(world: World) -> None:
 
 
 def test_another_publisher_is_read_by_its_own_definition(world: World) -> None:
-    """During a tap the publisher reconnects with another definition."""
     publisher, _subscriber = subscribed(world)
     world.state(LookWanted(1, "/chatter", 5, latched=True))
     publisher.send(encode_frame(text("one")))
@@ -103,7 +100,6 @@ def test_another_publisher_is_read_by_its_own_definition(world: World) -> None:
 
 @pytest.mark.parametrize("definition", ["", "no/such field", "string data\n" * 3, "std_msgs/String data\n"])
 def test_an_unreadable_definition_is_reported(world: World, definition: str) -> None:
-    """The report has the first bytes and the reason instead."""
     subscriber = world.connect(encode_header(ASK))
     publisher = world.upstream(HEADER | {"message_definition": definition})
     world.gets_header(subscriber)
@@ -115,7 +111,6 @@ def test_an_unreadable_definition_is_reported(world: World, definition: str) -> 
 
 
 def test_lengths_that_lie_are_shown_as_far_as_the_bytes_go(world: World) -> None:
-    """A string claims to be longer than the message."""
     publisher, _subscriber = subscribed(world)
     world.state(LookWanted(1, "/chatter", 1, latched=True))
     publisher.send(encode_frame(struct.pack("<I", 1 << 31) + b"x"))
@@ -123,7 +118,6 @@ def test_lengths_that_lie_are_shown_as_far_as_the_bytes_go(world: World) -> None
 
 
 def test_taps_are_few_and_end_with_control(world: World) -> None:
-    """Beyond `MOST_LOOKS` there is no further tap; when control ends, its taps end."""
     publisher, subscriber = subscribed(world)
     for number in range(MOST_LOOKS + 1):
         world.state(LookWanted(number, "/chatter", 1, latched=True))

@@ -15,7 +15,6 @@ Types = dict[str, dict[str, Any]]
 
 @pytest.mark.nightly
 def test_md5sums_of_full_texts_are_those_of_genpy(genpy_types: Types) -> None:
-    """The full text of every installed message gives the md5sum that nodes compare."""
     for name, entry in genpy_types.items():
         if entry["kind"] == "msg":
             assert Definitions.from_full_text(name, entry["text"]).md5sum(name) == entry["md5sum"], name
@@ -23,14 +22,12 @@ def test_md5sums_of_full_texts_are_those_of_genpy(genpy_types: Types) -> None:
 
 @pytest.mark.nightly
 def test_full_texts_come_back_as_they_were(genpy_types: Types) -> None:
-    """The full text that is built from definitions equals the output of ROS's generators, byte for byte."""
     for name, entry in genpy_types.items():
         if entry["kind"] == "msg":
             assert Definitions.from_full_text(name, entry["text"]).full_text(name) == entry["text"], name
 
 
 def test_files_are_found_by_both_forms_of_their_names() -> None:
-    """pkg/T.msg and pkg/msg/T.msg are the same type; the same holds for services."""
     files = {"a/B.msg": "C c\n", "a/msg/C.msg": "int32 x\n", "a/D.srv": "B b\n---\n", "a/srv/E.srv": "---\n"}
     definitions = Definitions.from_files(files)
     assert definitions.message_types == [
@@ -51,13 +48,11 @@ def test_files_are_found_by_both_forms_of_their_names() -> None:
     "file", ["B.msg", "a/srv/B.msg", "a/b/B.msg", "a/B.txt", "../a/B.msg", "a/B.msg\n", "/a/B.msg", ""]
 )
 def test_other_file_names_are_refused(file: str) -> None:
-    """A file name without package and type is refused, and the error shows the valid forms."""
     with pytest.raises(DefinitionError, match=r"write pkg/T\.msg"):
         Definitions.from_files({file: ""})
 
 
 def test_a_type_has_one_definition() -> None:
-    """Two files or two sections for one type are refused."""
     with pytest.raises(DefinitionError, match="a/B is defined in two files"):
         Definitions.from_files({"a/B.msg": "", "a/msg/B.msg": ""})
     with pytest.raises(DefinitionError, match="a/C is defined twice"):
@@ -67,7 +62,6 @@ def test_a_type_has_one_definition() -> None:
 
 
 def test_extending_lets_the_new_types_win(standard: Definitions) -> None:
-    """An operator's own version of a standard type is used, also inside other types."""
     own = Definitions.from_files({"geometry_msgs/Point.msg": "float32 x\n"})
     both = standard.extended(own)
     assert both.md5sum("geometry_msgs/Point") == own.md5sum("geometry_msgs/Point")
@@ -77,7 +71,6 @@ def test_extending_lets_the_new_types_win(standard: Definitions) -> None:
 
 
 def test_unknown_types_are_named_with_similar_ones(standard: Definitions) -> None:
-    """The error for an unknown type suggests similar types."""
     with pytest.raises(
         DefinitionError, match=r"std_msgs/Strin: no such message type; did you mean .*std_msgs/String"
     ):
@@ -89,7 +82,6 @@ def test_unknown_types_are_named_with_similar_ones(standard: Definitions) -> Non
 
 
 def test_types_that_contain_themselves_are_refused() -> None:
-    """A cycle of types is refused and named by every query, and the other types still work."""
     definitions = Definitions.from_files({"a/B.msg": "C[] c", "a/C.msg": "B[] b", "a/D.msg": "int8 x"})
     for ask in (definitions.md5sum, definitions.layout, definitions.full_text):
         with pytest.raises(DefinitionError, match="a/B contains a/C contains a/B"):
@@ -133,7 +125,6 @@ def test_layouts_do_not_explode() -> None:
     ).map("".join)
 )
 def test_any_full_text_is_used_or_refused(text: str) -> None:
-    """Text from an unknown host's connection header never raises anything but DefinitionError."""
     try:
         definitions = Definitions.from_full_text("a/B", text)
         assert len(definitions.md5sum("a/B")) == 32

@@ -97,7 +97,6 @@ def without_empty(value: Any) -> Any:
 
 @pytest.mark.nightly
 def test_messages_of_genpy_are_read_by_their_layout(genpy_types: dict[str, dict[str, Any]]) -> None:
-    """For every installed message, a serialised example is read completely, and its values are equal."""
     read_types = 0
     for name, entry in genpy_types.items():
         if entry["kind"] != "msg":
@@ -114,7 +113,6 @@ def test_messages_of_genpy_are_read_by_their_layout(genpy_types: dict[str, dict[
 
 
 def test_fixed_parts_are_never_neighbours(standard: Definitions) -> None:
-    """All bytes before the first variable part are one part, and leaves fill their part without a gap."""
     for name in standard.message_types:
         parts = standard.layout(name).parts
         for part, following in pairwise(parts):
@@ -126,7 +124,6 @@ def test_fixed_parts_are_never_neighbours(standard: Definitions) -> None:
 
 
 def test_places_find_fields_by_path(standard: Definitions) -> None:
-    """A path leads to a field's part and its leaf, string or array; an unknown path has no result."""
     places = standard.layout("geometry_msgs/PoseWithCovarianceStamped").places
     assert places["header.frame_id"] == FieldLocation(1, StringPart("header.frame_id"))
     assert places["pose.pose.orientation.w"] == FieldLocation(
@@ -168,5 +165,4 @@ def test_arrays_of_every_kind() -> None:
 
 
 def test_an_empty_message_has_no_parts(standard: Definitions) -> None:
-    """A message without fields has no bytes."""
     assert standard.layout("std_msgs/Empty") == MessageLayout((), 0, 0, {})

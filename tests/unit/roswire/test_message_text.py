@@ -12,7 +12,6 @@ RULE = "=" * 80
 
 
 def test_fields_and_constants_of_every_form() -> None:
-    """Comments, blanks, tabs, arrays, packages and the short name of Header are read as genmsg reads them."""
     message = parse_message(
         "my_msgs/All",
         "# comment\r\n"
@@ -55,7 +54,6 @@ def test_fields_and_constants_of_every_form() -> None:
     ],
 )
 def test_bad_lines_are_refused_with_their_place(line: str, complaint: str) -> None:
-    """An error names its file and line."""
     with pytest.raises(DefinitionError, match=complaint) as refused:
         parse_message("a/B", f"int32 first\n\n{line}", "B.msg")
     assert refused.value.source == "B.msg"
@@ -64,7 +62,6 @@ def test_bad_lines_are_refused_with_their_place(line: str, complaint: str) -> No
 
 
 def test_services_are_split_at_the_rule() -> None:
-    """A service is a request and a response; errors in the response use the line numbers of the whole file."""
     service = parse_service("a/Add", "int32 x\n--- sum\nint32 y\n", "Add.srv")
     assert (service.request.name, service.response.name) == ("a/AddRequest", "a/AddResponse")
     assert service.request.fields == (Field("int32", "x"),)
@@ -77,7 +74,6 @@ def test_services_are_split_at_the_rule() -> None:
 
 
 def test_full_texts_are_split_at_their_rules() -> None:
-    """Each type of a full text has the number of its first line."""
     text = f"B b\n{RULE}\nMSG: a/B\nint32 x\n{RULE}\r\nMSG: c/D\r\nint32 y"
     assert split_full_text("a/A", text) == [("a/A", "B b", 1), ("a/B", "int32 x", 4), ("c/D", "int32 y", 7)]
     assert split_full_text("a/A", "") == [("a/A", "", 1)]
@@ -89,14 +85,12 @@ def test_full_texts_are_split_at_their_rules() -> None:
 
 
 def test_the_number_of_fields_is_bounded() -> None:
-    """A definition with too many fields is refused."""
     with pytest.raises(DefinitionError, match="more than 10000 fields"):
         parse_message("a/B", "\n".join(f"int8 f{number}" for number in range(10_001)), "B.msg")
 
 
 @given(text=st.text(st.sampled_from("int32 string[]=#/\n-abX1\t\u00e9\udce9"), max_size=60))
 def test_any_text_is_read_or_refused(text: str) -> None:
-    """Any text is read, or raises DefinitionError."""
     for parse in (
         lambda: parse_message("a/B", text, "B.msg"),
         lambda: parse_service("a/B", text, "B.srv"),

@@ -33,7 +33,6 @@ OUTER = (
 
 
 def test_fields_are_read_by_their_names() -> None:
-    """Times are in seconds, and bytes are hexadecimal digits."""
     assert read_fields(DEFINITIONS, "a/Outer", OUTER) == {
         "stamp": 5.25,
         "parts": [{"x": 1.5, "name": "one"}, {"x": 2.5, "name": "two"}],
@@ -43,7 +42,6 @@ def test_fields_are_read_by_their_names() -> None:
 
 
 def test_a_truncated_message_is_read_to_its_end() -> None:
-    """A message may be cut at any length; no bytes of a peer raise an exception."""
     for length in range(len(OUTER)):
         fields = read_fields(DEFINITIONS, "a/Outer", OUTER[:length])
         assert fields is not None
@@ -53,7 +51,6 @@ def test_a_truncated_message_is_read_to_its_end() -> None:
 
 
 def test_long_values_are_shortened() -> None:
-    """Shortening keeps a log record small."""
     many = read_fields(DEFINITIONS, "a/Many", struct.pack("<I100i", 100, *range(100)))
     assert many == {"values": [*range(MOST_ELEMENTS), f"{CUT} {100 - MOST_ELEMENTS} more"]}
     assert read_fields(DEFINITIONS, "a/Inner", inner(float("nan"), "")) == {"x": "nan", "name": ""}
@@ -70,7 +67,6 @@ def test_long_values_are_shortened() -> None:
 
 
 def test_a_shortened_array_does_not_hide_later_fields() -> None:
-    """After a scan, an image or a list of names, later fields are shown, with the number of omitted elements."""
     scan = struct.pack("<720f", *range(720))
     names = b"".join(struct.pack("<I", 3) + b"abc" for _ in range(100))
     data = b"".join(struct.pack("<I", 720) + scan for _ in range(2)) + struct.pack("<I", 100) + names
@@ -87,7 +83,6 @@ def test_a_shortened_array_does_not_hide_later_fields() -> None:
 
 
 def test_every_field_is_named_where_the_bytes_end() -> None:
-    """Fields after the end of the bytes are marked as missing."""
     cut = read_fields(LONG, "a/Long", struct.pack("<I", 2**32 - 1) + b"\0" * 4000)
     assert cut is not None
     assert list(cut) == ["ranges", "intensities", "names", "data", "last"]
@@ -95,7 +90,6 @@ def test_every_field_is_named_where_the_bytes_end() -> None:
 
 
 def test_fields_that_are_too_many_to_name_are_counted() -> None:
-    """A message with a thousand fields states how many are not shown."""
     wide = Definitions.from_files({"a/Wide.msg": "".join(f"int8 f{number}\n" for number in range(1000))})
     fields = read_fields(wide, "a/Wide", b"\0" * 1000)
     assert fields is not None
@@ -103,7 +97,6 @@ def test_fields_that_are_too_many_to_name_are_counted() -> None:
 
 
 def test_large_counts_of_unknown_hosts_take_no_time() -> None:
-    """Thousands of millions of empty elements, or more elements of varying size than are shown, are not walked."""
     empty = read_fields(LONG, "a/Empties", struct.pack("<I", 2**32 - 1) + b"\7")
     assert empty == {"values": [{}] * MOST_ELEMENTS + [f"{CUT} {2**32 - 1 - MOST_ELEMENTS} more"], "last": 7}
     many = read_fields(LONG, "a/Texts", struct.pack("<I", 100_000) + b"\0" * 400_001)

@@ -46,7 +46,6 @@ def rosmaster() -> Iterator[Oracle]:
 @settings(max_examples=examples(2000))
 @given(name=NAME_LIKE, caller_id=CALLER_IDS)
 def test_resolve_agrees_with_rosmaster(rosmaster: Oracle, name: str, caller_id: str) -> None:
-    """A name that is not refused resolves to rosmaster's name, which is canonical and resolves to itself."""
     try:
         resolved = names.resolve(name, caller_id)
     except InvalidNameError:
@@ -84,7 +83,6 @@ def test_every_ros_name_resolves(rosmaster: Oracle, name: str, caller_id: str) -
 
 @given(text=st.text(max_size=30), caller_id=st.text(max_size=10))
 def test_any_text_resolves_or_is_refused(text: str, caller_id: str) -> None:
-    """Any text resolves or raises the error for the peer."""
     for function in (names.resolve, names.resolve_namespace, names.resolve_parameter):
         try:
             assert function(text, caller_id).isascii()
@@ -102,7 +100,6 @@ def test_any_text_resolves_or_is_refused(text: str, caller_id: str) -> None:
     ],
 )
 def test_resolve_makes_the_canonical_name(name: str, caller_id: str, expected: str) -> None:
-    """Global, relative and private names are resolved to the global form."""
     assert names.resolve(name, caller_id) == expected
 
 
@@ -116,13 +113,11 @@ def test_resolve_makes_the_canonical_name(name: str, caller_id: str, expected: s
     ],
 )
 def test_resolve_refuses_what_is_not_a_ros_name(name: str) -> None:
-    """Names that are empty, overlong, look-alike or meaningless, or that leave the alphabet, are refused."""
     with pytest.raises(InvalidNameError):
         names.resolve(name, "/talker")
 
 
 def test_refusal_names_the_character_and_its_place() -> None:
-    """The error has the name, the wrong character and its position."""
     with pytest.raises(InvalidNameError, match=r"'/a b'.*character 3 is ' '"):
         names.resolve("/a b", "/talker")
     with pytest.raises(InvalidNameError, match="starts with a letter"):
@@ -137,7 +132,6 @@ def test_refusal_names_the_character_and_its_place() -> None:
 
 @pytest.mark.parametrize("caller_id", ["talker", "/", "~a", "/a b", "/\u0430"])
 def test_relative_names_need_a_valid_caller(caller_id: str) -> None:
-    """A caller_id that is not a global name can only resolve global names."""
     for name in ("chatter", "~chatter"):
         with pytest.raises(InvalidNameError):
             names.resolve(name, caller_id)
@@ -145,7 +139,6 @@ def test_relative_names_need_a_valid_caller(caller_id: str) -> None:
 
 
 def test_tools_with_a_hyphen_resolve_what_is_a_name() -> None:
-    """`/rosparam-4711` may use relative names; only a parameter may keep the hyphen."""
     assert names.canonical_tool_id("/rosparam-4711") == "/rosparam-4711"
     assert names.resolve("chatter", "/rosparam-4711") == "/chatter"
     assert names.resolve_parameter("~a", "/rosparam-4711") == "/rosparam-4711/a"
@@ -158,7 +151,6 @@ def test_tools_with_a_hyphen_resolve_what_is_a_name() -> None:
 
 
 def test_a_name_may_not_grow_too_long() -> None:
-    """The length limit applies to the resolved name."""
     caller_id = "/" + "a" * 600
     assert names.is_global_name(names.resolve("~" + "b" * 400, caller_id))
     with pytest.raises(InvalidNameError, match="1202 characters; at most 1024"):
@@ -188,7 +180,6 @@ def test_namespace_variant_allows_the_root() -> None:
     ],
 )
 def test_parameters_of_real_robots_pass(name: str) -> None:
-    """Keys as they come from YAML files (hyphens, dots, leading digits, inner spaces) are parameters."""
     assert names.resolve_parameter(name, "/talker") == name
     assert names.resolve_parameter(name + "/", "/talker") == name
 
@@ -197,13 +188,11 @@ def test_parameters_of_real_robots_pass(name: str) -> None:
     "name", ["", "/a\n", "/a*", "/a?", '/a"', "/a\\b", "/ a", "/a /b", "/a ", " ", "/a/~b", "/caf\u00e9"]
 )
 def test_parameters_that_could_mislead_are_refused(name: str) -> None:
-    """Patterns, quotes, outer spaces, control characters and text outside ASCII are not parameter names."""
     with pytest.raises(InvalidNameError):
         names.resolve_parameter(name, "/talker")
 
 
 def test_a_member_that_no_key_names_is_had_with_its_namespace() -> None:
-    """A dictionary may have any members. The error for such a member's key says to use its namespace instead."""
     assert names.is_relative_member("\u00fc")
     with pytest.raises(InvalidNameError, match="such a member is read and set with its namespace"):
         names.resolve_parameter("/ns/\u00fc", "/talker")
@@ -211,7 +200,6 @@ def test_a_member_that_no_key_names_is_had_with_its_namespace() -> None:
 
 @pytest.mark.parametrize("caller_id", ["/a", "/a/b", "/rostopic_4_1699999999999", "/_a", "/1"])
 def test_caller_id_is_returned_unchanged(caller_id: str) -> None:
-    """A canonical global name is returned as it is."""
     assert names.canonical_caller_id(caller_id) is caller_id
 
 
@@ -220,7 +208,6 @@ def test_caller_id_is_returned_unchanged(caller_id: str) -> None:
     ["", "/", "//", "a", "~a", "a//b", "/a\n", "/a/\n", "/a b", "//a-b", "/\u0430", "/" + "a" * 1024],
 )
 def test_caller_id_must_be_a_global_name(caller_id: str) -> None:
-    """Nothing else has a canonical form."""
     with pytest.raises(InvalidNameError, match="caller_id"):
         names.canonical_caller_id(caller_id)
     assert not names.is_global_name(caller_id)
@@ -239,7 +226,6 @@ def test_caller_id_is_folded_as_by_rospy_and_roscpp(caller_id: str, canonical: s
 
 
 def test_namespace_and_join_are_inverse() -> None:
-    """Joining a name's namespace and its last segment gives the name; global and private names are not joined."""
     assert [names.namespace(name) for name in ("/a/b/c", "/a", "/", "")] == ["/a/b/", "/", "/", "/"]
     assert names.join("/a/b/", "c") == names.join("/a/b", "c") == "/a/b/c"
     assert names.join("/a", "/c") == "/c"
@@ -265,5 +251,4 @@ def test_namespace_and_join_are_inverse() -> None:
     ],
 )
 def test_type_names(name: str, valid: bool) -> None:
-    """A type is package/Type or the wildcard."""
     assert names.is_valid_type_name(name) is valid

@@ -28,7 +28,6 @@ def some_tree(chance: random.Random, depth: int) -> Tree:
 
 
 def test_names_are_those_that_rosmaster_tells() -> None:
-    """The names have rosmaster's order, and its result for a key that begins with a slash or a tilde."""
     chance = random.Random(1)  # noqa: S311  not a secret
     trees = [some_tree(chance, 4) for _ in range(500)]
     asked = "".join(f"{json.dumps(tree)}\n" for tree in trees)

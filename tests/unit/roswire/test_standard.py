@@ -11,7 +11,6 @@ from roswire.definitions import Definitions
 def test_md5sums_are_those_of_the_installed_packages(
     standard: Definitions, genpy_types: dict[str, dict[str, Any]]
 ) -> None:
-    """Every message and service type of ROS's own packages exists with the md5sum that nodes compare."""
     for name, entry in genpy_types.items():
         md5sum = standard.service_md5sum if entry["kind"] == "service" else standard.md5sum
         assert md5sum(name) == entry["md5sum"], name
@@ -28,13 +27,11 @@ def test_every_type_is_whole(standard: Definitions) -> None:
 
 
 def test_types_beside_the_type_store(standard: Definitions) -> None:
-    """The message of /tf, which the tests' machine lacks, has the md5sum of ROS Noetic."""
     assert standard.md5sum("tf2_msgs/TFMessage") == "94810edda583a504dfda3829e70d7eec"
     assert standard.md5sum("tf/tfMessage") == "94810edda583a504dfda3829e70d7eec"
 
 
 def test_actions_and_drive_commands_beside_the_type_store(standard: Definitions) -> None:
-    """The messages of common actions equal genaction's output: they have the md5sums of ROS Noetic."""
     known = {
         "move_base_msgs/MoveBaseAction": "70b6aca7c7f7746d8d1609ad94c80bb8",
         "move_base_msgs/MoveBaseActionGoal": "660d6895a1b9a16dce51fbdd9a64a56b",
@@ -47,7 +44,6 @@ def test_actions_and_drive_commands_beside_the_type_store(standard: Definitions)
 
 
 def test_mavros_beside_the_type_store(standard: Definitions) -> None:
-    """The common types of mavros_msgs have the md5sums that nodes of ROS Noetic compare."""
     messages = {
         "geographic_msgs/GeoPoint": "c48027a852aeff972be80478ff38e81a",
         "mavros_msgs/Altitude": "1296a05dc5b6160be0ae04ba9ed3a3fa",

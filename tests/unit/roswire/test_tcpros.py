@@ -42,7 +42,6 @@ def header(*fields: bytes) -> bytes:
 
 
 def test_the_notation_of_a_header() -> None:
-    """A header is its length and then its fields, each with its length, in the given order."""
     assert encode_header({"topic": "/a", "type": "*"}) == b"\x16\0\0\0\x08\0\0\0topic=/a\x06\0\0\0type=*"
     assert decode_header(b"\x08\0\0\0topic=/a\x06\0\0\0type=*") == {"topic": "/a", "type": "*"}
 
@@ -51,7 +50,6 @@ def test_the_notation_of_a_header() -> None:
     fields=st.dictionaries(NAMES, st.text(st.characters(exclude_categories=["Cs"]))), cut=st.integers(1, 40)
 )
 def test_headers_come_back_in_any_pieces(fields: dict[str, str], cut: int) -> None:
-    """However a header arrives, its fields equal those that were sent, and no byte after it is lost."""
     data = encode_header(fields) + b"behind"
     parser = HeaderParser(limit=1 << 20)
     result = None
@@ -65,7 +63,6 @@ def test_headers_come_back_in_any_pieces(fields: dict[str, str], cut: int) -> No
 
 
 def test_value_may_hold_equal_signs_and_be_empty() -> None:
-    """A field is split at its first '='."""
     assert decode_header(header(b"a=b=c", b"d=")[4:]) == {"a": "b=c", "d": ""}
 
 
@@ -103,7 +100,6 @@ def test_headers_that_are_refused(data: bytes, error: type[ProtocolError], text:
 
 
 def test_a_lying_length_is_refused_before_anything_is_kept() -> None:
-    """Four bytes are enough to refuse a header that is too long, before it is stored."""
     parser = HeaderParser(limit=100)
     assert parser.feed(b"\x65\0\0") is None
     with pytest.raises(LimitExceededError):
@@ -111,14 +107,12 @@ def test_a_lying_length_is_refused_before_anything_is_kept() -> None:
 
 
 def test_an_empty_header_is_complete() -> None:
-    """A header of length 0 has no fields."""
     parser = HeaderParser()
     assert parser.feed(length(0) + b"x") == {}
     assert parser.rest == b"x"
 
 
 def test_a_complete_header_takes_nothing_more() -> None:
-    """Feeding bytes after the end of the header is the caller's mistake, not the peer's."""
     parser = HeaderParser()
     parser.feed(encode_header(FIELDS))
     with pytest.raises(RuntimeError):
@@ -127,7 +121,6 @@ def test_a_complete_header_takes_nothing_more() -> None:
 
 @given(data=st.binary(max_size=80))
 def test_random_bytes_raise_only_the_error_for_the_peer(data: bytes) -> None:
-    """Any bytes are parsed or raise PeerError."""
     for parser in (HeaderParser(limit=60), FrameParser(limit=60), ServiceReplyParser(limit=60)):
         try:
             parser.feed(length(len(data)) + data)
@@ -144,7 +137,6 @@ def test_random_bytes_raise_only_the_error_for_the_peer(data: bytes) -> None:
 
 @given(bodies=st.lists(st.binary(max_size=20), max_size=6), cut=st.integers(1, 30))
 def test_frames_come_back_in_any_pieces(bodies: list[bytes], cut: int) -> None:
-    """Bodies are returned whole and in order however the bytes arrive."""
     data = b"".join(map(encode_frame, bodies))
     parser = FrameParser()
     received = [body for at in range(0, len(data), cut) for body in parser.feed(data[at : at + cut])]
@@ -156,7 +148,6 @@ def test_frames_come_back_in_any_pieces(bodies: list[bytes], cut: int) -> None:
     cut=st.integers(1, 30),
 )
 def test_service_replies_come_back_in_any_pieces(replies: list[tuple[bool, str]], cut: int) -> None:
-    """Answers and errors of a service are returned whole and in order however the bytes arrive."""
     data = b"".join(
         encode_service_reply(text.encode()) if ok else encode_service_error(text) for ok, text in replies
     )
@@ -166,7 +157,6 @@ def test_service_replies_come_back_in_any_pieces(replies: list[tuple[bool, str]]
 
 
 def test_frames_beyond_the_limit_are_refused_at_their_length() -> None:
-    """A declared length beyond the limit is refused before its body arrives."""
     with pytest.raises(LimitExceededError, match="11 bytes; at most 10"):
         FrameParser(limit=10).feed(length(11))
     with pytest.raises(LimitExceededError, match="11 bytes; at most 10"):
@@ -176,6 +166,5 @@ def test_frames_beyond_the_limit_are_refused_at_their_length() -> None:
 
 
 def test_the_notation_of_service_replies() -> None:
-    """A success is 1 before its frame, an error is 0; text that is not UTF-8 is replaced."""
     assert encode_service_reply(b"ab") == b"\x01\x02\0\0\0ab"
     assert encode_service_error("no\ud800") == b"\x00\x03\0\0\0no?"

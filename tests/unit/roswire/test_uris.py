@@ -37,7 +37,6 @@ def test_node_uris_as_ros_writes_them(text: str, expected: NodeUri) -> None:
     ],
 )
 def test_refused_node_uris_say_why(text: str, complaint: str) -> None:
-    """URIs other than http://host:port/path are rejected with the reason and a valid form."""
     with pytest.raises(InvalidUriError, match=complaint) as refused:
         parse_node_uri(text)
     assert str(refused.value).isprintable()
@@ -60,7 +59,6 @@ def test_service_uris() -> None:
     port=st.integers(1, 65535),
 )
 def test_a_written_uri_is_read_back(host: str, port: int) -> None:
-    """The URI written for any host and port is read back to that host and port."""
     assert parse_node_uri(node_uri(host, port)) == NodeUri("http", host, port, "/")
     assert parse_node_uri(node_uri(host, port, "/key/")) == NodeUri("http", host, port, "/key/")
     assert parse_service_uri(service_uri(host, port)) == NodeUri("rosrpc", host, port, "")
@@ -71,7 +69,6 @@ def test_a_written_uri_is_read_back(host: str, port: int) -> None:
     prefix=st.sampled_from(["", "http://", "rosrpc://"]),
 )
 def test_any_text_is_read_or_refused(text: str, prefix: str) -> None:
-    """Any text is read or raises the error for the peer; an accepted URI is read again unchanged."""
     for parse, write in ((parse_node_uri, node_uri), (parse_service_uri, service_uri)):
         try:
             uri = parse(prefix + text)

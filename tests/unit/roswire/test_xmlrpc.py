@@ -80,7 +80,6 @@ def without_bare_returns(value: Value) -> Value:
 
 @given(params=st.lists(VALUES, max_size=4), method=st.from_regex(r"[A-Za-z_.]{1,20}", fullmatch=True))
 def test_calls_are_read_as_python_reads_them(params: list[Value], method: str) -> None:
-    """A call that we build is read back unchanged, here and by the parser of rosmaster and rospy."""
     body = build_call(method, params)
     assert parse_call(body) == MethodCall(method, tuple(params))
     assert python_loads(body) == (tuple(params), method)
@@ -89,7 +88,6 @@ def test_calls_are_read_as_python_reads_them(params: list[Value], method: str) -
 @given(params=st.lists(VALUES, max_size=4))
 @example(params=[{"\r": 1}])
 def test_calls_of_python_are_read(params: list[Value]) -> None:
-    """Documents of xmlrpc.client (rospy, rosmaster) are read as the values that were written."""
     body = xmlrpc.client.dumps(tuple(params), "m").encode()
     expected = [without_bare_returns(value) for value in params]
     if body.count(b"<name>") == xmlrpc.client.dumps(tuple(expected), "m").count("<name>"):
@@ -98,7 +96,6 @@ def test_calls_of_python_are_read(params: list[Value]) -> None:
 
 @given(value=VALUES)
 def test_answers_are_read_as_python_reads_them(value: Value) -> None:
-    """An answer is read back unchanged, here and by Python."""
     body = build_response(value)
     assert parse_response(body) == value
     assert python_loads(body) == ((value,), None)
@@ -191,7 +188,6 @@ def test_roscpp_calls_are_read() -> None:
     ],
 )
 def test_values_as_ros_clients_write_them(element: str, expected: Value) -> None:
-    """Every notation that a ROS client uses is read, with its type."""
     value = read(element)
     assert value == expected
     assert type(value) is type(expected)
@@ -277,7 +273,6 @@ ENTITY_BOMB = (
     ],
 )
 def test_invalid_xml_rpc_is_refused(body: bytes, text: str) -> None:
-    """Input that is ungrammatical, ambiguous or out of range is refused with the position and the reason."""
     with pytest.raises(ProtocolError, match=text) as refused:
         parse_call(body)
     assert "byte" in str(refused.value)
@@ -321,7 +316,6 @@ def test_limits_hold() -> None:
 
 
 def test_parts_of_a_multicall_are_bounded() -> None:
-    """A multicall has a separate limit on its parts; other calls do not."""
     body = build_call("system.multicall", [["a"] * 3])
     assert len(parse_call(body, XmlRpcLimits(parts=3)).params) == 1
     with pytest.raises(LimitExceededError, match="3 calls; at most 2"):
@@ -342,7 +336,6 @@ PREFIX = b"<methodCall><methodName>m</methodName><params><param>"
     ],
 )
 def test_large_documents_are_refused_where_they_go_wrong(body: bytes, text: str) -> None:
-    """A long tag, or a flood of attributes or nested elements, is refused without being stored."""
     with pytest.raises(ProtocolError, match=text):
         parse_call(body)
 
@@ -360,7 +353,6 @@ def test_large_values_in_pieces() -> None:
 )
 @pytest.mark.parametrize("tag", ["double", "int", "base64", "dateTime.iso8601"])
 def test_an_invalid_long_number_takes_linear_time(tag: str, number: str) -> None:
-    """A number that is invalid in its last byte is rejected in linear time."""
     begun = time.process_time()
     with pytest.raises(ProtocolError):
         read(f"<value><{tag}>{number}</{tag}></value>")
@@ -385,7 +377,6 @@ SCRAPS = st.one_of(
 @settings(max_examples=examples(500))
 @given(scraps=st.lists(SCRAPS, max_size=12), whole=st.booleans(), raw=st.binary(max_size=3))
 def test_scraps_raise_only_the_error_for_the_peer(scraps: list[str], whole: bool, raw: bytes) -> None:
-    """Any mixture of XML-RPC's own elements is parsed or raises PeerError."""
     text = "".join(scraps)
     body = (call(text) if whole else text.encode()).replace(b"-5", raw)
     for parse in (parse_call, parse_response):
@@ -418,7 +409,6 @@ def test_damaged_calls_raise_only_the_error_for_the_peer(data: st.DataObject) ->
 
 @given(data=st.binary(max_size=200))
 def test_random_bytes_are_refused(data: bytes) -> None:
-    """Bytes that are not a document are refused as the peer's fault."""
     with pytest.raises(PeerError):
         parse_call(data)
 
@@ -451,7 +441,6 @@ def test_values_without_a_notation_are_errors(value: object, text: str) -> None:
 
 
 def test_endless_values_are_errors() -> None:
-    """A list that contains itself is an error, not a crash."""
     endless: list[Value] = []
     endless.append(endless)
     with pytest.raises(EncodingError, match="deeper"):
@@ -459,13 +448,11 @@ def test_endless_values_are_errors() -> None:
 
 
 def test_texts_of_faults_are_always_sent() -> None:
-    """A fault is written whatever its text contains."""
     with pytest.raises(FaultReceived, match=r"fault 1: a\?<b>"):
         parse_response(build_fault(1, "a\x00<b>"))
 
 
 def test_the_deepest_readable_value_can_be_written() -> None:
-    """Reading and writing have the same depth limit."""
     depth = XmlRpcLimits().depth
     body = call("<value><array><data>" * depth + "</data></array></value>" * depth)
     assert parse_call(build_call("m", parse_call(body).params)) == parse_call(body)

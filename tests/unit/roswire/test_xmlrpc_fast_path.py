@@ -53,7 +53,6 @@ LISTS: st.SearchStrategy[Value] = st.lists(SCALARS, max_size=3)
 @given(values=st.lists(st.one_of(SCALARS, LISTS, st.lists(LISTS, max_size=2)), max_size=4), data=st.data())
 @settings(max_examples=examples(1000))
 def test_the_pattern_and_the_walk_read_the_same_values(values: list[Value], data: st.DataObject) -> None:
-    """For a whole or damaged call or answer, both give the same values, or the pattern leaves it to the parser."""
     whole = [dumped(values, "registerService"), dumped(values, None), ROSCPP]
     whole.append(dumped(parts(values, ["/a", "/b", 1]), "system.multicall"))
     body = bytearray(data.draw(st.sampled_from(whole)))
@@ -74,7 +73,6 @@ def test_the_pattern_and_the_walk_read_the_same_values(values: list[Value], data
 
 @pytest.mark.parametrize("quote", [b"'", b'"'])
 def test_calls_of_ros_clients_and_answers_of_rosmaster_are_usual(quote: bytes) -> None:
-    """The pattern matches registrations of all clients, and the answers of rosmaster."""
     told: list[Value] = ["/talker", "/chatter", "std_msgs/String", "http://10.0.0.5:40001/"]
     python = dumped(told, "registerPublisher").replace(b"version='1.0'", b"version=%b1.0%b" % (quote, quote))
     assert read_common_call(python, XmlRpcLimits()) == ("registerPublisher", told)
@@ -92,7 +90,6 @@ def test_calls_of_ros_clients_and_answers_of_rosmaster_are_usual(quote: bytes) -
 
 @pytest.mark.parametrize("value", [7, True, False, -0.5, 1e-05, "", "a b", [1.5, 2.0], []])
 def test_a_multicall_of_roslaunch_is_usual_however_long(value: Value) -> None:
-    """Parts with scalars or lists of scalars are read one by one; the same limits hold."""
     params: list[Value] = ["/roslaunch", "/start/part/value", value]
     several = parts(*[params] * 2000)
     body = dumped(several, "system.multicall")
@@ -111,7 +108,6 @@ def test_a_multicall_of_roslaunch_is_usual_however_long(value: Value) -> None:
     "value", [{"a": {"b": [1, {}]}}, "x" * 40_000, [[[1]]], "<robot/>\n", "<struct>", "]]>", {}], ids=repr
 )
 def test_a_part_that_is_not_plain_is_left_to_the_walk_alone(value: Value) -> None:
-    """The pattern leaves structs, text with mark-up, and parts that are too long for one pattern to the parser."""
     several = parts(["/a", "/b", 1], ["/a", "/c", value], ["/a", "/d", 2])
     body = dumped(several, "system.multicall")
     assert read_common_call(body, XmlRpcLimits()) == ("system.multicall", several)
@@ -121,7 +117,6 @@ def test_a_part_that_is_not_plain_is_left_to_the_walk_alone(value: Value) -> Non
 
 
 def test_two_values_are_not_taken_for_one_struct() -> None:
-    """Tags that balance only together with tags in comments are rejected, as by the general parser."""
     first, second = (b"<value><struct><!--<%bstruct>--></struct></value>" % slash for slash in (b"", b"/"))
     within = first + b"</param><param>" + second
     body = dumped(parts(["/a"]), "system.multicall")
@@ -132,7 +127,6 @@ def test_two_values_are_not_taken_for_one_struct() -> None:
 
 
 def test_few_parts_are_walked_alone() -> None:
-    """If most parts are complex, using only the general parser takes less time."""
     params: list[Value] = ["/a", "/b", {}]
     several = parts(*[params] * 256)
     body = dumped(several, "system.multicall")
@@ -156,7 +150,6 @@ PIECES = [
 @given(data=st.data())
 @settings(max_examples=examples(1000))
 def test_no_struct_hides_what_is_around_it(data: st.DataObject) -> None:
-    """For tags, comments and sections that span parts, the result equals the parser's, or is left to it."""
     given: list[list[Value]] = [
         ["/a", "/b", 1],
         ["/a", "/c", {"d": {"e": 1}}],
@@ -177,7 +170,6 @@ def test_no_struct_hides_what_is_around_it(data: st.DataObject) -> None:
 @pytest.mark.parametrize("piece", [b" ", b"\n", b"<value>a</value>", b"<value>a</value> \n", b"1"])
 @pytest.mark.parametrize("before", [b"", b"<value>", b"<value><int>", LIST, LIST[:20]])
 def test_an_invalid_document_takes_linear_time(piece: bytes, before: bytes) -> None:
-    """A document that fails to match at its last byte is left to the general parser in linear time."""
     short, long = (spoilt(before, piece, 1_000_000 // shorter) for shorter in (16, 1))
     of_short, of_long = (min(seconds_to_leave(texts) for _ in range(3)) for texts in (short, long))
     assert of_long < 64 * (of_short + 0.0005)  # 16 times as long; a quadratic pattern takes 256 times as long
@@ -207,7 +199,6 @@ def seconds_to_leave(texts: list[bytes]) -> float:
 
 
 def test_one_value_too_many_is_refused_however_short() -> None:
-    """The limits also hold for short documents."""
     body = dumped(["a"] * 4, "m")
     with pytest.raises(PeerError, match="more than 3 values"):
         parse_call(body, XmlRpcLimits(elements=3))

@@ -77,19 +77,16 @@ def test_values_survive_roscpp(roscpp: Peer, value: Value) -> None:
 
 
 def test_nan_survives_roscpp(roscpp: Peer) -> None:
-    """Not-a-number stays not-a-number."""
     (value,) = roscpp(build_response(math.nan)).params
     assert isinstance(value, float)
     assert math.isnan(value)
 
 
 def test_faults_are_faults_for_roscpp(roscpp: Peer) -> None:
-    """roscpp reads our fault as a fault, with its code and text."""
     call = roscpp(build_fault(-1, "no such <method>"))
     assert call == MethodCall("fault", ({"faultCode": -1, "faultString": "no such <method>"},))
 
 
 def test_a_large_answer_is_read_by_roscpp(roscpp: Peer) -> None:
-    """roscpp reads the state of a large robot completely."""
     value: Value = [1, "state", [[f"/topic_{number}", [f"/node_{number}"]] for number in range(2000)]]
     assert roscpp(build_response(value)).params == (value,)

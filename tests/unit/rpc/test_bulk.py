@@ -30,7 +30,6 @@ VALUES: st.SearchStrategy[Value] = st.recursive(
 
 
 async def test_room_for_one_of_a_host_and_two_in_all() -> None:
-    """A host keeps its place. Another host waits only for a free place, and each host only for its own."""
     turns = bulk_turns(lambda _host: QuotaClass.REGISTERED)
     inside: list[Any] = []
     go = asyncio.Event()
@@ -53,7 +52,6 @@ async def test_room_for_one_of_a_host_and_two_in_all() -> None:
 
 
 async def test_room_comes_back_after_a_failure() -> None:
-    """A request that fails or is cancelled gives back what it took; one that took nothing gives back nothing."""
     turns = bulk_turns(lambda _host: QuotaClass.REGISTERED)
     for _ in range(3):
         with pytest.raises(KeyError), Bulk(turns, HOSTS[0], TIME) as bulk:
@@ -69,12 +67,10 @@ async def test_room_comes_back_after_a_failure() -> None:
 
 @given(value=VALUES)
 def test_a_value_has_the_same_weight_as_in_the_mirror(value: Value) -> None:
-    """A value weighs what it counts for in the bound of all parameters."""
     assert weigh(value, 1 << 30) == measure(value)[0]
 
 
 def test_counting_ends_at_the_limit() -> None:
-    """Counting a huge value is short."""
     wide: Value = [list(range(1000)) for _ in range(1000)]
     assert 5000 <= weigh(wide, 5000) < 20_000
     assert 5000 <= weigh(dict.fromkeys(map(str, range(100_000)), 1), 5000) < 6000
@@ -92,7 +88,6 @@ def test_weight_is_about_what_is_written(letter: str) -> None:
 
 
 async def test_large_values_of_a_host_go_one_at_a_time() -> None:
-    """A guest's second large value waits for its first; its small one and another host's large one do not."""
     large = LargeWrites(1000, lambda _host: QuotaClass.REGISTERED)
     inside: list[str] = []
     go = asyncio.Event()
@@ -115,7 +110,6 @@ async def test_large_values_of_a_host_go_one_at_a_time() -> None:
 
 
 async def test_a_large_value_has_its_turn_until_the_standby_has_it() -> None:
-    """So a host has at most one large value on its way to the standby, behind which all other changes wait."""
     has_it = asyncio.Event()
 
     async def stored() -> None:
@@ -140,7 +134,6 @@ async def test_a_large_value_has_its_turn_until_the_standby_has_it() -> None:
 
 @pytest.mark.nightly
 async def test_the_work_of_a_thread_is_charged_to_its_host() -> None:
-    """A host whose large document was read in a thread is next after the others, as if the loop had read it."""
     time, order = ProcessorTime(lambda host: host, lambda: 0.0), list[Any]()
     bulk = Bulk(bulk_turns(lambda _host: QuotaClass.REGISTERED), HOSTS[0], time)
     with pytest.raises(ZeroDivisionError):

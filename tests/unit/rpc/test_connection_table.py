@@ -86,7 +86,6 @@ def come(
 
 
 def test_many_addresses_do_not_keep_a_named_host_out() -> None:
-    """After 200 unknown and twelve named hosts with full quotas, another named host still gets a connection."""
     quota_classes = QuotaClasses(
         {guest(n): QuotaClass.NAMED for n in range(200, 212)} | {ROBOT: QuotaClass.NAMED}
     )
@@ -111,7 +110,6 @@ def test_a_registered_host_gets_the_reserve() -> None:
 
 
 def test_only_a_lower_class_makes_room() -> None:
-    """An unknown host's unfinished request ends before a named host's idle connection; a higher class never yields."""
     quota_classes = QuotaClasses({OTHER: QuotaClass.NAMED, ROBOT: QuotaClass.REGISTERED})
     connection_table = books(quota_classes, Bounds(whole=3, host=3, unknown=1, kept=0))
     unknown = come(connection_table, guest(1), Stage.UNFINISHED)
@@ -126,7 +124,6 @@ def test_only_a_lower_class_makes_room() -> None:
 
 
 def test_an_unfinished_request_of_the_same_class_has_its_time() -> None:
-    """A request that has just begun is not ended for another host of the same class; one that hangs is."""
     quota_classes = QuotaClasses({OTHER: QuotaClass.NAMED, ROBOT: QuotaClass.NAMED})
     connection_table = books(quota_classes, Bounds(whole=1, host=1, unknown=0, kept=0))
     slow = come(connection_table, OTHER, Stage.UNFINISHED)
@@ -138,7 +135,6 @@ def test_an_unfinished_request_of_the_same_class_has_its_time() -> None:
 
 
 def test_a_host_at_its_own_quota_ends_no_connection() -> None:
-    """It gets the reason, and its own connections stay."""
     quota_classes = QuotaClasses({ROBOT: QuotaClass.NAMED, OTHER: QuotaClass.NAMED})
     connection_table = books(quota_classes, Bounds(whole=4, host=2, unknown=0, kept=0))
     there = [come(connection_table, ROBOT), come(connection_table, ROBOT), come(connection_table, OTHER)]
@@ -149,7 +145,6 @@ def test_a_host_at_its_own_quota_ends_no_connection() -> None:
 
 
 def test_a_host_that_registers_is_no_longer_unknown() -> None:
-    """A connection is filed under the class at its start, but the present class protects it."""
     quota_classes = QuotaClasses({ROBOT: QuotaClass.NAMED})
     connection_table = books(quota_classes, Bounds(whole=2, host=2, unknown=2, kept=0))
     risen, unknown = come(connection_table, guest(1)), come(connection_table, guest(2))
@@ -160,7 +155,6 @@ def test_a_host_that_registers_is_no_longer_unknown() -> None:
 
 
 def test_connections_turned_away_in_all() -> None:
-    """Connections that receive the refusal have quotas also, for each host and for all."""
     quota_classes = QuotaClasses({ROBOT: QuotaClass.NAMED, OTHER: QuotaClass.NAMED})
     connection_table = books(quota_classes, Bounds(1, 1, 0, 0))
     told = Guest(connection_table, ROBOT)
@@ -172,7 +166,6 @@ def test_connections_turned_away_in_all() -> None:
 
 
 def test_bytes_are_freed_by_the_host_that_holds_most() -> None:
-    """Bodies that are never finished fill the memory: the largest goes for a host that holds less, and only then."""
     quota_classes = QuotaClasses(dict.fromkeys((ROBOT, OTHER, guest(1)), QuotaClass.REGISTERED))
     connection_table = books(
         quota_classes, Bounds(9, 9, 0, 0), Bounds(whole=100, host=100, unknown=0, kept=0)
@@ -199,7 +192,6 @@ def test_bytes_are_freed_by_the_host_that_holds_most() -> None:
     )
 )
 def test_no_order_of_events_loses_count(steps: list[tuple[int, Stage | None, QuotaClass, bool]]) -> None:
-    """After any arrivals, departures and changes of class, the counts are exact and within the bounds."""
     quota_classes, here = QuotaClasses(), list[Guest]()
     connection_table = books(quota_classes, Bounds(whole=6, host=3, unknown=2, kept=2))
     for number, stage, quota_class, risen in steps:
@@ -216,7 +208,6 @@ def test_no_order_of_events_loses_count(steps: list[tuple[int, Stage | None, Quo
 
 
 def test_served_connections_of_unknown_hosts_may_make_room() -> None:
-    """If a listener allows it, a served connection of an unknown host makes room; a known host's never does."""
     quota_classes = QuotaClasses({ROBOT: QuotaClass.REGISTERED, OTHER: QuotaClass.REGISTERED})
     connection_table: ConnectionTable[Address] = ConnectionTable(
         quota_classes,

@@ -43,7 +43,6 @@ async def test_turns_go_round() -> None:
 
 
 async def test_one_host_never_has_all_slots() -> None:
-    """A host whose requests never end leaves slots for all others."""
     turns = slots(4, 2)
     stuck = [asyncio.create_task(turns.enter(HOST)) for _ in range(10)]
     await asyncio.sleep(0)
@@ -79,7 +78,6 @@ async def test_turns_balance() -> None:
 
 
 async def test_a_cancelled_request_gets_no_turn() -> None:
-    """If a peer leaves just when a slot is free, the slot goes to the next request, and is not lost."""
     turns = slots(1, 1)
     await turns.enter(HOST)
     gone, following = (asyncio.create_task(turns.enter(HOST)) for _ in range(2))
@@ -94,7 +92,6 @@ async def test_a_cancelled_request_gets_no_turn() -> None:
 
 
 async def test_requests_of_many_guests_leave_slots_for_the_robot() -> None:
-    """Hosts without a registration never get the reserved slots, and unknown hosts never get those of others."""
     quota_classes = {HOST: QuotaClass.REGISTERED}
     turns: Turns[Address] = Turns(Bounds(8, 4, 2, 4), lambda host: quota_classes.get(host, QuotaClass.NAMED))
     guests = [ipaddress.ip_address(f"10.1.0.{n}") for n in range(200)]
@@ -113,7 +110,6 @@ async def test_requests_of_many_guests_leave_slots_for_the_robot() -> None:
 
 
 async def test_a_host_that_begins_waits_for_no_guest() -> None:
-    """Guests with long requests fill the slots; each other host that the policy names is still served, one by one."""
     guests = [ipaddress.ip_address(f"10.1.0.{n}") for n in range(1, 5)]
     turns: Turns[Address] = Turns(
         Bounds(8, 4, 2, 4), lambda host: QuotaClass(host not in guests[3:]), own_slots=True
@@ -160,7 +156,6 @@ async def test_own_slots_balance() -> None:
 
 
 async def test_many_addresses_of_one_network_take_turns_as_one() -> None:
-    """A hundred guests with a hundred requests each have half of the slots, and every second turn."""
     guests = [ipaddress.ip_address(f"10.1.0.{n}") for n in range(100)]
     turns: Turns[Address] = Turns(
         Bounds(8, 4, 0, 0),
@@ -192,7 +187,6 @@ async def test_many_addresses_of_one_network_take_turns_as_one() -> None:
 
 
 async def test_a_host_in_debt_waits_outside_the_slots() -> None:
-    """However many requests of a host in debt wait, every slot is free for others; paid, they are served."""
     debtor, payer = ipaddress.ip_address("10.0.0.66"), ipaddress.ip_address("10.0.0.1")
     debts = {str(debtor): 0.01}
     bounds = Bounds(1, 1, 0, 0)

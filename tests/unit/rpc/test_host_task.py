@@ -21,8 +21,6 @@ def time() -> ProcessorTime:
 
 
 async def test_work_that_waits_for_nothing_ends_at_once(time: ProcessorTime) -> None:
-    """The first step runs before the constructor returns, also inside a piece of work while others wait."""
-
     async def work() -> str:
         return "done"
 
@@ -39,7 +37,6 @@ async def test_work_that_waits_for_nothing_ends_at_once(time: ProcessorTime) -> 
 
 
 async def test_a_task_is_the_current_one_in_its_steps(time: ProcessorTime) -> None:
-    """The running task is the current one, in every step; the task in whose step it was made is current again after."""
     seen: list[object] = []
 
     async def inner() -> None:
@@ -61,8 +58,6 @@ async def test_a_task_is_the_current_one_in_its_steps(time: ProcessorTime) -> No
 
 
 async def test_a_limit_of_time_ends_a_wait(time: ProcessorTime) -> None:
-    """`asyncio.timeout` ends a wait, and the task goes on with the next one."""
-
     async def work() -> str:
         with pytest.raises(TimeoutError):
             async with asyncio.timeout(0.001):
@@ -100,8 +95,6 @@ async def test_a_cancelled_task_ends(busy: bool, time: ProcessorTime) -> None:
 
 
 async def test_a_task_may_refuse_a_cancellation(time: ProcessorTime) -> None:
-    """A coroutine may catch its cancellation and continue. A coroutine that cancels itself ends at its next wait."""
-
     async def refuses() -> str:
         try:
             await asyncio.Event().wait()
@@ -126,8 +119,6 @@ async def test_a_task_may_refuse_a_cancellation(time: ProcessorTime) -> None:
 
 
 async def test_an_error_reaches_the_owner(time: ProcessorTime) -> None:
-    """An exception of the first or of a later step is the task's; the host can work on."""
-
     async def work(steps: int) -> None:
         for _ in range(steps):
             await asyncio.sleep(0)

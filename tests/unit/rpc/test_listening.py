@@ -23,7 +23,6 @@ def test_plain_address(text: str, plain: str) -> None:
 
 @pytest.mark.nightly
 def test_listen_on_both_families() -> None:
-    """`::` takes IPv4 peers as well."""
     with listen("::", 0) as sock, socket.create_connection(("127.0.0.1", sock.getsockname()[1]), WAIT):
         accepted, address = sock.accept()
         accepted.close()
@@ -32,6 +31,5 @@ def test_listen_on_both_families() -> None:
 
 @pytest.mark.nightly
 def test_listen_on_a_port_in_use() -> None:
-    """A port in use is an error, and no socket is left open."""
     with listen("127.0.0.1", 0) as sock, pytest.raises(OSError, match="in use"):
         listen("127.0.0.1", sock.getsockname()[1])

@@ -50,7 +50,6 @@ def loop() -> Loop:
 
 
 async def test_a_turn_of_the_loop_is_bounded(loop: Loop) -> None:
-    """However much work waits, a turn runs for its length and one piece more; then the loop handles other events."""
     ran = [loop.time.run(GUEST, loop.work(GUEST)) for _ in range(500)]
     assert sum(ran) == 4
     await loop.all()
@@ -59,7 +58,6 @@ async def test_a_turn_of_the_loop_is_bounded(loop: Loop) -> None:
 
 
 async def test_the_robot_waits_for_one_piece_of_a_flood(loop: Loop) -> None:
-    """500 requests of a guest wait, and one of the robot comes last: it is next."""
     for _ in range(500):
         loop.time.run(GUEST, loop.work(GUEST))
     loop.time.run(ROBOT, loop.work(ROBOT))
@@ -68,7 +66,6 @@ async def test_the_robot_waits_for_one_piece_of_a_flood(loop: Loop) -> None:
 
 
 async def test_a_robot_that_worked_alone_owes_nothing(loop: Loop) -> None:
-    """The robot was the only caller for an hour; under a flood by a new guest, it is served next."""
     for _ in range(1000):
         assert loop.time.run(ROBOT, loop.work(ROBOT))
         await asyncio.sleep(0)
@@ -81,7 +78,6 @@ async def test_a_robot_that_worked_alone_owes_nothing(loop: Loop) -> None:
 
 
 async def test_a_debt_stays_while_others_wait(loop: Loop) -> None:
-    """A host that took a long piece while others waited is next when they have had as much."""
     for host in (GUEST, ROBOT) * 50:
         loop.time.run(host, loop.work(host, 20 * PIECE if not loop.order else PIECE))
     await loop.all()
@@ -89,7 +85,6 @@ async def test_a_debt_stays_while_others_wait(loop: Loop) -> None:
 
 
 async def test_two_hundred_unknown_hosts_are_one(loop: Loop) -> None:
-    """Unknown hosts have together what one named host has, and take turns among themselves."""
     for host in UNKNOWN * 2:
         loop.time.run(host, loop.work(host))
     for _ in range(100):
@@ -102,7 +97,6 @@ async def test_two_hundred_unknown_hosts_are_one(loop: Loop) -> None:
 
 @pytest.mark.parametrize("factor", [0.1, 10.0])
 async def test_time_counts_and_not_the_number_of_requests(factor: float, loop: Loop) -> None:
-    """Two hosts whose requests cost differently have the same processor time, not the same number of requests."""
     for _ in range(2000):
         loop.time.run(GUEST, loop.work(GUEST, PIECE))
         loop.time.run(ROBOT, loop.work(ROBOT, PIECE * factor))
@@ -113,7 +107,6 @@ async def test_time_counts_and_not_the_number_of_requests(factor: float, loop: L
 
 
 def test_no_host_saves_time_and_debts_stay() -> None:
-    """A host that did nothing for long begins where the others are; one that took a long piece waits for it."""
     line: Line[str, int] = Line()
     for number in range(100):
         line.put("guest", number)
@@ -152,8 +145,6 @@ def test_a_charge_costs_the_same_for_any_number_of_hosts() -> None:
 
 
 async def test_steps_of_coroutines_are_charged_and_wait(loop: Loop) -> None:
-    """Long handlers that give way between their pieces delay each step of another host's by a turn at most."""
-
     async def handler(host: Address, pieces: int) -> Address:
         for _ in range(pieces):
             loop.work(host)()
@@ -173,7 +164,6 @@ async def test_steps_of_coroutines_are_charged_and_wait(loop: Loop) -> None:
 
 
 async def test_cancelled_and_failed_work_takes_no_turn_of_others(loop: Loop) -> None:
-    """Whatever is cancelled or raises, waiting or running, ends its coroutine, and the others go on."""
     ended: list[int] = []
 
     async def handler(number: int) -> int:
@@ -207,7 +197,6 @@ async def test_cancelled_and_failed_work_takes_no_turn_of_others(loop: Loop) -> 
 
 
 async def test_a_defect_in_work_is_reported_and_stops_no_other(loop: Loop) -> None:
-    """Work that raises is reported to the loop; what waits behind it runs."""
     reports: list[str] = []
     asyncio.get_running_loop().set_exception_handler(
         lambda _loop, context: reports.append(context["message"])

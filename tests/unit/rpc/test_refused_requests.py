@@ -51,7 +51,6 @@ async def test_malformed(
 
 
 async def test_nothing_is_served_after_a_refusal(server: Server, client: Client) -> None:
-    """Bytes behind a refused request (smuggled requests among them) are thrown away."""
     await client.send(b"GET / HTTP/1.1\r\nHost: m\r\n\r\n" + post(b"smuggled"))
     assert (await client.response())[0] == 405
     await client.ended()
@@ -61,14 +60,12 @@ async def test_nothing_is_served_after_a_refusal(server: Server, client: Client)
 async def test_a_request_before_a_malformed_one_is_answered_or_the_connection_ends(
     server: Server, client: Client
 ) -> None:
-    """Rubbish behind a good request ends the connection; the good request was served at most once."""
     await client.send(post(b"good") + b"\x00\x01rubbish\r\n\r\n")
     await client.ended()
     assert len(server.requests) <= 1
 
 
 async def test_large_refused_body_still_gets_its_answer() -> None:
-    """A client that sends a large body before it reads learns why it is refused, not just a reset."""
     async with serving(refusal=b"<fault/>") as server:
         client = await server.connect()
         client.writer.write(post(b"x" * (4 << 20)))
@@ -79,7 +76,6 @@ async def test_large_refused_body_still_gets_its_answer() -> None:
 
 
 async def test_a_refusal_gets_the_beginning_of_the_body() -> None:
-    """The refusing function gets it in one piece or in several; nothing is served."""
     async with serving(refusal=b"<fault/>") as server:
         for pieces in ([post(b"<methodCall/>")], [post(b"", length=13), b"<method", b"Call/>"]):
             client = await server.connect()
@@ -91,7 +87,6 @@ async def test_a_refusal_gets_the_beginning_of_the_body() -> None:
 
 
 async def test_a_request_with_expect_is_refused_at_once() -> None:
-    """`Expect: 100-continue` of a peer that no rule names is answered with the refusal."""
     async with serving(refusal=b"<fault/>") as server:
         client = await server.connect()
         await client.send(post(b"", "Expect: 100-continue", length=1000))
@@ -107,7 +102,6 @@ async def test_refused_before_the_body() -> None:
 
 
 async def test_chunked_body_beyond_the_limit() -> None:
-    """A body that never announced its size is cut off at the limit."""
     async with serving(limits=replace(LIMITS, body_bytes=100_000)) as server:
         client = await server.connect()
         await client.send(b"POST / HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\n")

@@ -18,7 +18,6 @@ pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 async def test_requests_on_one_connection(client: Client) -> None:
-    """A kept-alive connection is served request by request, in order."""
     for body in (b"one", b"", b"three"):
         await client.send(post(body))
         status, headers, answer = await client.response()
@@ -57,8 +56,6 @@ async def test_pipelined_requests(server: Server, client: Client) -> None:
 
 @pytest.mark.parametrize("together", [False, True], ids=["one by one", "in one piece"])
 async def test_requests_that_are_answered_at_once(together: bool) -> None:
-    """Such requests and others on one connection are answered in their order, whole or in pieces; nothing is kept."""
-
     async def slowly(request: HttpRequest) -> bytes:
         await asyncio.sleep(0)
         return b"known" if b"known" in request.body else request.body
@@ -78,7 +75,6 @@ async def test_requests_that_are_answered_at_once(together: bool) -> None:
 
 
 async def test_an_answer_at_once_needs_no_slot() -> None:
-    """While all slots are taken, a question that needs none is answered: it costs its host processor time only."""
     go = asyncio.Event()
 
     async def slow(request: HttpRequest) -> bytes:
@@ -99,7 +95,6 @@ async def test_an_answer_at_once_needs_no_slot() -> None:
 
 
 async def test_requests_of_a_host_that_used_much_wait_for_another_hosts() -> None:
-    """Requests of many connections are served by the processor time that their hosts have used, not as they came."""
     order: list[str] = []
     now = 0.0
 
@@ -123,7 +118,6 @@ async def test_requests_of_a_host_that_used_much_wait_for_another_hosts() -> Non
 
 @pytest.mark.parametrize("at_once", [False, True])
 async def test_a_server_that_keeps_no_connection(at_once: bool, server: Server) -> None:
-    """Each answer announces and makes the end of the connection: rosmaster checks all open ones at every call."""
     server.http.keep = False
     server.at_once = lambda _request: b"known" if at_once else None
     client = await server.connect()
@@ -134,7 +128,6 @@ async def test_a_server_that_keeps_no_connection(at_once: bool, server: Server) 
 
 
 async def test_many_connections_are_accepted_in_one_turn(server: Server) -> None:
-    """Connections that wait in the kernel are accepted many at a time, whatever else the loop does in each turn."""
     clients = [socket.socket() for _ in range(50)]
     for client in clients:
         client.connect(("127.0.0.1", server.port))  # the kernel accepts; the loop has not run since
@@ -148,7 +141,6 @@ async def test_many_connections_are_accepted_in_one_turn(server: Server) -> None
 
 
 async def test_connections_that_come_faster_than_they_are_opened() -> None:
-    """A host that floods with connections fills its own part of those that wait; another host's is opened at once."""
     now = 0.0
 
     def tick() -> float:
@@ -168,7 +160,6 @@ async def test_connections_that_come_faster_than_they_are_opened() -> None:
 
 
 async def test_unknown_hosts_that_came_before_a_named_one() -> None:
-    """A named host's call is answered while most connections of unknown hosts still wait to be accepted."""
     program = first_for([ipaddress.ip_network("127.0.0.2")])
     now = 0.0
 
@@ -195,7 +186,6 @@ async def test_unknown_hosts_that_came_before_a_named_one() -> None:
 
 @pytest.mark.parametrize("later", [False, True])
 async def test_a_program_that_the_kernel_refuses(later: bool) -> None:
-    """All hosts are served, from the start or after a change of the policy."""
     wrong = bytes(8)
     program = first_for([ipaddress.ip_network("127.0.0.2")]) if later else wrong
     async with serving(shares=Shares(first=lambda: program)) as server:
@@ -226,14 +216,12 @@ async def test_byte_by_byte(client: Client) -> None:
 
 
 async def test_chunked_body(client: Client) -> None:
-    """A chunked body is one body."""
     await client.send(b"POST / HTTP/1.1\r\nHost: m\r\nTransfer-Encoding: chunked\r\n\r\n")
     await client.send(b"3\r\nabc\r\n4;extension=1\r\ndefg\r\n0\r\nTrailer: yes\r\n\r\n")
     assert (await client.response())[2] == b"answer to abcdefg"
 
 
 async def test_http_1_0_and_connection_close(server: Server) -> None:
-    """A client that does not keep the connection gets its answer and the end of the stream."""
     for request in (b"POST / HTTP/1.0\r\nContent-Length: 1\r\n\r\nx", post(b"x", "Connection: close")):
         client = await server.connect()
         await client.send(request)
@@ -243,7 +231,6 @@ async def test_http_1_0_and_connection_close(server: Server) -> None:
 
 
 async def test_expect_100_continue(client: Client) -> None:
-    """A client that waits for `100 Continue` gets it."""
     await client.send(post(b"", "Expect: 100-continue", length=4))
     async with asyncio.timeout(WAIT):
         assert await client.reader.readuntil(b"\r\n\r\n") == b"HTTP/1.1 100 Continue\r\n\r\n"
@@ -252,8 +239,6 @@ async def test_expect_100_continue(client: Client) -> None:
 
 
 async def test_a_defect_in_the_handler() -> None:
-    """A handler that fails costs its caller an answer `500`; the connection and the server go on."""
-
     async def handler(request: HttpRequest) -> bytes:
         if request.body == b"bad":
             raise KeyError("a defect")
@@ -267,8 +252,6 @@ async def test_a_defect_in_the_handler() -> None:
 
 
 async def test_a_handler_without_an_answer() -> None:
-    """The peer finds its connection reset, not ended in good order; nothing of it stays counted."""
-
     async def handler(_request: HttpRequest) -> bytes:
         raise NoAnswerError
 
@@ -280,7 +263,6 @@ async def test_a_handler_without_an_answer() -> None:
 
 
 async def test_pieces_that_arrive_while_a_host_waits_for_its_turn_are_read_in_order() -> None:
-    """The pieces of a request arrive while other hosts use the processor; the request is whole."""
     now = 0.0
 
     def work() -> None:
@@ -306,7 +288,6 @@ async def test_pieces_that_arrive_while_a_host_waits_for_its_turn_are_read_in_or
 
 
 async def test_a_request_in_service_keeps_its_connection() -> None:
-    """A connection whose handler waits is not evicted, even if all other connections are evicted at once."""
     begun, go = asyncio.Event(), asyncio.Event()
 
     async def handler(request: HttpRequest) -> bytes:

@@ -69,8 +69,6 @@ async def test_idle_connection() -> None:
 
 
 async def test_answers_that_are_not_taken() -> None:
-    """A client that sends without reading is not served: at most one answer waits for it."""
-
     async def handler(_request: HttpRequest) -> bytes:
         return b"x" * LARGE
 
@@ -107,8 +105,6 @@ async def test_slow_reader_that_moves() -> None:
 
 
 async def test_next_request_after_a_slow_answer() -> None:
-    """After a large answer was finally read, the connection is served again."""
-
     async def handler(request: HttpRequest) -> bytes:
         return b"x" * LARGE if request.body == b"large" else b"small"
 
@@ -140,7 +136,6 @@ async def test_connections_per_host() -> None:
 
 
 async def test_connections_that_are_too_many_do_not_stay() -> None:
-    """A few at a time receive the reason; the others are cut, and so are those that do not leave."""
     limits, shares = (
         replace(LIMITS, linger_seconds=0.2),
         Shares(connections=two_hosts(1), farewells=two_hosts(2)),
@@ -181,7 +176,6 @@ async def test_bytes_per_host() -> None:
 
 
 async def test_small_requests_that_wait_are_counted() -> None:
-    """Requests that arrive together with a served one wait, and count for their host."""
     release = asyncio.Event()
 
     async def handler(_request: HttpRequest) -> bytes:
@@ -205,7 +199,6 @@ async def test_small_requests_that_wait_are_counted() -> None:
 
 
 async def test_requests_behind_one_that_is_served_are_not_read() -> None:
-    """Only one piece of 2,000 requests is read while another one is served; all are answered."""
     release = asyncio.Event()
 
     async def handler(_request: HttpRequest) -> bytes:

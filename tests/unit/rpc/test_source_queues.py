@@ -43,7 +43,6 @@ NETWORK = _network(4, 32) | _network(6, 128)
 def test_the_program_sends_hosts_of_the_networks_to_the_first_socket(
     known: list[Network], others: list[Network]
 ) -> None:
-    """An address goes to the first socket exactly if one of the networks holds it."""
     program = first_for(known)
     for network in [*known, *others]:
         for source in (network.network_address, network.broadcast_address):
@@ -111,14 +110,12 @@ def test_the_kernel_sorts_connections(port: Callable[..., Port], host: str) -> N
     ("known", "first"), [("::1", True), ("::/0", True), ("::2", False), ("127.0.0.0/8", False)]
 )
 def test_the_kernel_sorts_connections_of_ipv6(port: Callable[..., Port], known: str, first: bool) -> None:
-    """By the whole address."""
     both = port("::", known)
     both.accepts("::1", both.first if first else both.queues.second)
 
 
 @pytest.mark.nightly
 def test_a_full_queue_keeps_no_host_of_the_other_one_out(port: Callable[..., Port]) -> None:
-    """Unknown hosts fill their queue: a known host connects at once."""
     both = port("127.0.0.1", "127.0.0.2/32")
     both.queues.second.listen(1)
     with contextlib.ExitStack() as stack:
@@ -133,7 +130,6 @@ def test_a_full_queue_keeps_no_host_of_the_other_one_out(port: Callable[..., Por
 
 @pytest.mark.nightly
 def test_a_new_policy_changes_the_queues(port: Callable[..., Port]) -> None:
-    """The program is attached again when it is another one."""
     both = port("127.0.0.1", "127.0.0.2/32")
     both.program = first_for(networks("127.0.0.3/32"))
     both.queues.update()
@@ -143,7 +139,6 @@ def test_a_new_policy_changes_the_queues(port: Callable[..., Port]) -> None:
 
 @pytest.mark.nightly
 def test_the_first_socket_outlives_the_second(port: Callable[..., Port]) -> None:
-    """Control ends, and its second socket with it: all connections wait at the first, and the next control sorts."""
     both = port("127.0.0.1", "127.0.0.2/32")
     both.queues.second.close()
     for source in ("127.0.0.2", "127.0.0.3"):
@@ -157,14 +152,12 @@ def test_the_first_socket_outlives_the_second(port: Callable[..., Port]) -> None
 
 @pytest.mark.nightly
 def test_a_port_with_two_sockets_is_in_use(port: Callable[..., Port]) -> None:
-    """A search for a free port passes it by."""
     both = port("127.0.0.1")
     with pytest.raises(OSError, match="in use"):
         listen("127.0.0.1", both.first.getsockname()[1])
 
 
 def test_a_new_policy_sorts_connections() -> None:
-    """The program is made once for each policy."""
     policies = [compile_policy(f"[Nodes]\ndefault = {host}\n", file="a.ini") for host in ("10.0.0.1", "*")]
     policy = policies[0]
     program = NamedFirst(lambda: policy)
@@ -175,7 +168,6 @@ def test_a_new_policy_sorts_connections() -> None:
 
 
 def test_hosts_that_the_policy_names_are_accepted_first() -> None:
-    """Members of groups and networks, and this machine; not hosts that only `*` names."""
     rules = "default = team 10.1.0.0/16\n/guest/** = *\n"
     policy = compile_policy(f"[Groups]\nteam = 10.0.0.1 fd77::/64\n[Nodes]\n{rules}", file="a.ini")
     program = NamedFirst(lambda: policy)()
@@ -186,7 +178,6 @@ def test_hosts_that_the_policy_names_are_accepted_first() -> None:
 
 
 def test_blocked_hosts_are_accepted_after_named_hosts() -> None:
-    """A block wins over the network that holds the host; with too many blocks, the named hosts stay in front."""
     known, blocked = networks("10.0.0.0/16", "fd00::/64"), ["10.0.0.7", "fd00::7"]
     program = first_for(known, map(address_of, blocked))
     for source, socket_number in (
@@ -203,7 +194,6 @@ def test_blocked_hosts_are_accepted_after_named_hosts() -> None:
 
 
 def test_a_block_makes_a_new_program() -> None:
-    """The block of a host that no rule names needs no instruction."""
     policies = [compile_policy("[Nodes]\n/a = 10.0.0.0/24\n", file="a.ini")]
     program = NamedFirst(lambda: policies[-1])
     before = program()

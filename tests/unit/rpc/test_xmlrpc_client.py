@@ -18,7 +18,6 @@ pytestmark = [pytest.mark.anyio, pytest.mark.timeout(20)]
 
 @pytest.mark.nightly
 async def test_a_kept_connection_that_does_not_answer_is_given_up_in_time() -> None:
-    """The time limit of a call also holds on a kept connection; it is closed, and the next call opens another."""
     asked = 0
     ended: asyncio.Queue[None] = asyncio.Queue()
 
@@ -79,8 +78,6 @@ async def test_a_large_call_has_more_time() -> None:
     "chunk", [b"1\r\nx\r\n", b"2000\r\n" + b"x" * 0x2000 + b"\r\n"], ids=["bytes", "blocks"]
 )
 def test_an_answer_without_end_is_read_to_its_limit(chunk: bytes) -> None:
-    """A node that answers for ever, in chunks of any size, is cut at the limit; what was kept is that at most."""
-
     async def scene() -> None:
         sent = 0
 
@@ -115,8 +112,6 @@ def test_an_answer_without_end_is_read_to_its_limit(chunk: bytes) -> None:
 
 @pytest.mark.nightly
 async def test_a_deep_answer_of_a_node_is_refused() -> None:
-    """An answer that is deeper than what nodes are asked for is nonsense, and costs the call alone."""
-
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.readuntil(b"\r\n\r\n")
         body = build_response([1, "", [[[[0]]]]])

@@ -11,7 +11,6 @@ NAMES = [
 
 
 def test_usual_names_stay_and_unusual_ones_are_safe_paths() -> None:
-    """A name from outside never leads out of a folder, and two names never become the same file."""
     shown = [file_name(name) for name in NAMES]
     assert shown[:3] == NAMES[:3]
     assert len(set(shown)) == len(NAMES)
@@ -22,7 +21,6 @@ def test_usual_names_stay_and_unusual_ones_are_safe_paths() -> None:
 
 
 def test_no_two_sets_of_texts_have_one_hash() -> None:
-    """Another name, another text, an added text, or exchanged texts each give another hash."""
     sets = [
         {"a": "1", "b": "2"},
         {"a": "2", "b": "1"},

@@ -65,13 +65,11 @@ def test_the_vectors() -> None:
     ],
 )  # fmt: skip
 def test_a_proof_is_of_one_request(parts: dict[str, object]) -> None:
-    """If any part of the request changes, the signature is invalid."""
     _challenge, signature = parse_proof(PROOF)
     assert not is_signed(bytes.fromhex(VERIFYING), stated(**parts), signature)  # type: ignore[arg-type]  # as above
 
 
 def test_neither_the_reading_key_nor_the_saved_key_is_the_token() -> None:
-    """The reading key and the saved key differ from the secret, and differ for each token."""
     other = "rosrv_5c0f3d2b9a12_AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"
     secret = TOKEN.rpartition("_")[2]
     assert secret not in reading_key(TOKEN)
@@ -82,7 +80,6 @@ def test_neither_the_reading_key_nor_the_saved_key_is_the_token() -> None:
 @pytest.mark.parametrize("part", ["method", "target", "if_match", "content_type"])
 @pytest.mark.parametrize("text", ["a\nb", "a\r", "\x00", "é", "a\x7f"])
 def test_no_part_spills_into_another(part: str, text: str) -> None:
-    """A control character, which could move a line to another part, is refused."""
     with pytest.raises(BadProofError, match="character"):
         stated(**{part: text})
 
@@ -93,8 +90,6 @@ def test_no_part_spills_into_another(part: str, text: str) -> None:
     st.binary(max_size=20),
 )
 def test_different_requests_have_different_statements(one: list[str], two: list[str], body: bytes) -> None:
-    """No two requests have the same statement."""
-
     def text(parts: list[str]) -> bytes:
         challenge, method, target, match, kind = parts
         return statement(
@@ -108,13 +103,11 @@ def test_different_requests_have_different_statements(one: list[str], two: list[
     "header", ["", "x", "a b", f"{'c' * 201} {'A' * 86}", f"c {'A' * 85}", f"c {'A' * 87}", f"c\n {'A' * 86}"]
 )
 def test_a_malformed_proof_is_rejected(header: str) -> None:
-    """A header in another form is rejected before any computation."""
     with pytest.raises(BadProofError, match="CHALLENGE SIGNATURE"):
         parse_proof(header)
 
 
 def test_the_page_shows_what_a_script_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The example of docs/reference/rest.md computes the reading key and the proof of the vectors."""
     page = (Path(__file__).parents[3] / "docs" / "reference" / "rest.md").read_text()
     [example] = [block.partition("```")[0] for block in page.split("```python\n")[1:]]
     monkeypatch.setenv("ROSRV_TOKEN", TOKEN)

@@ -34,12 +34,10 @@ ACEApIhnpdGjdF9HHm+vAXk/KSt3Z7TQEDyKJzsKxJvmkYU=
 
 @pytest.mark.parametrize("signature", [OPENSSH, OF_SHA256, OPENSSH.replace("\n", "\r\n"), f"\n{OPENSSH}\n"])
 def test_a_signature_by_openssh_is_accepted(signature: str) -> None:
-    """Both hashes of the format are valid; the key is named as `ssh-keygen -l` names it, with its comment."""
     assert signer([OTHER_LINE, LINE], TEXT, signature) == NAME == name_of(LINE)
 
 
 def test_a_signature_is_openssh_s_byte_for_byte() -> None:
-    """`ssh-keygen -Y verify` of any version accepts the output of `rosrv sign`."""
     assert signed(TEXT) == OPENSSH
 
 
@@ -62,7 +60,6 @@ def test_a_signature_is_openssh_s_byte_for_byte() -> None:
     ],
 )
 def test_anything_else_is_refused_with_what_to_do(text: str, signature: str, why: str) -> None:
-    """Covers a changed text or signature, another key, another purpose and another format."""
     with pytest.raises(UnsignedError) as refused:
         signer([LINE], text, signature)
     assert str(refused.value).startswith(why) or why in str(refused.value)
@@ -70,7 +67,6 @@ def test_anything_else_is_refused_with_what_to_do(text: str, signature: str, why
 
 
 def test_every_bit_of_a_signature_counts() -> None:
-    """After a change of any one character, the signature is invalid for this text."""
     body = OPENSSH.removeprefix(BEGIN).removesuffix(END)
     taken = []
     for place, character in enumerate(body):
@@ -85,7 +81,6 @@ def test_every_bit_of_a_signature_counts() -> None:
 
 
 def test_without_keys_no_signature_is_needed() -> None:
-    """Without keys, signatures are ignored."""
     assert signer([], TEXT, "") == signer([], TEXT, "nonsense") == ""
 
 
@@ -101,14 +96,12 @@ def test_without_keys_no_signature_is_needed() -> None:
     ],
 )
 def test_an_invalid_key_is_an_error(line: str) -> None:
-    """The configuration is rejected, and the error shows the form of a key."""
     with pytest.raises(ValueError, match="ssh-keygen -t ed25519"):
         checked_key(line)
     assert checked_key(LINE) == LINE
 
 
 def test_a_signature_beside_a_file_is_read_up_to_a_bound(tmp_path: Path) -> None:
-    """A missing or too long file, or a folder, is not a signature."""
     file = tmp_path / "p.ini"
     assert read_signature(file) == ""
     (tmp_path / "p.ini.sig").write_text(OPENSSH)

@@ -49,7 +49,6 @@ def test_common_topics_join_specifications(other: str) -> None:
 
 
 def test_a_file_with_nothing_but_an_order_needs_no_relay() -> None:
-    """It changes the order of the monitors, also of those on other relays."""
     code = checked(a=spec("a", "/a"), b=spec("b", "/b"), order="order b < a;")
     assert ([*code.monitors], [{*group.files} for group in groups_of(code)]) == (
         ["b", "a"],

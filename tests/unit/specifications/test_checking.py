@@ -45,7 +45,6 @@ def test_nothing_is_left_out_without_an_error() -> None:
 @pytest.mark.parametrize("text", ["wrong() {", "wrong() { event e() /x nobody/Knows '{}' { } }"])
 @pytest.mark.parametrize("others", [{}, {"b.rv": WRONG}, {"b.rv": WRONG, "c.rv": GOOD, "d.rv": USER}])
 def test_a_file_whose_topics_are_unknown_is_left_out_at_a_start(text: str, others: dict[str, str]) -> None:
-    """Nothing can hold its topics, which the start reports; the robot keeps its master and its other monitors."""
     found = contents_at_start({"a.rv": text} | others, {})
     assert [error.partition(":")[0] for error in found.left_out.values()] == ["a.rv"]
     assert len(found.unbuilt) == bool(others)
@@ -53,7 +52,6 @@ def test_a_file_whose_topics_are_unknown_is_left_out_at_a_start(text: str, other
 
 
 def test_a_definition_that_cannot_be_read_leaves_out_all_files() -> None:
-    """The types of no file are known then; the robot keeps its master."""
     found = contents_at_start({"a.rv": GOOD}, {"own/Own.msg": "int32 int32 x\n"})
     assert (found.monitors, list(found.left_out)) == ({}, ["a.rv"])
 

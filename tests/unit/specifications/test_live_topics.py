@@ -62,12 +62,10 @@ STRING, OTHER = "992ce8a1687cec8c8bd883ec73ca41d1", "0" * 32
 
 @pytest.mark.parametrize("theirs", [STRING, "*", ""])
 def test_a_definition_that_fits_or_is_not_known(theirs: str) -> None:
-    """As in ROS: the md5sum decides, and a `*` fits all."""
     assert judged({"/chatter": {"/talker": LiveType("std_msgs/String", theirs)}}) == ([], [])
 
 
 def test_a_type_of_the_same_name_with_another_definition() -> None:
-    """It is a conflict before the load, as another name is; a warning if it is forced."""
     live = {"/chatter": {"/talker": LiveType("std_msgs/String", OTHER)}}
     ((conflict,), warnings) = judged(live)
     assert warnings == []
@@ -122,7 +120,6 @@ def test_a_change_that_holds_a_topic_with_traffic_needs_consent() -> None:
 
 
 def test_a_change_that_holds_a_topic_without_traffic_warns_only() -> None:
-    """While the robot stands, no message is lost; a single publisher with traffic is enough to ask."""
     still = LiveType("geometry_msgs/Twist", moving=False)
     conflicts, [warning] = held(CHANGED, {"/cmd_vel": {"/teleop": still}})
     assert conflicts == []

@@ -120,7 +120,6 @@ async def test_a_relay_with_unchanged_specifications_gets_the_same_statement(wor
 
 
 async def test_each_relay_receives_its_own_specifications(world: World) -> None:
-    """It receives a change before anything comes into force; its first statement precedes all else."""
     assert world.rollout.statement(0).ahead
     assert files_of(world.rollout.statement(0)) == ["a.rv"]
     assert files_of(world.rollout.statement(1)) == ["b.rv"]

@@ -338,7 +338,6 @@ async def test_a_folder_that_a_reload_refuses_is_refused_at_a_start(desk: Desk, 
 
 
 async def test_a_first_start_leaves_out_a_file_that_it_cannot_parse(desk: Desk) -> None:
-    """The robot gets its master, also if `--enable` names a monitor of the file; the alarm says that nothing guards."""
     (desk.folder / "a.rv").write_text("nonsense")
     for _ in range(2):
         monitors = await desk.monitors()
@@ -356,7 +355,6 @@ async def test_a_first_start_leaves_out_a_file_that_it_cannot_parse(desk: Desk) 
 async def test_a_first_start_leaves_out_a_file_that_it_cannot_use(
     desk: Desk, others: dict[str, str], fault: str
 ) -> None:
-    """The others come into force, and the file stays an alarm over a crash and a restart until it is whole."""
     (desk.folder / "a.rv").unlink()
     for name, text in others.items():
         (desk.folder / name).write_text(text)
@@ -386,7 +384,6 @@ async def test_a_first_start_leaves_out_a_file_that_it_cannot_use(
 
 
 async def test_an_unconfirmed_promotion_returns_to_shadow_mode(desk: Desk) -> None:
-    """Also after a restart; a confirmation, shadow mode or a disabled period of its own ends the limit."""
     monitors = await desk.monitors()
     promote = partial(admin.MonitorShadow, ["a"], False)
 

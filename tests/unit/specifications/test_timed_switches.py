@@ -17,7 +17,6 @@ pytestmark = pytest.mark.anyio
 
 
 async def test_a_clock_that_is_set_back_does_not_extend_a_time_limit(tmp_path: Path) -> None:
-    """The monitor is enabled again after the ordered time."""
     store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     enabled: asyncio.Queue[float] = asyncio.Queue()
 

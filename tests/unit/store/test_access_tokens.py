@@ -9,7 +9,6 @@ from tests.support.virtual_clock import VirtualClock
 
 
 def test_only_its_own_secret_proves_a_token() -> None:
-    """Another token's secret, a changed one, and the stored hash do not match."""
     row, text = make_token("alice", "viewer", now=1000.0, seconds=60)
     parsed = parse_token(text)
     assert parsed is not None
@@ -23,7 +22,6 @@ def test_only_its_own_secret_proves_a_token() -> None:
 
 
 def test_the_stored_row_does_not_have_the_secret() -> None:
-    """The row has only a salted hash: the same name twice gives different ones."""
     row, text = make_token("alice", "viewer", now=1000.0, seconds=60)
     assert text.split("_", 2)[2] not in repr(row)
     again, _text = make_token("alice", "viewer", now=1000.0, seconds=60)
@@ -31,7 +29,6 @@ def test_the_stored_row_does_not_have_the_secret() -> None:
 
 
 def test_a_token_is_valid_until_its_end_or_revocation() -> None:
-    """After that it is invalid."""
     row, _text = make_token("alice", "viewer", now=1000.0, seconds=60)
     ends = Deadlines()
     with using(machine := VirtualClock(wall=1059.9)):
@@ -48,12 +45,10 @@ def test_a_token_is_valid_until_its_end_or_revocation() -> None:
              "rosrv_0123456789ab_" + "a" * 42 + "é", " rosrv_0123456789ab_" + "a" * 43],
 )  # fmt: skip
 def test_an_invalid_token_is_none(text: str) -> None:
-    """Only the exact form is parsed."""
     assert parse_token(text) is None
 
 
 @pytest.mark.parametrize("name", ["", "disk", "operator", "a b", "-a", "a" * 64, "a\n", "é", "../x"])
 def test_misleading_names_are_refused(name: str) -> None:
-    """A name is short and plain, and has no other meaning in a record."""
     with pytest.raises(BadTokenNameError, match="is not a valid token name"):
         make_token(name, "viewer", now=0.0, seconds=1)

@@ -15,7 +15,6 @@ def numbers(changes: list[Encoded] | None) -> list[int] | None:
 
 
 def test_a_consumer_gets_all_changes_after_a_number_in_order() -> None:
-    """At most as many bytes as it asks for, but at least one change; only known numbers have an answer."""
     calls: list[int] = []
     feed = ChangeFeed(7, lambda: calls.append(1), 1000)
     assert numbers(feed.after(7, 100)) == []
@@ -32,7 +31,6 @@ def test_a_consumer_gets_all_changes_after_a_number_in_order() -> None:
 
 
 def test_a_consumer_that_is_away_for_long_learns_that_changes_are_missing() -> None:
-    """The oldest changes are dropped; the last stays however large it is."""
     feed = ChangeFeed(0, lambda: None, 100)
     for number in range(1, 1001):
         feed.add([change(number)])
@@ -48,7 +46,6 @@ def test_a_consumer_that_is_away_for_long_learns_that_changes_are_missing() -> N
 
 
 def test_changes_that_the_consumer_has_are_dropped() -> None:
-    """A number that was never given drops nothing else."""
     feed = ChangeFeed(0, lambda: None, 1000)
     feed.add([change(1), change(2), change(3)])
     feed.release(2)
@@ -60,7 +57,6 @@ def test_changes_that_the_consumer_has_are_dropped() -> None:
 
 
 def test_a_consumer_that_is_there_gets_more_room() -> None:
-    """Changes beyond the room are dropped as soon as it has less room again."""
     feed = ChangeFeed(0, lambda: None, 100)
     feed.keep(400)
     feed.add([Encoded(number, b"x" * 100) for number in range(1, 5)])

@@ -36,7 +36,6 @@ def apply(connection: sqlite3.Connection, change: Change) -> list[str]:
 
 
 def test_rows_are_put_and_deleted(connection: sqlite3.Connection) -> None:
-    """A row replaces the row with its key; a deletion takes the rows that meet all conditions."""
     rows = [(name, size, 0, None, None) for size, name in enumerate("abcdef")]
     assert apply(connection, Put("thing", rows)) == list("abcdef")
     assert apply(connection, Put("thing", [("a", 9, 0.5, b"x", "y")])) == list("abcdef")
@@ -78,7 +77,6 @@ def test_rows_are_put_and_deleted(connection: sqlite3.Connection) -> None:
 def test_a_change_that_does_not_fit_names_the_reason(
     connection: sqlite3.Connection, change: Change, reason: str
 ) -> None:
-    """No SQL is made of it."""
     with pytest.raises(ChangeError, match=reason.replace("(", r"\(")):
         apply(connection, change)
 
@@ -92,8 +90,6 @@ def test_a_comparison_is_one_of_four(comparison: str) -> None:
 
 
 def test_only_consecutive_rows_of_one_table_are_joined() -> None:
-    """Deletions, other tables and large values stay where they are."""
-
     def put(name: str, table: str = "thing") -> Put:
         return Put(table, [(name,)])
 

@@ -70,7 +70,6 @@ def keeper(tmp_path: Path) -> Iterator[Keeper]:
 
 @pytest.mark.nightly
 async def test_a_rollback_without_a_number_takes_the_previous_revision(keeper: Keeper) -> None:
-    """It is the last stored revision below the present one, also where numbers are missing."""
     assert await keeper.wanted(None) == row(5)
     assert await keeper.wanted(4) == row(4)
 
@@ -80,7 +79,6 @@ async def test_a_rollback_without_a_number_takes_the_previous_revision(keeper: K
 async def test_the_error_names_the_missing_and_the_stored_revisions(
     keeper: Keeper, asked: int | None, said: str
 ) -> None:
-    """Revision 0 is a number like any other."""
     keeper.in_force = row(4)
     with pytest.raises(RefusedError) as caught:
         await keeper.wanted(asked)
@@ -89,7 +87,6 @@ async def test_the_error_names_the_missing_and_the_stored_revisions(
 
 @pytest.mark.nightly
 async def test_two_unconfirmed_changes_roll_back_to_the_last_confirmed_one(keeper: Keeper) -> None:
-    """The limit starts again with the second change; a change without a limit ends it."""
     begun = clock.wall()
     for number, within in ((8, 300.0), (9, 600.0)):
         keeper.change(row(number), within)
@@ -108,7 +105,6 @@ async def test_two_unconfirmed_changes_roll_back_to_the_last_confirmed_one(keepe
 async def test_only_a_start_of_the_appliance_reads_the_disk_in_place_of_its_revision(
     keeper: Keeper, who: str, restarted: bool, taken: bool
 ) -> None:
-    """An operator's own revision survives every start."""
     keeper.change(row(8, who))
     again = Keeper(keeper.store)
     assert again.started(restarted=restarted) is taken
@@ -131,7 +127,6 @@ class Returning(Keeper):
 async def test_a_change_that_cannot_go_back_is_tried_again_until_it_has(
     keeper: Keeper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A disk error before the change is tried again; one after the change ends the attempts."""
     monkeypatch.setattr(revisions, "_AGAIN_SECONDS", 0.0)
     again = Returning(keeper.store)
     again.started(restarted=True)

@@ -60,7 +60,6 @@ def killed_after(work: Callable[[StateStore], None], directory: Path) -> None:
 
 
 def test_the_registry_comes_back_as_it_was(tmp_path: Path) -> None:
-    """Incarnations with all their fields, registrations in the order they were made."""
     store = reopened(tmp_path)
     store.save_incarnation(incarnation("k1"))
     second = RegistrationRow("k1", "publication", "/b", "std_msgs/String", 2)
@@ -76,7 +75,6 @@ def test_the_registry_comes_back_as_it_was(tmp_path: Path) -> None:
 def test_changes_of_a_killed_process_are_applied_from_any_of_them_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Wherever control was killed, the next one starts and finds the registry, however much the database had."""
     changes: list[Encoded] = []
     append = WriteAhead.append
 
@@ -116,7 +114,6 @@ def test_changes_of_a_killed_process_are_applied_from_any_of_them_on(
 
 
 def test_forgetting_an_incarnation_removes_its_rows(tmp_path: Path) -> None:
-    """Its registrations and grants are removed; those of another stay."""
     store = reopened(tmp_path)
     for key in ("k1", "k2"):
         store.save_incarnation(incarnation(key))
@@ -145,7 +142,6 @@ def test_parameters_keep_their_types(tmp_path: Path) -> None:
 
 
 def test_revisions_are_listed_newest_first(tmp_path: Path) -> None:
-    """Every policy that was in force is stored with the user who loaded it."""
     store = reopened(tmp_path)
     rows = [RevisionRow(n, f"text {n}", "p.ini", float(n), "disk", "note") for n in (1, 2, 3)]
     for row in rows:
@@ -158,8 +154,6 @@ def test_revisions_are_listed_newest_first(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_a_parameter_that_was_just_set_outlasts_the_process(tmp_path: Path) -> None:
-    """The next control has the changes, in order, though the tree was not saved since and nothing was closed."""
-
     def first(store: StateStore) -> None:
         store.save_parameters({"a": 1})
         store.note_parameter("/b", [1.5, {"c": b"x"}])
@@ -178,8 +172,6 @@ def test_a_parameter_that_was_just_set_outlasts_the_process(tmp_path: Path) -> N
 
 @pytest.mark.nightly
 def test_owners_of_parameters_outlast_the_process(tmp_path: Path) -> None:
-    """The next control has the owners of keys; removing a key removes the keys below it, and no similar name."""
-
     def first(store: StateStore) -> None:
         for key in ("/", "/a", "/a/b", "/a/b/c", "/a/bc", "/ab", "/a-", "/b"):
             store.parameter_owned(key, "10.0.0.9")
@@ -199,7 +191,6 @@ def test_owners_of_parameters_outlast_the_process(tmp_path: Path) -> None:
 
 
 def test_saving_the_tree_removes_its_earlier_changes(tmp_path: Path) -> None:
-    """Changes after the tree was saved stay."""
     store = reopened(tmp_path)
     store.note_parameter("/a", 1)
     store.save_parameters({"a": 1})
@@ -211,7 +202,6 @@ def test_saving_the_tree_removes_its_earlier_changes(tmp_path: Path) -> None:
 
 
 def test_a_large_value_is_kept_with_the_tree(tmp_path: Path) -> None:
-    """A value that takes long to write is not saved as a change."""
     store = reopened(tmp_path)
     store.note_parameter("/map", "x" * LARGEST_CHANGE)
     store.close()
@@ -221,7 +211,6 @@ def test_a_large_value_is_kept_with_the_tree(tmp_path: Path) -> None:
 
 
 def test_a_standby_gets_each_large_value_once(tmp_path: Path) -> None:
-    """Six megabytes that a host sets again and again are sent as often, without the tree, and kept once."""
     store = reopened(tmp_path)
     store.note_whole_parameters()
     feed = store.database.follow(lambda: None, 1 << 30)
@@ -235,7 +224,6 @@ def test_a_standby_gets_each_large_value_once(tmp_path: Path) -> None:
 
 
 def test_changes_of_many_keys_end_in_the_tree(tmp_path: Path) -> None:
-    """On one of two appliances, the changes since the tree are bounded, though no tree is stored for a few."""
     store = reopened(tmp_path)
     due = [store.tree_is_due]
     store.note_whole_parameters()
@@ -250,7 +238,6 @@ def test_changes_of_many_keys_end_in_the_tree(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_replaced_changes_give_the_same_tree(seed: int, tmp_path: Path) -> None:
-    """After any changes, also by several processes, the kept ones lead to the tree that all of them led to."""
     chance, names = random.Random(seed), ("a", "b", "c")  # noqa: S311  no secret
     tree: Tree = {"a": {"b": {"c": 1}}, "b": 5}
     store = reopened(tmp_path)

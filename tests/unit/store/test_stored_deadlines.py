@@ -15,7 +15,6 @@ WALL = 1_790_000_000.0
 
 
 def test_a_clock_that_is_set_back_over_a_restart_revives_no_token(tmp_path: Path) -> None:
-    """An ended token stays ended, and another one has no more time left than before."""
     machine = VirtualClock(wall=WALL)
     with clock.using(machine):
         store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
@@ -41,7 +40,6 @@ def test_a_clock_that_is_set_back_over_a_restart_revives_no_token(tmp_path: Path
 
 
 def test_a_full_disk_is_asked_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is queued for a full disk; the next save stores the times."""
     store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     ends = StoredDeadlines(store)
     ends.passed("one", clock.wall() + 60.0)

@@ -71,7 +71,6 @@ def database(tmp_path: Path, failures: list[str]) -> Iterator[Database]:
 
 @pytest.mark.nightly
 async def test_queued_statements_are_in_the_file_once_settled(database: Database, tmp_path: Path) -> None:
-    """After `settled` another connection sees every statement, in order."""
     for size in range(500):
         database.put("thing", "a", size)
     await database.settled()
@@ -80,7 +79,6 @@ async def test_queued_statements_are_in_the_file_once_settled(database: Database
 
 
 def test_closing_writes_what_is_left(tmp_path: Path) -> None:
-    """Nothing that was queued before `close` is lost."""
     database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
     for number in range(3000):
         database.put("thing", str(number), 1)
@@ -99,7 +97,6 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_write_that_fails_is_tried_again_until_it_succeeds(
     impatient: None, tmp_path: Path, failures: list[str]
 ) -> None:
-    """While another process locks the file, the failure is reported; afterwards the row is saved."""
     database = Database(tmp_path / "state.db", SCHEMA, failed=failures.append, drive=ByHand)
     blocker = sqlite3.connect(tmp_path / "state.db", isolation_level=None)
     blocker.execute("BEGIN EXCLUSIVE")
@@ -120,7 +117,6 @@ def test_a_write_that_fails_is_tried_again_until_it_succeeds(
 async def test_changes_that_cannot_be_written_at_the_end_are_reported(
     impatient: None, tmp_path: Path, failures: list[str]
 ) -> None:
-    """A caller that waits does not get the answer that they are on the disk. The next start applies them."""
     database = Database(tmp_path / "state.db", SCHEMA, failed=failures.append, drive=ByHand)
     blocker = sqlite3.connect(tmp_path / "state.db", isolation_level=None)
     blocker.execute("BEGIN EXCLUSIVE")
@@ -155,7 +151,6 @@ async def test_a_thread_writes_changes(tmp_path: Path) -> None:
 def test_a_waiting_caller_learns_that_the_disk_is_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An operator who waits gets an error; once the disk has space again, all queued statements are written."""
     monkeypatch.setattr("appliance.store.writer_thread._SETTLE_SECONDS", 0)
     with small_disk(tmp_path / "disk", "1m") as place:
         failures: list[str] = []
@@ -183,7 +178,6 @@ def test_a_waiting_caller_learns_that_the_disk_is_full(
 async def test_callers_learn_that_writing_has_ended(
     tmp_path: Path, failures: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After a defect of the writer, waiting callers and orders get an error; the next start applies the changes."""
     monkeypatch.setattr("appliance.store.writer_thread._SETTLE_SECONDS", 0)
 
     def defect(_tables: Tables, _change: Change) -> NoReturn:
@@ -209,8 +203,6 @@ async def test_callers_learn_that_writing_has_ended(
 async def test_writing_continues_without_the_file_of_changes(
     database: Database, tmp_path: Path, failures: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If the disk fails while the file of changes is emptied, the database is written; the owner gets a message."""
-
     def broken(_descriptor: int, _length: int) -> NoReturn:
         raise OSError(errno.EIO, "Input/output error")
 
@@ -225,7 +217,6 @@ async def test_writing_continues_without_the_file_of_changes(
 async def test_settled_statements_survive_a_power_failure(
     database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """When `settled` returns, the disk has the database's log, and the current file of statements under way."""
     synced: list[tuple[str, int]] = []
     fsync = os.fsync
 
@@ -241,7 +232,6 @@ async def test_settled_statements_survive_a_power_failure(
 
 
 def test_a_file_that_is_not_a_database_is_an_error_with_a_remedy(tmp_path: Path) -> None:
-    """Garbage in the place of the state is an error with the file's name, and stays untouched."""
     file = tmp_path / "state.db"
     file.write_bytes(b"this is not a database" * 100)
     with pytest.raises(StoreError, match=r"state\.db.*move the file away"):
@@ -264,7 +254,6 @@ def test_a_file_that_lost_all_it_had_is_not_taken_for_a_new_one(tmp_path: Path) 
 
 
 def test_an_unwritable_folder_is_not_taken_for_a_bad_file(tmp_path: Path) -> None:
-    """With a full disk or a missing folder, the message does not ask to move the state away."""
     with pytest.raises(StoreError, match=r"state\.db.*free space") as caught:
         Database(tmp_path / "missing" / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
     assert "move" not in str(caught.value)
@@ -272,7 +261,6 @@ def test_an_unwritable_folder_is_not_taken_for_a_bad_file(tmp_path: Path) -> Non
 
 @pytest.mark.nightly
 def test_statements_queued_by_a_killed_process_are_there_after_the_next_start(tmp_path: Path) -> None:
-    """Nothing that `put` took is lost to SIGKILL or reordered, whatever the writer thread had done by then."""
     killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), SCHEMA], check=False, timeout=60)
     assert killed.returncode == -signal.SIGKILL
     again = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
@@ -284,7 +272,6 @@ def test_statements_queued_by_a_killed_process_are_there_after_the_next_start(tm
 def test_rows_of_one_table_are_one_statement(
     database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """This holds for any number of consecutive rows; statements between them are carried out in their order."""
     numbers: list[int] = []
     append = WriteAhead.append
 
@@ -311,7 +298,6 @@ def test_rows_of_one_table_are_one_statement(
 def test_a_block_of_statements_is_one_write_and_delays_no_other_thread(
     database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The block is written in order at its end, also if it fails; another thread's statements are written at once."""
     kept: list[list[str]] = []
     append = WriteAhead.append
 
@@ -340,7 +326,6 @@ def test_a_block_of_statements_is_one_write_and_delays_no_other_thread(
 async def test_the_file_of_statements_on_their_way_is_empty_once_all_are_in(
     database: Database, tmp_path: Path
 ) -> None:
-    """It does not grow with the number of statements that were ever made."""
     for number in range(100):
         database.put("thing", str(number), 1)
     await database.settled()
@@ -365,7 +350,6 @@ def names_after_start(tmp_path: Path) -> list[str]:
 
 
 def test_a_change_torn_by_the_crash_is_left_out(tmp_path: Path) -> None:
-    """However much of the last change was written, it was never confirmed; the complete ones before it are applied."""
     file = tmp_path / "state.ahead"
     leave_behind(file, encoded(1, "whole"))
     whole = file.stat().st_size
@@ -379,7 +363,6 @@ def test_a_change_torn_by_the_crash_is_left_out(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damage", [b"\x00", b"\xff"])
 def test_nothing_behind_a_damaged_change_is_applied(tmp_path: Path, damage: bytes) -> None:
-    """A power failure may leave any block of the file empty; a later change could depend on the missing one."""
     file = tmp_path / "state.ahead"
     leave_behind(file, encoded(1, "first"))
     begin = file.stat().st_size
@@ -397,7 +380,6 @@ def test_nothing_behind_a_damaged_change_is_applied(tmp_path: Path, damage: byte
 
 
 def test_changes_behind_a_missing_one_are_left_out(tmp_path: Path) -> None:
-    """A power failure may undo changes that had left the file; later changes in the file are then left out."""
     leave_behind(tmp_path / "state.ahead", encoded(1, "kept"))
     assert names_after_start(tmp_path) == ["kept"]
     ahead = WriteAhead(tmp_path / "state.ahead")
@@ -409,7 +391,6 @@ def test_changes_behind_a_missing_one_are_left_out(tmp_path: Path) -> None:
 
 
 def test_changes_that_the_database_has_are_not_repeated(tmp_path: Path) -> None:
-    """A power failure may leave an old content of the file, though the database has later changes."""
     file = tmp_path / "state.ahead"
     leave_behind(file, encoded(1, "a"))
     old = file.read_bytes()
@@ -431,7 +412,6 @@ def test_a_large_value_that_is_lost_takes_no_later_change_with_it(tmp_path: Path
 
 
 def test_statements_that_an_earlier_release_left_are_executed(tmp_path: Path) -> None:
-    """The first start after an upgrade executes the SQL in its file, without a torn last statement."""
     Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand).close()
     bodies = [
         msgspec.msgpack.encode(("INSERT OR REPLACE INTO thing VALUES (?, ?), (?, ?)", ["a", 1, "b", 2])),
@@ -443,7 +423,6 @@ def test_statements_that_an_earlier_release_left_are_executed(tmp_path: Path) ->
 
 
 def test_a_change_of_a_later_release_is_an_error_that_names_it(tmp_path: Path) -> None:
-    """It is not dropped: the file stays as it is."""
     body = msgspec.msgpack.encode(Put("future", [("a", 1)]))
     leave_behind(tmp_path / "state.ahead", Encoded(1, body))
     before = (tmp_path / "state.ahead").read_bytes()
@@ -453,7 +432,6 @@ def test_a_change_of_a_later_release_is_an_error_that_names_it(tmp_path: Path) -
 
 
 def test_a_change_that_fits_no_table_is_refused_at_once(database: Database) -> None:
-    """The caller gets the error; the changes around it are saved."""
     database.put("thing", "before", 1)
     with pytest.raises(ChangeError, match="a row of thing has 2 values, not 3"):
         database.put("thing", "bad", 1, 2)
@@ -465,7 +443,6 @@ def test_a_change_that_fits_no_table_is_refused_at_once(database: Database) -> N
 
 @pytest.mark.nightly
 def test_a_feed_has_all_changes_of_the_database_in_its_order(tmp_path: Path) -> None:
-    """Threads that make changes at once get different numbers; large values are in the feed as well."""
     database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
     database.put("thing", "earlier", 1)
     calls: list[int] = []
@@ -503,7 +480,6 @@ def test_a_feed_has_all_changes_of_the_database_in_its_order(tmp_path: Path) -> 
 def test_a_feed_that_begins_during_a_change_has_the_whole_change(
     database: Database, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A large value, which is encoded for feeds only, is encoded then."""
     feeds: list[ChangeFeed] = []
 
     def late(changes: Sequence[tuple[Change, bool]]) -> Iterator[tuple[Change, bool]]:
@@ -517,7 +493,6 @@ def test_a_feed_that_begins_during_a_change_has_the_whole_change(
 
 
 def test_numbers_continue_after_each_start_and_each_start_has_its_own_history(tmp_path: Path) -> None:
-    """A start that changes nothing leaves the stored history as it was: another appliance may have the same state."""
     found: list[tuple[str, int]] = []
     for start in range(3):
         database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
@@ -540,7 +515,6 @@ def test_numbers_continue_after_each_start_and_each_start_has_its_own_history(tm
 
 @pytest.mark.nightly
 def test_a_copy_is_of_one_moment_and_leaves_no_file(tmp_path: Path) -> None:
-    """Its rows are those up to its number, while another thread writes; a killed process may have left a part."""
     (tmp_path / "state.new").write_bytes(b"a part")
     database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
     database.put("thing", "0", 0)
@@ -600,7 +574,6 @@ class _Gate:
 
 @pytest.mark.nightly
 def test_closing_waits_for_a_write_that_is_under_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A thread that has the descriptor's number writes to that file, also if another thread closes it by then."""
     gate = _Gate()
     monkeypatch.chdir(tmp_path)
     flags = {name: getattr(os, name) for name in ("O_RDWR", "O_CREAT", "O_APPEND", "O_CLOEXEC")}
@@ -619,7 +592,6 @@ def test_closing_waits_for_a_write_that_is_under_way(tmp_path: Path, monkeypatch
 
 
 def test_a_closed_file_of_statements_refuses_every_use(tmp_path: Path) -> None:
-    """After `close` each use is an error that names the file; a file that got the number stays as it is."""
     ahead = WriteAhead(tmp_path / "state.ahead")
     ahead.close()
     with (tmp_path / "another").open("wb") as another:
@@ -636,7 +608,6 @@ def test_a_closed_file_of_statements_refuses_every_use(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_a_change_is_kept_or_refused_however_it_meets_the_end(tmp_path: Path) -> None:
-    """While the database closes, each thread that submits learns which of its rows are kept, and these are there."""
     kept: list[str] = []
     database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
     begin = threading.Barrier(9)

@@ -31,7 +31,6 @@ def test_the_kernels_flag_decides(
 
 
 def test_the_structure_is_the_kernels() -> None:
-    """The flags are at the offset of the 64-bit kernel (adjtimex(2)), and the structure is large enough."""
     assert clock_sync.Timex.status.offset == 40
     assert ctypes.sizeof(clock_sync.Timex) >= 208
 

@@ -42,7 +42,6 @@ class _Life:
     ],
 )
 def test_only_readers_of_the_log_are_ended(tmp_path: Path, holding: list[str | int], ended: set[str]) -> None:
-    """The named reader is ended, or all readers if the kernel names none; no other process is ended."""
     admin = socket.create_server(("127.0.0.1", 0))
     facts = Facts(state=tmp_path, config=tmp_path / "c", rosmaster_port=1)
     supervisor = Supervisor((*roles_of(), READER), facts, admin=admin, ready=lambda _said: None)

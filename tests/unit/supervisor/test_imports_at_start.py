@@ -43,20 +43,17 @@ def imported(*modules: str) -> set[str]:
 
 @pytest.mark.parametrize("role", ENTRIES)
 def test_a_process_imports_no_library_it_may_never_need(role: str) -> None:
-    """A start without monitors, namespace or help text does not load these libraries."""
     found = imported("appliance.supervisor.child_entry", "appliance.supervisor.logs", ENTRIES[role])
     assert found.isdisjoint(NEVER - MAY.get(role, set()) | ALSO.get(role, set()))
 
 
 def test_the_supervisor_imports_no_library_it_may_never_need() -> None:
-    """This also holds for `rosrv up`, which uses `typer` for its flags."""
     assert imported("appliance.cli.main", "appliance.cli.up").isdisjoint(
         NEVER - {"typer"} | {"appliance.channel.admin", "appliance.configuration.inventory"}
     )
 
 
 def test_the_launcher_of_a_program_has_no_loop_and_no_log() -> None:
-    """The launcher of rosmaster and rosout imports only the parts that drop its rights."""
     assert imported("appliance.supervisor.child_entry").isdisjoint(
         {"asyncio", "structlog", "appliance.channel.admin"}
     )

@@ -32,7 +32,6 @@ def _is_open(descriptor: int) -> bool:
 
 
 def test_a_kept_socket_is_there_until_it_is_dropped(kept: InheritedListeners) -> None:
-    """A kept socket is returned by its name; a dropped socket is closed."""
     descriptor = _listening()
     kept.keep("outer:a1", descriptor)
     assert list(kept) == [("outer:a1", descriptor)]
@@ -42,7 +41,6 @@ def test_a_kept_socket_is_there_until_it_is_dropped(kept: InheritedListeners) ->
 
 
 def test_a_name_stands_for_one_socket(kept: InheritedListeners) -> None:
-    """Keeping another socket under the same name closes the first socket, even if the store is full."""
     first, second, other = _listening(), _listening(), _listening()
     kept.keep("other", other)
     kept.keep("rvmaster", first)
@@ -64,7 +62,6 @@ def test_there_is_a_bound(kept: InheritedListeners) -> None:
 
 @pytest.mark.parametrize("name", ["", "a b", "a\n", "-a", "x" * 201, "\u00e4", "a\0"])
 def test_only_plain_names_are_accepted(kept: InheritedListeners, name: str) -> None:
-    """A name is a short word of letters, digits and a few marks."""
     descriptor = _listening()
     with pytest.raises(ListenerRejectedError, match="not a valid name"):
         kept.keep(name, descriptor)
@@ -72,7 +69,6 @@ def test_only_plain_names_are_accepted(kept: InheritedListeners, name: str) -> N
 
 
 def test_only_listening_sockets_are_kept(kept: InheritedListeners) -> None:
-    """A file, or a socket that does not listen, is refused and closed."""
     read_end, write_end = os.pipe()
     os.close(write_end)
     with pytest.raises(ListenerRejectedError, match="not a socket"):

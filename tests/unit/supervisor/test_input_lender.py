@@ -74,7 +74,6 @@ def text(descriptor: int | None) -> str:
 
 
 def test_a_role_gets_its_inputs(home: Path, borrower: Borrower) -> None:
-    """A role gets its files, those beside a file, and those below a folder, as they are at the time of the request."""
     for name in ("robot.ini", "robot.ini.sig", "monitors/m.rv", "monitors/msg/p/T.msg"):
         assert text(borrower.open(home / name)) == name
     replaced = home / "new"
@@ -86,13 +85,11 @@ def test_a_role_gets_its_inputs(home: Path, borrower: Borrower) -> None:
 
 
 def test_a_role_gets_nothing_else(home: Path, borrower: Borrower) -> None:
-    """Other files of the home are not lent, by whatever path; nor is the content of a folder that is only passed."""
     for path in (home / ".ssh_key", home / "monitors/../.ssh_key", home, Path("/etc/shadow")):
         assert borrower.open(path) is None
 
 
 def test_a_hanging_supervisor_delays_a_role_once(tmp_path: Path) -> None:
-    """Control serves nodes while the supervisor hangs, and takes a late answer for no other file."""
     (tmp_path / "late").write_text("late")
     ours, supervisors = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with ours, supervisors, (tmp_path / "late").open() as late:
@@ -111,7 +108,6 @@ def test_a_hanging_supervisor_delays_a_role_once(tmp_path: Path) -> None:
 def test_a_link_cannot_lend_the_files_of_another_user(
     home: Path, borrower: Borrower, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    """The owner of the folder decides what its links reach: root does not follow them with its own rights."""
     secret = tmp_path_factory.mktemp("other") / "secret"
     secret.write_text("secret")
     secret.chmod(0o600)
@@ -125,7 +121,6 @@ def test_a_link_cannot_lend_the_files_of_another_user(
 
 
 def test_a_library_reads_a_copy_of_a_lent_file(tmp_path: Path) -> None:
-    """The forwarders present a certificate whose files only root may read; OpenSSL opens them by a path."""
     need_root()
     made = make_certificates(tmp_path / "closed")
     made.ca.parent.chmod(0o700)
@@ -135,7 +130,6 @@ def test_a_library_reads_a_copy_of_a_lent_file(tmp_path: Path) -> None:
 
 
 def test_root_of_a_container_reads_the_files_of_an_owner(home: Path) -> None:
-    """Without CAP_DAC_OVERRIDE, as in compose.yaml, root reads a checkout that umask 077 closed."""
     rights = "--bounding-set=-dac_override,-dac_read_search"
     files = [str(home / "robot.ini"), str(home / "monitors")]
     home.parent.chmod(0o711)

@@ -60,7 +60,6 @@ def surroundings() -> Surroundings:
 
 @pytest.mark.nightly
 async def test_control_learns_of_each_opening_and_closing(surroundings: Surroundings) -> None:
-    """A finding is sent with its reason, and so is its end; both have the report."""
     told: list[Message] = []
     surroundings.found = ["reached", None]
     watchdog = IsolationWatchdog(surroundings, told.append)
@@ -72,7 +71,6 @@ async def test_control_learns_of_each_opening_and_closing(surroundings: Surround
 
 @pytest.mark.nightly
 async def test_a_probe_that_cannot_be_made_counts_as_open(surroundings: Surroundings) -> None:
-    """An unknown state does not count as closed."""
     told: list[Message] = []
     surroundings.found = [NetworkError("no child")]
     assert "no child" in str(await IsolationWatchdog(surroundings, told.append).look())
@@ -81,7 +79,6 @@ async def test_a_probe_that_cannot_be_made_counts_as_open(surroundings: Surround
 
 @pytest.mark.nightly
 async def test_a_new_control_receives_the_last_finding(surroundings: Surroundings) -> None:
-    """A control that starts after the finding still receives it."""
     surroundings.found = ["reached"]
     watchdog = IsolationWatchdog(surroundings, lambda _message: None)
     assert watchdog.news() == [FirewallReported("container", FirewallState())]
@@ -121,7 +118,6 @@ async def test_a_master_side_port_that_cannot_be_closed_is_reported(
 async def test_a_failing_probe_is_a_finding_and_probes_go_on(
     surroundings: Surroundings, broken: Exception
 ) -> None:
-    """A short lack of files or processes is reported as a fault, and its end is reported after the next probe."""
     told: list[Message] = []
     surroundings.found = [broken, *[None] * 100_000]
     running = asyncio.create_task(IsolationWatchdog(surroundings, told.append, every=0.001).run())
@@ -160,7 +156,6 @@ async def test_probes_are_repeated(surroundings: Surroundings) -> None:
 
 @pytest.mark.nightly
 async def test_without_isolation_nothing_is_probed() -> None:
-    """Isolation `none` is not probed, and is not reported as proved."""
     told: list[Message] = []
     assert await IsolationWatchdog(NoIsolation(), told.append).look() is None
     assert told == [FirewallReported("none", FirewallState())]
@@ -168,7 +163,6 @@ async def test_without_isolation_nothing_is_probed() -> None:
 
 @pytest.mark.nightly
 def test_without_isolation_there_is_no_address_for_hosts(surroundings: Surroundings) -> None:
-    """Control receives the reason; the supervisor raises nothing."""
     assert asyncio.run(IsolationWatchdog(surroundings, lambda _message: None).endpoint()) == EndpointFound(
         None, "isolation container has no tunnels: use isolation netns or container"
     )
@@ -178,7 +172,6 @@ def test_without_isolation_there_is_no_address_for_hosts(surroundings: Surroundi
 async def test_a_crowd_of_new_hosts_costs_a_few_threads(
     surroundings: Surroundings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Many requests for routes are all answered, a bounded number at a time."""
     lock, entered, most = threading.Lock(), [0], [0]
     release = threading.Event()
 

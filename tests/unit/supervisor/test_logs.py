@@ -26,7 +26,6 @@ except ValueError:
 
 
 def test_lines_are_json_without_secrets() -> None:
-    """Each line is one JSON object, whatever its source, and a traceback has no values."""
     done = subprocess.run([sys.executable, "-c", _PROGRAM], capture_output=True, text=True, check=True)
     own, foreign = map(json.loads, done.stderr.splitlines())
     assert (own["event"], own["host"], foreign["event"]) == ("own", "10.0.0.1", "foreign")

@@ -41,7 +41,6 @@ def test_only_relays_have_files_each_its_own(tmp_path: Path) -> None:
 
 
 def test_every_relay_reads_the_state_of_the_last_run(tmp_path: Path) -> None:
-    """Without an orderly end the state is read as well, but no mark says that the state outlived the machine."""
     first = MonitorMemory(tmp_path, 2)
     write(first, 0, b"a")
     write(first, 1, b"b")
@@ -56,7 +55,6 @@ def test_every_relay_reads_the_state_of_the_last_run(tmp_path: Path) -> None:
 
 
 def test_a_run_that_is_killed_at_its_start_loses_nothing(tmp_path: Path) -> None:
-    """The state of the last run stays until each relay has written its own."""
     write(MonitorMemory(tmp_path, 1), 0, b"a")
     for _ in range(3):
         memory = MonitorMemory(tmp_path, 2)
@@ -70,14 +68,12 @@ def test_a_run_that_is_killed_at_its_start_loses_nothing(tmp_path: Path) -> None
 
 
 def test_the_files_of_short_runs_are_bounded(tmp_path: Path) -> None:
-    """This holds however often the appliance is killed at its start."""
     for _ in range(10):
         write(MonitorMemory(tmp_path, 2), 0)
     assert len([*(tmp_path / FOLDER).iterdir()]) <= 5
 
 
 def test_fewer_relays_drop_the_state_of_the_others(tmp_path: Path) -> None:
-    """Once all present relays have written their state, the remaining state does not return in a later run."""
     first = MonitorMemory(tmp_path, 2)
     write(first, 0, b"a")
     write(first, 1, b"b")
@@ -86,7 +82,6 @@ def test_fewer_relays_drop_the_state_of_the_others(tmp_path: Path) -> None:
 
 
 def test_an_orderly_end_is_reported_once(tmp_path: Path) -> None:
-    """The mark has the boot of the machine and the time; the next run removes it."""
     first = MonitorMemory(tmp_path, 1)
     write(first, 0)
     boot = given(first, 0)[0][0].boot
@@ -101,8 +96,6 @@ def test_an_orderly_end_is_reported_once(tmp_path: Path) -> None:
 def test_on_a_full_disk_the_state_survives_relays_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The appliance starts, and reports that the state will not survive a restart of the appliance."""
-
     def full(_descriptor: int, _offset: int, _size: int) -> None:
         raise OSError(28, "No space left on device")
 
@@ -115,7 +108,6 @@ def test_on_a_full_disk_the_state_survives_relays_only(
 
 
 def test_a_foreign_folder_does_not_stop_the_start(tmp_path: Path) -> None:
-    """A folder that is not of an earlier run, such as a user's copy, is ignored and stays."""
     MonitorMemory(tmp_path, 1).close()
     copy = tmp_path / FOLDER / "copy"
     copy.mkdir()

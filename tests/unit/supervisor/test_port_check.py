@@ -12,12 +12,10 @@ pytestmark = pytest.mark.nightly
 
 
 def test_a_free_port_is_free() -> None:
-    """The appliance can listen on the chosen port."""
     require_free("127.0.0.1", free_port())
 
 
 def test_a_taken_port_is_reported_with_its_owner() -> None:
-    """The message names the port and the process that uses it."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(StartError, match=rf"port {port} .* in use by process {os.getpid()} \("):
@@ -25,7 +23,6 @@ def test_a_taken_port_is_reported_with_its_owner() -> None:
 
 
 def test_a_port_is_free_again_when_only_old_connections_linger() -> None:
-    """A port without a listener is free even if a connection is in TIME_WAIT."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
         client = socket.create_connection(("127.0.0.1", port))
@@ -36,7 +33,6 @@ def test_a_port_is_free_again_when_only_old_connections_linger() -> None:
 
 
 def test_an_address_of_another_machine_is_an_error() -> None:
-    """A listening address that this machine lacks is refused with a clear message."""
     with pytest.raises(StartError, match=r"cannot listen on 192\.0\.2\.1:1"):
         require_free("192.0.2.1", 1)
 
@@ -56,7 +52,6 @@ def test_the_first_free_port() -> None:
 
 
 def test_spare_ports_overlap_none_that_are_taken() -> None:
-    """The ports are adjacent and outside every used range; if there are none, the policy's range is too large."""
     within = range(1024, 65_536)
     assert spare_ports(64, [range(32_768, 61_000)], within) == range(65_472, 65_536)
     assert spare_ports(64, [range(65_500, 65_501), range(60_000, 65_490)], within) == range(59_936, 60_000)

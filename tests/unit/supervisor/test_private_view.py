@@ -86,7 +86,6 @@ def seen(home: Path, view: PrivateView | None) -> dict[str, Any]:
 @pytest.mark.parametrize("umask", [0o022, 0o027, 0o077])
 @pytest.mark.parametrize("mode", [0o700, 0o750, 0o755])
 def test_another_user_runs_the_program_of_a_closed_home(home: Path, mode: int, umask: int) -> None:
-    """The user reads the program, writes only its own state, and sees no other file of the home."""
     home.chmod(mode)
     for path in (home / "x y", *(home / "x y").rglob("*")):
         path.chmod(path.stat().st_mode & ~umask)
@@ -113,7 +112,6 @@ def test_another_user_runs_the_program_of_a_closed_home(home: Path, mode: int, u
 
 @pytest.mark.nightly
 def test_one_closed_file_is_enough(home: Path) -> None:
-    """A file of the program that a pull under umask 077 closed is shown like a closed folder."""
     home.chmod(0o755)
     (home / "x y/appliance/main.py").chmod(0o600)
     view = view_of([home / "x y/appliance"], home / "state")

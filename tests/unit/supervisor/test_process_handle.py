@@ -43,7 +43,6 @@ def test_a_slow_start_is_waited_for_and_a_hang_is_not(
 
 @pytest.mark.nightly
 async def test_a_process_that_cannot_be_watched_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    """If too many files are open, the start fails, and no process is left that uses the next one's port."""
     started: list[subprocess.Popen[bytes]] = []
     popen = subprocess.Popen
 

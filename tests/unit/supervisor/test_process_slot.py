@@ -23,7 +23,6 @@ def slot() -> ProcessSlot:
 
 
 def test_restarts_of_a_dying_process_wait_up_to_a_second(slot: ProcessSlot) -> None:
-    """The first restart has no delay; repeated deaths wait longer and are reported."""
     delays = []
     for _ in range(FAILING_AFTER):
         assert not slot.is_failing
@@ -34,7 +33,6 @@ def test_restarts_of_a_dying_process_wait_up_to_a_second(slot: ProcessSlot) -> N
 
 
 def test_restarts_of_an_optional_process_wait_up_to_a_minute() -> None:
-    """A tunnel process that dies at every start is restarted more and more slowly, and is failing until a run lasts."""
     slot = ProcessSlot(
         Role(name="charon", user="rosrv-ipsec", part="ipsec", entry="m:f", dispensable=True), 0
     )
@@ -51,7 +49,6 @@ def test_restarts_of_an_optional_process_wait_up_to_a_minute() -> None:
 
 
 def test_a_process_that_ran_long_is_restarted_at_once(slot: ProcessSlot) -> None:
-    """Its earlier deaths no longer count."""
     for _ in range(FAILING_AFTER):
         slot.record_death(process(lived=0.1))
     assert slot.record_death(process(lived=60)) == pytest.approx(60, abs=5)
@@ -60,7 +57,6 @@ def test_a_process_that_ran_long_is_restarted_at_once(slot: ProcessSlot) -> None
 
 
 def test_a_plan_has_the_number_of_an_indexed_role_only(slot: ProcessSlot) -> None:
-    """Only a process of an indexed role receives its index."""
     facts = Facts(state=Path("/state"), config=Path("/state/run/config.json"), rosmaster_port=1)
     assert slot.plan(facts, 3, None).index == 1
     alone = ProcessSlot(Role(name="signer", user="rosrv-signer", part="signer", entry="m:f"), 0)

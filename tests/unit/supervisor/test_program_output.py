@@ -24,7 +24,6 @@ class Loop:
 
 
 def test_each_line_is_a_line_of_the_log() -> None:
-    """Parts of a line are put together, a long line is divided, control characters are replaced; the end is the end."""
     reader, writer = os.pipe()
     loop: Any = Loop()
     with capture_logs() as logged, os.fdopen(reader, "rb", buffering=0) as output:

@@ -17,7 +17,6 @@ BY_NAME = {role.name: role for role in ROLES}
 
 
 def test_rosmaster_binds_loopback_only() -> None:
-    """rosmaster listens only on loopback, on the given port."""
     role = BY_NAME["rosmaster"]
     assert role.program is not None
     program = role.program(FACTS)
@@ -26,7 +25,6 @@ def test_rosmaster_binds_loopback_only() -> None:
 
 
 def test_rosmaster_runs_no_code_of_its_home() -> None:
-    """Python does not import from its folder in the state directory."""
     role = BY_NAME["rosmaster"]
     assert role.program is not None
     assert role.program(FACTS).argv[:2] == ("/usr/bin/python3", "-s")
@@ -61,7 +59,6 @@ def test_rosout_writes_no_files() -> None:
 
 
 def test_a_missing_rosmaster_is_an_error_that_says_what_to_install(tmp_path: Path) -> None:
-    """The message has the command that installs rosmaster."""
     with pytest.raises(StartError, match="apt install python3-rosmaster"):
         require_programs({HERE: "coreutils", tmp_path / "rosmaster": "python3-rosmaster"})
     require_programs({HERE: "coreutils"})
@@ -75,7 +72,6 @@ def test_links_are_between_roles_and_go_both_ways() -> None:
 
 
 def test_the_compiler_has_only_its_link() -> None:
-    """The compiler has its own user, but no network, file or right, and starts on demand."""
     compiler = BY_NAME["compiler"]
     assert compiler in roles_of()
     assert compiler.user not in {role.user for role in ROLES if role is not compiler}
@@ -94,7 +90,6 @@ def test_rows_are_consistent() -> None:
 
 
 def test_rest_can_be_left_out() -> None:
-    """Without REST there is no such role; the other processes do not depend on it."""
     api, control = BY_NAME["api"], BY_NAME["control"]
     assert [role for role in roles_of() if role not in roles_of(api=False)] == [api]
     assert api.dispensable

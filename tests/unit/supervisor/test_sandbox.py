@@ -59,14 +59,12 @@ def test_only_sockets_of_granted_families_can_be_opened() -> None:
 
 
 def test_a_machine_without_the_library_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without libseccomp a required filter is an error with its remedy; an optional filter is reported."""
     monkeypatch.setattr(seccomp, "LIBRARY", "libnowhere.so.9")
     with pytest.raises(seccomp.SeccompError, match="apt install libseccomp2"):
         seccomp.load_filter(SandboxPlan())
 
 
 def test_no_call_is_both_allowed_and_forbidden() -> None:
-    """The lists have no system call in common, and each name is listed once."""
     assert not set(ALLOWED) & {
         *FORBIDDEN,
         *STARTS_PROGRAMS,
@@ -83,12 +81,10 @@ def test_no_call_is_both_allowed_and_forbidden() -> None:
 
 @pytest.mark.parametrize(("abi", "lacks"), [(0, 1), (1, 2), (3, 2), (4, 1), (5, 1), (6, 0), (7, 0)])
 def test_missing_limits_of_an_older_kernel_are_reported(abi: int, lacks: int) -> None:
-    """The report names the limits that each kernel version lacks."""
     assert len(landlock.lacking(abi)) == lacks
 
 
 def test_each_process_has_a_list_except_the_starter_of_charon() -> None:
-    """Processes that parse untrusted input have a list; only external programs and their starter may run programs."""
     for role in ROLES:
         sandbox = role.sandbox(FACTS)
         assert sandbox.allowlist is (role.name not in {"rosmaster", "rosout", "charon"}), role.name
@@ -98,7 +94,6 @@ def test_each_process_has_a_list_except_the_starter_of_charon() -> None:
 
 
 def test_a_saved_file_may_be_replaced(tmp_path: Path) -> None:
-    """A configured file's folder is readable, relative to where the appliance was started."""
     assert folders_of(tmp_path / "policy.ini", None) == (str(tmp_path),)
     assert folders_of(Path("policy.ini")) == (str(Path.cwd()),)
     (tmp_path / "link").symlink_to("/srv/robot/policy.ini")
@@ -106,7 +101,6 @@ def test_a_saved_file_may_be_replaced(tmp_path: Path) -> None:
 
 
 def test_a_program_includes_its_dynamic_linker(tmp_path: Path) -> None:
-    """Links are followed to the executed file; each sandbox includes its folder and the linker's configuration."""
     link = tmp_path / "python"
     link.symlink_to("/usr/bin/python3")
     first, *loaders = executables_of(link)

@@ -20,7 +20,6 @@ def listening(path: Path) -> socket.socket:
 
 @pytest.mark.nightly
 def test_start_ready_and_stop_are_reported(tmp_path: Path) -> None:
-    """A start reports its steps and times, `READY=1` when nodes may connect, and `STOPPING=1` at an orderly end."""
     with listening(tmp_path / "notify") as heard:
         manager = ServiceManager.of({"NOTIFY_SOCKET": str(tmp_path / "notify")})
         manager.starting("builds its firewall")
@@ -33,7 +32,6 @@ def test_start_ready_and_stop_are_reported(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_the_watchdog_is_fed_twice_in_its_time(tmp_path: Path) -> None:
-    """While the loop runs, the watchdog is notified after each half of its interval; a start gets more time."""
     environment = {
         "NOTIFY_SOCKET": str(tmp_path / "notify"),
         "WATCHDOG_USEC": "20000",
@@ -58,7 +56,6 @@ def test_the_watchdog_is_fed_twice_in_its_time(tmp_path: Path) -> None:
 
 
 def test_without_a_service_manager_nothing_is_sent() -> None:
-    """After a manual start, or if the watchdog is for another process, nothing is sent."""
     manager = ServiceManager.of({"WATCHDOG_USEC": "1000000", "WATCHDOG_PID": "1"})
     manager.ready("nobody hears it")
     assert manager.watchdog_seconds is None
@@ -66,5 +63,4 @@ def test_without_a_service_manager_nothing_is_sent() -> None:
 
 @pytest.mark.nightly
 def test_a_service_manager_that_has_gone_stops_nothing(tmp_path: Path) -> None:
-    """A missing socket does not end the appliance."""
     ServiceManager(str(tmp_path / "gone"), None).ready("nobody hears it")

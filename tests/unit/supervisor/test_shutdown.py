@@ -76,7 +76,6 @@ def test_each_is_asked_first_and_rosmaster_last(crowd: Crowd) -> None:
 
 
 def test_a_process_that_does_not_end_is_killed(crowd: Crowd) -> None:
-    """SIGTERM and then SIGKILL go only to processes that still run."""
     crowd.add("relay", "SIGKILL")
     crowd.add("api", "SIGTERM")
     crowd.add("control", "Stop")
@@ -98,7 +97,6 @@ def test_an_unkillable_process_does_not_delay_the_end(crowd: Crowd) -> None:
 
 
 async def test_a_pending_restart_is_cancelled(crowd: Crowd) -> None:
-    """A restart that is still delayed does not happen."""
     crowd.add("relay", "Stop")
     slot = crowd.slots[0]
     slot.process = None

@@ -63,10 +63,8 @@ def by_itself(script: str) -> None:
 
 
 def test_held_signals_arrive_when_a_handler_is_set() -> None:
-    """Held signals arrive when a handler is set; later ones are dropped, and the previous handlers are restored."""
     by_itself(_HELD)
 
 
 def test_a_thread_does_not_take_them() -> None:
-    """The kernel delivers a signal to any thread that accepts it; if all block it, the signal waits."""
     by_itself(_THREAD)

@@ -20,7 +20,6 @@ ROLES = (
 
 
 def test_parts_are_made_and_closed_to_others(tmp_path: Path) -> None:
-    """Every role gets a folder for its user only; others can traverse the directory but not list it."""
     state = StateDirectory(tmp_path / "deep" / "state")
     state.prepare(ROLES)
     modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in state.path.iterdir()}
@@ -30,7 +29,6 @@ def test_parts_are_made_and_closed_to_others(tmp_path: Path) -> None:
 
 
 def test_leftovers_of_a_killed_process_are_removed_at_the_next_start(tmp_path: Path) -> None:
-    """A temporary file in the folder of a role is removed; the operator's own file beside it stays."""
     killed = StateDirectory(tmp_path)
     killed.prepare(ROLES)
     own = name_to_make(tmp_path / "kit.tgz")
@@ -45,7 +43,6 @@ def test_leftovers_of_a_killed_process_are_removed_at_the_next_start(tmp_path: P
 
 
 def test_a_second_user_of_the_directory_is_refused_by_name(tmp_path: Path) -> None:
-    """The message names the process that uses the directory; when that process ends, the directory is free."""
     first = StateDirectory(tmp_path)
     with pytest.raises(StartError, match=f"process {os.getpid()}"):
         StateDirectory(tmp_path)
@@ -55,7 +52,6 @@ def test_a_second_user_of_the_directory_is_refused_by_name(tmp_path: Path) -> No
 
 @pytest.mark.nightly
 def test_a_stale_admin_socket_is_replaced(tmp_path: Path) -> None:
-    """A socket left by a crash does not stop the next start from listening."""
     state = StateDirectory(tmp_path)
     state.open_admin_socket().close()  # as after a crash: a file without a listener
     with state.open_admin_socket(), socket.socket(socket.AF_UNIX) as client:
@@ -66,7 +62,6 @@ def test_a_stale_admin_socket_is_replaced(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_a_path_too_long_for_a_socket_is_a_clear_error(tmp_path: Path) -> None:
-    """The kernel accepts at most 107 bytes; the message advises a shorter path."""
     state = StateDirectory(tmp_path / ("x" * 120))
     with pytest.raises(StartError, match="shorter path"):
         state.open_admin_socket()
@@ -75,7 +70,6 @@ def test_a_path_too_long_for_a_socket_is_a_clear_error(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["file", "link"])
 def test_a_part_that_is_not_a_folder_is_refused(tmp_path: Path, kind: str) -> None:
-    """A file or symbolic link in place of a role's folder is refused and not changed."""
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir(mode=0o755)
     elsewhere.chmod(0o755)
@@ -91,7 +85,6 @@ def test_a_part_that_is_not_a_folder_is_refused(tmp_path: Path, kind: str) -> No
 
 
 def test_a_directory_that_cannot_be_made_is_a_clear_error(tmp_path: Path) -> None:
-    """The message names the directory and the flag that sets it."""
     (tmp_path / "file").write_text("")
     with pytest.raises(StartError, match=r"file/state cannot be used: .*--state DIR"):
         StateDirectory(tmp_path / "file" / "state")
@@ -139,7 +132,6 @@ def test_a_directory_of_others_is_refused_and_unchanged(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("files", [(), ("lost+found/x",), ("lock",), ("control/state.db",)])
 def test_a_directory_of_the_appliance_is_accepted(tmp_path: Path, files: tuple[str, ...]) -> None:
-    """Covers an empty directory, the root of a disk, a directory of an earlier run, and a restored backup."""
     state = StateDirectory(folder(tmp_path / "state", *files))
     assert stat.S_IMODE(state.path.stat().st_mode) == 0o711
     state.close()
@@ -158,7 +150,6 @@ def test_a_lock_that_is_a_link_is_not_followed(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can make files of others")
 def test_a_foreign_lock_makes_no_state_directory(tmp_path: Path) -> None:
-    """In a world-writable directory, a file with the lock's name proves nothing."""
     theirs = folder(tmp_path / "theirs", "lock")
     os.chown(theirs / "lock", 61099, 61099)
     with pytest.raises(StartError, match="is not the state directory"):
@@ -168,7 +159,6 @@ def test_a_foreign_lock_makes_no_state_directory(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root gives folders to other users")
 def test_a_start_that_was_killed_is_completed(tmp_path: Path) -> None:
-    """If a start was killed before a folder got its owner, the next start sets the owner."""
     (tmp_path / "lock").touch()
     (tmp_path / "control").mkdir()
     state = StateDirectory(tmp_path)

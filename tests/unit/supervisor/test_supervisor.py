@@ -75,7 +75,6 @@ def made(
 async def test_a_master_that_dies_during_a_check_is_checked_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The answer came from a process that has ended: the start waits for the next process instead of failing."""
     supervisor = made(tmp_path, ROSMASTER)
     slot = supervisor.slots[0]
     first, second = StandIn(), StandIn()
@@ -130,8 +129,6 @@ async def test_a_machine_without_processes_causes_no_tight_loop(
 
 
 def test_a_control_that_asks_for_too_much_at_once_is_replaced(tmp_path: Path) -> None:
-    """Unanswered requests are limited; earlier requests are answered."""
-
     async def scene() -> tuple[StandIn, int]:
         supervisor, control = made(tmp_path, CONTROL), StandIn()
         for number in range(10_000):
@@ -148,7 +145,6 @@ def test_a_control_that_asks_for_too_much_at_once_is_replaced(tmp_path: Path) ->
 async def test_a_slow_start_is_waited_for_and_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """While a process makes progress the log names it; without progress the error names it."""
     monkeypatch.setattr(module, "_START_SECONDS", 0.0)
     monkeypatch.setattr(module, "_LOOK_SECONDS", 0.01)
     supervisor, slow, reasons = made(tmp_path, CONTROL), StandIn(), list[str]()
@@ -176,7 +172,6 @@ async def test_a_slow_start_is_waited_for_and_reported(
 
 @pytest.mark.parametrize("wanted", [False, True])
 def test_a_process_on_demand_may_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wanted: bool) -> None:
-    """The end of such a process is not a failure or a restart; a new one starts only if it was requested before."""
     role = Role(name="compiler", user="rosrv-compiler", part="compiler", entry="m:f", on_demand=True)
     asyncio.run(_end_by_themselves(made(tmp_path, role), monkeypatch, wanted))
 

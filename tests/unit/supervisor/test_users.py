@@ -9,7 +9,6 @@ from appliance.supervisor.users import NUMERIC_IDS, account_of
 
 
 def test_without_a_user_of_that_name_the_numeric_id_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As root on a machine without these users, each role still has its own numeric id."""
     monkeypatch.setattr(os, "geteuid", lambda: 0)
 
     def unknown(name: str) -> pwd.struct_passwd:
@@ -37,7 +36,6 @@ def test_without_a_user_of_that_name_the_numeric_id_is_used(monkeypatch: pytest.
 
 
 def test_a_user_of_that_name_is_preferred(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As root, the users that an administrator created are used."""
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     made = pwd.struct_passwd(("rosrv", "x", 123, 456, "", "/", "/bin/false"))
     monkeypatch.setattr(pwd, "getpwnam", lambda _name: made)
@@ -45,7 +43,6 @@ def test_a_user_of_that_name_is_preferred(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_caller_who_is_not_root_runs_everything(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without root no process can change its user: all roles run as the caller."""
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     monkeypatch.setattr(os, "getegid", lambda: 1001)
     assert {(account_of(user).uid, account_of(user).gid) for user in NUMERIC_IDS} == {(1000, 1001)}

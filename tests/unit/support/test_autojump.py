@@ -14,7 +14,6 @@ pytestmark = pytest.mark.anyio
 
 
 async def test_a_year_passes_at_once() -> None:
-    """The loop's clock, the monotonic and the system clock pass together."""
     loop = asyncio.get_running_loop()
     before = loop.time(), clock.now(), clock.wall()
     await asyncio.sleep(365 * 86_400)
@@ -26,7 +25,6 @@ async def test_a_year_passes_at_once() -> None:
 
 
 async def test_timers_fire_in_the_order_of_their_times() -> None:
-    """Each sees exactly its own time, whatever was scheduled first."""
     loop, fired = asyncio.get_running_loop(), list[float]()
     began = loop.time()
     for seconds in (3.0, 0.1, 2.0, 0.0):
@@ -36,8 +34,6 @@ async def test_timers_fire_in_the_order_of_their_times() -> None:
 
 
 async def test_a_time_limit_passes_only_if_nothing_else_can_happen() -> None:
-    """However much a task does before, it takes no time."""
-
     async def busy() -> str:
         for _ in range(1000):
             await asyncio.sleep(0)
@@ -49,7 +45,6 @@ async def test_a_time_limit_passes_only_if_nothing_else_can_happen() -> None:
 
 
 async def test_functions_for_threads_run_one_after_another_in_the_loop() -> None:
-    """They run in the order of the calls, find no running loop, and their errors reach the caller."""
     order: list[int] = []
 
     def work(number: int) -> int:
@@ -66,7 +61,6 @@ async def test_functions_for_threads_run_one_after_another_in_the_loop() -> None
 
 
 async def test_a_cancelled_function_does_not_run() -> None:
-    """It had not begun."""
     ran: list[int] = []
     future = asyncio.get_running_loop().run_in_executor(None, ran.append, 1)
     future.cancel()
@@ -75,8 +69,6 @@ async def test_a_cancelled_function_does_not_run() -> None:
 
 
 def test_a_deadlock_names_what_the_tasks_wait_for() -> None:
-    """The test fails at once, with the innermost place of each task."""
-
     async def never() -> None:
         await asyncio.Event().wait()
 
@@ -96,7 +88,6 @@ def test_a_poll_without_end_fails() -> None:
 
 
 async def test_a_socket_and_a_program_are_refused() -> None:
-    """The message says how to mark the test."""
     for use in (
         asyncio.open_connection("127.0.0.1", 1),
         asyncio.create_subprocess_exec("true"),

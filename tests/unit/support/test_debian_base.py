@@ -12,7 +12,6 @@ https://packages.example/tool nodistro main Somebody
 
 
 def test_only_the_suite_and_its_updates_are_used() -> None:
-    """The suite itself comes first; other suites and third-party packages are left out."""
     assert debian_sources(TARGETS, "bookworm") == [
         "deb http://mirror.example/debian/ bookworm contrib main",
         "deb http://mirror.example/debian-security/ bookworm-security main",
@@ -20,7 +19,6 @@ def test_only_the_suite_and_its_updates_are_used() -> None:
 
 
 def test_a_machine_without_the_suite_has_no_lines_for_it() -> None:
-    """If the machine has no line for a suite, no line is invented."""
     assert debian_sources(TARGETS, "sid") == []
 
 

@@ -32,7 +32,6 @@ REPORT = """<testsuites><testsuite>
     ids=["thread", "process", "socket", "pause"],
 )
 def test_a_deterministic_test_may_not_depend_on_chance(act: Callable[[], object]) -> None:
-    """The attempt is an error, and is reported even if the product catches the error."""
     with WATCH.watching() as found, pytest.raises(ChanceError):
         act()
     assert len(found) == 1
@@ -49,7 +48,6 @@ def test_every_test_file_runs_at_night_in_one_stage() -> None:
 
 
 def test_results_are_read_from_the_report(tmp_path: Path) -> None:
-    """Ids are those that pytest accepts; errors count as failures."""
     (tmp_path / "report.xml").write_text(REPORT)
     assert list(outcomes_of(tmp_path / "report.xml")) == [
         ("tests/a.py::test_one[x]", "passed", 1.5),
@@ -59,14 +57,12 @@ def test_results_are_read_from_the_report(tmp_path: Path) -> None:
 
 
 def test_the_bound_of_a_chance() -> None:
-    """Without a failure it is about 3/n; the chance of 5 or fewer failures of 50 at 20 % is nearly 5 %."""
     assert largest_chance(0, 300) == pytest.approx(3 / 300, rel=0.01)
     assert largest_chance(5, 50) == pytest.approx(0.2, abs=0.005)
     assert largest_chance(7, 7) == pytest.approx(1.0)
 
 
 def test_few_tests_are_unsteady_each_with_a_date_and_a_reason() -> None:
-    """At most ten tests may fail by chance."""
     lines = [line for line in UNSTEADY.read_text().splitlines() if line and not line.startswith("#")]
     assert len(unsteady()) == len(lines) <= 10
     assert all(re.fullmatch(r"\S+::\S+ 20\d\d-\d\d-\d\d \S.{20,}", line) for line in lines)

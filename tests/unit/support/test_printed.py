@@ -26,7 +26,6 @@ def done(output: str, status: int) -> "subprocess.CompletedProcess[str]":
 
 
 def test_a_report_of_problems_is_an_answer() -> None:
-    """Exit status 1 with rows."""
     assert row_of(done('{"troubles":["disk full"]}\n', 1)) == {"troubles": ["disk full"]}
     assert rows_of(done("", 0)) == []
 
@@ -37,14 +36,12 @@ def test_a_report_of_problems_is_an_answer() -> None:
     ids=["stands by", "not running", "container gone"],
 )
 def test_an_error_counts_as_silence(output: str, status: int) -> None:
-    """No key is missing, and no empty text is decoded."""
     with pytest.raises(NoAnswerError, match=re.escape(output.strip() or "no appliance is running")):
         row_of(done(output, status))
 
 
 @pytest.mark.nightly
 def test_waiting_goes_on_without_an_answer() -> None:
-    """The condition is tried again; the last error is in the message of a failure."""
     answers = iter([done("", 2), done(STANDS_BY, 1), done('{"role":"active"}\n', 0)])
     assert eventually(lambda: row_of(next(answers))["role"], "it is active") == "active"
     with pytest.raises(AssertionError, match=r"it is active\nno answer: .*exit status 2"):
@@ -52,7 +49,6 @@ def test_waiting_goes_on_without_an_answer() -> None:
 
 
 def test_no_test_decodes_an_error_as_an_answer() -> None:
-    """A verb that may fail is read with `row_of` and `rows_of`, as `Appliance` and `Compose` do."""
     found = {
         path.name
         for path in files_of_tests()

@@ -24,17 +24,14 @@ PUBLISHED = {
 
 
 def test_private_attributes_are_not_read() -> None:
-    """A test that needs a value uses a public name, or a visible effect."""
     assert [file for file, tree in trees(r"(?<!\bself)(?<!\bcls)\._(?!_)") if any(private(tree))] == []
 
 
 def test_stand_ins_accept_only_known_calls() -> None:
-    """With neither `__getattr__` nor a mock, a name that changed in the product fails in its tests."""
     assert [file for file, tree in trees("__getattr|mock|Mock") if any(answers_anything(tree))] == []
 
 
 def test_the_rule_finds_what_it_forbids() -> None:
-    """Covers reading, calling and setting, a class that answers everything, and any import of a mock."""
     for text in ("x._y", "x.y._z()", "x._y = 1", "f()._y"):
         assert list(private(ast.parse(text))), text
     for text in ("self._y", "x.y", "x.__dict__", "t._replace(a=1)"):

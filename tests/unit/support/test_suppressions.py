@@ -17,7 +17,6 @@ NO_REASON = {"", "when needed", "needed", "for mypy", "for ruff", "a test"}
 
 
 def test_each_suppression_has_its_reason() -> None:
-    """The reason is on the same line, and says why the suppression is correct here."""
     reasons = [
         (path, reason) for path in sources() for reason in reasons_in(path.read_text(encoding="utf-8"))
     ]
@@ -41,7 +40,6 @@ def test_each_suppression_has_its_reason() -> None:
     ],
 )
 def test_the_reason_is_what_follows(line: str, reason: str) -> None:
-    """The reason follows the last suppression of a line, after any separator."""
     assert list(reasons_in(line)) == [reason]
 
 

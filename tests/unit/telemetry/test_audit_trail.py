@@ -56,7 +56,6 @@ def test_errors_do_not_reveal_the_path_of_the_log() -> None:
 
 @pytest.mark.parametrize("failed", [None, "full"])
 def test_changes_go_on_without_the_log_where_allowed(failed: str | None) -> None:
-    """With `on_audit_failure: allow`, or while the log works, changes are not blocked."""
     log = Log()
     log.failed = failed
     assert trail(log, deny=failed is None).obstacle is None
@@ -65,7 +64,6 @@ def test_changes_go_on_without_the_log_where_allowed(failed: str | None) -> None
 
 
 def test_refusals_of_unknown_hosts_are_marked() -> None:
-    """A refusal of an address that no rule names is marked; what others get wrong, or are granted, is not."""
     log = Log()
     one = trail(log, deny=True)
     one.happened("limit exceeded", "too much", decision="deny", host=UNKNOWN)
@@ -77,7 +75,6 @@ def test_refusals_of_unknown_hosts_are_marked() -> None:
 
 
 def test_an_event_has_the_severity_of_the_registry() -> None:
-    """A severity in the call takes precedence; an event that is not in the registry is informational."""
     log = Log()
     one = trail(log, deny=True)
     one.happened("tunnel refused", "no certificate")
@@ -87,7 +84,6 @@ def test_an_event_has_the_severity_of_the_registry() -> None:
 
 
 def test_events_of_a_host_beyond_its_quota_are_counted() -> None:
-    """The events of a host beyond its quota are marked to be folded; decisions on its calls and orders are not."""
     log = Log()
     one = trail(log, deny=True)
     one.happened("connection opened", "", host=GUEST)
@@ -101,7 +97,6 @@ def test_events_of_a_host_beyond_its_quota_are_counted() -> None:
 
 
 def test_details_of_features_are_added_to_a_record() -> None:
-    """A feature's detail replaces one of the event, whose name an untrusted specification may have chosen."""
     log = Log()
     one = trail(log, deny=False, details=lambda event, *_: {"kept": f"in {event}"})
     one.happened("message dropped", "too fast", host="10.0.0.9", more={"kept": "forged"})
@@ -109,8 +104,6 @@ def test_details_of_features_are_added_to_a_record() -> None:
 
 
 def test_records_that_the_log_has_yet_to_count_are_not_owed() -> None:
-    """A host that asks faster than the log counts repetitions owes for none of them once the log has caught up."""
-
     class Behind(Log):
         async def wait_durable(self) -> str | None:
             for record in self.records:
@@ -126,7 +119,6 @@ def test_records_that_the_log_has_yet_to_count_are_not_owed() -> None:
 
 
 def test_records_that_are_written_are_owed() -> None:
-    """A host owes for its records on the disk also after the log has caught up."""
     log = Log()
     one = trail(log, deny=True)
     while not one.owing(GUEST):

@@ -4,7 +4,6 @@ from appliance.telemetry.metrics import LastMinute, Meter
 
 
 def test_only_the_last_minute_counts() -> None:
-    """Events of 60 seconds are summed by name; older ones no longer count, with or without new events."""
     now = 100.2
     counted = LastMinute(lambda: now)
     counted.add("publish", 5)
@@ -21,7 +20,6 @@ def test_only_the_last_minute_counts() -> None:
 
 
 def test_a_flood_holds_a_minute_of_seconds() -> None:
-    """An hour of events leaves the counts of its last minute."""
     now = 0.0
     counted = LastMinute(lambda: now)
     for second in range(3600):

@@ -76,7 +76,6 @@ def number_in(text: str) -> str:
 def test_a_call_is_held_approved_used_once_and_held_again(
     appliance: Appliance, robot: Host, tmp_path: Path
 ) -> None:
-    """The same number while it waits; other arguments are another call; a lease is for all of them."""
     brake = {"op": "call_service", "service": "/brake"}
 
     def call(on: bool) -> dict[str, Any]:
@@ -110,7 +109,6 @@ def test_a_call_is_held_approved_used_once_and_held_again(
 
 
 def test_a_publication_lasts_for_its_lease(appliance: Appliance, robot: Host, tmp_path: Path) -> None:
-    """The door tells its client in words that the lease is over, on a connection that stays open."""
     advertise = {"op": "advertise", "topic": "/cmd_vel", "type": "geometry_msgs/Twist", "id": "a"}
     publish = {"op": "publish", "topic": "/cmd_vel", "msg": TWIST, "id": "p"}
     with RosSession(appliance.master_uri, tmp_path, robot) as ros:
@@ -178,7 +176,6 @@ MOTION = POLICY + "[Authority]\nbase = /cmd_vel\ntake base = site agent\nlease b
 def test_a_lease_on_a_motion_ends_by_silence_and_the_guard_stops_the_robot(
     appliance: Appliance, robot: Host, tmp_path: Path
 ) -> None:
-    """Without a guard, a record says that nothing stops the robot."""
     appliance.reload(MOTION)
     publish = {"op": "publish", "topic": "/cmd_vel", "msg": TWIST, "id": "p"}
     advertise = {"op": "advertise", "topic": "/cmd_vel", "type": "geometry_msgs/Twist", "id": "a"}

@@ -79,7 +79,6 @@ def site(lab: Lab, robot: Host, tmp_path: Path) -> Iterator[Site]:
 
 
 def test_one_host_at_a_time_is_heard(site: Site) -> None:
-    """Nobody, the pilot, the boss who overrides, the pilot who asked; a killed holder loses the group."""
     assert site.drive("take", "base", "--host", PILOT).startswith(f"base: held by {PILOT}")
     assert site.heard("/pilot") == {"/pilot"}
     site.drive("take", "base", "--host", BOSS)

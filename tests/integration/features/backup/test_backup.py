@@ -85,7 +85,6 @@ def test_backed_up_while_running_and_restored_elsewhere(tmp_path: Path) -> None:
 
 
 def test_a_half_restored_state_is_not_started() -> None:
-    """If a restore was interrupted, `rosrv up` ends with the remedy and changes nothing."""
     appliance = Appliance()
     try:
         appliance.state.mkdir(mode=0o711)

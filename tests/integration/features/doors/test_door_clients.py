@@ -53,8 +53,6 @@ async def next_frame(client: ClientConnection, op: str) -> Any:
 
 
 def test_a_rosbridge_client_hears_publishes_and_calls(site: Site, ros: RosSession) -> None:
-    """The first message that it publishes also reaches a listener that connects for it."""
-
     async def work(client: ClientConnection) -> None:
         await asyncio.to_thread(ros.talker, "roscpp", "/chatter")
         await client.send(json.dumps({"op": "subscribe", "topic": "/chatter"}))

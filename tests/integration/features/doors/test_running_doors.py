@@ -69,7 +69,6 @@ def frame(client: ClientConnection, **wanted: Any) -> Any:
 def test_an_agent_hears_publishes_and_calls_within_its_rights(
     appliance: Appliance, common_robot: Host, tmp_path: Path
 ) -> None:
-    """A refusal has the words of the record, with the line of the rule."""
     with RosSession(appliance.master_uri, tmp_path, common_robot) as ros:
         ros.talker("rospy", "/chatter")
         listener = ros.listener("rospy", "/answer")
@@ -143,7 +142,6 @@ def test_a_ticket_opens_the_door_of_a_person_until_it_is_over(
 
 
 def test_doors_survive_a_restart_and_a_removed_one_ends(appliance: Appliance, common_robot: Host) -> None:
-    """Its address stays reserved for its name."""
     before = appliance.rows("door", "list")
     appliance.stop()
     appliance.start()

@@ -84,7 +84,6 @@ def test_over_the_command_line(appliance: Appliance, tmp_path: Path) -> None:
 
 
 def test_over_rest_it_is_not_for_viewers(appliance: Appliance, tmp_path: Path) -> None:
-    """The bundle is the same as over the socket; a viewer and an invalid request are refused with a reason."""
     rest = appliance.rest()
     viewer = appliance.rest(
         json.loads(appliance.rosrv("token", "add", "eve", "--role", "viewer", "--json").stdout)["token"]
@@ -111,7 +110,6 @@ def test_over_rest_it_is_not_for_viewers(appliance: Appliance, tmp_path: Path) -
 
 
 def test_a_recording_exports_as_evidence(appliance: Appliance, tmp_path: Path) -> None:
-    """The log proves the bundle's messages; the export is recorded; an unknown id is refused with a reason."""
     order = appliance.rosrv(
         "record", "now", "--before", "2s", "--after", "1s", "--note", "the arm hit the door", "--json"
     )
@@ -150,7 +148,6 @@ def test_a_time_without_records(appliance: Appliance, tmp_path: Path) -> None:
 
 
 def test_the_verifier_of_this_version_is_the_one_in_its_bundles(appliance: Appliance, tmp_path: Path) -> None:
-    """A user who distrusts the verifier in a bundle can compare it."""
     bundle = tmp_path / "a.zip"
     appliance.rosrv("evidence", "export", "--since", "1h", "-o", str(bundle))
     with zipfile.ZipFile(bundle) as archive:

@@ -82,7 +82,6 @@ def in_force(appliance: Appliance, path: object) -> dict[str, Any]:
 
 
 def test_a_bundle_comes_into_force(site: tuple[BundleSite, str]) -> None:
-    """Policy and hosts of a bundle come into force, with a record, and the collector gets the robot's report."""
     served, url = site
     with robot(served, url) as appliance:
         path = served.add(bundle_files(OPEN_POLICY + "# of the bundle\n"))
@@ -122,7 +121,6 @@ def appliance(site: tuple[BundleSite, str]) -> Iterator[Appliance]:
 
 
 def test_bad_bundles_are_refused_with_the_reason(site: tuple[BundleSite, str], appliance: Appliance) -> None:
-    """A bundle whose tests fail, or with an error in any part, changes nothing; the reason is shown and recorded."""
     served, _url = site
     before = bundles_of(appliance)["in_force"]
     revision = appliance.status()["policy"]["revision"]
@@ -144,7 +142,6 @@ def test_bad_bundles_are_refused_with_the_reason(site: tuple[BundleSite, str], a
 
 
 def test_an_unhealthy_bundle_goes_back_in_all_parts(site: tuple[BundleSite, str]) -> None:
-    """A bundle under which denials multiply is rolled back at once, with its specifications and its hosts."""
     served, url = site
     served.selection = ""  # an earlier bundle would be tried for as long
     with robot(served, url, confirm_seconds=120) as appliance:
@@ -167,7 +164,6 @@ def test_an_unhealthy_bundle_goes_back_in_all_parts(site: tuple[BundleSite, str]
 
 
 def test_a_bundle_that_would_hold_a_moving_topic_waits(site: tuple[BundleSite, str], tmp_path: Path) -> None:
-    """A robot that drives keeps its commands; once it stands, the bundle comes into force, and its monitor holds."""
     served, url = site
     served.selection = ""
     with robot(served, url) as appliance:
@@ -185,7 +181,6 @@ def test_a_bundle_that_would_hold_a_moving_topic_waits(site: tuple[BundleSite, s
 
 
 def test_a_kill_while_unconfirmed_goes_back_and_tries_again(site: tuple[BundleSite, str]) -> None:
-    """If control dies before the confirmation, the robot goes back to what it had, and then tries the bundle again."""
     served, url = site
     with robot(served, url, confirm_seconds=10) as appliance:
         path = served.add(bundle_files(OPEN_POLICY + "# tried\n", monitors__quiet_dot_rv=MONITOR))
@@ -200,7 +195,6 @@ def test_a_kill_while_unconfirmed_goes_back_and_tries_again(site: tuple[BundleSi
 
 
 def test_a_change_on_the_robot_is_reported(site: tuple[BundleSite, str]) -> None:
-    """If an operator changes a part on the robot, that stays and is reported, until the part is as it was before."""
     served, url = site
     with robot(served, url) as appliance:
         in_force(appliance, served.add(bundle_files(OPEN_POLICY, monitors__quiet_dot_rv=MONITOR)))
@@ -223,7 +217,6 @@ def changed(site: BundleSite) -> bool:
 
 
 def test_a_lying_collector_is_an_alarm(site: tuple[BundleSite, str]) -> None:
-    """A selection for other robots is rejected, recorded and shown; the bundle in force stays."""
     served, url = site
     with robot(served, url) as appliance:
         path = served.add(bundle_files(OPEN_POLICY))

@@ -95,7 +95,6 @@ def said(ros: RosSession, bag: Path, topic: str) -> list[str]:
 def test_a_recording_has_the_timestamps_of_the_monitors(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """Times are exact to the nanosecond: time-dependent monitors give the same results on the recording."""
     ros.talker("rospy", "/dated")
     lines = appliance.recorded(event="monitor log", count=15)
     appliance.rosrv("record", "now", "--before", "1m", "--after", "1s")
@@ -216,7 +215,6 @@ def test_a_drop_makes_a_recording_that_stock_tools_read(
 def test_messages_of_a_killed_relay_are_in_the_recording(
     appliance: Appliance, ros: RosSession, tmp_path: Path, victims: tuple[str, ...]
 ) -> None:
-    """Every message that a subscriber got is in the recording once, except the message in transfer."""
     topic = f"/chatter_{len(victims)}"
     listener = ros.listener("roscpp", topic, name="ear")
     ros.talker("roscpp", topic, name="voice")
@@ -251,7 +249,6 @@ def test_a_killed_recorder_resumes(appliance: Appliance, ros: RosSession, tmp_pa
 
 
 def test_nodes_can_order_a_recording_if_the_policy_allows(appliance: Appliance, ros: RosSession) -> None:
-    """roscpp, rospy and the stock tool can order; a denied node gets the reason; no node can replace the service."""
     service = "/rosrv/record_now"
     ros.talker("roscpp", "/chatter", name="voice")
     eventually(lambda: appliance.status()["recorder"]["running"], appliance.story)
@@ -292,8 +289,6 @@ def test_nodes_can_order_a_recording_if_the_policy_allows(appliance: Appliance, 
 def test_over_rest_messages_are_for_investigators(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """Operators order, viewers list, admins remove; the bag is complete, and its download is recorded."""
-
     def token(role: str) -> str:
         made = appliance.rosrv("token", "add", f"the-{role}", "--role", role, "--json").stdout
         return str(json.loads(made)["token"])

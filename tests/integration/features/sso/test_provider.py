@@ -92,7 +92,6 @@ def opened(running: Appliance) -> Iterator[Callable[[], Browser]]:
 def test_a_person_signs_in_and_a_restart_ends_the_session(
     running: Appliance, opened: Callable[[], Browser]
 ) -> None:
-    """The session has the role of the claim, its own keys only, and ends with the appliance."""
     browser = opened()
     signed = browser.sign_on("alice").raise_for_status().json()
     assert (signed["name"], signed["role"], signed["groups"]) == ("sso:alice", "operator", ["floor"])

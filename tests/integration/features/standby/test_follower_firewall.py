@@ -96,7 +96,6 @@ def reaches(site: Site, name: str) -> bool:
 
 
 def test_a_follower_changes_over_with_the_robot(site: Site) -> None:
-    """Its idle connections with the old holder are reset, and the fixed address leads to the new one."""
     site.follow()
     assert site.refused(site.follower, FIXED, MASTER)
     with held(site, "a", 1) as first:
@@ -112,7 +111,6 @@ def test_a_follower_changes_over_with_the_robot(site: Site) -> None:
 
 
 def test_without_the_witness_a_follower_shuts_out_both(site: Site) -> None:
-    """A boot without the network does so too; the witness's first answer admits the holder again."""
     following = site.follow()
     with held(site, "a", 1) as holder:
         eventually(lambda: reaches(site, "a"), "the follower admits a")
@@ -135,7 +133,6 @@ def test_without_the_witness_a_follower_shuts_out_both(site: Site) -> None:
 
 
 def test_a_restored_witness_is_not_followed(site: Site) -> None:
-    """Its lease has a smaller epoch than the follower has saved, which also survives the follower's restart."""
     following = site.follow()
     with held(site, "a", 1):
         eventually(lambda: reaches(site, "a"), "the follower admits a")
@@ -154,7 +151,6 @@ def test_a_restored_witness_is_not_followed(site: Site) -> None:
 
 
 def test_an_attacker_gains_nothing_from_a_followers_datagrams(site: Site) -> None:
-    """Its key grants no lease, and a flood under its address does not reach the witness, which goes on."""
     following = site.follow()
     with held(site, "a", 1) as holder:
         eventually(lambda: reaches(site, "a"), "the follower admits a")
@@ -180,7 +176,6 @@ def test_an_attacker_gains_nothing_from_a_followers_datagrams(site: Site) -> Non
 
 
 def test_other_addresses_do_not_reach_the_witness(site: Site) -> None:
-    """Only the appliances and the followers do."""
     attacker = site.attacker.run(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
     follower = site.follower.run(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
     body = {"boot": "", "session": "x", "number": 1, "epoch": 1, "do": "look"}

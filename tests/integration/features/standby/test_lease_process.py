@@ -149,7 +149,6 @@ def site(tmp_path: Path) -> Iterator[Site]:
 
 
 def test_a_grant_is_reported_with_its_end_and_its_epoch_is_on_the_disk(site: Site) -> None:
-    """The supervisor gets each extension."""
     site.start()
     site.until(site.held)
     assert site.reports[-1].epoch == site.record.epoch == 2
@@ -174,7 +173,6 @@ def test_without_answers_no_extension_follows(site: Site) -> None:
 
 
 def test_garbage_and_forgeries_change_nothing(site: Site) -> None:
-    """From the witness's address without its key, from the other appliance without the key, and from any host."""
     site.start()
     site.until(site.held)
     stranger = site.bound(STRANGER, 0)
@@ -192,7 +190,6 @@ def test_garbage_and_forgeries_change_nothing(site: Site) -> None:
 
 
 def test_a_greater_epoch_of_the_other_appliance_ends_its_own(site: Site) -> None:
-    """Once its lease has lapsed, the epoch is stored, and the lease is not renewed."""
     site.start()
     site.until(site.held)
     site.until(lambda: not site.held(), serving=False)
@@ -205,7 +202,6 @@ def test_a_greater_epoch_of_the_other_appliance_ends_its_own(site: Site) -> None
 
 
 def test_a_damaged_epoch_file_keeps_it_passive(site: Site) -> None:
-    """The process ends with the reason, and claims nothing."""
     site.epoch.write_text("7x\n")
     site.start()
     eventually(lambda: site.failures, "the reason")
@@ -215,7 +211,6 @@ def test_a_damaged_epoch_file_keeps_it_passive(site: Site) -> None:
 
 
 def test_a_smaller_epoch_of_the_witness_grants_nothing(site: Site) -> None:
-    """Its lease was lost or replaced by an older copy."""
     site.epoch.write_text("40\n")
     site.start()
     for _ in range(30):
@@ -225,7 +220,6 @@ def test_a_smaller_epoch_of_the_witness_grants_nothing(site: Site) -> None:
 
 
 def test_it_claims_only_while_control_is_ready(site: Site) -> None:
-    """A control that could not serve withdraws its presence; once it could, the lease is claimed."""
     site.start()
     site.control.send(lease_link.ControlUnready())
     later = clock.since_boot() + 3 * EXPIRY
@@ -237,7 +231,6 @@ def test_it_claims_only_while_control_is_ready(site: Site) -> None:
 
 
 def test_a_holder_that_does_not_serve_gives_the_lease_away(site: Site) -> None:
-    """It keeps the lease as long as the other appliance could not serve, either; then it releases the lease."""
     site.start()
     site.until(site.held)
     theirs, able = PeerChannel("b", "a", PEER_KEY), [False]

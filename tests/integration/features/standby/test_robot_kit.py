@@ -153,7 +153,6 @@ def site(tmp_path: Path) -> Iterator[RobotSite]:
 
 
 def test_the_robots_kit_fences_the_appliances_beside_protect(site: RobotSite) -> None:
-    """Installed, with closed ports, changed over, installed again, removed."""
     robot, a, b = site.robot, site.peer("a"), site.peer("b")
     said = site.script(robot, site.kit / "witness" / "install.sh").stdout
     assert "the first lease is written: a has all data" in said
@@ -196,7 +195,6 @@ def test_the_robots_kit_fences_the_appliances_beside_protect(site: RobotSite) ->
 
 
 def test_a_follower_and_the_robot_are_installed_in_any_order(site: RobotSite) -> None:
-    """The follower shuts out both until the witness answers; removed, it has no rule."""
     follower = site.follower
     site.script(follower, site.kit / "follower-arm" / "install.sh")
     assert not any(site.connects(host, FOLLOWER, NODE) for host in site.hosts.values())
@@ -235,7 +233,6 @@ def test_a_new_kit_begins_a_new_lease_with_the_first_appliance_alone_in_sync(sit
 
 
 def test_an_incomplete_kit_changes_nothing(site: RobotSite) -> None:
-    """The copy of the folder was interrupted."""
     (site.kit / "witness" / "witness.json").unlink()
     done = site.script(site.robot, site.kit / "witness" / "install.sh", check=False)
     assert done.returncode == 1 and "copy the whole folder" in done.stderr
@@ -244,7 +241,6 @@ def test_an_incomplete_kit_changes_nothing(site: RobotSite) -> None:
 
 
 def test_a_python_that_cannot_run_the_program_changes_nothing(site: RobotSite) -> None:
-    """A small installation lacks modules such as hmac; the error names the module and the remedy."""
     program = site.kit / "witness" / "witness.py"
     program.write_text("import hmac_that_is_missing\n" + program.read_text())
     done = site.script(site.robot, site.kit / "witness" / "install.sh", check=False)
@@ -264,7 +260,6 @@ def test_damaged_settings_can_be_removed(site: RobotSite) -> None:
 
 
 def test_the_scripts_are_posix_and_complete(site: RobotSite) -> None:
-    """They run with dash, and all values are filled in."""
     for script in site.kit.glob("*/*.sh"):
         done = subprocess.run(["/bin/dash", "-n", str(script)], capture_output=True, text=True, check=False)
         assert (done.returncode, done.stderr) == (0, "")

@@ -48,7 +48,6 @@ def site(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Site]:
 
 
 def test_a_new_holder_resets_the_connections_of_the_old_one(site: Site) -> None:
-    """In both directions, also the idle ones; new connections reach the new holder through the same address."""
     site.serve()
     a, b = site.peer("a"), site.peer("b")
     epoch = a.granted(1)
@@ -86,7 +85,6 @@ def test_a_new_holder_resets_the_connections_of_the_old_one(site: Site) -> None:
 
 
 def test_a_connection_that_the_old_holder_never_answered_is_reset(site: Site) -> None:
-    """It does not wait until its kernel repeats its first packet, up to seconds later; the next one works."""
     site.serve()
     a, b = site.peer("a"), site.peer("b")
     epoch = a.granted(1)
@@ -106,7 +104,6 @@ def test_a_connection_that_the_old_holder_never_answered_is_reset(site: Site) ->
 
 
 def test_a_reboot_shuts_out_both_until_the_holder_renews(site: Site) -> None:
-    """The boot rule needs no witness; the first renewal admits the holder again, and a claim waits."""
     process = site.serve()
     a, b = site.peer("a"), site.peer("b")
     epoch = a.granted(1)
@@ -133,7 +130,6 @@ def test_a_reboot_shuts_out_both_until_the_holder_renews(site: Site) -> None:
 
 
 def test_a_damaged_lease_shuts_out_both_until_begin(site: Site) -> None:
-    """The log and the answers have the command."""
     (site.folder / "lease").write_bytes(b"damaged")
     process = site.serve()
     assert "witness.py begin" in site.log()
@@ -148,7 +144,6 @@ def test_a_damaged_lease_shuts_out_both_until_begin(site: Site) -> None:
 
 
 def test_rules_that_another_program_removes_are_written_again(site: Site) -> None:
-    """Whether they were removed, or rules for established connections were put before them."""
     site.serve()
     site.peer("a").granted(1)
     if site.backend == "nft":
@@ -197,7 +192,6 @@ def test_an_attacker_on_the_network_gets_no_lease_and_delays_none(site: Site) ->
 
 
 def test_forged_datagrams_take_no_room_from_a_renewal(site: Site) -> None:
-    """While the witness reads nothing, a flood from its address fills one buffer; the renewal is in another."""
     process = site.serve()
     a = site.peer("a")
     epoch = a.granted(1)
@@ -222,7 +216,6 @@ def test_forged_datagrams_take_no_room_from_a_renewal(site: Site) -> None:
 
 
 def test_the_appliances_socket_gets_the_lease(site: Site) -> None:
-    """The asyncio socket of an appliance, with lost first answers."""
     site.serve()
 
     async def claimed() -> WitnessAnswer:
@@ -249,7 +242,6 @@ def test_the_appliances_socket_gets_the_lease(site: Site) -> None:
 
 
 def test_the_units_start_the_witness_and_shut_out_both_before_the_network() -> None:
-    """systemd accepts both files; their commands are those of the program."""
     folder = Path(witness.__file__).parent
     units = sorted((folder / "kit_files").glob("*.service"))
     command = [need_program("systemd-analyze", "systemd"), "verify", *map(str, units)]

@@ -60,7 +60,6 @@ def guards(site: StandbySite, name: str) -> dict[str, Any]:
 
 
 def test_a_door_a_held_group_and_guards(site: StandbySite) -> None:
-    """The ticket opens the door of the other appliance, the group is free there, and each guard is as it was."""
     a, b = site.appliances["a"], site.appliances["b"]
     tablet = site.lab.host("ocu", f"{OCU}/24")
     trusting = ssl.create_default_context()

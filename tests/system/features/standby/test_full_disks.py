@@ -47,7 +47,6 @@ def until_able(site: StandbySite) -> None:
 
 
 def test_a_standby_that_the_witness_does_not_answer(site: StandbySite) -> None:
-    """Both appliances report it, and refuse the order to switch over; the robot notices nothing."""
     until_able(site)
     with site.without_link((ADDRESSES["b"], ROBOT)):
         for one in site.appliances.values():
@@ -61,7 +60,6 @@ def test_a_standby_that_the_witness_does_not_answer(site: StandbySite) -> None:
 
 
 def test_a_full_disk_of_the_robot(site: StandbySite, robot: StandbyRobot) -> None:
-    """A takeover and a boot of the robot need no free space."""
     until_able(site)
     with filled(site.home / "robot"):
         site.cut("a")
@@ -74,7 +72,6 @@ def test_a_full_disk_of_the_robot(site: StandbySite, robot: StandbyRobot) -> Non
 
 
 def test_a_full_disk_of_the_active_appliance(site: StandbySite, robot: StandbyRobot) -> None:
-    """The standby takes over; once there is room, the other appliance is its standby."""
     until_able(site)
     site.promote("b")
     site.until_taken_over("a")

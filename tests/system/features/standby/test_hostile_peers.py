@@ -46,7 +46,6 @@ def nothing_is_lost(site: StandbySite, robot: StandbyRobot) -> Iterator[None]:
 
 
 def test_a_full_disk_of_the_standby(site: StandbySite, robot: StandbyRobot) -> None:
-    """The active appliance answers alone within a second, and takes the standby back once it has space."""
     active, passive = site.pair()
     one = site.appliances[passive]
     one.stop()
@@ -173,7 +172,6 @@ async def reads_nothing(link: ReplicationLink[Any], robot: StandbyRobot) -> None
 
 
 def test_a_client_without_the_certificate(site: StandbySite, tmp_path: Path) -> None:
-    """It gets nothing, also from the standby's address."""
     stranger = Liar(site, tmp_path, certificate=False)
 
     async def ask(link: ReplicationLink[Any]) -> Any:

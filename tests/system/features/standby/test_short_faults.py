@@ -9,7 +9,6 @@ from tests.support.requirements import need_program, need_root, needs
 
 @pytest.mark.parametrize("kind", FAULTS)
 def test_no_short_fault_ends_a_subscription(kind: str) -> None:
-    """All nodes have messages again, no node has ended, and no answered change is lost."""
     need_root()
     need_program("nft", "nftables")
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")

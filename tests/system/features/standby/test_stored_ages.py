@@ -22,7 +22,6 @@ def blocked_for(site: StandbySite, name: str) -> float:
 
 @pytest.mark.parametrize("ahead", [HOUR, -HOUR])
 def test_a_block_keeps_its_length_over_switchovers(site: StandbySite, ahead: float) -> None:
-    """The other appliance's first start was at a wrong time; neither the way there nor back changes the block."""
     active, passive = site.pair()
     age = site.appliances[passive].state / "control" / "age"
     now = time.time_ns()

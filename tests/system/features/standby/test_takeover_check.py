@@ -105,7 +105,6 @@ def until_obstacle_without_active(site: StandbySite) -> None:
 
 
 def test_a_policy_that_it_cannot_load(site: StandbySite) -> None:
-    """The standby notices it when it is replicated, and also its replacement."""
     text = f"{OPEN_POLICY}[Options]\ntakeover = granted\n"
     load(site, text, "")
     until_obstacle(site, NO_SIGNATURE, "a", "b")
@@ -137,7 +136,6 @@ def test_a_missing_folder(site: StandbySite) -> None:
 
 
 def test_a_specification_that_it_cannot_load(site: StandbySite) -> None:
-    """The compiler of the standby compiles it, and its signature is missing; a signed one ends the alarm."""
     make_ready(site)
     one = site.appliances[site.holder()]
     one.ask(admin.MonitorLoad({"seen.rv": RULE}))

@@ -59,7 +59,6 @@ def nothing_is_lost(site: StandbySite, robot: StandbyRobot) -> Iterator[None]:
 
 
 def test_a_power_cut_of_the_active_appliance(site: StandbySite, robot: StandbyRobot) -> None:
-    """The standby takes over, also for new nodes and tools, and the other appliance comes back as its standby."""
     active, passive = site.pair()
     site.cut(active)
     site.until_taken_over(passive)
@@ -71,7 +70,6 @@ def test_a_power_cut_of_the_active_appliance(site: StandbySite, robot: StandbyRo
 
 
 def test_the_death_of_one_process(site: StandbySite, robot: StandbyRobot) -> None:
-    """No death of a process needs the other appliance, except perhaps that of the lease."""
     for role in ROLES:
         active, epoch = site.pair()[0], site.lease.read().epoch
         for pid in site.pids(active, role):
@@ -85,7 +83,6 @@ def test_the_death_of_one_process(site: StandbySite, robot: StandbyRobot) -> Non
 
 
 def test_a_paused_appliance_answers_nothing_when_it_wakes_up(site: StandbySite, robot: StandbyRobot) -> None:
-    """Neither the robot nor any other host gets an answer to a request that arrived while it slept."""
     active, passive = site.pair()
     site.signal(active, signal.SIGSTOP)
     requests = [request(site, active, method) for method in ("getParam", "setParam")]
@@ -130,7 +127,6 @@ def answer_to(sock: socket.socket) -> bytes:
 
 
 def test_a_cut_between_the_appliances(site: StandbySite, robot: StandbyRobot) -> None:
-    """The active one goes on alone, and takes the other back."""
     active, passive = site.pair()
     with site.without_link((ADDRESSES["a"], ADDRESSES["b"])):
         eventually(lambda: site.in_sync() == {active}, site.story)
@@ -201,7 +197,6 @@ def stopped(pid: int) -> bool:
 
 
 def test_a_cut_between_the_active_appliance_and_the_robot(site: StandbySite, robot: StandbyRobot) -> None:
-    """The standby takes over, although it hears the active one."""
     active, passive = site.pair()
     with site.without_link((ADDRESSES[active], ROBOT)):
         site.until_taken_over(passive)
@@ -209,7 +204,6 @@ def test_a_cut_between_the_active_appliance_and_the_robot(site: StandbySite, rob
 
 
 def test_a_port_of_the_replication_that_is_in_use(site: StandbySite, robot: StandbyRobot) -> None:
-    """The new active appliance reports it, serves the robot alone, and takes the other back when the port is free."""
     active, passive = site.pair()
     host = site.appliances[passive].host
     assert isinstance(host, Host)
@@ -224,7 +218,6 @@ def test_a_port_of_the_replication_that_is_in_use(site: StandbySite, robot: Stan
 
 
 def test_the_death_of_the_witness(site: StandbySite, robot: StandbyRobot) -> None:
-    """Its rules stay, and the active appliance goes on by the promises of the other one."""
     pair = site.pair()
     site.stop_witness()
     wait(3 * EXPIRY)
@@ -245,7 +238,6 @@ def test_flapping_links(site: StandbySite, robot: StandbyRobot) -> None:
 
 
 def test_a_boot_of_the_robot(site: StandbySite, robot: StandbyRobot) -> None:
-    """The robot admits no appliance at first, then the holder again: no other can have had a grant."""
     pair = site.pair()
     robot.cut()
     robot.boot()
@@ -254,7 +246,6 @@ def test_a_boot_of_the_robot(site: StandbySite, robot: StandbyRobot) -> None:
 
 @pytest.mark.parametrize("order", ["robot first", "appliances first"])
 def test_a_power_cut_of_all_three(site: StandbySite, robot: StandbyRobot, order: str) -> None:
-    """One appliance serves again, in each order of the starts; without the witness neither does."""
     for name in ADDRESSES:
         site.cut(name)
     robot.cut()

@@ -146,7 +146,6 @@ def opened_connection(joined: JoinedHost) -> Process:
 
 
 def test_nodes_behind_tunnels_are_back(tunnelled: TunnelledStandbySite, tmp_path: Path) -> None:
-    """After each power cut topics in both directions are back in five seconds, then calls work; no node restarts."""
     site, found = tunnelled.site, []
     with tunnelled.join(tunnelled.kit("add", "ocu-1")) as joined:
         joined.wait_until_up()
@@ -178,7 +177,6 @@ def test_nodes_behind_tunnels_are_back(tunnelled: TunnelledStandbySite, tmp_path
 def test_a_takeover_after_the_host_has_ended_its_tunnel(
     tunnelled: TunnelledStandbySite, tmp_path: Path
 ) -> None:
-    """If the second appliance is reached late, nodes that only read receive messages again soon as well."""
     site = tunnelled.site
     with tunnelled.join(tunnelled.kit("add", "ocu-1")) as joined:
         joined.wait_until_up()
@@ -197,7 +195,6 @@ def test_a_takeover_after_the_host_has_ended_its_tunnel(
 
 
 def test_connections_through_the_new_tunnel_stay(tunnelled: TunnelledStandbySite, tmp_path: Path) -> None:
-    """On a host whose swanctl is slow, the reset of the earlier connections spares those of the new tunnel."""
     programs = tmp_path / "slow"
     programs.mkdir()
     slow = programs / "swanctl"
@@ -220,7 +217,6 @@ def test_connections_through_the_new_tunnel_stay(tunnelled: TunnelledStandbySite
 
 
 def test_revoked_certificates_and_new_ones(tunnelled: TunnelledStandbySite) -> None:
-    """Both appliances refuse a revoked certificate; without the authority's key the second one only revokes."""
     first, second = tunnelled.site.appliances["a"], tunnelled.site.appliances["b"]
     stolen, kit = tunnelled.kit("add", "ocu-1"), tunnelled.kit("kit", "ocu-1")
     with tunnelled.join(stolen, tunnelled.attacker) as thief, tunnelled.join(kit) as joined:
@@ -256,7 +252,6 @@ def test_revoked_certificates_and_new_ones(tunnelled: TunnelledStandbySite) -> N
 
 
 def test_the_sealed_key_serves_on_the_second_appliance(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """With the same passphrase on both, the second appliance enrols hosts after a takeover."""
     need_root()
     need_strongswan()
     home = tmp_path_factory.mktemp("sealed")
@@ -291,7 +286,6 @@ def test_the_sealed_key_serves_on_the_second_appliance(tmp_path_factory: pytest.
 
 
 def test_an_appliance_that_lost_the_lease_ends_its_tunnels(tunnelled: TunnelledStandbySite) -> None:
-    """Cut off from the robot, the appliance ends charon, its sockets, its IPsec states and its interface."""
     one = tunnelled.site.appliances["a"]
     host = one.host
     assert isinstance(host, Host)
@@ -309,7 +303,6 @@ def test_an_appliance_that_lost_the_lease_ends_its_tunnels(tunnelled: TunnelledS
 
 
 def test_an_appliance_without_a_lease_has_no_tunnels(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Without the witness it ends its tunnels with their IPsec state, and opens them again with a new lease."""
     need_root()
     need_strongswan()
     with Lab("rosrv-one") as lab:

@@ -113,7 +113,6 @@ def test_the_files_of_the_page_are_cached_for_good_and_compressed(client: Client
 
 
 def test_every_module_is_included_once(client: Client) -> None:
-    """The scripts have each module of the console and of the features, and import vendored files only."""
     [name] = re.findall(r"/console/static/js/main\.\w+\.js", client.get("/console").text)
     script = client.get(name).text
     [late] = re.findall(r"/console/static/features/[\w./-]+", script)
@@ -165,7 +164,6 @@ def test_vendored_versions_match_the_lock_file() -> None:
     "path", sorted(p for p in FILES.rglob("*") if p.suffix in (".js", ".css", ".html", ".svg")), ids=str
 )
 def test_no_file_names_another_host(path: Path) -> None:
-    """No file contains the address of another host that could be fetched."""
     text = NAMESPACES.sub("", path.read_text())
     assert re.findall(r"(?:https?:|wss?:)?//[a-z0-9-]+\.[a-z]{2,}[^\s\"'`]*", text) == []
 

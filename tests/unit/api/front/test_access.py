@@ -66,7 +66,6 @@ def test_a_step_back_of_the_clock_revives_no_token() -> None:
 
 
 def test_an_expired_token_is_refused() -> None:
-    """A token is refused after its expiry, even if it was recognised before."""
     row, text = make_token("a", "viewer", now=clock.wall() - 100, seconds=50)
     door = TokenAuthenticator(10, lambda _token: None)
     door.state([kept(row)])
@@ -91,7 +90,6 @@ def test_the_costly_check_runs_once_for_a_good_token(monkeypatch: pytest.MonkeyP
 
 
 def test_a_token_with_many_requests_delays_the_check_of_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sixty first requests of a viewer cost one check, and an administrator waits for one check at most."""
     rows = [make_token(name, "viewer", now=clock.wall(), seconds=60) for name in ("eve", "adam")]
     door = TokenAuthenticator(10, lambda _token: None)
     door.state([kept(row) for row, _text in rows])

@@ -78,7 +78,6 @@ async def test_it_is_not_ready_while_nodes_are_not_served(wrong: dict[str, Any] 
 
 
 async def test_it_is_not_ready_during_a_lapse_of_the_lease() -> None:
-    """The last sample may be from before the lapse."""
     probed = Probed(SERVING)
     async with sampled(probed):
         probed.control.paused = "the lease has lapsed"

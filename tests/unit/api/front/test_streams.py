@@ -30,7 +30,6 @@ def taken(streams: Streams, who: Bearer, peer: str, most: int = 100) -> list[Cal
 
 
 def test_two_hundred_viewers_leave_slots_to_operators() -> None:
-    """200 hosts with a token each get all slots that are not reserved; an operator still gets one."""
     streams = Streams(REST_STREAMS, REST_STREAM_PEERS, 16)
     viewers = sum(len(taken(streams, bearer(f"v{one}"), f"10.0.{one}.1")) for one in range(200))
     assert viewers == 12

@@ -183,7 +183,6 @@ def _unread(text: str) -> str:
 
 
 def test_the_page_has_each_call(app: FastAPI, contract: dict[str, Any]) -> None:
-    """Without a token, people read every call of the contract, also after a path that does not exist."""
     lost = requested(app, "GET", "/v1/nothing")
     assert lost.status_code == 404
     assert '</v1/openapi.html>; rel="service-doc"' in lost.headers["link"]

@@ -105,7 +105,6 @@ def test_denials_without_a_policy_are_not_blamed_on_it() -> None:
 
 
 def test_a_connection_without_a_grant() -> None:
-    """The change gives the right to request the grant; if the policy already gives it, no change helps."""
     reason = f"no grant for [/it] at {HOST} to subscribe to [/x]; requestTopic comes first"
     found = why(denied("connection refused", reason, category="topic"))
     assert allowing(found) == ["[Subscribers] /x = 10.0.0.9", "/it = 10.0.0.1 10.0.0.9"]

@@ -15,12 +15,10 @@ KNOWN = PolicyInForce(
 
 @pytest.mark.parametrize("host", [None, "10.0.0.1", "fd00::66", "10.*", "[12]", "\udcff"])
 def test_addresses_and_globs_need_no_policy(host: str | None) -> None:
-    """The search itself takes them, and rejects invalid text."""
     assert not has_name(Filter(host=host))
 
 
 def test_a_name_becomes_its_networks() -> None:
-    """All addresses of a group count; a name that nothing has is an error, not a search without a result."""
     for name, networks in (
         ("tablet", ("10.77.0.66/32", "fd00::66/128")),
         ("laptop", ("10.113.0.5/32",)),

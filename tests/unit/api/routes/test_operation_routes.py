@@ -405,7 +405,6 @@ def require_problem(answer: httpx.Response, status: int, kind: str) -> None:
 
 
 def test_the_matrix_has_every_operation() -> None:
-    """`LEAST` has every operation and nothing else."""
     assert LEAST.keys() == {operation.name for operation in NAMED}
     assert {operation.name for operation in NAMED if operation.dry_run} == {
         "load_policy", "load_monitors", "replace_monitor",
@@ -463,7 +462,6 @@ def served() -> Iterator[tuple[str, Any]]:
 
 
 def test_each_path_is_served_once() -> None:
-    """An operation does not hide a route that is written by hand, such as the certificate authority's."""
     paths = [path for path, _ in served()]
     assert sorted(paths) == sorted(set(paths))
 

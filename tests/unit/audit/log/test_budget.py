@@ -35,7 +35,6 @@ class Desk:
 
 
 def test_a_host_in_debt_waits_until_it_is_paid() -> None:
-    """A host beyond its quota waits as long as its debt lasts; time pays the debt, and no other host waits."""
     desk = Desk()
     desk.spend(GUEST)
     assert desk.budget.pause(GUEST) == 1.0
@@ -49,7 +48,6 @@ def test_a_host_in_debt_waits_until_it_is_paid() -> None:
 
 
 def test_a_folded_record_costs_nothing() -> None:
-    """If the log only counted a record, the host gets back its cost."""
     desk = Desk()
     record = desk.spend(GUEST)
     desk.budget.folded(record)
@@ -57,7 +55,6 @@ def test_a_folded_record_costs_nothing() -> None:
 
 
 def test_two_hundred_hosts_leave_the_robot_its_quota() -> None:
-    """Two hundred hosts, each with the largest debt, are slowed down; the robot is not."""
     desk = Desk()
     guests = [f"10.1.{number // 100}.{number % 100}" for number in range(200)]
     for guest in guests:
@@ -70,7 +67,6 @@ def test_two_hundred_hosts_leave_the_robot_its_quota() -> None:
 
 
 def test_unknown_hosts_have_no_debt() -> None:
-    """Any number of addresses of unknown hosts uses no memory here."""
     desk = Desk()
     for number in range(1000):
         unknown = AuditRecord(id="0", time=0, event="decision", host=f"10.9.0.{number}", unknown=True)
@@ -81,7 +77,6 @@ def test_unknown_hosts_have_no_debt() -> None:
 
 
 def test_a_nearly_full_disk_lowers_every_quota() -> None:
-    """In the reserve the quotas are small; a host within its quota is not slowed down."""
     desk = Desk()
     desk.spend(GUEST, 1 << 18)
     assert desk.budget.pause(GUEST) == 0
@@ -93,7 +88,6 @@ def test_a_nearly_full_disk_lowers_every_quota() -> None:
 
 
 def test_the_last_of_the_disk_is_kept() -> None:
-    """In the last quarter of the reserve other hosts are denied; with free space again they are served."""
     desk = Desk()
     desk.registered.clear()  # as after a restart
     desk.budget.room(RESERVE.kept - 1)
@@ -104,7 +98,6 @@ def test_the_last_of_the_disk_is_kept() -> None:
 
 
 def test_every_text_of_a_peer_counts() -> None:
-    """Long names, resources, reasons and keys of a peer all count."""
     plain = weight(AuditRecord(id="0", time=0, event="decision", host=GUEST))
     long = "x" * 1000
     for record in (

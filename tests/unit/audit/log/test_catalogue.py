@@ -9,12 +9,10 @@ PAGE = Path(__file__).parents[4] / "docs" / "reference" / "audit-events.md"
 
 
 def test_the_page_matches_the_program() -> None:
-    """The page is the output of `python -m distribution.audit_events_page`."""
     assert PAGE.read_text() == markdown()
 
 
 def test_severities_and_fields_come_from_the_code() -> None:
-    """Severities and fields are read from the calls that record an event, even if a call records one of two events."""
     found = {use.event: use for use in uses()}
     assert {"who", "method", "status", "count"} <= set(found["rest call"].fields)
     assert found["forwarding gap"].severities == {"alarm"}
@@ -23,5 +21,4 @@ def test_severities_and_fields_come_from_the_code() -> None:
 
 
 def test_handwritten_fields_belong_to_registered_events() -> None:
-    """Every event that has handwritten fields is in the registry."""
     assert set(ELSEWHERE) <= set(EVENTS)

@@ -43,7 +43,6 @@ class Row:
 
 @pytest.mark.parametrize("value", [Ended(), Row(), [Ended()], {"z": Row(), "a": 1}])
 def test_a_record_that_was_read_is_stored_as_the_same_text(value: object) -> None:
-    """An export has the record as it was read, and its verification computes the hash of the same text."""
     columns = to_columns(make(detail={"ended": value}), 1)
     assert to_columns(from_columns(columns), 1) == columns
 
@@ -58,7 +57,6 @@ def test_a_record_that_was_read_is_stored_as_the_same_text(value: object) -> Non
     ids=lambda value: type(value).__name__,
 )  # fmt: skip
 def test_any_detail_can_be_stored(value: Any) -> None:
-    """Any value in `detail` is stored, cut or escaped where necessary, and bounded in size."""
     columns = to_columns(make(detail={"value": value}), 1)
     assert len(columns.detail) <= LARGEST_DETAIL
     assert from_columns(columns).detail
@@ -84,7 +82,6 @@ def test_texts_are_bounded_and_storable(field: str) -> None:
     ids=str,
 )  # fmt: skip
 def test_fields_of_a_wrong_type(fields: dict[str, Any]) -> None:
-    """A record with fields of a wrong type, which only our own defect can cause, is stored as well as possible."""
     columns = to_columns(make(**fields), 1)
     assert all(type(one) in (str, int, bytes, type(None)) for one in columns)
     assert abs(columns.time) < 1 << 63

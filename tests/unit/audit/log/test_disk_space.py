@@ -28,7 +28,6 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_low_space_raises_an_alarm_before_the_disk_is_full(disk: Path) -> None:
-    """Below the reserve an alarm is raised and hosts in debt wait; with free space again all is as before."""
     budget = Budget(lambda _host: QuotaClass.REGISTERED)
     with capture_logs() as said:
         log = AuditLog(disk / "audit.db", drive=ByHand, budget=budget, reserve=_RESERVE)

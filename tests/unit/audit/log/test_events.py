@@ -5,12 +5,10 @@ from distribution.audit_events_page import uses
 
 
 def test_every_recorded_event_is_registered() -> None:
-    """Every event that the program records has its name and description in the registry."""
     found = {use.event: use.place for use in uses()}
     assert {"checkpoint", "policy loaded", "rest call"} <= set(found)
     assert {name: where for name, where in found.items() if name not in EVENTS} == {}
 
 
 def test_severities_belong_to_registered_events() -> None:
-    """Each event that has a severity is in the registry."""
     assert SEVERITIES.keys() <= EVENTS.keys()

@@ -39,7 +39,6 @@ def offer(folder: RecordFolder, *records: AuditRecord, now: float = 0) -> list[A
 
 
 def test_first_in_full_then_counted() -> None:
-    """The first denial is recorded in full; its repetitions become one summary with count, first and last time."""
     folder = make_folder(seconds=10)
     same = [denial() for _ in range(100)]
     assert offer(folder, *same) == same[:1]
@@ -54,7 +53,6 @@ def test_first_in_full_then_counted() -> None:
 
 
 def test_summaries_continue_with_the_repetitions() -> None:
-    """A repeated denial has a summary every period, and is recorded in full after a quiet period."""
     folder = make_folder(seconds=10)
     offer(folder, denial(), denial(), now=0)
     assert [one.detail["count"] for one in folder.expire(10)] == [1]
@@ -84,7 +82,6 @@ class Interrupted(dict[Any, Any]):
 def test_a_repetition_gets_the_id_of_a_record_that_is_just_written(
     monkeypatch: pytest.MonkeyPatch, attribute: str
 ) -> None:
-    """Between two looks of the answering thread, the writing thread offers the first denial."""
     folder = make_folder()
     first, second = denial(), denial()
     assert folder.in_full(first) == first.id
@@ -101,7 +98,6 @@ def test_a_repetition_gets_the_id_of_a_record_that_is_just_written(
 
 
 def test_the_reason_of_a_summary_counts_in_english() -> None:
-    """One denial or record is singular, more are plural."""
     reasons = []
     for folds in (False, True):
         state = new_state(denial(folds=folds), HOST)
@@ -117,7 +113,6 @@ def test_the_reason_of_a_summary_counts_in_english() -> None:
 
 
 def test_a_summary_has_no_author_if_none_is_known() -> None:
-    """A call without a valid token has no author."""
     folder = make_folder(seconds=10)
     calls = [denial(detail={"who": None, "method": "GET", "status": 401}) for _ in range(2)]
     offer(folder, *calls, now=0)
@@ -127,7 +122,6 @@ def test_a_summary_has_no_author_if_none_is_known() -> None:
 
 
 def test_different_records_are_not_folded() -> None:
-    """A record that differs in host, caller, resource, reason, rule, revision, category or decision is not folded."""
     folder = make_folder()
     kinds = [
         denial(), denial(reason="other"), denial(host="10.0.0.2"), denial(caller_id="/other"), denial("/b"),
@@ -138,7 +132,6 @@ def test_different_records_are_not_folded() -> None:
 
 
 def test_an_allow_ends_the_folding_it_contradicts() -> None:
-    """The summary of earlier denials precedes the allow, and the next denial is recorded in full."""
     folder = make_folder()
     offer(folder, denial(), denial())
     allowed = denial(decision="allow")
@@ -150,14 +143,12 @@ def test_an_allow_ends_the_folding_it_contradicts() -> None:
 
 
 def test_allows_that_change_something_are_never_folded() -> None:
-    """Each allow of a call that changes something is recorded in full."""
     folder = make_folder()
     allows = [denial(decision="allow") for _ in range(50)]
     assert offer(folder, *allows) == allows
 
 
 def test_varied_names_are_folded_per_host() -> None:
-    """Varied names of one host use bounded memory and records. Every denial is counted; other hosts are unaffected."""
     folder = make_folder(keys_per_host=16, keys=64)
     flood = offer(folder, *(denial(f"/{number}") for number in range(10_000)))
     assert len(flood) == 17
@@ -176,7 +167,6 @@ def test_varied_names_are_folded_per_host() -> None:
 
 
 def test_varied_addresses_are_folded_together() -> None:
-    """Memory is bounded even with a new address for each denial, and every denial is counted."""
     folder = make_folder(keys=64)
     written = offer(folder, *(denial(host=f"10.1.{n // 256}.{n % 256}") for n in range(20_000)))
     assert len(folder) <= 2 * 64 + 1
@@ -189,7 +179,6 @@ def test_varied_addresses_are_folded_together() -> None:
 
 
 def test_a_summary_names_host_and_call() -> None:
-    """The summary has the caller, call, key and node, and omits other details."""
     folder = make_folder()
     detail = {"call": "getParam", "key": "/secret", "node": "/arm", "unrelated": 1}
     offer(folder, *(denial(resource="getParam", detail=detail) for _ in range(5)))
@@ -202,7 +191,6 @@ def test_a_summary_names_host_and_call() -> None:
 
 
 def test_the_loudest_callers_are_named() -> None:
-    """A summary of a whole host lists its most frequent callers and calls with their counts."""
     folder = make_folder(keys_per_host=4)
     calls = ["setParam", "getParam", "deleteParam"]
     flood = [
@@ -226,7 +214,6 @@ def test_long_names_are_bounded() -> None:
 
 
 def test_zero_seconds_records_everything() -> None:
-    """With folding off every denial is recorded in full."""
     folder = make_folder(seconds=0)
     same = [denial() for _ in range(10)]
     assert offer(folder, *same) == same
@@ -241,7 +228,6 @@ def test_would_deny_is_never_folded() -> None:
 
 
 def test_denials_of_different_parameters_are_separate() -> None:
-    """A denial of another key or another call is recorded in full; a repetition is counted."""
     folder = RecordFolder(FoldSettings(), lambda: "0" * 20, lambda: 0)
     kinds = [
         denial(resource="getParam", detail={"call": "getParam", "key": "/a"}),
@@ -253,7 +239,6 @@ def test_denials_of_different_parameters_are_separate() -> None:
 
 
 def test_a_reported_count_is_added() -> None:
-    """A denial with a count from its reporter adds that count to the summary and its tallies."""
     folder = make_folder(seconds=10)
     flood = [denial(detail={"count": 1000}) for _ in range(10)]
     assert offer(folder, *flood) == flood[:1]
@@ -266,7 +251,6 @@ def test_a_reported_count_is_added() -> None:
 
 
 def test_an_invalid_count_is_one() -> None:
-    """A `count` that is not a positive number means one denial."""
     folder = make_folder(seconds=10)
     strange: tuple[object, ...] = (True, 0, -5, "9", 2.5, None)
     offer(folder, denial(), *(denial(detail={"count": one}) for one in strange))
@@ -274,7 +258,6 @@ def test_an_invalid_count_is_one() -> None:
 
 
 def test_invalid_text_can_be_stored() -> None:
-    """Names and reasons with invalid characters are counted like others; key and state can be written."""
     folder = make_folder(seconds=10)
     strange: dict[str, Any] = {"caller_id": "/\ud800", "reason": "\udcff", "detail": {"call": "\ud801"}}
     first, second = denial("/\udfff", **strange), denial("/\udfff", **strange)
@@ -288,7 +271,6 @@ def test_invalid_text_can_be_stored() -> None:
 
 
 def test_unknown_hosts_leave_named_hosts_their_kinds() -> None:
-    """Unknown hosts that vary each field use few kinds; a named host keeps its own kinds."""
     folder = make_folder(keys=64, unknown=8)
     flood = [
         denial(
@@ -312,7 +294,6 @@ def test_unknown_hosts_leave_named_hosts_their_kinds() -> None:
 
 
 def test_a_reason_with_peer_text_is_one_kind() -> None:
-    """Refusals whose reasons differ only in numbers, names or quotations share one kind and one summary."""
     folder = make_folder(seconds=10)
     flood = [
         denial(reason=f"number {number} of '/x{number}' at /n{number} is too large", event="malformed")
@@ -326,7 +307,6 @@ def test_a_reason_with_peer_text_is_one_kind() -> None:
 
 
 def test_named_hosts_keep_a_line_each() -> None:
-    """With all kinds in use, a named host's denials are still counted under its own address."""
     folder = make_folder(keys=64, keys_per_host=16)
     offer(folder, *(denial(f"/{n}", host=f"10.1.0.{host}") for host in range(4) for n in range(50)))
     late = [denial(f"/{number}", host="10.2.0.1") for number in range(10)]
@@ -342,7 +322,6 @@ def read(key: str, **fields: Any) -> AuditRecord:
 
 
 def test_reads_are_folded_like_denials() -> None:
-    """The first read of a kind is recorded in full; the rest become one summary with caller, key and count."""
     folder = make_folder(seconds=10)
     same = [read("/a") for _ in range(500)]
     assert offer(folder, *same, read("/b"))[:1] == same[:1]
@@ -353,7 +332,6 @@ def test_reads_are_folded_like_denials() -> None:
 
 
 def test_reads_of_other_topics_are_not_folded() -> None:
-    """Fetching other topics of a recording is recorded in full; a repetition is counted."""
     folder = make_folder()
     scan, image, again = (
         denial("", event="recording read", decision=None, folds=True, category=None, caller_id=None,
@@ -364,7 +342,6 @@ def test_reads_of_other_topics_are_not_folded() -> None:
 
 
 def test_reads_beyond_the_quota_are_recorded_in_full() -> None:
-    """Beyond the quota of kinds, each read is a record with its key, and takes no kind from denials."""
     folder = make_folder(keys=64, keys_per_host=16)
     varied = [read(f"/{number}") for number in range(1000)]
     assert offer(folder, *varied) == varied
@@ -374,7 +351,6 @@ def test_reads_beyond_the_quota_are_recorded_in_full() -> None:
 
 
 def test_a_denial_ends_the_folding_of_reads() -> None:
-    """Reads before a denial are summarised before it; the next read is in full."""
     folder = make_folder()
     offer(folder, read("/a"), read("/a"))
     refused = read("/a", decision="deny", folds=False)
@@ -384,7 +360,6 @@ def test_a_denial_ends_the_folding_of_reads() -> None:
 
 
 def test_another_key_ends_no_folding() -> None:
-    """Denials of one parameter stay folded while the same call for another parameter is allowed."""
     folder = make_folder()
     flood = [one for n in range(100) for one in (read(f"/a/{n}"), read("/b", decision="deny", folds=False))]
     written = offer(folder, *flood)
@@ -392,7 +367,6 @@ def test_another_key_ends_no_folding() -> None:
 
 
 def test_events_beyond_the_budget_are_counted() -> None:
-    """Events that no call waits for are counted by kind, and beyond the limit by host."""
     folder = make_folder(keys=64, keys_per_host=4)
     opened = [
         denial(f"/t{n % 8}", event="connection opened", decision=None, folds=True, reason="")
@@ -406,7 +380,6 @@ def test_events_beyond_the_budget_are_counted() -> None:
 
 
 def test_a_denied_caller_gets_a_recorded_id_or_none() -> None:
-    """The id is of a recorded denial, beyond every limit, for unknown hosts, and for single and batched records."""
     for gathered in (1, 7, 400):
         folder = make_folder(keys_per_host=4, unknown=3)
         denials = [

@@ -8,7 +8,6 @@ from appliance.audit.log.ids import ID_LENGTH, IdSource
 
 
 def test_ids_grow_and_have_one_length() -> None:
-    """Ids of one source are unique, sort as text in order of creation, and are safe in URLs."""
     source = IdSource()
     ids = [source.next() for _ in range(10_000)]
     assert ids == sorted(set(ids))
@@ -17,7 +16,6 @@ def test_ids_grow_and_have_one_length() -> None:
 
 
 def test_ids_grow_when_the_clock_is_set_back() -> None:
-    """The clock never makes an id smaller than the last one."""
     clock = itertools.chain([2_000_000_000], itertools.repeat(1_000_000_000))
     source = IdSource(clock=lambda: next(clock))
     ids = [source.next() for _ in range(5)]
@@ -25,19 +23,16 @@ def test_ids_grow_when_the_clock_is_set_back() -> None:
 
 
 def test_ids_grow_after_a_restart_with_the_clock_set_back() -> None:
-    """A source that gets the last id of the log makes only greater ones, whatever the clock says."""
     last = IdSource(clock=lambda: 5_000_000_000).next()
     assert IdSource(last, clock=lambda: 1).next()[:16] > last[:16]
 
 
 def test_sources_in_the_same_nanosecond_differ() -> None:
-    """Two processes with the same clock make different ids (in 65535 of 65536 cases)."""
     ids = {IdSource(clock=lambda: 7).next() for _ in range(20)}
     assert len(ids) >= 18
 
 
 def test_ids_report_how_far_the_clock_was_set_back() -> None:
-    """Ids report how far the clock was set back, also after a restart, until the clock has caught up."""
     now = 10_000_000_000
     before = IdSource(clock=lambda: now)
     last = before.next()

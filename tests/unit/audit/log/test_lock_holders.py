@@ -51,7 +51,6 @@ def log(tmp_path: Path) -> Iterator[AuditLog]:
 
 @pytest.mark.parametrize(("suffix", "byte"), [("-shm", 120), ("-shm", 121), ("-shm", 122), ("", 0x40000000)])
 def test_the_holder_of_a_writers_lock_is_found(log: AuditLog, suffix: str, byte: int) -> None:
-    """The kernel's list names the process until it ends."""
     file = log.path.with_name(log.path.name + suffix)
     with holding(file, byte) as pid:
         # The kernel gives its list in parts: a lock that ends elsewhere can hide another one for once.
@@ -60,7 +59,6 @@ def test_the_holder_of_a_writers_lock_is_found(log: AuditLog, suffix: str, byte:
 
 
 def test_a_lock_without_a_process_is_found(log: AuditLog) -> None:
-    """A lock of an open file description is found though it has no process."""
     file = log.path.with_name(log.path.name + "-shm")
     with file.open("rb") as opened:
         fcntl.fcntl(opened, fcntl.F_OFD_SETLK, struct.pack("hhqqi4x", fcntl.F_RDLCK, 0, 120, 1, 0))
@@ -68,7 +66,6 @@ def test_a_lock_without_a_process_is_found(log: AuditLog) -> None:
 
 
 def test_an_ordinary_reader_is_not_reported(log: AuditLog) -> None:
-    """An unfinished read holds no lock that the writer needs; locks on other files are ignored."""
     with holding(log.path.with_name(log.path.name + "-shm"), 124), holding(Path(__file__), 120):
         connection = open_for_reading(log.path)
         connection.execute("BEGIN")

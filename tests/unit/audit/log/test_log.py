@@ -42,7 +42,6 @@ def events(path: Path) -> Counter[str]:
 
 @pytest.mark.parametrize("durability", ["strict", "batched"])
 def test_durable_records_are_on_disk(make_log: MakeLog, path: Path, durability: str) -> None:
-    """After `wait_durable` a reader finds the records in order."""
     log = make_log(durability=durability)
     sent = [decision(log, number) for number in range(500)]
     for one in sent:
@@ -62,7 +61,6 @@ def tried_again(log: AuditLog) -> str | None:
 @pytest.mark.nightly
 @pytest.mark.parametrize("durability", ["strict", "batched"])
 def test_records_reach_the_disk_without_a_wait(path: Path, durability: Durability) -> None:
-    """A thread writes each record soon, even if no caller waits for it."""
     log = AuditLog(path, durability=durability)
     for number in range(1, 4):
         log.record(decision(log))
@@ -72,7 +70,6 @@ def test_records_reach_the_disk_without_a_wait(path: Path, durability: Durabilit
 
 @pytest.mark.parametrize(("durability", "gather"), [("strict", 0.0), ("batched", 0.04)])
 def test_only_a_batched_log_gathers_records(path: Path, durability: Durability, gather: float) -> None:
-    """In strict mode a record does not wait for others."""
     asked: list[float] = []
 
     def drive(name: str, turn: Turn, seconds: float) -> ByHand:
@@ -84,7 +81,6 @@ def test_only_a_batched_log_gathers_records(path: Path, durability: Durability, 
 
 
 def test_a_turn_writes_one_batch(path: Path, time: VirtualClock) -> None:
-    """A turn that leaves records in the queue is due again at once, and later ones when there is work."""
     log = AuditLog(path, drive=ByHand)
     for number in range(3000):
         log.record(decision(log, number))
@@ -98,7 +94,6 @@ def test_a_turn_writes_one_batch(path: Path, time: VirtualClock) -> None:
 
 
 def test_a_defect_is_a_failure(path: Path, time: VirtualClock, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After an unforeseen error the log has failed, callers get the reason, and the queue does not grow."""
     log = AuditLog(path, drive=ByHand)
 
     def defect(*_: object) -> NoReturn:
@@ -150,7 +145,6 @@ def test_a_reopened_log_continues(make_log: MakeLog, path: Path) -> None:
 
 @pytest.mark.nightly
 def test_a_killed_writer_loses_nothing_confirmed(path: Path) -> None:
-    """After SIGKILL during a write the chain continues, and all confirmed records are there."""
     script = (
         "import asyncio, sys; from pathlib import Path; from appliance.audit.log.log import AuditLog;"
         "from tests.support.audit import decision\n"
@@ -186,7 +180,6 @@ def test_a_killed_writer_loses_nothing_confirmed(path: Path) -> None:
 
 @pytest.mark.nightly
 def test_counted_denials_survive_a_kill(path: Path) -> None:
-    """Repetitions that were counted but not yet summarised survive SIGKILL."""
     script = (
         "import asyncio, os, signal, sys; from pathlib import Path; from appliance.audit.log.log import AuditLog;"
         "from appliance.audit.log.folding import FoldSettings; from tests.support.audit import decision\n"
@@ -223,7 +216,6 @@ def test_flood_of_denials(make_log: MakeLog, path: Path) -> None:
 def test_a_repeated_denial_gets_the_id_of_a_stored_record(
     make_log: MakeLog, path: Path, unknown: bool, at_once: bool
 ) -> None:
-    """A repetition is only counted and has the id of the record in full; another denial has its own."""
     log = make_log()
 
     def told(**about: Any) -> str:
@@ -289,7 +281,6 @@ def test_full_disk(disk: Path) -> None:
 
 @pytest.mark.nightly
 def test_failure_and_recovery_are_printed_once(disk: Path) -> None:
-    """Standard error names the failure with file and reason, and later the recovery."""
     filler = disk / "filler"
     with structlog.testing.capture_logs() as said:
         log = AuditLog(disk / "audit.db", drive=ByHand, reserve=0)
@@ -312,7 +303,6 @@ def test_failure_and_recovery_are_printed_once(disk: Path) -> None:
 
 @pytest.mark.nightly
 def test_the_queue_is_bounded_and_losses_are_counted(disk: Path, time: VirtualClock) -> None:
-    """Records that do not fit in the queue while the disk is full are counted, and the count is recorded."""
     path = disk / "audit.db"
     log = AuditLog(path, drive=ByHand, queue_limit=100)
     assert settle(log) is None
@@ -339,7 +329,6 @@ def test_the_queue_is_bounded_and_losses_are_counted(disk: Path, time: VirtualCl
 
 @pytest.mark.parametrize("content", [b"", b"not a database" * 1000, b"SQLite format 3\0" + b"\0" * 5000])
 def test_a_damaged_file_is_an_error_and_stays(path: Path, content: bytes) -> None:
-    """A file that is not a log is named in the error and stays unchanged."""
     path.write_bytes(content)
     log = AuditLog(path, drive=ByHand)
     assert log.failed is not None
@@ -351,7 +340,6 @@ def test_a_damaged_file_is_an_error_and_stays(path: Path, content: bytes) -> Non
 
 
 def test_another_database_is_an_error(path: Path) -> None:
-    """A database of another program is not written to."""
     with closing(sqlite3.connect(path)) as other:
         other.execute("CREATE TABLE something (x)")
     log = AuditLog(path, drive=ByHand)
@@ -361,7 +349,6 @@ def test_another_database_is_an_error(path: Path) -> None:
 
 
 def test_a_changed_end_stops_writing(make_log: MakeLog, path: Path) -> None:
-    """A log whose last records were changed while it was closed is not continued."""
     log = make_log()
     log.record(decision(log))
     log.close()
@@ -376,7 +363,6 @@ def test_a_changed_end_stops_writing(make_log: MakeLog, path: Path) -> None:
 
 
 def test_a_removed_file_is_noticed(make_log: MakeLog, path: Path) -> None:
-    """A log file removed or replaced while it is written stops the log with a reason."""
     log = make_log()
     assert settle(log) is None
     path.rename(path.with_name("stolen.db"))
@@ -385,7 +371,6 @@ def test_a_removed_file_is_noticed(make_log: MakeLog, path: Path) -> None:
 
 
 def test_a_second_writer_is_refused(make_log: MakeLog, path: Path) -> None:
-    """The second process reports the reason and takes over when the first ends."""
     first = make_log()
     second = AuditLog(path, drive=ByHand)
     assert second.failed is not None
@@ -399,7 +384,6 @@ def test_a_second_writer_is_refused(make_log: MakeLog, path: Path) -> None:
 
 
 def test_the_process_that_locks_the_log_is_named(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The owner and the reason of the failure name other processes; once the lock ends, the log continues."""
     told: list[list[int]] = []
     monkeypatch.setattr(log_database, "_BUSY_SECONDS", 0)
     monkeypatch.setattr(log_module, "holders", lambda _path: [os.getpid(), 4711])
@@ -414,7 +398,6 @@ def test_the_process_that_locks_the_log_is_named(path: Path, monkeypatch: pytest
 
 
 def test_a_missing_directory_is_a_failure(tmp_path: Path) -> None:
-    """The failure names the directory, and the log works once it exists."""
     path = tmp_path / "missing" / "audit.db"
     log = AuditLog(path, drive=ByHand)
     assert str(path) in (log.failed or "")
@@ -426,7 +409,6 @@ def test_a_missing_directory_is_a_failure(tmp_path: Path) -> None:
 
 
 def test_missing_earlier_log_is_an_alarm(make_log: MakeLog, path: Path) -> None:
-    """If a signed log existed at this path and is gone, the first record of the new log says so."""
     log = make_log(checkpoint_every=1)
     log.record(decision(log))
     assert settle(log) is None
@@ -441,7 +423,6 @@ def test_missing_earlier_log_is_an_alarm(make_log: MakeLog, path: Path) -> None:
 
 
 def test_waiting_on_a_closed_log_is_an_error(make_log: MakeLog) -> None:
-    """A caller that waits on a closed log gets an error instead of waiting forever."""
     log = make_log()
     log.close()
     log.record(decision(log))
@@ -449,7 +430,6 @@ def test_waiting_on_a_closed_log_is_an_error(make_log: MakeLog) -> None:
 
 
 def test_recovery_counts_denials_once(make_log: MakeLog, path: Path) -> None:
-    """Denials being counted when the log failed are counted once, not twice."""
     log = make_log(fold=FoldSettings(seconds=3600))
     for _ in range(50):
         log.record(decision(log, decision="deny"))
@@ -474,7 +454,6 @@ def signed_now(log: AuditLog) -> str | None:
 
 
 def test_a_signature_can_be_requested_at_once(make_log: MakeLog, path: Path) -> None:
-    """Regular checkpoints are an hour apart; a caller gets one over all records at once, and no second one is made."""
     log = make_log(checkpoint_seconds=3600)
     for number in range(5):
         log.record(decision(log, number))
@@ -490,7 +469,6 @@ def test_a_signature_can_be_requested_at_once(make_log: MakeLog, path: Path) -> 
 
 
 def test_a_refused_signature_is_reported(make_log: MakeLog) -> None:
-    """The caller gets the signer's reason; without an answer the caller decides how long to wait."""
     asked: list[int] = []
     log = make_log(checkpoint_seconds=3600, signer=lambda number, _text: asked.append(number))
     log.record(decision(log))
@@ -507,7 +485,6 @@ def test_a_refused_signature_is_reported(make_log: MakeLog) -> None:
 
 
 def test_abandoned_waits_leave_no_memory(make_log: MakeLog) -> None:
-    """While the signer is down, orders that stop waiting leave nothing in memory."""
     asked: list[int] = []
     log = make_log(checkpoint_seconds=3600, signer=lambda number, _text: asked.append(number))
 

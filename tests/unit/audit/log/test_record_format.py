@@ -25,7 +25,6 @@ _RECORD = AuditRecord(
 
 
 def test_json_has_the_documented_fields() -> None:
-    """A record's JSON has exactly the documented fields with the documented values."""
     assert as_object(LogEntry(9, _RECORD)) == {
         "schema": 1, "id": "0" * 20, "time": "2026-03-01T12:00:00.000000007Z", "sequence": 9,
         "event": "decision",
@@ -38,14 +37,12 @@ def test_json_has_the_documented_fields() -> None:
 
 
 def test_no_decision_no_rule() -> None:
-    """Without a decision, `decision` is absent and `rule` is null."""
     shown = as_object(LogEntry(1, AuditRecord(id="0" * 20, time=0, event="appliance started")))
     assert "decision" not in shown
     assert shown["rule"] is None
 
 
 def test_json_is_one_line_of_ascii() -> None:
-    """NDJSON has no byte that a terminal interprets, and a client's text is decoded unchanged."""
     text = as_json(LogEntry(1, _RECORD))
     assert text.isascii()
     assert text.isprintable()
@@ -85,7 +82,6 @@ def test_time(time: int, text: str) -> None:
 
 
 def test_a_viewer_gets_monitor_records_without_messages() -> None:
-    """The record names the omitted fields; fields of the same name without a message stay."""
     said = {"before": "00", "before_fields": {"data": "x"}, "conditions": {"m.rv:3": {"text": "x"}}}
     dropped = AuditRecord(
         id="0" * 20, time=0, event="message dropped", detail={"monitor": "m", "at": ["m.rv:3"], **said}

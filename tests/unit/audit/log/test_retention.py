@@ -49,7 +49,6 @@ def make_old(make_log: MakeLog, notary: Notary) -> None:
 
 
 def test_old_records_are_removed_and_that_is_recorded(make_log: MakeLog, path: Path, notary: Notary) -> None:
-    """Records past the limit are removed, the log names them, and verification proves the rest."""
     make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     fresh = decision(log, reason="fresh")
@@ -73,7 +72,6 @@ def test_old_records_are_removed_and_that_is_recorded(make_log: MakeLog, path: P
 
 
 def test_removal_by_age_waits_for_receipts(make_log: MakeLog, path: Path, notary: Notary) -> None:
-    """With `fleet.retention_waits`, old records stay until the collector has them; then they are removed."""
     make_old(make_log, notary)
     received = [700]
     log = make_log(checkpoint_every=100, retention=Retention(days=1, collected=lambda: received[0]))
@@ -92,7 +90,6 @@ def test_removal_by_age_waits_for_receipts(make_log: MakeLog, path: Path, notary
 
 
 def test_removal_by_size_does_not_wait_for_receipts(make_log: MakeLog, path: Path) -> None:
-    """The log's size limit wins: uncollected records are removed."""
     log = make_log(checkpoint_every=200, retention=Retention(size=2 << 20, collected=lambda: 0))
     for number in range(6000):
         log.record(decision(log, number, reason="x" * 400))
@@ -114,7 +111,6 @@ def test_young_records_stay(make_log: MakeLog, path: Path) -> None:
 
 
 def test_records_with_future_times_delay_no_removal(make_log: MakeLog, path: Path, notary: Notary) -> None:
-    """After a year of a fast clock, its records delay no removal and are not removed early."""
     now = itertools.count(clock.wall_ns() - 7 * _DAY, 1000)
     notary.ago, ahead = 7 * _DAY, 0
     log = make_log(checkpoint_every=10, clock=lambda: next(now) + ahead)
@@ -134,7 +130,6 @@ def test_records_with_future_times_delay_no_removal(make_log: MakeLog, path: Pat
 
 
 def test_waiting_for_the_signers_clock_is_not_an_alarm(make_log: MakeLog, path: Path, notary: Notary) -> None:
-    """The machine's clock is a year ahead: the signer waits, nothing is removed, and no delay is reported."""
     log = make_log(checkpoint_every=10, retention=Retention(days=30))
     for number in range(100):
         log.record(decision(log, number))
@@ -154,7 +149,6 @@ def test_waiting_for_the_signers_clock_is_not_an_alarm(make_log: MakeLog, path: 
 
 
 def test_a_log_past_its_size_loses_its_oldest_records(make_log: MakeLog, path: Path) -> None:
-    """The log stays near its limit."""
     log = make_log(checkpoint_every=200, retention=Retention(size=2 << 20))
     for number in range(12_000):
         log.record(decision(log, number))
@@ -170,7 +164,6 @@ def test_a_log_past_its_size_loses_its_oldest_records(make_log: MakeLog, path: P
 
 
 def test_denials_and_alarms_are_removed_last(make_log: MakeLog, path: Path) -> None:
-    """A flood of allows removes no denial: each denial is copied with its id, time and original position."""
     log = make_log(checkpoint_every=200, retention=Retention(size=2 << 20))
     early = decision(log, decision="deny", host="10.0.0.66", resource="/cmd_vel", reason="no")
     log.record(early)
@@ -235,7 +228,6 @@ def test_unsigned_records_stay(make_log: MakeLog, path: Path) -> None:
 
 
 def test_removal_beyond_retention_is_found(make_log: MakeLog, path: Path, notary: Notary) -> None:
-    """Removing more records than the retention record names is found."""
     make_old(make_log, notary)
     log = make_log(retention=Retention(days=1))
     log.record(decision(log))

@@ -13,7 +13,6 @@ _PAGE = Path(__file__).parents[4] / "docs" / "reference" / "audit-log.md"
 
 
 def test_the_page_matches_the_code() -> None:
-    """The reviewer's page has the fields, events and schema of the code (python -m distribution.audit_record_page)."""
     generated = _PAGE.read_text().split("<!-- generated: python -m distribution.audit_record_page -->\n")[1]
     assert generated == markdown()
 
@@ -32,7 +31,6 @@ def test_every_field_is_documented() -> None:
 
 
 def test_a_line_of_an_export_is_a_record_and_its_position() -> None:
-    """The schema of an exported line has the fields that an export writes, including the position in the chain."""
     assert list(CHAIN["properties"]) == list(ChainProof.__struct_fields__)
 
 

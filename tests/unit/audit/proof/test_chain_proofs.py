@@ -76,7 +76,6 @@ def test_it_verifies_elsewhere(log: Path, public: bytes, tmp_path: Path, wanted:
 
 
 def test_a_line_is_a_record_with_its_position(log: Path) -> None:
-    """Each line of an export is the record as a search returns it, with its position as an added field."""
     for entry, chain in evidence(log, ALL):
         line = json.loads(evidence_line(entry, chain))
         assert set(line.pop("chain")) >= {"previous", "hash", "then"}
@@ -87,7 +86,6 @@ def test_a_line_is_a_record_with_its_position(log: Path) -> None:
 def test_an_export_after_retention_is_proved(
     make_log: MakeLog, path: Path, public: bytes, notary: Notary, tmp_path: Path
 ) -> None:
-    """The records that retention left can be proved, from the first to the last."""
     make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     log.record(decision(log))

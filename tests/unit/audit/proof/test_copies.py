@@ -66,7 +66,6 @@ def test_an_unchanged_log_agrees(log: Path) -> None:
 def test_history_signed_by_root_is_found(
     log: Path, key: Ed25519PrivateKey, tmp_path: Path, change: str
 ) -> None:
-    """A history rewritten and signed with the real key passes every local check, but disagrees with the copy."""
     copies = signed_checkpoints(log)
     write_anew(log, key, tmp_path / "signer", change)
     public = key.public_key().public_bytes_raw()
@@ -76,7 +75,6 @@ def test_history_signed_by_root_is_found(
 
 
 def test_the_range_is_between_two_checkpoints(log: Path, key: Ed25519PrivateKey, tmp_path: Path) -> None:
-    """The reported range begins after the last checkpoint that agrees and ends at the first that disagrees."""
     copies = signed_checkpoints(log)
     write_anew(log, key, tmp_path / "signer", "UPDATE record SET reason = 'x' WHERE sequence = 110")
     result = verify(log, copies=copies)
@@ -87,7 +85,6 @@ def test_the_range_is_between_two_checkpoints(log: Path, key: Ed25519PrivateKey,
 
 
 def test_an_end_removed_by_root_is_found(log: Path, key: Ed25519PrivateKey, tmp_path: Path) -> None:
-    """The copy reveals that the last records were removed, even with their checkpoints and the signer's memory gone."""
     copies = signed_checkpoints(log)
     with closing(sqlite3.connect(log)) as connection:
         connection.execute("DELETE FROM record WHERE sequence > 90")
@@ -111,7 +108,6 @@ def test_another_log_is_found(log: Path, make_log: MakeLog, path: Path) -> None:
 
 
 def test_a_forged_copy_proves_nothing(log: Path) -> None:
-    """A copy without a valid signature is reported and not compared with the log."""
     copies = signed_checkpoints(log)
     forged = msgspec.structs.replace(copies[0], hash="0" * 64)
     result = verify(log, copies=[forged, *copies[1:]])
@@ -121,7 +117,6 @@ def test_a_forged_copy_proves_nothing(log: Path) -> None:
 
 
 def test_a_replaced_key_is_found(log: Path, tmp_path: Path) -> None:
-    """If root replaces the key, its pin and every signature, the key of the copies shows it."""
     copies = signed_checkpoints(log)
     other = Ed25519PrivateKey.generate()
     write_anew(log, other, tmp_path / "signer", "UPDATE record SET reason = 'x' WHERE sequence = 60")
@@ -133,7 +128,6 @@ def test_a_replaced_key_is_found(log: Path, tmp_path: Path) -> None:
 def test_checkpoints_of_removed_records_contradict_nothing(
     make_log: MakeLog, path: Path, notary: Notary
 ) -> None:
-    """Checkpoints whose records were removed prove nothing, and the result says so."""
     notary.ago = 2 * 86_400_000_000_000
     log = make_log(checkpoint_every=20, clock=lambda: 1)
     for number in range(60):
@@ -171,7 +165,6 @@ def test_formats_of_a_copy(log: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["", "{}\n", "[" * 100_000, '{"log": 1}\n', "\x00\xff\n"])
 def test_a_file_without_checkpoints_is_an_error(tmp_path: Path, text: str) -> None:
-    """A file without a checkpoint, or a missing file, is an error that names it."""
     file = tmp_path / "kept"
     file.write_text(text)
     with pytest.raises(CopiesUnreadableError, match="kept: no checkpoint"):

@@ -63,7 +63,6 @@ def fresh(make_log: MakeLog, path: Path) -> Path:
 
 
 def test_a_forged_removal_is_found(fresh: Path) -> None:
-    """The log alone reveals the removal: its checkpoints do not record it, and it has no signature."""
     forge(fresh)
     result = verify(fresh)
     assert kinds(result) == {FindingKind.REMOVAL_UNFOUNDED}
@@ -71,7 +70,6 @@ def test_a_forged_removal_is_found(fresh: Path) -> None:
 
 
 def test_the_signer_and_copies_find_it_too(fresh: Path, notary: Notary) -> None:
-    """A forged removal is also found with the signer's memory and with copied checkpoints."""
     copies = signed_checkpoints(fresh)
     forge(fresh)
     with closing(sqlite3.connect(fresh)) as attacker:
@@ -85,7 +83,6 @@ def test_the_signer_and_copies_find_it_too(fresh: Path, notary: Notary) -> None:
 
 @pytest.mark.parametrize("whose", ["own", "nobody's", "another's"])
 def test_another_signature_does_not_help(fresh: Path, whose: str) -> None:
-    """The forger's own key, garbage, and a signature of another text are not valid."""
     with closing(sqlite3.connect(fresh)) as connection:
         (log_id,) = connection.execute("SELECT id FROM log").fetchone()
         query = "SELECT signature FROM checkpoint WHERE signature IS NOT NULL LIMIT 1"
@@ -102,7 +99,6 @@ def test_another_signature_does_not_help(fresh: Path, whose: str) -> None:
 
 
 def test_a_signed_removal_covers_no_other(make_log: MakeLog, path: Path, notary: Notary) -> None:
-    """After a real removal of old records, its signature does not cover a removal of new ones."""
     make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     log.record(decision(log, decision="deny", host="10.0.0.66"))
@@ -123,7 +119,6 @@ def test_a_signed_removal_covers_no_other(make_log: MakeLog, path: Path, notary:
 def test_the_signer_refuses_removals_beyond_its_settings(
     make_log: MakeLog, path: Path, notary: Notary
 ) -> None:
-    """A control that asks for more than the signer's settings allow gets no signature, and all records stay."""
     make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     notary.kept = type(notary.kept)()  # forever
@@ -148,7 +143,6 @@ def old(path: Path) -> Path:
 
 
 def test_a_log_that_only_0_1_0_opened_names_the_remedy(old: Path) -> None:
-    """The layout of 0.1.0 is upgraded by 0.2.0, not by this version."""
     with closing(sqlite3.connect(old)) as database:
         database.execute("PRAGMA user_version = 1")
     with pytest.raises(
@@ -158,7 +152,6 @@ def test_a_log_that_only_0_1_0_opened_names_the_remedy(old: Path) -> None:
 
 
 def test_an_old_log_is_valid_with_a_note(old: Path) -> None:
-    """A log from before signed removals is valid; the result says that no signature covers its removals."""
     result = verify(old)
     assert result.ok, result.findings
     assert (result.removed, result.removal) == (68, "unsigned")

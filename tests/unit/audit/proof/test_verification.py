@@ -94,7 +94,6 @@ def test_a_first_signature_during_the_verification_has_its_key(
 
 
 def test_an_unchanged_log_is_complete(log: Path, key: Ed25519PrivateKey) -> None:
-    """An unchanged log is complete, and the result names the last record that a signature covers."""
     result = verify(log, key.public_key().public_bytes_raw())
     assert result.ok
     assert result.first == 1
@@ -114,7 +113,6 @@ def test_any_changed_field(log: Path, column: str) -> None:
 
 
 def test_changed_bytes_of_the_file(log: Path) -> None:
-    """A byte changed in the file, bypassing SQLite, is found and its record named."""
     data = log.read_bytes()
     with closing(sqlite3.connect(log)) as connection:
         (target,) = connection.execute("SELECT id FROM record WHERE sequence = 77").fetchone()
@@ -142,7 +140,6 @@ def test_attack(log: Path, title: str) -> None:
 
 
 def test_an_inserted_record_with_a_valid_hash_is_found(log: Path) -> None:
-    """The hash is computed from the inserted record itself."""
     with closing(sqlite3.connect(log)) as connection:
         connection.execute("UPDATE record SET sequence = -sequence WHERE sequence >= 60")
         connection.execute("UPDATE record SET sequence = 1 - sequence WHERE sequence < 0")
@@ -156,7 +153,6 @@ def test_an_inserted_record_with_a_valid_hash_is_found(log: Path) -> None:
 
 
 def test_a_removed_end_is_found(log: Path) -> None:
-    """Removing records covered by a checkpoint is found."""
     last = verify(log).last
     attack(log, "DELETE FROM record WHERE sequence > 150")
     kinds = found(log)
@@ -189,7 +185,6 @@ def test_rewritten_chain(log: Path) -> None:
 
 
 def test_rewritten_chain_and_checkpoints(log: Path) -> None:
-    """Rewritten checkpoints do not have valid signatures."""
     rewrite(log, 60)
     with closing(sqlite3.connect(log)) as connection:
         for number, text in connection.execute("SELECT number, text FROM checkpoint").fetchall():
@@ -204,7 +199,6 @@ def test_rewritten_chain_and_checkpoints(log: Path) -> None:
 
 
 def test_signatures_of_another_key_are_found(log: Path) -> None:
-    """Checkpoints signed with a foreign key are a finding."""
     other = Ed25519PrivateKey.generate()
     with closing(sqlite3.connect(log)) as connection:
         for number, text in connection.execute("SELECT number, text FROM checkpoint").fetchall():
@@ -217,13 +211,11 @@ def test_signatures_of_another_key_are_found(log: Path) -> None:
 
 
 def test_the_reviewers_key_counts(log: Path) -> None:
-    """A key given by the reviewer overrides the key pinned beside the log."""
     other = Ed25519PrivateKey.generate().public_key().public_bytes_raw()
     assert {kind for kind, _first, _last in found(log, public_key=other)} == {FindingKind.WRONG_KEY}
 
 
 def test_signatures_without_a_key_are_a_finding(log: Path) -> None:
-    """The pinned key was removed from beside the log."""
     log.with_name("audit.pub").unlink()
     assert FindingKind.NO_KEY in {kind for kind, _first, _last in found(log)}
 
@@ -250,7 +242,6 @@ def signer_memory(log: Path, directory: Path) -> None:
 def test_the_signers_memory_finds_a_removed_end(
     log: Path, tmp_path: Path, statements: tuple[str, ...], kind: FindingKind
 ) -> None:
-    """A log without its last records and checkpoints passes alone, but disagrees with the signer's memory."""
     signer_memory(log, tmp_path / "signer")
     assert found(log, signer=tmp_path / "signer") == []
     attack(log, *statements)
@@ -272,7 +263,6 @@ def test_overwritten_page(log: Path, sequence: int) -> None:
 
 
 def test_a_truncated_file_is_found(log: Path) -> None:
-    """The file is cut in the middle."""
     data = log.read_bytes()
     log.write_bytes(data[: len(data) // 2 // 4096 * 4096])
     try:
@@ -282,7 +272,6 @@ def test_a_truncated_file_is_found(log: Path) -> None:
 
 
 def test_a_missing_log_is_an_error(tmp_path: Path) -> None:
-    """The error names the file."""
     with pytest.raises(LogUnreadableError, match=r"audit\.db: there is no audit log"):
         verify(tmp_path / "audit.db")
     with pytest.raises(LogUnreadableError, match="no such directory"):
@@ -297,7 +286,6 @@ def content(path: Path) -> list[tuple[object, ...]]:
 
 
 def test_each_changed_byte_is_found_or_harmless(log: Path) -> None:
-    """Bytes all over the file are changed one at a time: each change is found, or no reader sees it."""
     before, data = content(log), log.read_bytes()
     found_out = 0
     for position in range(7, len(data), len(data) // 250):
@@ -320,7 +308,6 @@ def test_each_changed_byte_is_found_or_harmless(log: Path) -> None:
 
 
 def test_a_clock_set_back_is_valid(make_log: MakeLog, path: Path) -> None:
-    """Records stay in order of creation when the clock jumps into the past, and the log is valid."""
     now = [2_000_000_000_000_000_000]
     log = make_log(clock=lambda: now[0], checkpoint_every=10)
     for number in range(30):
@@ -381,7 +368,6 @@ _REMOVED = (
     ],
 )  # fmt: skip
 def test_hostile_content_has_a_verdict(log: Path, statements: tuple[str, ...]) -> None:
-    """Whatever the tables contain, verification ends with findings in printable words."""
     with closing(sqlite3.connect(log)) as connection:
         for statement in statements:
             connection.execute(statement)
@@ -393,7 +379,6 @@ def test_hostile_content_has_a_verdict(log: Path, statements: tuple[str, ...]) -
 
 @pytest.mark.parametrize("curve", ["secp256k1", "an unsupported one"])
 def test_a_key_of_another_kind_is_an_error(tmp_path: Path, curve: str) -> None:
-    """The error says which kind of key is needed."""
     public = ec.generate_private_key(ec.SECP256K1()).public_key()
     der = public.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
     if curve != "secp256k1":
@@ -406,7 +391,6 @@ def test_a_key_of_another_kind_is_an_error(tmp_path: Path, curve: str) -> None:
 
 
 def test_a_missing_key_is_an_error(tmp_path: Path) -> None:
-    """The error names the file and the reason."""
     with pytest.raises(KeyUnreadableError, match=r"gone\.pem: No such file or directory$"):
         read_public_key(tmp_path / "gone.pem")
 
@@ -417,7 +401,6 @@ def unsign(path: Path, first: int) -> None:
 
 
 def test_pending_signatures_are_not_tampering(log: Path, tmp_path: Path) -> None:
-    """Signatures at the end that are made but not yet stored in the log are not a finding."""
     signer_memory(log, tmp_path / "signer")
     unsign(log, 2)
     result = verify(log, signer=tmp_path / "signer")
@@ -427,7 +410,6 @@ def test_pending_signatures_are_not_tampering(log: Path, tmp_path: Path) -> None
 
 
 def test_too_many_missing_signatures_are_found(make_log: MakeLog, path: Path, tmp_path: Path) -> None:
-    """More missing signatures at the end than can be pending mean that signatures were removed."""
     log = make_log(checkpoint_every=1, checkpoint_seconds=3600)
     for number in range(70):
         log.record(decision(log, number))
@@ -446,8 +428,6 @@ def test_too_many_missing_signatures_are_found(make_log: MakeLog, path: Path, tm
 def test_a_checkpoint_made_during_verification_is_not_a_finding(
     log: Path, make_log: MakeLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A checkpoint signed while verification begins is not reported as removed."""
-
     def meanwhile(directory: Path, log_id: str) -> SignerMemory | None:
         writing = make_log(checkpoint_every=10, checkpoint_seconds=3600)
         for number in range(40):
@@ -475,7 +455,6 @@ def test_findings_are_limited(log: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_forged_log_does_not_keep_verification_busy(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the limit of findings the search for misplaced records ends: it could take hours in a large log."""
     monkeypatch.setattr("appliance.audit.proof.verification._MOST_FINDINGS", 3)
     searched: list[int] = []
 

@@ -56,7 +56,6 @@ def of(*records: AuditRecord, limit: int = 10) -> DenialSummary:
 
 
 def test_the_host_with_the_most_denials_is_first() -> None:
-    """Each has its number, its first and last time, its most frequent rules or reasons, and its callers."""
     found = of(
         denial(1), denial(2, "10.0.0.2", rule=RULE), denial(3, "10.0.0.2", rule=RULE, caller_id="/b"),
         denial(4, "10.0.0.2", "value 7 is wrong"), denial(5, "10.0.0.2", "value 8 is wrong"),
@@ -73,7 +72,6 @@ def test_the_host_with_the_most_denials_is_first() -> None:
 
 
 def test_decisions_come_before_the_noise_of_a_port_scan(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A few denied calls are shown before frequent and varied malformed data, and the number of other reasons."""
     monkeypatch.setattr(denial_summary, "_MOST_NAMES", 8)
     noise = [
         denial(at, reason=f"{word} is not HTTP", event="malformed")
@@ -92,7 +90,6 @@ def test_decisions_come_before_the_noise_of_a_port_scan(monkeypatch: pytest.Monk
 
 
 def test_revoked_rights_are_not_counted() -> None:
-    """A blocked robot is not listed as an attacker; that repetitions are counted together changes nothing."""
     revoked = msgspec.structs.replace(denial(1), event="revoked")
     counted = msgspec.structs.replace(folded(KIND, "10.0.0.1", 5), detail={"of": "revoked", "count": 5})
     assert of(revoked, counted).hosts == []
@@ -100,7 +97,6 @@ def test_revoked_rights_are_not_counted() -> None:
 
 
 def test_counted_repetitions_count_as_their_number() -> None:
-    """With the times of the first and last of them, and the reasons and callers that the record counts."""
     found = of(
         folded(KIND, "10.0.0.1", 5, reasons={"no rule": 5}),
         folded(HOST, "10.0.0.2", 7, reasons={"busy 3": 4, "busy 4": 2, OTHERS: 1}, callers={"/x": 3, "/y": 4}),
@@ -120,7 +116,6 @@ def test_counted_repetitions_count_as_their_number() -> None:
 
 @pytest.mark.parametrize("scope", [ALL, ALL_UNKNOWN])
 def test_repetitions_of_many_hosts_count_for_the_hosts_that_are_named(scope: str) -> None:
-    """The rest belongs to no single host; a damaged record never counts more than its number."""
     found = of(denial(1), folded(scope, None, 100, hosts={"10.0.0.1": 60, "10.0.0.9": 10, OTHERS: 20}))
     assert found.denials == 101
     assert [(row.host, row.count) for row in found.hosts] == [
@@ -133,7 +128,6 @@ def test_repetitions_of_many_hosts_count_for_the_hosts_that_are_named(scope: str
 
 
 def test_a_denial_without_a_host_is_listed() -> None:
-    """Such as an order over REST that was rejected."""
     assert [(row.host, row.count) for row in of(denial(1, None)).hosts] == [("(no host)", 1)]
 
 
@@ -153,13 +147,11 @@ def test_everything_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_no_reason_has_contents_of_messages() -> None:
-    """Viewers may read the summary."""
     said = denial(1, reason="m: 3 alarm with frame = secret", detail={"monitor": "m"})
     assert "secret" not in msgspec.json.encode(of(said)).decode()
 
 
 def test_the_summary_counts_the_denials_of_a_search(make_log: MakeLog) -> None:
-    """It reads the records of `--deny`, in the same time; a folded flood counts with its number."""
     log = make_log()
     for _ in range(30):
         log.record(decision(log, decision="deny", host="10.0.0.1", caller_id="/flood", resource="/x"))
@@ -175,7 +167,6 @@ def test_the_summary_counts_the_denials_of_a_search(make_log: MakeLog) -> None:
 
 @pytest.mark.nightly
 def test_ten_thousand_denials_take_less_than_half_a_second(make_log: MakeLog) -> None:
-    """The limit is four times the processor time of 2026, in which a hundred thousand take a second."""
     log = make_log()
     assert log.close() is None
     connection = open_for_writing(log.path)

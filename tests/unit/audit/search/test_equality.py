@@ -36,7 +36,6 @@ def _deny(**fields: Any) -> AuditRecord:
 
 
 def test_a_flood_is_one_row_with_the_first_record_and_the_last_value() -> None:
-    """The count includes the repetitions that a record stands for, in either order of reading."""
     log = _log(
         _drop(),
         _drop("8 more in the same second: limit.drive dropped it: speed 0.41", detail={"count": 8}),
@@ -49,7 +48,6 @@ def test_a_flood_is_one_row_with_the_first_record_and_the_last_value() -> None:
 
 
 def test_a_count_without_a_reason_continues_its_records() -> None:
-    """The fast path of a relay knows only the number; the row has the newest known reason."""
     log = _log(
         _drop(),
         _drop("8 more in the same second", detail={"count": 8}),
@@ -74,25 +72,21 @@ def test_a_count_without_a_reason_continues_its_records() -> None:
     ids=str,
 )  # fmt: skip
 def test_records_that_differ_in_more_than_values_are_not_equal(other: dict[str, Any]) -> None:
-    """A row never hides another cause."""
     assert not equal_key(_drop()).equals(equal_key(_drop(**other)))
 
 
 def test_actions_for_one_message_do_not_break_the_row() -> None:
-    """A drop and a log line alternate; they are two rows. A decision between them ends both."""
     pair = [_drop(), _drop("speed 4", event="monitor log")]
     assert [row.count for row in grouped(_log(*pair * 5))] == [5, 5]
     assert [row.count for row in grouped(_log(*pair * 2, _deny(), *pair))] == [2, 2, 1, 1, 1]
 
 
 def test_decisions_keep_their_order() -> None:
-    """Only consecutive decisions are one row."""
     allow = _deny(decision="allow")
     assert [row.count for row in grouped(_log(_deny(), _deny(), allow, _deny()))] == [2, 1, 1]
 
 
 def test_a_summary_of_repetitions_continues_its_record() -> None:
-    """A summary of one kind counts its repetitions; a summary of many kinds is another row."""
     state = new_state(_deny(), KIND)
     for _ in range(4):
         state.count_in(_deny())
@@ -105,7 +99,6 @@ def test_a_summary_of_repetitions_continues_its_record() -> None:
 
 
 def test_a_number_of_records_is_not_a_number_of_repetitions() -> None:
-    """`records lost` with a count is one event."""
     assert times(AuditRecord(id="0" * 20, time=0, event="records lost", detail={"count": 50})) == 1
 
 
@@ -123,7 +116,6 @@ _CHOICE = st.sampled_from(
 
 @given(st.lists(_CHOICE), st.booleans())
 def test_no_record_is_lost(records: list[AuditRecord], newest_first: bool) -> None:
-    """All rows together have all records and all repetitions."""
     numbers = count(1)
     log = [LogEntry(next(numbers), record) for record in records]
     rows = grouped(log[::-1] if newest_first else log)

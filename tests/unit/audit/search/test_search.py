@@ -91,7 +91,6 @@ def test_filters(log: AuditLog, path: Path, wanted: Filter, expected: list[int])
 
 
 def test_a_text_is_found_before_and_after_indexing(log: AuditLog, path: Path) -> None:
-    """A text is found as soon as its record is on disk."""
     for number in range(600):
         log.record(decision(log, number, reason=f"needle {number}"))
         if number % 100 == 0:
@@ -104,7 +103,6 @@ def test_a_text_is_found_before_and_after_indexing(log: AuditLog, path: Path) ->
 @pytest.mark.parametrize("newest_first", [True, False])
 @pytest.mark.parametrize("wanted", [Filter(), Filter(resource="/cmd_*"), Filter(text="lets it")])
 def test_pages_give_every_record_once(log: AuditLog, path: Path, wanted: Filter, newest_first: bool) -> None:
-    """Pages are in order, even while records are added."""
     everything = [entry.record.id for entry in search(path, wanted, limit=1000).entries]
     found: list[str] = []
     cursor = None
@@ -121,14 +119,12 @@ def test_pages_give_every_record_once(log: AuditLog, path: Path, wanted: Filter,
 
 
 def test_an_export_has_everything_oldest_first(log: AuditLog, path: Path) -> None:
-    """The export has every record once, oldest first, with pages of any size."""
     entries = list(export(path, Filter(), page=9))
     assert [entry.sequence for entry in entries] == list(range(1, len(entries) + 1))
     assert len(entries) >= 105
 
 
 def test_a_record_is_shown_with_its_neighbours(log: AuditLog, path: Path) -> None:
-    """A record is found by its id or its sequence, with earlier and later actions of the same host or caller."""
     entry = search(path, Filter(resource="/cmd_7", host="10.0.0.2")).entries[2]
     shown = show(path, entry.record.id, neighbours=2)
     assert shown is not None
@@ -141,7 +137,6 @@ def test_a_record_is_shown_with_its_neighbours(log: AuditLog, path: Path) -> Non
 
 
 def test_a_follower_gets_new_records(log: AuditLog, path: Path) -> None:
-    """A follower gets the matching records made after it began, once and in order."""
     follower = Follower(path, Filter(decision=("deny",)))
     assert follower.poll() == []
     sent = [decision(log, number, decision="deny", resource=f"/n{number}") for number in range(25)]
@@ -173,13 +168,11 @@ def test_invalid_filters_are_errors(log: AuditLog, path: Path, wanted: Filter, m
     "arguments", [{"limit": 0}, {"limit": 10_001}, {"cursor": "x"}, {"cursor": "-1"}, {"cursor": "9" * 30}]
 )
 def test_invalid_pages_are_errors(log: AuditLog, path: Path, arguments: dict[str, Any]) -> None:
-    """A wrong limit or cursor is an error."""
     with pytest.raises(FilterError):
         search(path, Filter(), **arguments)
 
 
 def test_a_missing_log_is_an_error(tmp_path: Path) -> None:
-    """The error names the missing file and the option that sets the path."""
     with pytest.raises(LogUnreadableError, match=r"no audit log yet.*--state"):
         search(tmp_path / "audit.db", Filter())
     with pytest.raises(LogUnreadableError, match=r"no such directory.*--state"):
@@ -187,14 +180,12 @@ def test_a_missing_log_is_an_error(tmp_path: Path) -> None:
 
 
 def test_a_damaged_log_is_an_error(path: Path) -> None:
-    """Searching a file that is not a log is an error that names it."""
     path.write_bytes(b"rubbish" * 1000)
     with pytest.raises(LogUnreadableError, match=r"audit\.db"):
         search(path, Filter())
 
 
 def test_reading_leaves_no_trace(log: AuditLog, path: Path) -> None:
-    """Searching a stopped log does not change its file."""
     log.close()
     before = path.read_bytes()
     search(path, Filter(text="needle"))
@@ -202,7 +193,6 @@ def test_reading_leaves_no_trace(log: AuditLog, path: Path) -> None:
 
 
 def test_reads_over_rest_can_be_left_out(log: AuditLog, path: Path) -> None:
-    """The filter omits allowed GETs of REST; orders, refused reads, and unknown methods of clients stay."""
     calls = [
         ("GET", "allow", "rest call", "rest"), ("HEAD", "allow", "rest call", "rest"),
         ("POST", "allow", "rest call", "rest"),
@@ -222,7 +212,6 @@ def test_reads_over_rest_can_be_left_out(log: AuditLog, path: Path) -> None:
 
 
 def test_records_are_found_by_token_name(log: AuditLog, path: Path) -> None:
-    """A token's name finds its requests, and a glob those of several tokens; text from a node never matches."""
     details: list[dict[str, Any]] = [{"who": "alice"}, {"who": "bob"}, {"text": '"who":"alice"'}, {}]
     for detail in details:
         log.record(decision(log, resource="/v1/x", detail=detail))

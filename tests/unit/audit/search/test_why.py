@@ -63,12 +63,10 @@ def test_a_denial_names_its_rule() -> None:
 
 
 def test_an_event_without_a_reason_is_described() -> None:
-    """The line describes the event instead of being empty."""
     assert list(lines_of(AuditRecord(id="1", time=1, event="log begun"))) == ["log begun"]
 
 
 def test_a_drop_says_whether_it_was_recorded() -> None:
-    """The line has the command that shows the messages around the drop, or the reason why there is no recording."""
     planned = {"recording": "18e9aa02efc40abb0e51", "charged_to": "robot"}
     drop = AuditRecord(id="1", time=1_500_000_000, event="message dropped", reason="no", detail=planned)
     assert list(lines_of(drop)) == [
@@ -86,6 +84,5 @@ def test_a_drop_says_whether_it_was_recorded() -> None:
 
 
 def test_every_monitors_trigger_says_whether_it_was_recorded() -> None:
-    """An event of a monitor that may trigger a recording is never silent about it."""
     for event in _ACTIONS:
         assert any("not recorded: " in line for line in lines_of(AuditRecord(id="1", time=1, event=event)))

@@ -29,7 +29,6 @@ def show_on_terminal(monkeypatch: pytest.MonkeyPatch, columns: int = 200) -> Non
 def test_a_log_is_complete_only_once_something_is_signed(
     capsys: pytest.CaptureFixture[str], signed_through: int, verdict: str
 ) -> None:
-    """Without a signature, anyone who can write the files could have written another log."""
     print_verification(
         Verification(
             ok=True, log="one", first=1, last=9, records=9, removed=0, checkpoints=1, signed_checkpoints=1,

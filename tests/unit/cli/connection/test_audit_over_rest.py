@@ -102,7 +102,6 @@ def test_following_survives_broken_connections(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_following_ends_without_a_server(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Five failed connections in a row end the command."""
     monkeypatch.setattr(audit_rest, "_AGAIN_SECONDS", 0.0)
     rest: list[Answer | Exception] = [Answer([], breaks=True)]
     rest += [NotRunningError("cannot be reached")] * 5

@@ -111,7 +111,6 @@ def test_repeated_reading_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_chunks_of_the_same_time_are_unpacked_once(
     name: str, pack: Callable[[bytes], bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A recording whose chunks overlap, as the flight recorder writes them, costs no more than one in order."""
     monkeypatch.setattr(regular_files, "LARGEST_CHUNK", 1 << 17)
     monkeypatch.setattr(bounded_bag, "PER_BYTE", 2 if name == "none" else 60)
     chunks = []

@@ -46,7 +46,6 @@ def test_output_has_what_subscribers_would_receive(tmp_path: Path) -> None:
 
 
 def test_output_is_in_the_order_of_the_robot_for_every_tool(tmp_path: Path) -> None:
-    """Tools sort by time and then by connection; a message comes before those that it causes, and after `init`'s."""
     (tmp_path / "a.rv").write_text("""a() { std_msgs::Int32 n;
         init() { n.data = 100; PUBLISH(/out, std_msgs/Int32, n); }
         event e(int x) /t std_msgs/Int32 '{data:x}' { n.data = x; PUBLISH(/out, std_msgs/Int32, n); } }""")

@@ -60,7 +60,6 @@ def robot_of(tmp_path: Path) -> Robot:
 
 
 def test_an_acknowledged_alarm_stays_one_until_it_is_over(robot: Robot) -> None:
-    """It has the operator's name, also after a restart; the same condition is a new alarm when it comes back."""
     robot.acknowledge()
     robot.restart()
     alarm = robot.alarm()
@@ -78,7 +77,6 @@ def test_an_acknowledged_alarm_stays_one_until_it_is_over(robot: Robot) -> None:
 
 @pytest.mark.parametrize(("passed", "severity"), [(3599, "notice"), (3601, "warning"), (-1, "warning")])
 def test_a_silenced_alarm_is_a_notice_for_its_time(robot: Robot, passed: float, severity: str) -> None:
-    """The silence survives a restart and a flapping condition; a clock that is set back ends it."""
     clock = VirtualClock()
     with using(clock):
         robot.silence(3600)
@@ -93,7 +91,6 @@ def test_a_silenced_alarm_is_a_notice_for_its_time(robot: Robot, passed: float, 
 
 
 def test_a_silence_is_ended_by_an_order(robot: Robot) -> None:
-    """Then it is an alarm at once, and both orders are recorded."""
     robot.silence(3600)
     robot.silence(None)
     alarm = robot.alarm()
@@ -106,7 +103,6 @@ def test_a_silence_is_ended_by_an_order(robot: Robot) -> None:
 
 
 def test_only_a_present_alarm_is_handled(robot: Robot) -> None:
-    """A typing error is reported; an alarm is not silenced for ever, or in advance."""
     with pytest.raises(SenselessError):
         robot.silence(8 * 86_400)
     with pytest.raises(UnknownThingError, match="neither silenced"):

@@ -56,7 +56,6 @@ def test_a_clock_that_was_set_back_is_recorded_once(trail: Trail) -> None:
 
 
 def test_each_step_forward_is_recorded(trail: Trail) -> None:
-    """The record says that less time passed than the timestamps suggest; a step of one second is ignored."""
     started = [1000.0]
     clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0, lambda: started[0])
     for started[0] in (1000.0, 1001.0, 4600.0, 4600.0, 1000.0, 1003.0):

@@ -37,7 +37,6 @@ def used(state: Path, memory: dict[int, dict[str, int]]) -> dict[str, LimitUse]:
 
 
 def test_each_resource_has_its_use_and_the_host_with_most(tmp_path: Path) -> None:
-    """A row counts all hosts, and names the host that is nearest to its own quota."""
     (tmp_path / "control").mkdir()
     (tmp_path / "control" / "audit.db").write_bytes(bytes(1000))
     (tmp_path / "control" / "audit.db-wal").write_bytes(bytes(24))
@@ -54,7 +53,6 @@ def test_each_resource_has_its_use_and_the_host_with_most(tmp_path: Path) -> Non
 
 
 def test_without_retention_the_disk_is_the_limit(tmp_path: Path) -> None:
-    """The log may grow until the disk is full; a robot without relays uses nothing."""
     (tmp_path / "control").mkdir()
     queries = used(tmp_path, {})
     assert queries["bytes of latched messages, one relay"].used == 0

@@ -66,7 +66,6 @@ def opens(tokens: TokenOrders, text: str | None) -> bool:
 
 
 async def test_an_unannounced_token_is_replaced(lives: Lives) -> None:
-    """Control dies before it could announce the first token: the next control replaces and revokes the lost token."""
     lost = await lives.next().first()
     tokens = lives.next()
     assert opens(tokens, lost)
@@ -150,7 +149,6 @@ async def test_earlier_tokens_are_valid_for_the_grace_time(lives: Lives) -> None
 
 
 async def test_the_list_shows_an_end_as_the_door_judges_it(lives: Lives) -> None:
-    """A step back of the system time, also before a restart, does not show an expired token as valid."""
     tokens = lives.next()
     await tokens.add(TokenAdd("alice", "viewer", 3600))
     await tokens.add(TokenAdd("bob", "viewer", 7200))

@@ -134,7 +134,6 @@ def number_in(text: str) -> int:
 
 
 async def test_an_approval_of_one_call_is_used_once(site: Site) -> None:
-    """By the same host, for the same service and arguments; a repetition of a call that waits keeps its number."""
     first = number_in(await site.call(b"1"))
     assert first == number_in(await site.call(b"1")) == 17
     assert number_in(await site.call(b"2")) != first
@@ -277,7 +276,6 @@ async def test_a_call_without_an_answer_ends_with_an_alarm(site: Site) -> None:
 
 
 async def test_an_approval_ends_when_the_policy_no_longer_asks(site: Site) -> None:
-    """A block and a denial end it for good: a later policy does not bring it back."""
     for change in ("[Publishers]\n", "block"):
         number = number_in(site.publish("/x"))
         await site.orders.approve(ApproveCall(number, 3600.0), "ann")
@@ -306,7 +304,6 @@ async def test_a_host_has_a_quota_of_waiting_calls(site: Site) -> None:
 
 
 async def test_no_call_passes_without_an_approval_of_its_own(site: Site) -> None:
-    """In random histories, each allowed call uses up one approval, or falls into a lease."""
     chance = random.Random(11)  # noqa: S311  a history by seed
     once: list[tuple[Address, bytes]] = []
     leases: dict[Address, float] = {}

@@ -110,7 +110,6 @@ def site() -> Iterator[Site]:
 
 @pytest.mark.parametrize("number", [2_000, pytest.param(100_000, marks=pytest.mark.nightly)])
 async def test_never_two_holders_and_never_none_for_longer_than_the_lease(site: Site, number: int) -> None:
-    """Hosts take, ask, give, move, fall silent and end at random, at the same time, while the relays lag."""
     chance, hosts, hand_overs = site.chance, (PILOT, SECOND, BOSS, AGENT, STRANGER), 0
     orders, moves = site.orders, set[str]()
     kinds = (
@@ -144,7 +143,6 @@ async def test_never_two_holders_and_never_none_for_longer_than_the_lease(site: 
 
 
 async def test_the_next_holder_of_a_group(site: Site) -> None:
-    """A free group is taken, a held one only by a host that may override; one that asked follows the holder."""
     orders = site.orders
     await orders.take(DriveTake("base", PILOT), "op")
     for host in (SECOND, AGENT, STRANGER):
@@ -174,7 +172,6 @@ async def test_the_next_holder_of_a_group(site: Site) -> None:
 
 
 async def test_a_holder_loses_a_group(site: Site) -> None:
-    """It is silent for the lease, its nodes end, the policy takes its claim, or the policy no longer has the group."""
     take = DriveTake("base", PILOT)
     await site.orders.take(take, "op")
     await site.pass_time(3 * LEASE, [PILOT])
@@ -203,7 +200,6 @@ async def test_a_holder_loses_a_group(site: Site) -> None:
 
 
 async def test_nothing_is_handed_over_while_a_relay_starts(site: Site) -> None:
-    """The relay may still let the earlier holder through. A group is always freed; a host that waits follows later."""
     await site.orders.take(DriveTake("base", PILOT), "op")
     await site.orders.ask(DriveAsk("base", SECOND), "op")
     site.ready = False
@@ -218,7 +214,6 @@ async def test_nothing_is_handed_over_while_a_relay_starts(site: Site) -> None:
 
 
 async def test_a_relay_that_is_lost_during_a_hand_over_lets_no_two_hosts_through(site: Site) -> None:
-    """The order fails, and the answer to a node does not name it as the holder."""
     for take in (
         lambda: site.orders.take(DriveTake("base", BOSS), "op"),
         lambda: site.orders.take_called(OwnServiceCalled(7, "/rosrv/drive/take", BOSS, "/pad")),
@@ -234,8 +229,6 @@ async def test_a_relay_that_is_lost_during_a_hand_over_lets_no_two_hosts_through
 
 
 async def test_a_node_takes_and_gives_for_its_host(site: Site) -> None:
-    """The services answer with what the host holds, or with the reason."""
-
     def called(host: str) -> OwnServiceCalled:
         return OwnServiceCalled(7, "/rosrv/drive/take", host, "/pad")
 

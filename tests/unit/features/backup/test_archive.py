@@ -32,7 +32,6 @@ def refused(file: Path, state: Path, words: str) -> None:
     ],
 )  # fmt: skip
 def test_an_unknown_name_is_rejected(tmp_path: Path, name: str) -> None:
-    """The whole archive is rejected before anything is written."""
     file = tmp_path / "evil.tar.gz"
     with tarfile.open(file, "w:gz", format=tarfile.GNU_FORMAT) as tar:
         for one in (LOG, name):
@@ -42,7 +41,6 @@ def test_an_unknown_name_is_rejected(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("kind", [tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.CHRTYPE, tarfile.DIRTYPE])
 def test_only_files_are_accepted(tmp_path: Path, kind: bytes) -> None:
-    """Links, devices and folders are rejected."""
     refused(
         archive(tmp_path / "evil", header("api/x", kind=kind, linkname="/etc/passwd")),
         tmp_path / "s",
@@ -77,7 +75,6 @@ def test_impossible_sizes_are_rejected(tmp_path: Path, size: int) -> None:
 
 
 def test_a_duplicate_name_is_rejected(tmp_path: Path) -> None:
-    """This holds for two files, and for a file and a folder."""
     for name in (LOG, f"{LOG}/x"):
         refused(archive(tmp_path / "evil", header(name)), tmp_path / "state", NOTHING)
 
@@ -89,7 +86,6 @@ def test_too_many_files_are_rejected(tmp_path: Path) -> None:
 
 
 def test_every_flipped_bit_is_found(tmp_path: Path) -> None:
-    """A checksum over the content detects each changed bit."""
     content = random.Random(1).randbytes(2000)  # noqa: S311  some bits of a compressed file may have two values
     whole = archive(
         tmp_path / "whole", header("api/x", len(content)), content.ljust(2048, b"\0")
@@ -103,7 +99,6 @@ def test_every_flipped_bit_is_found(tmp_path: Path) -> None:
 
 
 def test_an_unreadable_archive_is_an_error(tmp_path: Path) -> None:
-    """If the file is missing, is not an archive, or has no audit log, the error names it."""
     (tmp_path / "rubbish").write_bytes(b"\x1f\x8b rubbish")
     refused(tmp_path / "rubbish", tmp_path / "state", "rubbish cannot be restored")
     refused(tmp_path / "nowhere", tmp_path / "state", "nowhere cannot be restored")

@@ -87,7 +87,6 @@ def test_a_backup_is_restored(state: Path, tmp_path: Path) -> None:
 def test_a_key_pinned_during_the_backup_is_included(
     state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first checkpoint may be signed, and its key pinned, while a backup begins: the restored log verifies."""
     pin, file = state / "control" / "audit.pub", tmp_path / "backup.tar.gz"
     key = pin.read_bytes()
     pin.unlink()
@@ -103,7 +102,6 @@ def test_a_key_pinned_during_the_backup_is_included(
 
 
 def test_a_backup_needs_no_ros(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Backup and restore work without rosmaster; no backup contains recordings of messages."""
     monkeypatch.setattr(shutil, "which", lambda _program: None)
     (state / "recordings").mkdir()
     (state / "recordings" / "recording.bag").write_text("what messages said")
@@ -128,7 +126,6 @@ def test_nothing_is_overwritten(state: Path, tmp_path: Path) -> None:
 @pytest.mark.nightly
 @pytest.mark.parametrize("size", ["8k", "64k"])
 def test_a_full_disk_is_reported(state: Path, tmp_path: Path, size: str) -> None:
-    """The error says to free space, not to change permissions."""
     with small_disk(tmp_path / "disk", size) as place:
         (state / "api" / "key.pem").write_bytes(os.urandom(200_000))
         with pytest.raises(BackupError, match=f"{place}: the disk is full; free space") as caught:
@@ -138,7 +135,6 @@ def test_a_full_disk_is_reported(state: Path, tmp_path: Path, size: str) -> None
 
 
 def test_a_missing_state_directory_is_an_error(tmp_path: Path) -> None:
-    """The error names the directory."""
     with pytest.raises(BackupError, match="not the state directory of an appliance"):
         back_up(tmp_path, tmp_path / "x.tar.gz")
 
@@ -173,7 +169,6 @@ def test_an_unreadable_part_is_an_error(state: Path, tmp_path: Path) -> None:
 
 
 def test_planted_links_and_pipes_are_refused(state: Path, tmp_path: Path) -> None:
-    """If the user of a part plants links, pipes or linked folders, a backup by root does not follow them."""
     secret = tmp_path / "shadow"
     secret.write_text("root's")
     (tmp_path / "outside").mkdir()
@@ -192,7 +187,6 @@ def test_planted_links_and_pipes_are_refused(state: Path, tmp_path: Path) -> Non
 def test_a_late_link_is_not_followed(
     state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    """A file or folder that becomes a link after the check reveals nothing of its target."""
     (tmp_path / "shadow").write_text("root's")
     (state / "api" / "key.pem").symlink_to(tmp_path / "shadow")
     (state / "api" / "folder").symlink_to(tmp_path)
@@ -208,7 +202,6 @@ def test_a_late_link_is_not_followed(
 
 
 def test_a_file_of_another_user_is_refused(state: Path, tmp_path: Path) -> None:
-    """A hard link to another user's file is reported, and no backup is left."""
     need_root()
     for path in (state / "api", *(state / "api").iterdir()):
         os.chown(path, 61014, 61014)
@@ -256,7 +249,6 @@ def test_a_file_that_grows_is_refused(state: Path, tmp_path: Path, monkeypatch: 
 
 
 def test_too_many_files_are_refused(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A process that makes too many files is found when the backup is made, not at the restore."""
     monkeypatch.setattr(backup, "MOST_FILES", 5)
     with pytest.raises(BackupError, match=r"more than 5 files, .* in api"):
         for number in range(9):
@@ -268,8 +260,6 @@ def test_too_many_files_are_refused(state: Path, tmp_path: Path, monkeypatch: py
 def test_an_interrupted_backup_leaves_no_file(
     state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After Ctrl-C in the middle, the target is either a whole backup or missing."""
-
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -280,7 +270,6 @@ def test_an_interrupted_backup_leaves_no_file(
 
 
 def test_a_half_restored_state_is_not_backed_up(state: Path, tmp_path: Path) -> None:
-    """The state left by an interrupted restore is not a valid state."""
     (state / "restoring").touch()
     with pytest.raises(BackupError, match="a restore did not finish"):
         back_up(state, tmp_path / "backup.tar.gz")
@@ -302,7 +291,6 @@ def owned(state: Path) -> Iterator[Path]:
 
 
 def test_open_databases_are_copied_as_their_user(owned: Path, tmp_path: Path) -> None:
-    """The backup includes the write-ahead log, and root leaves no file beside the database."""
     with closing(sqlite3.connect(owned / "control" / "state.db")) as connection:
         connection.execute("PRAGMA journal_mode=WAL")
         connection.execute("INSERT INTO thing VALUES ('fresh')")
@@ -322,7 +310,6 @@ def test_open_databases_are_copied_as_their_user(owned: Path, tmp_path: Path) ->
 def test_a_database_replaced_by_a_link_reveals_nothing_of_root(
     owned: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A link planted after the check is followed only with the rights of its user."""
     secret = owned.parent / "secret.db"
     with closing(sqlite3.connect(secret)) as connection:
         connection.execute("CREATE TABLE secret (value TEXT)")

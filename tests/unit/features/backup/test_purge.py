@@ -31,7 +31,6 @@ def state(tmp_path: Path) -> Path:
 
 
 def test_all_of_it_is_removed_and_nothing_else(state: Path, tmp_path: Path) -> None:
-    """A key file that is still open reads as random bytes; the target of a link stays unchanged."""
     with (state / "signer" / "audit.key").open("rb") as still:
         files, written = purge(state)
         kept = still.read()
@@ -43,7 +42,6 @@ def test_all_of_it_is_removed_and_nothing_else(state: Path, tmp_path: Path) -> N
 
 
 def test_not_while_an_appliance_uses_it(state: Path) -> None:
-    """Nothing is touched, and the error names the process."""
     held = StateDirectory(state)
     try:
         with pytest.raises(BackupError, match=f"appliance .process {os.getpid()}.* already uses the state"):
@@ -54,7 +52,6 @@ def test_not_while_an_appliance_uses_it(state: Path) -> None:
 
 
 def test_only_a_state_directory_is_removed(tmp_path: Path) -> None:
-    """A folder with other files, an empty folder, and a missing one are refused."""
     (tmp_path / "home").mkdir()
     for place, why in (
         (tmp_path / "home", "empty"),
@@ -69,7 +66,6 @@ def test_only_a_state_directory_is_removed(tmp_path: Path) -> None:
 
 
 def test_the_command_asks_for_the_path_again(state: Path) -> None:
-    """A script confirms the path with --confirm, a person types it; a different path removes nothing."""
     run = CliRunner().invoke
     refused = run(app, ["purge", "--state", str(state), "--confirm", "/var/lib/rosrv"])
     assert (refused.exit_code, "nothing was changed" in refused.output) == (1, True)

@@ -17,7 +17,6 @@ from tests.support.requirements import need_root
 
 
 def test_a_backup_larger_than_the_disk_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A backup that unpacks to more than the free space is not started."""
     file = archive(tmp_path / "bomb", header("api/x", 1 << 24), bytes(1 << 24))
     assert file.stat().st_size < 1 << 16
     monkeypatch.setattr(backup_restore, "_room_in", lambda _state: 1 << 23)
@@ -27,7 +26,6 @@ def test_a_backup_larger_than_the_disk_is_refused(tmp_path: Path, monkeypatch: p
 
 
 def test_a_target_that_is_a_file_is_an_error(tmp_path: Path) -> None:
-    """A file at the path of the new state directory, or on the way to it, is named in the error."""
     (tmp_path / "file").touch()
     for state in (tmp_path / "file", tmp_path / "file" / "state"):
         with pytest.raises(BackupError, match=r"file.*: Not a directory"):
@@ -35,7 +33,6 @@ def test_a_target_that_is_a_file_is_an_error(tmp_path: Path) -> None:
 
 
 def test_an_interrupted_restore_does_not_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A killed restore leaves a mark that `rosrv up` refuses; an error or Ctrl-C leaves nothing."""
     file, state = archive(tmp_path / "backup", header("api/x")), tmp_path / "state"
     seen: list[str] = []
 

@@ -10,7 +10,6 @@ from tests.support.virtual_clock import VirtualClock
 
 
 def test_operators_see_the_last_minute_of_the_oldest_connections() -> None:
-    """Frames of earlier minutes do not count, and a door with many connections shows some of them."""
     session: Any = SimpleNamespace(received=0, sent=0, refusals=0, protocol_name="rosbridge")
     machine = VirtualClock()
     clients = []

@@ -82,7 +82,6 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
 
 @pytest.mark.anyio
 async def test_a_door_gets_only_sockets_to_the_appliance_with_its_own_address(bench: Bench) -> None:
-    """RVMaster's port and the ports of the policy's range, and no other port of the machine."""
     for number, port in enumerate((11311, 19001, 20000, 0, 11312, 8443, 22, 20001, -1, 1 << 20)):
         bench.hears(door_link.SocketWanted(number, port))
     assert [one.number for one in bench.sent] == [4, 5, 6, 7, 8, 9]
@@ -97,7 +96,6 @@ async def test_a_door_that_asks_for_many_sockets_at_once_waits(bench: Bench) -> 
 
 
 def test_the_process_of_a_removed_or_replaced_door_ends(bench: Bench) -> None:
-    """It ends when it links up again, and another one starts for the new door of the slot, also of the same name."""
     bench.hears(NEW)
     assert [type(one) for one in bench.sent] == [door_link.DoorGiven]
     for name, added in (("bob", 1.0), ("alice", 0.5)):
@@ -110,7 +108,6 @@ def test_the_process_of_a_removed_or_replaced_door_ends(bench: Bench) -> None:
 
 
 def test_the_death_of_a_process_is_recorded(bench: Bench) -> None:
-    """Not that of a door which was removed."""
     bench.hears(NEW)
     bench.link.lost("")
     assert bench.records == ["door failed"]
@@ -131,7 +128,6 @@ def test_a_process_gets_the_definitions_in_force_before_its_door_and_each_change
 
 
 def test_a_process_gets_the_valid_tickets_and_reports_ended_connections(bench: Bench) -> None:
-    """So connections of a ticket that ended while control was away end, and visits are forgotten."""
     bench.hears(door_link.DoorStarted("alice", 1.0, False))
     assert bench.sent[0].tickets == ["3f9a0c5d17e2"]
     bench.hears(door_link.ConnectionsChanged("10.0.0.7", "3f9a0c5d17e2", 1, 0, ""))
@@ -140,7 +136,6 @@ def test_a_process_gets_the_valid_tickets_and_reports_ended_connections(bench: B
 
 
 def test_a_full_door_and_one_that_keeps_ending_are_alarms(bench: Bench) -> None:
-    """A door that was full for a moment is not, nor one whose process ended ten minutes ago."""
     machine = VirtualClock()
 
     def alarms() -> list[str]:

@@ -23,7 +23,6 @@ def opened(home: Path) -> StateStore:
 
 
 def test_a_name_keeps_its_address_and_no_other_name_gets_it(tmp_path: Path) -> None:
-    """Also over restarts, and after its removal; the address of another network is never given to the policy."""
     store = opened(tmp_path)
     table = DoorTable(store, Doors())
     for name in ("alice", "bob"):
@@ -84,7 +83,6 @@ def test_doors_are_bounded(tmp_path: Path) -> None:
 
 
 def test_a_ticket_opens_one_door_until_its_end(tmp_path: Path) -> None:
-    """Its secret is not stored. Neither a step of the clock nor a restart gives it more time."""
     machine = VirtualClock(wall=WALL)
     with clock.using(machine):
         store = opened(tmp_path)

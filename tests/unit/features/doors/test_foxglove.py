@@ -46,7 +46,6 @@ async def publishes(robot: RosNode, topic: str, kind: str, definitions: Definiti
 
 @pytest.mark.parametrize("subprotocol", SUBPROTOCOLS)
 async def test_a_viewer_gets_channels_with_definitions_and_the_bytes_of_messages(subprotocol: str) -> None:
-    """Also of a type that no package of ROS defines: its definition comes from the publisher."""
     async with door_world() as world:
         robot = await world.robot("10.0.0.3", "/robot")
         definitions = standard_definitions().extended(OWN)
@@ -223,7 +222,6 @@ def test_an_asset_is_an_error_at_once() -> None:
 
 
 def test_a_subscription_ends_with_its_channel() -> None:
-    """The client sends no frame for it, and may subscribe with the same number again."""
     foxglove, _queue = viewer()
     subscribe = '{"op":"subscribe","subscriptions":[{"id":5,"channelId":%d}]}'
     assert foxglove.receive(subscribe % 1) == [SubscribeTopic("/t", "a/B")]
@@ -234,7 +232,6 @@ def test_a_subscription_ends_with_its_channel() -> None:
 
 
 def test_a_channel_that_comes_back_has_a_new_number() -> None:
-    """The door keeps nothing of channels that are gone, however many come and go."""
     foxglove, _queue = viewer()
     announced = []
     for number in range(100):

@@ -20,7 +20,6 @@ def types() -> KnownTypes:
 
 
 def test_a_type_is_known_once_a_publisher_sent_its_definition(types: KnownTypes) -> None:
-    """The newest definition is used for publishing; a message is read by that of its own publisher."""
     with pytest.raises(DefinitionError, match="no publisher of it has been heard"):
         types.message("own/Load")
     first = types.learn(header("own/Load", "int8 x"))
@@ -52,7 +51,6 @@ def test_a_type_with_too_large_messages_is_an_error(types: KnownTypes) -> None:
 
 
 def test_many_large_definitions_are_forgotten_in_order(types: KnownTypes) -> None:
-    """Publishers that define more and more types take bounded memory, and their types can be learned again."""
     types.message("std_msgs/String")
     large = "\n".join(f"int8 f{number}" for number in range(4000))
     for number in range(15):
@@ -66,7 +64,6 @@ def test_many_large_definitions_are_forgotten_in_order(types: KnownTypes) -> Non
 
 
 def test_the_operators_files_define_types_until_they_change(types: KnownTypes) -> None:
-    """Publishers' definitions of other types stay known."""
     types.learn(header("own/Heard", "int8 x"))
     with pytest.raises(DefinitionError, match="rosrv monitor reload"):
         types.service("own/Add")

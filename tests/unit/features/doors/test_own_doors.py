@@ -34,7 +34,6 @@ def people(**groups: tuple[str, ...]) -> Any:
 def test_a_token_has_the_door_of_its_name_and_a_person_that_of_a_group(
     who: str, door: str, reason: str
 ) -> None:
-    """A name that a provider gives a person opens no door, also if a door has this name."""
     rows = [
         DoorRow(name, "198.19.240.2", 1.0, None, 0, None, "") for name in ("alice", "agent-1", "bob", "floor")
     ]

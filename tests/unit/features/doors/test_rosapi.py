@@ -168,7 +168,6 @@ def test_other_services_are_not_answered(rosapi: Rosapi) -> None:
 
 
 async def test_the_sight_of_a_node_is_what_the_master_answers_it() -> None:
-    """A client asks over the WebSocket; a denial of the master is the answer to the client."""
     async with door_world() as world:
         world.master.answers["getSystemState"] = [[["/odom", ["/base"]]], [], [["/reset", ["/base"]]]]
         world.master.answers["getTopicTypes"] = [["/odom", "nav_msgs/Odometry"]]

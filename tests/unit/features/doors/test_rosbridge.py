@@ -170,7 +170,6 @@ def test_two_spellings_of_a_topic_both_get_its_messages(client: Client) -> None:
 
 
 def test_a_throttled_topic_drops_early_messages_or_keeps_the_newest(client: Client) -> None:
-    """Without a queue, an early message is dropped; with one, the newest wait for their turn."""
     client.sends({"op": "subscribe", "topic": "/chatter", "throttle_rate": 1000})
     for number in range(25):
         client.hears(str(number))
@@ -200,7 +199,6 @@ def test_a_client_that_does_not_read_loses_old_messages_and_no_memory(client: Cl
 
 
 def test_a_burst_of_small_messages_is_kept_and_of_large_ones_the_newest(client: Client) -> None:
-    """Many messages may come in one packet, and a client that reads gets them all."""
     for topic in ("/chatter", "/image"):
         client.sends({"op": "subscribe", "topic": topic})
     for number in range(500):

@@ -42,7 +42,6 @@ async def test_messages_pass_in_both_directions() -> None:
 
 
 async def test_each_new_client_of_a_topic_gets_the_last_message_of_latched_publishers() -> None:
-    """The publishers are other nodes and clients of the door. Earlier clients do not get the message again."""
     async with door_world() as world:
         publication = await talks(await world.robot("10.0.0.3", "/robot"), "/map", latched=True)
         await talks(await world.robot("10.0.0.4", "/other"), "/map")
@@ -68,7 +67,6 @@ async def test_each_new_client_of_a_topic_gets_the_last_message_of_latched_publi
 
 @pytest.mark.parametrize("left", [True, False])
 async def test_a_will_is_published_if_the_client_leaves_first(left: bool) -> None:
-    """As the stop of a base; a client that ends its publication has stopped it itself."""
     async with door_world() as world:
         robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
         heard: list[bytes] = []
@@ -222,7 +220,6 @@ async def test_a_service_of_a_client_is_answered_or_fails_when_the_client_leaves
 
 
 async def test_an_agent_that_connects_for_each_call_registers_once() -> None:
-    """Its topics stay for ten seconds after its last connection, and then end."""
     async with door_world() as world:
         for _ in range(5):
             client = await world.client()
@@ -294,7 +291,6 @@ async def test_fragments_of_websocket_frames_have_one_limit_together() -> None:
 
 
 async def test_fragments_take_the_memory_of_their_bytes() -> None:
-    """An endless frame of empty fragments takes none."""
     async with door_world() as world:
         client = await world.client()
         client.socket.send_text(b'{"op":"x"', fin=False)
@@ -316,7 +312,6 @@ async def test_fragments_take_the_memory_of_their_bytes() -> None:
 
 @pytest.mark.parametrize("reads", [True, False])
 async def test_a_client_that_is_disconnected_is_heard_no_more_and_leaves_in_time(reads: bool) -> None:
-    """Neither the frames that it has sent already, nor a client that does not read, keep the connection."""
     async with door_world() as world:
         robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
         heard: list[bytes] = []

@@ -90,7 +90,6 @@ def as_seen_by_rosbags(message: Any) -> Any:
 
 
 def test_every_standard_message_survives_json_and_cbor_and_is_what_rosbags_reads() -> None:
-    """Written values are read again unchanged, by this code and by an independent one."""
     random = Random(49)  # noqa: S311  drawn for a test
     compared = 0
     for name in standard().message_types:

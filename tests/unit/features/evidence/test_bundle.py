@@ -95,7 +95,6 @@ def reviewer(capsys: pytest.CaptureFixture[str], pem: Path) -> Reviewer:
 
 @pytest.mark.nightly
 def test_it_proves_itself_on_a_bare_machine(bundle: Path, pem: Path, tmp_path: Path) -> None:
-    """The system's Python runs the bundle's verifier without an environment, on the file and on the folder."""
     folder = tmp_path / "unpacked"
     shutil.unpack_archive(bundle, folder)
     options: list[list[object]] = [[bundle, "--key", pem], [folder, "--key", pem], []]
@@ -110,7 +109,6 @@ def test_it_proves_itself_on_a_bare_machine(bundle: Path, pem: Path, tmp_path: P
 
 @pytest.mark.nightly
 def test_an_old_python_runs_the_verifier(tmp_path: Path) -> None:
-    """Python 3.8, as in Ubuntu 20.04, supports its syntax, modules and methods; unsupported ones are found."""
     newer = tmp_path / "newer.py"
     newer.write_text(VERIFIER.read_text() + "print('a'.removeprefix('a'))\n")
     for program, status in ((VERIFIER, 0), (newer, 1)):
@@ -121,7 +119,6 @@ def test_an_old_python_runs_the_verifier(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_it_has_the_events_and_the_rules_in_force(bundle: Path, control: Control) -> None:
-    """A bundle has all records of its time span, earlier loads, and signed texts, but no other revisions."""
     found = members_of(bundle)
     specifications = ["%2E%2E/b%0A.rv", "a.rv", "msg/p/T.msg"]
     assert list(found) == [
@@ -147,7 +144,6 @@ def test_it_has_the_events_and_the_rules_in_force(bundle: Path, control: Control
 
 @pytest.mark.nightly
 def test_the_same_time_is_the_same_bundle(control: Control, tmp_path: Path) -> None:
-    """Two exports have the same manifest and members; only the record of the proof differs."""
     until = wall_ns() + 1
     control.work(3)
     first, second = (
@@ -159,7 +155,6 @@ def test_the_same_time_is_the_same_bundle(control: Control, tmp_path: Path) -> N
 
 @pytest.mark.nightly
 def test_every_change_of_a_member_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
-    """Every byte of small members, and a sample of the others, is changed; each change names its member."""
     members, chance = members_of(bundle), random.Random(5)  # noqa: S311  the same each time
     for name, data in members.items():
         places = range(len(data)) if len(data) <= 40 else chance.sample(range(len(data)), examples(12))
@@ -176,7 +171,6 @@ def test_every_change_of_a_member_is_named(bundle: Path, tmp_path: Path, reviewe
 def test_removed_added_or_exchanged_members_are_named(
     bundle: Path, tmp_path: Path, reviewer: Reviewer
 ) -> None:
-    """Covers each member removed, cut, or replaced by another member, and extra files."""
     members = members_of(bundle)
     for name, data in members.items():
         without = {other: data for other, data in members.items() if other != name}
@@ -204,7 +198,6 @@ def test_removed_added_or_exchanged_members_are_named(
 
 @pytest.mark.nightly
 def test_modules_in_the_folder_are_not_imported(bundle: Path, pem: Path, tmp_path: Path) -> None:
-    """A forger may put a json.py beside the verifier, or beside the copy that the reviewer makes."""
     folder = tmp_path / "unpacked"
     shutil.unpack_archive(bundle, folder)
     (folder / "json.py").write_text(
@@ -218,7 +211,6 @@ def test_modules_in_the_folder_are_not_imported(bundle: Path, pem: Path, tmp_pat
 
 @pytest.mark.nightly
 def test_a_bundle_cannot_control_the_terminal(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
-    """An escape sequence instead of a number could erase the result."""
     spoilt = "\x1b[2J\nvalid: the bundle is unchanged since the appliance sealed it"
 
     def change(records: list[dict[str, Any]]) -> None:
@@ -231,7 +223,6 @@ def test_a_bundle_cannot_control_the_terminal(bundle: Path, tmp_path: Path, revi
 
 
 def test_a_missing_bundle_is_named(tmp_path: Path, reviewer: Reviewer) -> None:
-    """The error explains the cause without an errno."""
     assert reviewer.status(tmp_path / "gone.zip") == 2
     assert reviewer.said == f"nothing can be verified: {tmp_path}/gone.zip: No such file or directory\n"
 
@@ -239,7 +230,6 @@ def test_a_missing_bundle_is_named(tmp_path: Path, reviewer: Reviewer) -> None:
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", ["manifest.json", "proof.json", "records.ndjson"])
 def test_large_members_use_little_memory(bundle: Path, tmp_path: Path, reviewer: Reviewer, name: str) -> None:
-    """A text of 100 MB that is small in the ZIP file is read piece by piece."""
     place = tmp_path / "x.zip"
     with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
         for member, data in members_of(bundle).items():
@@ -254,7 +244,6 @@ def test_large_members_use_little_memory(bundle: Path, tmp_path: Path, reviewer:
 
 @pytest.mark.nightly
 def test_a_duplicate_name_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
-    """Tools differ in which of two members with the same name they unpack."""
     with zipfile.ZipFile(bundle, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
         archive.writestr("policies/7.ini", members_of(bundle)["policies/7.ini"])
     assert reviewer.status(bundle) == 1
@@ -263,7 +252,6 @@ def test_a_duplicate_name_is_named(bundle: Path, tmp_path: Path, reviewer: Revie
 
 @pytest.mark.nightly
 def test_a_cut_or_damaged_file_is_never_valid(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
-    """After a cut or a changed byte the bundle is invalid, or only a header differs and each text is unchanged."""
     whole, members, chance = bundle.read_bytes(), members_of(bundle), random.Random(6)  # noqa: S311  the same each time
     place = tmp_path / "damaged.zip"
     for length in [0, 1, len(whole) - 1, *chance.sample(range(len(whole)), 5)]:
@@ -296,7 +284,6 @@ def _longer(place: Path) -> bytes:
 
 @pytest.mark.nightly
 def test_data_outside_members_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
-    """ZIP tools hide data before, between and after members, in comments, and in extra fields; here it is named."""
     members, place = members_of(bundle), tmp_path / "x.zip"
     whole = bundle.read_bytes()
 
@@ -352,7 +339,6 @@ def test_data_outside_members_is_named(bundle: Path, tmp_path: Path, reviewer: R
 def test_a_member_that_is_not_a_file_is_named(
     bundle: Path, tmp_path: Path, reviewer: Reviewer, kind: str
 ) -> None:
-    """A link, a pipe or a folder instead of a member is not followed or waited for."""
     folder = tmp_path / "unpacked"
     shutil.unpack_archive(bundle, folder)
     policy = folder / "policies/7.ini"
@@ -370,7 +356,6 @@ def test_a_member_that_is_not_a_file_is_named(
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", ["manifest.json", "proof.json", "records.ndjson", "audit.pub"])
 def test_a_pipe_does_not_block(bundle: Path, tmp_path: Path, reviewer: Reviewer, name: str) -> None:
-    """A named pipe is never opened as a member, bundle, key or file of checkpoints."""
     folder = tmp_path / "unpacked"
     shutil.unpack_archive(bundle, folder)
     (folder / name).unlink()
@@ -385,7 +370,6 @@ def test_a_pipe_does_not_block(bundle: Path, tmp_path: Path, reviewer: Reviewer,
 
 @pytest.mark.nightly
 def test_an_empty_file_is_not_a_bundle(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
-    """An empty bundle, folder or key is invalid, with a reason; an empty file of checkpoints has none."""
     empty = tmp_path / "empty"
     empty.touch()
     (tmp_path / "folder").mkdir()
@@ -398,7 +382,6 @@ def test_an_empty_file_is_not_a_bundle(bundle: Path, tmp_path: Path, reviewer: R
 def test_a_zip_bomb_is_not_unpacked(
     bundle: Path, tmp_path: Path, reviewer: Reviewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A ZIP file whose members overlap, or that unpacks to too much, is not read."""
     monkeypatch.setattr(bundle_verifier, "UNPACKED", 1 << 20)
     place, many = tmp_path / "x.zip", bytes(1 << 25)
     with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -428,7 +411,6 @@ def test_runs_are_in_order(bundle: Path, tmp_path: Path, reviewer: Reviewer, run
 
 
 def test_many_runs_take_few_steps() -> None:
-    """A lookup takes about as many comparisons as the number of runs has bits."""
     asked = 0
 
     class Counted(int):
@@ -502,7 +484,6 @@ def _invent(records: list[dict[str, Any]]) -> None:
 def test_a_forger_who_rehashes_has_no_signature(
     bundle: Path, tmp_path: Path, reviewer: Reviewer, change: Callable[[list[dict[str, Any]]], None]
 ) -> None:
-    """Changed records with a matching manifest do not match the log."""
     assert reviewer.status(written(lines(members_of(bundle), change), tmp_path / "x.zip")) == 1
     assert "manifest.json: does not match the hash in the log" in reviewer.said
     assert re.search(r"WRONG +(records?[ .]|checkpoint|policies)", reviewer.said), reviewer.said
@@ -512,7 +493,6 @@ def test_a_forger_who_rehashes_has_no_signature(
 def test_another_policy_with_a_matching_manifest_is_named(
     bundle: Path, tmp_path: Path, reviewer: Reviewer
 ) -> None:
-    """The record of the load has the hash of the text."""
     members = {**members_of(bundle), "policies/7.ini": OPEN.encode(), "specifications/2/a.rv": b"none"}
     assert reviewer.status(written(resealed(members), tmp_path / "x.zip")) == 1
     for place in ("policies/7.ini", "specifications/2/"):
@@ -523,7 +503,6 @@ def test_another_policy_with_a_matching_manifest_is_named(
 def test_a_bundle_of_another_key_is_invalid(
     bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The signature of a forger's own key is rejected if the reviewer has the right key."""
     other = Ed25519PrivateKey.generate().public_key()
     place = tmp_path / "other.pub"
     place.write_bytes(other.public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
@@ -536,7 +515,6 @@ def test_a_bundle_of_another_key_is_invalid(
 def test_copied_checkpoints_show_a_rewritten_history(
     bundle: Path, control: Control, tmp_path: Path, reviewer: Reviewer
 ) -> None:
-    """The copied checkpoints agree, or the first that differs is named; an unsigned copy proves nothing."""
     assert reviewer.status(bundle, "--json") == 0
     said = json.loads(reviewer.said)
     assert (said["ok"], said["findings"], said["kept_elsewhere"]) == (True, [], 0)
@@ -601,7 +579,6 @@ def _as_before(previous: bytes, columns: tuple[object, ...]) -> bytes:
 def test_a_load_before_the_upgrade_is_listed_as_unproven(
     make_log: MakeLog, tmp_path: Path, reviewer: Reviewer
 ) -> None:
-    """A bundle of version 0.1.0 is valid; the result says that no checkpoint covers its load."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("appliance.audit.log.log_writer.record_hash", _as_before)
         before = Control(make_log(checkpoint_seconds=3600))
@@ -628,7 +605,6 @@ def test_a_load_before_the_upgrade_is_listed_as_unproven(
 def test_records_removed_by_retention_are_listed(
     make_log: MakeLog, path: Path, notary: Notary, tmp_path: Path, reviewer: Reviewer
 ) -> None:
-    """The result names the removed loads and says that the state before them is unknown."""
     make_old(make_log, notary)
     passing = VirtualClock()
     with clock.using(passing):
@@ -647,7 +623,6 @@ def test_records_removed_by_retention_are_listed(
 
 @pytest.mark.nightly
 def test_copied_records_are_separate_runs(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
-    """Records that retention copied to the end of the log belong to their original time."""
     until = wall_ns() + 1
     for number in range(1200):
         control.log.record(decision(control.log, number))
@@ -666,7 +641,6 @@ def test_copied_records_are_separate_runs(control: Control, tmp_path: Path, revi
 def test_empty_and_too_large_time_spans_are_rejected(
     control: Control, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The error is a sentence, and no export is recorded."""
     with pytest.raises(BundleError, match="no record in that period"):
         export(control.log.path, TimeSpan(0, 1), control.ask, NAMES)
     monkeypatch.setattr(bundles, "MOST_RECORDS", 3)
@@ -675,7 +649,6 @@ def test_empty_and_too_large_time_spans_are_rejected(
 
 
 def test_an_export_needs_the_signer(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Without an answer the export ends after a timeout and names the signer."""
     monkeypatch.setattr("appliance.features.evidence.evidence_orders.SEAL_SECONDS", 0.2)
     log = open_log(path, signer=lambda _number, _text: None)
     running = Control(log)
@@ -687,7 +660,6 @@ def test_an_export_needs_the_signer(path: Path, monkeypatch: pytest.MonkeyPatch,
 
 @pytest.mark.nightly
 def test_a_text_changed_during_the_export_ends_it(control: Control) -> None:
-    """If a text changes during the export, the bundle matches its manifest or the export fails."""
     pieces = export(control.log.path, TimeSpan(control.begun, wall_ns() + 1), control.ask, NAMES)
     control.policies[7] = "[Nodes]\n"
     with pytest.raises(BundleError, match=r"policies/7\.ini changed during the export"):
@@ -695,7 +667,6 @@ def test_a_text_changed_during_the_export_ends_it(control: Control) -> None:
 
 
 def test_columns_are_packed_as_in_the_log() -> None:
-    """The verifier's MessagePack equals msgspec's, for every length and number where the format changes."""
     texts = ["é" * length for length in LENGTHS] + ["x" * length for length in (*LENGTHS, 65535, 65536)]
     numbers = [sign * (2**power + step) for power in range(63) for step in (-1, 0, 1) for sign in (-1, 1)]
     values = [None, *texts, *(text.encode() for text in texts), *NUMBERS, *numbers, -(2**63), 2**64 - 1]
@@ -707,7 +678,6 @@ def test_columns_are_packed_as_in_the_log() -> None:
 
 
 def test_the_verifier_runs_on_python_3_8() -> None:
-    """It imports only the standard library, and has no newer syntax."""
     tree = ast.parse(VERIFIER.read_text(), feature_version=(3, 8))
     imported = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
     imported |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}

@@ -38,7 +38,6 @@ def checked(workers: Workers, bundle: Path, key: Ed25519PrivateKey, seconds: flo
 def test_a_bundle_cannot_use_up_the_memory(
     control: Control, key: Ed25519PrivateKey, workers: Workers, tmp_path: Path
 ) -> None:
-    """A small file whose manifest needs much memory is invalid; then the same worker accepts a valid bundle."""
     bundle, bomb = control.exported(tmp_path / "bundle.zip"), tmp_path / "bomb.zip"
     with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in members_of(bundle).items():
@@ -53,7 +52,6 @@ def test_a_bundle_cannot_use_up_the_memory(
 def test_a_bundle_cannot_use_up_the_time(
     control: Control, key: Ed25519PrivateKey, workers: Workers, tmp_path: Path
 ) -> None:
-    """The limit of processor time ends the whole verification, not only that of a member."""
     members, bomb = members_of(control.exported(tmp_path / "bundle.zip")), tmp_path / "bomb.zip"
     manifest = json.loads(members["manifest.json"])
     names = [f"policies/{number}.ini" for number in range(100, 105)]
@@ -69,7 +67,6 @@ def test_a_bundle_cannot_use_up_the_time(
 def test_findings_are_few_and_short(
     control: Control, key: Ed25519PrivateKey, workers: Workers, tmp_path: Path
 ) -> None:
-    """A bundle with many faults, and names that are long or have control characters, has a short verdict."""
     members = members_of(control.exported(tmp_path / "bundle.zip"))
     members |= {f"\x1b{number}{'x' * 5000}": b"" for number in range(50)}
     with pytest.raises(EvidenceError) as error:

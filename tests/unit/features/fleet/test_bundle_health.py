@@ -60,7 +60,6 @@ def test_denials_are_counted_by_host() -> None:
 
 
 def test_denials_that_the_new_policy_causes_do_not_count() -> None:
-    """Hosts that lose a right by it do not count, however many they are; the robot's nodes and other hosts do."""
     hosts = [f"10.1.0.{number}" for number in range(1, 5)]
     narrower = compile_policy(
         "[Publishers]\ndefault = robot 10.0.0.0/24 10.1.0.1 10.1.0.2 10.1.0.3 10.1.0.4 10.1.0.5\n/stop/* = robot\n",

@@ -228,7 +228,6 @@ def timely(client: Client, url: str, reason: str, patch: pytest.MonkeyPatch) -> 
 def test_a_collector_that_misbehaves_in_the_handshake(
     name: str, client: Client, authority: FleetAuthority, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No client waits longer than an exchange takes, and all report the reason."""
     lie, reason = IN_HANDSHAKE[name]
     with lying_collector(authority.server_context, Visitor.wait, lie) as url:
         timely(client, url, reason, monkeypatch)
@@ -238,7 +237,6 @@ def test_a_collector_that_misbehaves_in_the_handshake(
 def test_a_collector_that_misbehaves_in_its_answer(
     name: str, client: Client, authority: FleetAuthority, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No client waits longer than an exchange takes, grows or follows, and all report the reason."""
     lie, reason = IN_ANSWER[name]
 
     def answer(visitor: Visitor) -> None:
@@ -253,7 +251,6 @@ def test_a_collector_that_misbehaves_in_its_answer(
 def test_a_collector_that_misbehaves_after_an_upload(
     name: str, pusher: Client, authority: FleetAuthority, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A segment without a usable answer does not count, and leaves no file."""
     lie, reason = IN_ANSWER[name]
     with lying_collector(authority.server_context, honest_until_the_upload(lie)) as url:
         timely(pusher, url, reason, monkeypatch)
@@ -275,7 +272,6 @@ def honest_until_the_upload(lie: Lie) -> Lie:
 def test_an_upload_that_the_collector_does_not_take(
     pause: float, authority: FleetAuthority, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A collector that reads nothing of an upload, or a byte now and then, does not hold the client."""
     monkeypatch.setattr(connection, "_EXCHANGE_SECONDS", _SECONDS)
     monkeypatch.setattr(connection, "_SLOWEST_UPLOAD", 1 << 40)
     size = 64 << 20
@@ -294,8 +290,6 @@ def test_an_upload_that_the_collector_does_not_take(
 
 
 def test_the_reason_of_an_early_refusal_arrives(authority: FleetAuthority) -> None:
-    """A collector that refuses an upload before its end gives its reason, its status and the time to wait."""
-
     def answer(visitor: Visitor) -> None:
         visitor.request()
         visitor.give(b"the disk is full", "503 Service Unavailable", "Retry-After: 60")
@@ -308,7 +302,6 @@ def test_the_reason_of_an_early_refusal_arrives(authority: FleetAuthority) -> No
 
 
 def test_a_connection_is_used_again_and_replaced_files_apply_to_the_next(authority: FleetAuthority) -> None:
-    """Exchanges share a connection while it lasts; the next connection reads the certificate files again."""
     visitors: list[Visitor] = []
 
     def answer(visitor: Visitor) -> None:
@@ -334,7 +327,6 @@ def test_a_connection_is_used_again_and_replaced_files_apply_to_the_next(authori
 def test_an_event_stream_ends_when_it_is_silent(
     authority: FleetAuthority, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Events arrive as long as the collector sends something in time."""
     monkeypatch.setattr(connection, "_SILENT_SECONDS", 1.5)
 
     def answer(visitor: Visitor) -> None:

@@ -31,7 +31,6 @@ OTHER = Fleet(collector="https://10.0.0.9:8444", robot="arm8", **FILES)
 def test_an_appliance_that_did_not_join_raises_an_alarm(
     takeovers: list[tuple[str, Fleet]], alarms: int, tmp_path: Path
 ) -> None:
-    """Each start of an active appliance compares its fleet with that of the other one, until both agree."""
     store = StateStore(tmp_path, failed=lambda _reason: None, kind=InlineDatabase)
     said: list[str] = []
     trail = cast(AuditTrail, SimpleNamespace(happened=lambda _event, reason, **_detail: said.append(reason)))

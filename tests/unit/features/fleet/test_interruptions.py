@@ -64,7 +64,6 @@ def killed_at(step: int, folder: Path) -> None:
 
 
 def test_a_kill_at_any_step_loses_nothing(site: tuple[RobotSite, str], tmp_path: Path) -> None:
-    """Killed at every access to its files in turn, the client finds the new bundle, and still refuses the old time."""
     served, url = site
     old = served.timestamp
     step = 0

@@ -99,7 +99,6 @@ Make = Callable[[], SegmentPusher]
     "number", [10**18, 10**19, 10**400, 4000, -1], ids=["1e18", "1e19", "1e400", "4000", "-1"]
 )
 def test_a_head_beyond_the_question_is_refused(number: int, collector: Collector, make: Make) -> None:
-    """A number that was not asked for, however large, is a reported trouble, without further questions."""
     collector.head = lambda _upto: {"number": number, "hashes": ["0" * 64]}
     pusher = make()
     assert pusher.step() > 0
@@ -108,7 +107,6 @@ def test_a_head_beyond_the_question_is_refused(number: int, collector: Collector
 
 
 def test_a_head_with_wrong_hashes_ends_the_search(collector: Collector, make: Make) -> None:
-    """A collector that has another history for every number gets all segments, after a few questions."""
     collector.head = lambda upto: {"number": upto, "hashes": ["0" * 64] * 900}
     pusher = make()
     while pusher.step() == 0:
@@ -139,7 +137,6 @@ def test_a_head_without_a_receipt_does_not_count(collector: Collector, make: Mak
 def test_a_receipt_for_another_segment_is_refused(
     changes: dict[str, Any], collector: Collector, make: Make, tmp_path: Path
 ) -> None:
-    """A receipt, however well signed, counts only for the segment that was pushed."""
     collector.changes = changes
     pusher = make()
     pusher.step()
@@ -151,8 +148,6 @@ def test_a_receipt_for_another_segment_is_refused(
 def test_a_kill_between_receipt_and_position(
     collector: Collector, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Killed after the receipt and before the position is stored, the pusher repeats that segment, and misses none."""
-
     class KilledError(BaseException):
         """The end of the process."""
 
@@ -204,7 +199,6 @@ def test_a_wait_of_a_year_is_an_hour(collector: Collector, make: Make) -> None:
 
 
 def test_a_replaced_log_counts_from_its_beginning(collector: Collector, make: Make, path: Path) -> None:
-    """After another log took the place of the log, no receipt of the old one counts, even if the collector is gone."""
     pusher = make()
     while pusher.step() == 0:
         pass
@@ -218,7 +212,6 @@ def test_a_replaced_log_counts_from_its_beginning(collector: Collector, make: Ma
 
 
 def test_a_robot_without_records_is_present(collector: Collector, make: Make) -> None:
-    """It states every minute that nothing waits, and not while the collector refuses a segment."""
     pusher = make()
     collector.changes = {"segment": "0" * 64}
     pusher.step()
@@ -235,7 +228,6 @@ def test_a_robot_without_records_is_present(collector: Collector, make: Make) ->
 
 
 def test_a_collector_that_lost_segments_gets_them_again(collector: Collector, make: Make) -> None:
-    """A robot without new records sends what a restored collector lacks."""
     pusher = make()
     while pusher.step() == 0:
         pass
@@ -248,7 +240,6 @@ def test_a_collector_that_lost_segments_gets_them_again(collector: Collector, ma
 
 
 def test_a_standby_without_a_log_is_present(collector: Collector, make: Make, path: Path) -> None:
-    """An appliance that was never active has nothing to push; the lost log of another one is a trouble."""
     for file in path.parent.glob("audit.db*"):
         file.unlink()
     pusher = make()

@@ -37,7 +37,6 @@ def joined(state: Path) -> Path:
 
 
 def test_a_join_gives_the_section_fleet(file: Path, tmp_path: Path) -> None:
-    """The settings of a join apply; keys of the file override them, and a collector in the file replaces all."""
     folder = joined(tmp_path / "state")
     state = {"state": tmp_path / "state"}
     fleet = resolve(None, {}, state).of(Fleet)
@@ -61,7 +60,6 @@ def test_a_join_gives_the_section_fleet(file: Path, tmp_path: Path) -> None:
 
 
 def test_a_damaged_join_is_a_mistake(tmp_path: Path) -> None:
-    """An unreadable file of a join is reported with its path and the command that makes it again."""
     (joined(tmp_path) / "fleet.json").write_text("{")
     (found,) = mistakes(None, {"state": tmp_path})
     assert found.startswith(f"{tmp_path}/joined/fleet.json: cannot be used: ")
@@ -69,7 +67,6 @@ def test_a_damaged_join_is_a_mistake(tmp_path: Path) -> None:
 
 
 def test_wrong_bundles_beside_a_join_are_a_mistake(file: Path, tmp_path: Path) -> None:
-    """A value that is not a table is reported, also if a join has one."""
     joined(tmp_path / "state")
     file.write_text("state: state\nfleet: {bundles: 3}\n")
     (found,) = mistakes(file, {})
@@ -105,6 +102,5 @@ def test_a_collector() -> None:
     ],
 )
 def test_an_invalid_collector_is_rejected(fleet: dict[str, object], why: str) -> None:
-    """A useless or impossible setting is an error with its key and the reason."""
     with pytest.raises(ValidationError, match=why):
         read({"fleet": fleet})

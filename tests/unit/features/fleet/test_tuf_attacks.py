@@ -83,7 +83,6 @@ def refused(field: Field, word: str, robot: VerifiedBundles | None = None) -> No
 
 
 def test_an_honest_collector_serves_each_new_bundle(field: Field) -> None:
-    """A robot gets the selected bundle with all texts, and the next one after it."""
     files = bundle_files(monitors__a_dot_rv="monitor", policy_dot_ini_dot_tests_dot_yaml="cases: []")
     path = field.site.add(files)
     taken = field.poll()
@@ -94,13 +93,11 @@ def test_an_honest_collector_serves_each_new_bundle(field: Field) -> None:
 
 
 def test_without_a_selection_nothing_is_taken(field: Field) -> None:
-    """Without a selection the robot takes nothing, without an error."""
     field.site.selection = ""
     assert field.poll() is None
 
 
 def test_rollback_of_the_timestamp_is_rejected(field: Field) -> None:
-    """An older timestamp, validly signed, is rejected once the robot has seen a newer one, also after a restart."""
     old = field.site.timestamp
     field.site.add()
     assert field.poll() is not None
@@ -110,7 +107,6 @@ def test_rollback_of_the_timestamp_is_rejected(field: Field) -> None:
 
 
 def test_rollback_by_a_stolen_timestamp_key_is_rejected(field: Field) -> None:
-    """A new timestamp that names an older snapshot is rejected."""
     field.site.add()
     assert field.poll() is not None
     field.give(f"{METADATA}/timestamp.json", field.timestamp(snapshot=2))
@@ -126,7 +122,6 @@ def test_a_withdrawn_bundle_is_rejected(field: Field) -> None:
 
 
 def test_the_former_bundle_may_be_selected_while_it_is_signed(field: Field) -> None:
-    """Going back to a bundle that is still signed is the collector's choice: it is a delay, not a rollback."""
     first = field.site.selection
     field.site.add(keep=2)
     assert field.poll() is not None
@@ -137,13 +132,11 @@ def test_the_former_bundle_may_be_selected_while_it_is_signed(field: Field) -> N
 
 
 def test_freeze_ends_with_the_timestamp(field: Field) -> None:
-    """A collector that serves the same metadata forever is noticed when the timestamp expires."""
     field.give(f"{METADATA}/timestamp.json", field.timestamp(snapshot=3, days=-0.01))
     refused(field, "expired")
 
 
 def test_freeze_by_a_stolen_timestamp_key_ends_with_the_snapshot(tmp_path: Path) -> None:
-    """Fresh timestamps of an expired snapshot are rejected: the snapshot's key is offline."""
     months_ago = datetime.datetime.now(datetime.UTC).replace(microsecond=0) - datetime.timedelta(days=70)
     site = RobotSite(tmp_path / "site", now=lambda: months_ago)
     site.repository.add(SITE, GROUP, bundle_files(), everywhere())
@@ -154,7 +147,6 @@ def test_freeze_by_a_stolen_timestamp_key_ends_with_the_snapshot(tmp_path: Path)
 
 
 def test_fast_forward_is_undone_by_new_keys(field: Field) -> None:
-    """A thief may set the timestamp's version to the highest number; after a rotation of the keys, robots go on."""
     field.give(f"{METADATA}/timestamp.json", field.timestamp(snapshot=3, version=2**31))
     assert field.poll() is not None
     field.site.lies.clear()
@@ -169,7 +161,6 @@ def test_fast_forward_is_undone_by_new_keys(field: Field) -> None:
 
 
 def test_mix_and_match_is_rejected(field: Field) -> None:
-    """Targets of one time with a snapshot of another time are rejected."""
     site = field.site
     old = (site.repository.metadata / f"2.{SITE}.{GROUP}.json").read_bytes()
     site.add()
@@ -217,7 +208,6 @@ def test_slow_retrieval_is_cut(field: Field, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_the_wrong_target_is_rejected(field: Field) -> None:
-    """Other bytes in place of the signed bundle, such as an earlier one, are rejected."""
     path = field.site.add(bundle_files("[Nodes]\n"))
     found = {at.version: target for at, target in field.site.repository.bundles()}
     old = (field.site.repository.targets / found[1].get_prefixed_paths()[0]).read_bytes()
@@ -241,7 +231,6 @@ def test_arbitrary_software_is_rejected(field: Field) -> None:
 
 
 def test_a_group_key_signs_for_no_other_group(field: Field) -> None:
-    """Extraneous bundles: the key of one group lists a bundle of another; its robots do not find it."""
     repository = field.site.repository
     repository.delegate(SITE, "lifts")
     archive = pack(bundle_files())
@@ -264,7 +253,6 @@ def test_a_group_key_signs_for_no_other_group(field: Field) -> None:
 
 
 def test_bundles_of_other_robots_are_rejected(field: Field) -> None:
-    """A bundle of another group or another site, validly signed, is rejected without a download."""
     repository = field.site.repository
     for site, group in ((SITE, "lifts"), ("site-b", GROUP)):
         repository.delegate(site, group)
@@ -279,7 +267,6 @@ def test_bundles_of_other_robots_are_rejected(field: Field) -> None:
     "selection", ["../../etc/passwd", "x", "a/b/0.tar", "site-a/arms/1.tar\nsite-a", "\x00" * 900]
 )
 def test_an_invalid_selection_is_rejected(field: Field, selection: str) -> None:
-    """A selection that is not the name of a bundle is rejected."""
     field.site.selection = selection
     refused(field, "invalid")
 
@@ -299,7 +286,6 @@ def test_a_later_ring_does_not_take_a_bundle_early(field: Field) -> None:
 
 
 def test_a_compromised_root_key_is_replaced(field: Field) -> None:
-    """After a rotation of root, targets, snapshot and group keys, robots follow; the old keys sign nothing any more."""
     site, repository = field.site, field.site.repository
     old = {
         role: repository.keys.signers(role, repository.keyids_of(role)) for role in ("snapshot", "targets")
@@ -321,7 +307,6 @@ def test_a_compromised_root_key_is_replaced(field: Field) -> None:
 
 
 def test_a_root_that_the_old_root_did_not_sign_is_rejected(field: Field) -> None:
-    """A new root needs the signature of the root that robots trust."""
     foreign = RobotSite(field.folder / "foreign")
     foreign.repository.rotate("root")
     field.give(f"{METADATA}/2.root.json", (foreign.repository.metadata / "2.root.json").read_bytes())
@@ -329,7 +314,6 @@ def test_a_root_that_the_old_root_did_not_sign_is_rejected(field: Field) -> None
 
 
 def test_lost_knowledge_begins_with_the_given_root(field: Field) -> None:
-    """A robot without its folder of metadata begins with the root that it was given, and follows all rotations."""
     for _ in range(3):
         field.site.repository.rotate("root")
     field.site.add()
@@ -338,8 +322,6 @@ def test_lost_knowledge_begins_with_the_given_root(field: Field) -> None:
 
 
 def test_redirects_and_compression_are_not_followed(field: Field) -> None:
-    """The connection stays with the configured collector, and expands nothing."""
-
     def elsewhere(handler: http.server.BaseHTTPRequestHandler) -> None:
         handler.send_response(302)
         handler.send_header("Location", "https://127.0.0.1:1/")

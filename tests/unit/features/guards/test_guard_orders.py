@@ -70,7 +70,6 @@ async def row(orders: GuardOrders) -> Any:
 
 
 async def test_a_guard_is_stopping_while_it_acts(manager: Manager, orders: GuardOrders) -> None:
-    """Whether it drops, changes or publishes; acts before the start do not count."""
     manager.records.counts["change", "fence"] = 5
     orders.look()
     assert (await row(orders)).state == "free"
@@ -94,7 +93,6 @@ async def test_a_guard_is_withholding_while_its_relay_says_so(manager: Manager, 
 
 
 async def test_a_guard_is_shown_with_the_values_in_its_text(orders: GuardOrders) -> None:
-    """And with the types that it was made for."""
     found = await row(orders)
     assert (found.loads, found.types) == ({"polygon": "0,0 1,0 1,1"}, TYPES)
 
@@ -112,7 +110,6 @@ async def test_a_guard_is_shown_with_the_values_in_its_text(orders: GuardOrders)
 async def test_a_plan_says_what_a_change_would_do(
     manager: Manager, orders: GuardOrders, request_: Any, loads: str, changed: Any
 ) -> None:
-    """Nothing is loaded or set; a refusal is part of the plan."""
     manager.givens.states = lambda _checked, _name: [SimpleNamespace(name="margin", value=0.2, kind="double")]
     manager.shadow = True
     plan = await orders.plan(guard_requests.GuardTry(**{"name": "fence", **request_}), "eve")
@@ -126,7 +123,6 @@ async def test_a_plan_says_what_a_change_would_do(
 
 
 async def test_values_are_set_in_one_change(manager: Manager, orders: GuardOrders) -> None:
-    """A polygon and a constant come into force together, and a guard in shadow mode stays there."""
     manager.shadow = True
     values = {"polygon": "0,0 2,0 2,2", "margin": "0.5"}
     await orders.set(guard_requests.GuardSet("fence", values, "2.0"), "eve")
@@ -169,7 +165,6 @@ async def test_a_monitor_that_is_not_a_guard_is_unknown(orders: GuardOrders) -> 
 
 
 async def test_a_new_guard_is_loaded(manager: Manager, orders: GuardOrders) -> None:
-    """In shadow mode if wanted, with the time limit of the order."""
     request = guard_requests.GuardNew("speed", {"command": "/c"}, {"vMax": "0.3"}, {"command": TYPES["command"]},
                                       shadow=True, confirm_within=300.0)  # fmt: skip
     await orders.new(request, "eve")

@@ -60,7 +60,6 @@ def deadman(commands: list[tuple[int, bytes, str]], end: int, silent: float) -> 
 
 
 def test_a_deadman_stops_for_each_node_that_falls_silent() -> None:
-    """Before the first command nothing is sent; another node's commands do not keep those of a silent one in force."""
     random = seeded(1)
     for _trace in TRACES:
         guard = Guarded("deadman")
@@ -76,7 +75,6 @@ def test_a_deadman_stops_for_each_node_that_falls_silent() -> None:
 
 @pytest.mark.parametrize("gap", [280, 300, 301, 309, 340])
 def test_a_deadman_stops_within_its_time_and_a_tick(gap: int) -> None:
-    """The limit itself is not late; the stop comes at the next tick of 10 ms, and is repeated until a command."""
     guard = Guarded("deadman")
     for at in (20, 20 + gap):
         guard.drive(twist(0.5), at)
@@ -98,7 +96,6 @@ def axis(wanted: float, last: float, most: float, growth: float) -> float:
 
 
 def test_a_speed_limit_bounds_velocities_and_their_growth() -> None:
-    """Braking is free, a reversal begins at zero, NaN is zero; a command within the limits is untouched."""
     random = seeded(2)
     for _trace in TRACES:
         growth = random.choice((0.8, 20.0))
@@ -118,7 +115,6 @@ def test_a_speed_limit_bounds_velocities_and_their_growth() -> None:
 
 
 def test_a_limit_of_zero_stops() -> None:
-    """It is the least value of the range."""
     guard = Guarded("speed", vMax=0, wMax=0)
     assert guard.drive(twist(*[9.0] * 6), 100) == (0,) * 6
 
@@ -126,14 +122,12 @@ def test_a_limit_of_zero_stops() -> None:
 @pytest.mark.parametrize("place", range(6))
 @pytest.mark.parametrize("leg", SPEEDS)
 def test_only_finite_commands_are_sane(place: int, leg: float) -> None:
-    """Any other velocity stops the base, on each axis."""
     legs = [0.1] * 6
     legs[place] = leg
     assert Guarded("sane").drive(twist(*legs), 1) == (tuple(legs) if math.isfinite(leg) else (0,) * 6)
 
 
 def test_a_rate_drops_motions_and_never_a_stop() -> None:
-    """A naive bucket of tokens, with bursts and silence."""
     random = seeded(3)
     for _trace in TRACES:
         guard, left, before, at = Guarded("rate", interval=0.1, burst=3), 0.0, -math.inf, 0
@@ -189,7 +183,6 @@ def simulated(guard: Guarded, random: Any, x: float, y: float, turned: float) ->
 
 
 def test_a_base_stays_inside_a_fence() -> None:
-    """Driven at random with up to 1.4 m/s, turns, NaN and infinity, also by commands that are not repeated."""
     random = seeded(4)
     for _trace in range(examples(120)):
         depths = simulated(Guarded("fence"), random, random.uniform(-1.7, 1.7), random.uniform(-1.7, 1.7),
@@ -198,7 +191,6 @@ def test_a_base_stays_inside_a_fence() -> None:
 
 
 def test_a_base_outside_a_fence_only_comes_back() -> None:
-    """It never gets further away than in one step, and a motion back inside passes."""
     random = seeded(5)
     for _trace in range(examples(120)):
         side = random.choice(((3.0, 0.5), (-3.0, 1.0), (0.0, 3.0), (1.5, -3.0), (3.0, 3.0)))
@@ -212,7 +204,6 @@ def test_a_base_outside_a_fence_only_comes_back() -> None:
 
 
 def test_without_a_position_only_turns_pass() -> None:
-    """Before the first position, after half a second of silence, and for NaN."""
     guard = Guarded("fence")
     assert guard.drive(twist(0.1), 1)[0] == 0
     guard.tell("by", odometry(0, 0, 0), 2)
@@ -226,8 +217,6 @@ def test_without_a_position_only_turns_pass() -> None:
 
 
 def test_a_fence_by_satellites_is_in_metres_from_its_origin() -> None:
-    """For velocities in that frame; without a fix, or for those in the base's frame, motions stop."""
-
     def passes(metres: float, y: float, *, fixed: int = 0, world: bool = True) -> bool:
         guard = Guarded("fence", {"by": "sensor_msgs/NavSatFix"}, worldFrame=world, lat0=48, lon0=11,
                         polygon="-50,-50 50,-50 50,50 -50,50")  # fmt: skip
@@ -252,7 +241,6 @@ def scan(ranges: list[float], start: float = -math.pi) -> bytes:
 
 
 def test_a_base_can_stop_before_the_nearest_thing() -> None:
-    """The distance covers reaction, braking, a person's approach and the margin; the fastest such velocity passes."""
     random, (reaction, braking, person, margin) = seeded(6), (0.2, 1.0, 1.6, 0.3)
     for _trace in TRACES:
         guard = Guarded("separation", reaction=reaction, braking=braking, person=person, margin=margin)
@@ -276,7 +264,6 @@ def test_a_base_can_stop_before_the_nearest_thing() -> None:
 
 @pytest.mark.parametrize("start", [-math.pi, 0.0, -2 * math.pi])
 def test_a_sector_is_ahead_whatever_the_first_angle_is(start: float) -> None:
-    """A thing behind does not count, and motions backward pass."""
     guard = Guarded("separation", sector=0.5)
     places = [start + place * math.pi / 4 for place in range(8)]
     ahead = [0.4 if abs(math.remainder(angle, 2 * math.pi)) < 0.1 else 9.0 for angle in places]
@@ -291,7 +278,6 @@ def test_a_sector_is_ahead_whatever_the_first_angle_is(start: float) -> None:
 
 
 def test_a_blind_or_silent_scanner_stops() -> None:
-    """No reading within its range, an empty scan, and silence."""
     for ranges in ([], [math.nan] * 4, [0.0] * 4, [11.0] * 4):
         guard = Guarded("separation")
         guard.tell("by", scan(ranges), 1)

@@ -35,7 +35,6 @@ def compiled(text: str) -> Compiled:
 
 @pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
 def test_a_preset_is_valid_as_it_is_and_for_each_of_its_types(preset: Preset) -> None:
-    """Its parameters are those that the language reads; commands are judged by the module."""
     [code] = compiled(preset.text).specifications
     given = {one.name: (one.default, one.unit) for one in code.givens}
     read = {one.name: (one.default, one.unit) for one in preset.parameters if not one.loads}
@@ -56,7 +55,6 @@ def test_a_preset_is_valid_as_it_is_and_for_each_of_its_types(preset: Preset) ->
 
 
 def test_a_guard_is_an_ordinary_text_with_its_topics_types_and_values() -> None:
-    """The first line names them; the text leads back to the preset."""
     types = {"command": "geometry_msgs/TwistStamped", "by": "geometry_msgs/PoseStamped"}
     text = text_of(
         Guard("yard", PRESETS["fence"], {"command": "/base/cmd", "by": "/pose"}, types,
@@ -109,14 +107,12 @@ WRONG = [
 def test_a_guard_that_cannot_be_made_is_refused(  # noqa: PLR0917  a row
     preset: str, name: str, topics: dict[str, str], types: dict[str, str], values: dict[str, str], why: str
 ) -> None:
-    """The error says what to write instead."""
     with pytest.raises(GuardError) as error:
         text_of(Guard(name, PRESETS[preset], topics, types, values))
     assert why in str(error.value)
 
 
 def test_the_page_names_an_existing_test_for_each_fault() -> None:
-    """Only the death of the appliance's machine has none."""
     page = (ROOT / "docs" / "guards.md").read_text(encoding="utf-8")
     rows = page.partition("## When the base is stopped")[2].partition("###")[0].splitlines()
     last = [row.split("|")[-2].strip() for row in rows if row.startswith("| ") and "what fails" not in row]

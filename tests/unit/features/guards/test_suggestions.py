@@ -35,7 +35,6 @@ def text(proposal: Proposal, graph: list[TopicFacts]) -> str:
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_a_robot_is_guarded_without_editing_a_file(robot: str) -> None:
-    """The last topic before the base is guarded, not those of a multiplexer; all guards together are valid."""
     graph = graph_of(robot)
     found = proposals(graph)
     by_command: dict[str, list[str]] = {}
@@ -49,7 +48,6 @@ def test_a_robot_is_guarded_without_editing_a_file(robot: str) -> None:
 
 
 def test_values_follow_the_present_rates_and_the_frame_of_the_commands() -> None:
-    """A command at 10 Hz may be silent for half a second; MAVROS takes velocities in the frame of the position."""
     base = {one.preset: one for one in proposals(graph_of("turtlebot3"))}
     assert base["deadman"].command == "rosrv guard new deadman /cmd_vel --shadow silent=0.5"
     assert base["fence"].topics["by"] == "/odom"
@@ -86,14 +84,12 @@ PLANS = [
 def test_a_guard_that_the_graph_contradicts_is_refused(
     preset: str, topics: dict[str, str], kinds: dict[str, str], why: str
 ) -> None:
-    """The error names the topic, its type, and what fits."""
     with pytest.raises(GuardError) as error:
         text_of(planned(PRESETS[preset], "guard", topics, graph_of("turtlebot3"), {}, kinds))
     assert why in str(error.value)
 
 
 def test_a_topic_that_comes_later_has_the_type_that_is_given() -> None:
-    """And an action's topics follow from its goal."""
     later = planned(
         PRESETS["speed"], "later", {"command": "/new"}, [], {}, {"command": "ackermann_msgs/AckermannDrive"}
     )

@@ -80,7 +80,6 @@ def run(verb: Any, robot: Robot, *arguments: Any, **options: Any) -> Any:
 
 
 def test_a_new_guard_is_loaded_and_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """In shadow mode if wanted; the file in the folder is what was loaded."""
     order = run(verbs.new, Robot(tmp_path), "fence", "/cmd_vel", ["margin=0.5"], by="/odom", shadow=True)
     assert (order.shadow, order.hold, order.note[:14]) == (True, False, "preset fence 1")
     assert (tmp_path / "fence.rv").read_text() == order.files["fence.rv"]
@@ -113,7 +112,6 @@ def test_a_guard_that_may_roll_back_is_not_written(tmp_path: Path) -> None:
 
 
 def test_a_name_that_is_taken_is_refused(tmp_path: Path) -> None:
-    """Nothing is loaded."""
     robot = Robot(tmp_path, FENCE)
     with pytest.raises(GuardError, match="a monitor fence is loaded: give --name"):
         run(verbs.new, robot, "fence", "/cmd_vel", by="/odom")
@@ -121,7 +119,6 @@ def test_a_name_that_is_taken_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_constant_is_set_and_a_polygon_is_loaded(tmp_path: Path) -> None:
-    """A guard in shadow mode stays there; a wrong value changes nothing."""
     robot = Robot(tmp_path, FENCE, shadow=True)
     run(verbs.set_values, robot, "fence", ["margin=0.5", "polygon=0,0 1,0 1,1"])
     load, constant = robot.orders
@@ -150,7 +147,6 @@ def test_a_guard_is_brought_into_force_and_removed(tmp_path: Path) -> None:
 
 
 def test_lists_and_proposals_are_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Each preset with its parameters; each proposal as a command, with the defaults that are to be checked."""
     run(verbs.list_guards, Robot(tmp_path, FENCE))
     shown = capsys.readouterr().out
     assert all(f"{name}: {preset.what}" in shown for name, preset in PRESETS.items())

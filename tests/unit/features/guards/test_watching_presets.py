@@ -35,7 +35,6 @@ def button(on: bool) -> bytes:
 
 @pytest.mark.parametrize("hands", [False, True])
 def test_an_emergency_stop_stays_until_a_reset(hands: bool) -> None:
-    """A reset is an edge while the stop is released; with two hands, two nodes reset within two seconds."""
     random = seeded(7)
     for _trace in TRACES:
         guard, at = Guarded("estop", twoHands=hands), 0
@@ -85,7 +84,6 @@ def scan(ranges: list[float]) -> bytes:
 
 
 def test_a_sensor_is_silent_frozen_or_blind() -> None:
-    """A repeated message counts bit by bit; NaN is equal to NaN."""
     random = seeded(8)
     for _trace in TRACES:
         guard, at, heard = Guarded("sensor", frozen=3, least=0.5), 0, -math.inf
@@ -109,7 +107,6 @@ def test_a_sensor_is_silent_frozen_or_blind() -> None:
 
 @pytest.mark.parametrize("preset", ["sensor", "separation"])
 def test_a_scan_that_is_too_large_to_judge_stops_the_base(preset: str) -> None:
-    """It uses up the budget; the guard begins again, and waits for a scan that it can judge."""
     guard = Guarded(preset)
     near = message("sensor_msgs/LaserScan", ranges=[4.0], range_max=30.0)
     guard.tell("by", near, 1)
@@ -136,7 +133,6 @@ BLIND = {
 @pytest.mark.parametrize("preset", BLIND)
 @pytest.mark.parametrize("fault", ["NaN", "cut short"])
 def test_a_faulty_sensor_never_releases_the_base(preset: str, fault: str) -> None:
-    """NaN stops it at once, and bytes that are not a message count as silence."""
     guard, (good, bad) = Guarded(preset), BLIND[preset]
     guard.tell("by", good, 1)
     assert runs(guard, 2)
@@ -149,7 +145,6 @@ def test_a_faulty_sensor_never_releases_the_base(preset: str, fault: str) -> Non
 
 
 def test_many_values_are_compared_by_their_sum() -> None:
-    """A repeated scan is always found, and on the module."""
     guard = Guarded("sensor", frozen=2)
     for at, (first, moves) in enumerate(((1.0, True), (1.0, True), (1.0, False), (2.0, True)), 1):
         guard.tell("by", scan([first] + [3.0] * 5000), at)
@@ -157,7 +152,6 @@ def test_many_values_are_compared_by_their_sum() -> None:
 
 
 def test_a_moving_base_is_stopped_when_its_sensor_falls_silent() -> None:
-    """Within the limit and a tick, once."""
     guard = Guarded("sensor")
     guard.tell("by", scan([1.0]), 5)
     assert runs(guard, 10)
@@ -176,7 +170,6 @@ SENSED: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("kind", SENSED)
 def test_other_sensors_are_watched_likewise(kind: str) -> None:
-    """Rows of the preset, for each of its types."""
     assert set(SENSED) == {*PRESETS["sensor"].topics["by"]} - {"sensor_msgs/LaserScan"}
     guard = Guarded("sensor", {"by": kind}, frozen=2)
     for at, moves in ((1, True), (2, True), (3, False)):
@@ -224,7 +217,6 @@ def test_two_sources_agree_for_a_number_of_messages() -> None:
 def test_an_interlock_needs_battery_position_and_check(
     charge: float | None, fixed: int | None, checked: bool | None, passes: bool
 ) -> None:
-    """A value that was never heard is missing, and an old one also."""
     guard = Guarded("arm", charge=0.25, needFix=True, needCheck=True, silent=1)
     if charge is not None:
         guard.tell("by", message("sensor_msgs/BatteryState", percentage=charge), 1)
@@ -288,7 +280,6 @@ def with_id(name: str, before: int, behind: int) -> bytes:
 
 
 def test_a_goal_without_a_result_is_cancelled() -> None:
-    """Only that one, once; a goal without an id is dropped, and never cancels all others."""
     guard = Guarded("answer", limit="2s")
     goals = [
         guard.tell("command", with_id(name, 24, 72), at) for name, at in (("a", 1), ("b", 500), ("", 600))

@@ -126,7 +126,6 @@ def test_tunnels_are_measured() -> None:
 
 
 def test_the_page_matches_the_code() -> None:
-    """docs/reference/metrics.md lists all metrics (python -m appliance.telemetry.metric_table)."""
     generated = PAGE.read_text().split("<!-- generated: python -m appliance.telemetry.metric_table -->\n")[1]
     assert generated.startswith(markdown())
 

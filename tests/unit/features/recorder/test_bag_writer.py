@@ -46,7 +46,6 @@ def test_read_by_rosbags(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("torn", [0, 1, 50, 200])
 def test_another_writer_continues_a_bag(tmp_path: Path, torn: int) -> None:
-    """A bag that ends in the middle of a chunk keeps all earlier chunks, and can be continued."""
     path = tmp_path / "left.bag"
     bag = BagWriter(tmp_path / "a.bag", {})
     size = bag.write([BagMessage(bag.connect(HEADER), SECOND, body(b"one"))])
@@ -61,7 +60,6 @@ def test_another_writer_continues_a_bag(tmp_path: Path, torn: int) -> None:
 
 
 def test_data_lost_in_a_power_cut_is_left_out_and_reported(tmp_path: Path) -> None:
-    """After a cut at any byte all whole chunks except the last stay, and the bag can be continued."""
     path, whole, headers = (
         tmp_path / "cut.bag",
         tmp_path / "whole.bag",
@@ -92,7 +90,6 @@ def test_data_lost_in_a_power_cut_is_left_out_and_reported(tmp_path: Path) -> No
 
 
 def test_stock_tools_find_beginning_and_end(tmp_path: Path) -> None:
-    """Stock tools read beginning and end from the first and last chunk, in any order of the chunks."""
     bag = BagWriter(tmp_path / "a.bag", {})
     chatter = bag.connect(HEADER)
     for times in ((5, 9), (3, 4), (7, 8)):

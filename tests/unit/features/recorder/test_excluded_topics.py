@@ -41,7 +41,6 @@ def test_the_sums_of_excluded_types_are_those_of_their_definitions() -> None:
 def test_a_publishers_type_is_compared_with_the_definition(
     topic: str, type_name: str, md5sum: str, why: str
 ) -> None:
-    """A topic whose claimed type is in `never`, but whose md5sum is another type's, is recorded."""
     never = ["/camera/*", IMAGE, "my_msgs/Face"]
     found = left_out_because(never, known_sums(never), topic, {"type": type_name, "md5sum": md5sum})
     assert found.endswith(why) if why else found == ""

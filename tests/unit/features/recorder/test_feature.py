@@ -12,7 +12,6 @@ BY_NAME = {role.name: role for role in ROLES}
 
 
 def test_the_recorder_runs_only_if_configured() -> None:
-    """The recorder has its own user and no network, and reads the audit log; the api reads its recordings."""
     recorder = BY_NAME["recorder"]
     assert recorder in roles_of(sections=Sections({RecorderRules: RecorderRules(enabled=True)}))
     assert recorder not in roles_of()

@@ -24,7 +24,6 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.mark.parametrize("what", ["bytes", "files"])
 def test_each_step_on_a_full_disk(disk: Path, tmp_path: Path, what: str) -> None:
-    """The disk fills before each step in turn: orders are answered, no half recording stays, and recording resumes."""
     scene = Scene(tmp_path, disk=8 << 20)
     order = Trigger(scene.clock.now, "order", "r", "eve")
 

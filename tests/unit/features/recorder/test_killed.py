@@ -85,7 +85,6 @@ def _read_both_ways(bag: Path, target: Path) -> int:
 
 @pytest.mark.parametrize("memory", ["same", "another"])
 def test_killed_at_each_file_operation(tmp_path: Path, memory: str) -> None:
-    """Each named recording is complete, removals are reported until they are noted, and no other file remains."""
     removed, kept, chatter = set[int](), set[int](), dict[str, int]()
     for operation in count(1):
         folder = tmp_path / str(operation)

@@ -52,13 +52,11 @@ def test_another_library_reads_it(tmp_path: Path, size: int) -> None:
 
 
 def test_a_bag_without_messages_is_a_valid_file(tmp_path: Path) -> None:
-    """The converted file has no messages, and is valid."""
     BagWriter(tmp_path / "a.bag", {}).close()
     assert read(tmp_path / "a.mcap", tmp_path / "a.bag") == ([], [])
 
 
 def test_a_file_that_is_not_a_bag_is_an_error(tmp_path: Path) -> None:
-    """The error is raised before the first byte is written."""
     (tmp_path / "a.bag").write_text("no bag")
     with pytest.raises(ValueError, match="not a bag"):
         next(as_mcap(tmp_path / "a.bag"))

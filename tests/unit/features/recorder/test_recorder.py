@@ -151,7 +151,6 @@ def test_before_and_after(scene: Scene) -> None:
 
 
 def test_a_recording_of_the_memory_is_temporary(scene: Scene) -> None:
-    """The recording has the requested time, as far as memory has it, for ten minutes or until the next recorder."""
     trigger = Trigger(BEGAN, "order", "r", "eve: of what is in memory")
 
     def asked(since: int, until: int) -> messages.Message:
@@ -207,7 +206,6 @@ def test_a_recording_of_the_memory_is_temporary(scene: Scene) -> None:
 
 
 def test_triggers_that_overlap_make_one_recording(scene: Scene) -> None:
-    """The recording is extended to the maximum length; later triggers begin another."""
     scene.happen()
     scene.later(0.1)
     for _second in range(20):
@@ -225,7 +223,6 @@ def test_triggers_that_overlap_make_one_recording(scene: Scene) -> None:
 
 
 def test_a_flood_of_triggers_does_not_fill_the_disk(tmp_path: Path) -> None:
-    """Each kind begins a limited number of recordings an hour; control gets one report, and orders still work."""
     scene = Scene(tmp_path, per_hour=3)
     told: list[messages.Message] = []
     for _minute in range(10):
@@ -251,7 +248,6 @@ def planned(scene: Scene, recording_id: str, charged_to: str) -> str:
 
 
 def test_a_planned_recording_is_made(scene: Scene) -> None:
-    """A recording has the id from the audit record, and includes later triggers while it is open."""
     first = planned(scene, "a" * 20, "10.0.0.9")
     scene.later(1)
     second = planned(scene, "a" * 20, "10.0.0.9")
@@ -266,7 +262,6 @@ def test_a_planned_recording_is_made(scene: Scene) -> None:
 
 
 def test_a_guest_does_not_change_the_robots_recording(scene: Scene) -> None:
-    """Robot and guest have separate recordings at the same time, also over a restart of the recorder."""
     planned(scene, "a" * 20, "10.0.0.9")
     scene.later(1)
     planned(scene, "b" * 20, "robot")
@@ -284,7 +279,6 @@ def test_a_guest_does_not_change_the_robots_recording(scene: Scene) -> None:
 
 
 def test_a_recording_that_cannot_be_made_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a full disk control learns of each missing recording."""
     scene = Scene(tmp_path)
     monkeypatch.setattr(RecordingStore, "free", property(lambda _self: 0))
     for name in ("a" * 20, "b" * 20):
@@ -296,7 +290,6 @@ def test_a_recording_that_cannot_be_made_is_reported(tmp_path: Path, monkeypatch
 
 
 def test_a_flood_of_service_calls_does_not_fill_the_disk(tmp_path: Path) -> None:
-    """Service calls have an hourly limit, as triggers do: each call is answered, and control gets one report."""
     scene = Scene(tmp_path, per_hour=2)
     told: list[messages.Message] = []
     for number in range(6):
@@ -315,7 +308,6 @@ def test_a_flood_of_service_calls_does_not_fill_the_disk(tmp_path: Path) -> None
 
 
 def test_a_recording_has_at_most_an_eighth_of_the_disk(tmp_path: Path) -> None:
-    """Messages beyond an eighth of the disk are counted, and the recording says why it ended."""
     scene = Scene(tmp_path, disk=8 * 100_000)
     scene.happen()
     for _message in range(12):
@@ -330,7 +322,6 @@ def test_a_recording_has_at_most_an_eighth_of_the_disk(tmp_path: Path) -> None:
 
 
 def test_excluded_topics_are_listed_with_the_reason(scene: Scene) -> None:
-    """The configuration may exclude a topic; one that only claims an excluded type makes a recording incomplete."""
     named = scene.writer.open("/camera", "10.0.0.1", HEADER | {LEFT_OUT: NAMED})
     assert named is not None
     ExcludedStream(named).write(memoryview(frame(TEXT)), 1, 1)
@@ -357,7 +348,6 @@ def test_excluded_topics_are_listed_with_the_reason(scene: Scene) -> None:
 
 
 def test_messages_that_had_left_the_memory_are_reported(scene: Scene) -> None:
-    """The description lists the topics whose oldest messages are gone."""
     for _message in range(30):
         scene.say(bytes(100_000))
     scene.happen()
@@ -368,7 +358,6 @@ def test_messages_that_had_left_the_memory_are_reported(scene: Scene) -> None:
 
 
 def test_the_next_recorder_continues_after_a_crash(scene: Scene) -> None:
-    """The recording keeps its name, and has each message once and the trigger once."""
     scene.happen()
     scene.later(0.1)
     [part] = scene.folder.iterdir()
@@ -399,7 +388,6 @@ def test_a_restart_of_the_appliance_ends_a_recording(scene: Scene) -> None:
 
 
 def test_a_late_recorder_handles_earlier_triggers(scene: Scene) -> None:
-    """A new recorder handles triggers that its memory still covers; a trigger with a recording begins no second one."""
     scene.happen()
     scene.clock.now += 3 * SECOND
     scene.begin_anew()
@@ -412,7 +400,6 @@ def test_a_late_recorder_handles_earlier_triggers(scene: Scene) -> None:
 
 
 def test_a_recording_is_reported_until_it_is_noted(scene: Scene) -> None:
-    """A recording can be removed by order; an order for an unknown recording is refused."""
     scene.happen()
     [opened] = [
         said.recording for said in scene.later(0.1) if isinstance(said, recorder_link.RecordingOpened)
@@ -432,7 +419,6 @@ def test_a_recording_is_reported_until_it_is_noted(scene: Scene) -> None:
 
 
 def test_revisions_are_the_last_that_control_sent(scene: Scene) -> None:
-    """The revisions are read when a recording begins and when it ends."""
     scene.happen()
     assert recorder_link.RevisionsWanted() in scene.later(0.1)
     scene.later(0, recorder_link.RevisionsStated(4, 2))
@@ -441,7 +427,6 @@ def test_revisions_are_the_last_that_control_sent(scene: Scene) -> None:
 
 
 def test_a_header_that_is_not_text_is_recorded(scene: Scene) -> None:
-    """Comments in Latin-1 in a definition, and any bytes in a field, still give a readable bag."""
     hostile = {"message_definition": "# caf\udce9\nstring data\n", "latching": "x", "type": "t" * 10_000}
     scene.stream = scene.writer.open("/cafe", "10.0.0.2", HEADER | hostile)
     scene.said = 0
@@ -461,7 +446,6 @@ def test_a_header_that_is_not_text_is_recorded(scene: Scene) -> None:
 def test_a_recorder_killed_after_the_last_write_loses_nothing(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Only the final name is missing: the appliance's next start, with a new memory, names the recording."""
     scene.happen()
     scene.later(0.1)
 
@@ -481,7 +465,6 @@ def test_a_recorder_killed_after_the_last_write_loses_nothing(
 
 
 def test_a_clock_that_is_set_back_ends_one_recording_only(scene: Scene) -> None:
-    """The clock goes back an hour, to before the memory was made: the recording ends, and the next one is normal."""
     scene.happen()
     scene.later(0.1)
     scene.clock.now -= 100 * SECOND
@@ -497,7 +480,6 @@ def test_a_clock_that_is_set_back_ends_one_recording_only(scene: Scene) -> None:
 
 
 def test_the_number_of_headers_is_bounded(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Messages whose headers exceed the limit are missing, and the recording says so; other messages are in it."""
     monkeypatch.setattr("appliance.features.recorder.recording._MOST_HEADERS", 20_000)
     scene.happen()
     scene.later(0.1)

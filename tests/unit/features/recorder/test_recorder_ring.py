@@ -44,7 +44,6 @@ def kept(descriptor: int) -> list[tuple[str, bytes]]:
 
 
 def test_messages_dropped_by_monitors_are_recorded(memory: int) -> None:
-    """Each message is recorded as received, with the publisher's true name and host, for the whole connection."""
     story = Story(sink=given(memory))
     story.topic.monitor(lambda _batch: None, wanted=True)
     member = story.join()
@@ -74,7 +73,6 @@ def test_excluded_topics_are_not_recorded(memory: int, never: tuple[str, ...]) -
 
 
 def test_a_topic_with_the_sum_of_another_type_is_recorded(memory: int) -> None:
-    """A guest's string that claims a camera's type is still recorded."""
     sums = known_sums(["sensor_msgs/Image"])
     recorded = RecorderRing(RingTerms(0, 1, 60, ["/*"], ["sensor_msgs/Image"], sums), os.dup(memory), wall_ns)
     header = {"type": "sensor_msgs/Image", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1", "callerid": "/g"}
@@ -85,7 +83,6 @@ def test_a_topic_with_the_sum_of_another_type_is_recorded(memory: int) -> None:
 
 
 def test_a_judged_message_has_the_time_of_its_judgement(memory: int) -> None:
-    """An unjudged message has the time of its recording; both follow a change of the clock."""
     second, machine = 10**9, VirtualClock(wall=5000)
     with using(machine):
         stream = given(memory, now=lambda: 5000 * second + 7).open("/chatter", "10.0.0.1", HEADER)
@@ -101,7 +98,6 @@ def test_a_judged_message_has_the_time_of_its_judgement(memory: int) -> None:
 
 @pytest.mark.parametrize("size", [10, 100_000])
 def test_each_message_is_recorded_once(memory: int, size: int) -> None:
-    """This holds for any length, and for messages that monitors publish later on their own topic."""
     story = Story(sink=given(memory))
     member = story.join()
     story.topic.upstream_opened(HEADER)
@@ -112,7 +108,6 @@ def test_each_message_is_recorded_once(memory: int, size: int) -> None:
 
 
 def test_a_connection_that_ends_within_a_message_is_no_longer_recorded(memory: int) -> None:
-    """Delivering a message may end the topic; the remaining bytes then belong to no connection."""
     story = Story(sink=given(memory))
     story.join()
     story.topic.upstream_opened(HEADER)

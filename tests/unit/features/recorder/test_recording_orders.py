@@ -194,7 +194,6 @@ async def test_orders_have_the_name_of_their_operator() -> None:
 
 
 async def test_an_open_recording_is_listed(scene: Scene) -> None:
-    """Until it is closed, a recording has its end as the plan extends it, and a request for it answers when to ask."""
     ours, recorder = memory_link(recorder_link.RecorderLink)
     scene.orders.link.attach(ours)
     opened = OpenRecording(KEPT.id, 1_000, 5 * 10**9, Trigger(1_000, "drop", "record", "so"))

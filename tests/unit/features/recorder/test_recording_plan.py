@@ -43,7 +43,6 @@ def dropped() -> Callable[..., dict[str, str]]:
 
 
 def test_each_host_has_its_own_hour_of_each_kind() -> None:
-    """The hourly limit is per host and kind, also over a restart: saved recordings count."""
     limit = HourlyLimit(2, [recording(1, "drop", charged_to=GUEST)])
     now = 10 * SECOND
 
@@ -58,7 +57,6 @@ def test_each_host_has_its_own_hour_of_each_kind() -> None:
 
 
 def test_a_guests_flood_leaves_the_robot_its_recording(dropped: Callable[..., dict[str, str]]) -> None:
-    """A guest's drops use up only the guest's hourly limit, and each record says so; the robot gets its recording."""
     plan = made(longest=80)
     said = [dropped(plan, GUEST, NOW + number * 20 * SECOND) for number in range(100)]
     recordings = {row["recording"] for row in said if "recording" in row}
@@ -78,7 +76,6 @@ def test_unknown_hosts_are_one(dropped: Callable[..., dict[str, str]]) -> None:
 
 
 def test_a_monitor_that_keeps_dropping_prolongs_one_recording(dropped: Callable[..., dict[str, str]]) -> None:
-    """With a drop each half minute for a quarter of an hour, the second recording continues the first."""
     plan = made(longest=3600)
     said = [dropped(plan, GUEST, NOW + number * 30 * SECOND)["recording"] for number in range(30)]
     assert [said.count(name) for name in dict.fromkeys(said)] == [1, 29]
@@ -99,7 +96,6 @@ def test_recordings_of_a_host_do_not_overlap() -> None:
 
 
 def test_a_recording_is_prolonged_to_the_maximum(dropped: Callable[..., dict[str, str]]) -> None:
-    """After the maximum another recording begins, within the hourly limit."""
     plan = made(longest=100)
     said = [dropped(plan, GUEST, NOW + number * 5 * SECOND) for number in range(21)]
     assert said[0] == said[8] != said[9]
@@ -109,7 +105,6 @@ def test_a_recording_is_prolonged_to_the_maximum(dropped: Callable[..., dict[str
 def test_hosts_together_have_two_open_recordings_and_the_robot_its_own(
     dropped: Callable[..., dict[str, str]],
 ) -> None:
-    """A third guest gets no recording but the reason; the robot still gets one."""
     plan = made()
     assert "recording" in dropped(plan, GUEST, NOW)
     assert "recording" in dropped(plan, "10.0.0.8", NOW)
@@ -119,7 +114,6 @@ def test_hosts_together_have_two_open_recordings_and_the_robot_its_own(
 
 
 def test_a_record_without_a_recording_has_the_reason(dropped: Callable[..., dict[str, str]]) -> None:
-    """The reason says that the recorder is off, or that the last recording could not be made."""
     assert "is off" in dropped(made(enabled=False), GUEST, NOW)["not_recorded"]
     plan = made()
     found = dropped(plan, GUEST, NOW)["recording"]
@@ -133,7 +127,6 @@ def test_a_record_without_a_recording_has_the_reason(dropped: Callable[..., dict
 def test_recordings_of_an_order_are_prolonged_and_closed_ones_are_not(
     dropped: Callable[..., dict[str, str]],
 ) -> None:
-    """Control knows which recordings began with a node's call, and which are closed."""
     plan = made()
     plan.opened(ROBOT, "asked", NOW - 60 * SECOND, NOW + 10 * SECOND)
     assert dropped(plan, "127.0.0.1", NOW)["recording"] == "asked"
@@ -154,7 +147,6 @@ def test_recordings_of_an_order_are_prolonged_and_closed_ones_are_not(
 
 
 def test_the_record_of_a_drop_says_which_recording_has_it() -> None:
-    """An alarm also names its recording; a record that is not a trigger names none."""
     rules = RecorderRules(enabled=True, per_hour=1, triggers=["drop", "alarm", "denial"])
     plan = RecordingPlan(rules, lambda host: host, IdSource().next)
     drop = plan.detail("message dropped", None, Severity.WARNING, "10.0.0.9", 1)

@@ -66,7 +66,6 @@ def room_for(store: RecordingStore, charged_to: str) -> tuple[list[tuple[Recordi
 
 
 def test_saved_recordings_are_found_again(tmp_path: Path) -> None:
-    """The next recorder finds saved recordings in time order; unfinished ones are parts, damaged ones are ignored."""
     store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
     second, first = put(store, recording(2)), put(store, recording(1))
     store.part("f" * 20).mkdir()
@@ -90,7 +89,6 @@ def test_saved_recordings_are_found_again(tmp_path: Path) -> None:
 
 
 def test_a_noted_recording_is_reported_once(tmp_path: Path) -> None:
-    """A recording is reported again until control has noted it."""
     store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
     first, second = put(store, recording(1)), put(store, recording(2))
     store.note(first.id)
@@ -112,7 +110,6 @@ def test_the_kind_with_most_bytes_makes_room(tmp_path: Path) -> None:
 
 
 def test_a_guest_makes_room_from_its_own_recordings(tmp_path: Path) -> None:
-    """However many recordings a guest causes, it has a quarter of the disk, and those of other hosts stay."""
     store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
     put(store, recording(1, size=8 * MIB, charged_to=ROBOT))
     put(store, recording(2, size=8 * MIB, charged_to="10.0.0.7"))
@@ -126,7 +123,6 @@ def test_a_guest_makes_room_from_its_own_recordings(tmp_path: Path) -> None:
 
 
 def test_no_guest_displaces_a_recording_of_the_robot(tmp_path: Path) -> None:
-    """Ten guests take the free space and then each other's; for the robot, half of the disk is cleared again."""
     store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
 
     def arrive(number: int, charged_to: str) -> str:
@@ -148,7 +144,6 @@ def test_no_guest_displaces_a_recording_of_the_robot(tmp_path: Path) -> None:
 
 
 def test_a_guest_has_no_recording_if_the_robot_uses_all(tmp_path: Path) -> None:
-    """The reason for the missing recording is reported."""
     store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
     for number in range(8):
         put(store, recording(number, size=8 * MIB, charged_to=ROBOT))
@@ -185,7 +180,6 @@ def test_old_recordings_are_removed(tmp_path: Path) -> None:
 
 
 def test_a_recording_of_an_earlier_version_ages_from_its_end(tmp_path: Path) -> None:
-    """The file with its time of saving is missing, or empty after a power cut."""
     age = 0
     store = RecordingStore(tmp_path, disk=64 * MIB, seconds=10, clock=lambda: age)
     (tmp_path / put(store, recording(1)).id / "since").unlink()

@@ -112,7 +112,6 @@ def test_records_across_blocks(memory: memoryview) -> None:
 
 
 def test_only_the_requested_time_is_read(memory: memoryview) -> None:
-    """Messages before and after the window are left out."""
     clock = Clock()
     stream = opened(ring(memory, clock))
     for number in range(1, 10):
@@ -122,7 +121,6 @@ def test_only_the_requested_time_is_read(memory: memoryview) -> None:
 
 
 def test_later_messages_are_for_the_next_call(memory: memoryview) -> None:
-    """A call that reads until now loses no message that arrives during the call."""
     clock = Clock(10)
     writer = ring(memory, clock)
     stream = opened(writer)
@@ -136,7 +134,6 @@ def test_later_messages_are_for_the_next_call(memory: memoryview) -> None:
 
 
 def test_table_that_changes_while_it_is_copied(memory: memoryview, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A block's row may be older than the next block's row: no message between them is lost."""
     writer = ring(memory)
     stream = opened(writer)
     for number in range(1, 4):
@@ -156,7 +153,6 @@ def test_table_that_changes_while_it_is_copied(memory: memoryview, monkeypatch: 
 
 
 def test_a_flood_displaces_only_itself(memory: memoryview) -> None:
-    """A flooding topic that writes a hundred rings full displaces neither a quiet topic nor one within its quota."""
     writer = ring(memory)
     quiet, busy, flood = (
         opened(writer, "/quiet"),
@@ -180,7 +176,6 @@ def test_a_flood_displaces_only_itself(memory: memoryview) -> None:
 
 
 def test_many_topics_of_a_host_displace_only_its_own(memory: memoryview) -> None:
-    """A host whose many topics keep their quotas has a limited part of the ring; other hosts' messages stay."""
     writer = ring(memory)
     quiet = opened(writer, "/quiet")
     quiet.write(memoryview(frame(b"here")), 1, 1)
@@ -192,7 +187,6 @@ def test_many_topics_of_a_host_displace_only_its_own(memory: memoryview) -> None
 
 
 def test_a_single_topic_may_fill_the_ring(memory: memoryview) -> None:
-    """A topic may use free space beyond its quota."""
     stream = opened(ring(memory))
     for number in range(1, 81):
         stream.write(memoryview(frame(bytes(10_000))), 1, number)
@@ -200,7 +194,6 @@ def test_a_single_topic_may_fill_the_ring(memory: memoryview) -> None:
 
 
 def test_large_messages_after_a_partly_displaced_one(memory: memoryview) -> None:
-    """All whole messages of many blocks are read after the start of the oldest message is gone."""
     stream = opened(ring(memory))
     for number in range(1, 41):
         stream.write(memoryview(frame(bytes([number]) * 150_000)), 1, number)
@@ -214,7 +207,6 @@ def test_large_messages_after_a_partly_displaced_one(memory: memoryview) -> None
 
 
 def test_a_record_beyond_the_quota_is_counted(memory: memoryview) -> None:
-    """A message larger than its topic's quota is dropped and counted; the next one is kept."""
     stream = opened(ring(memory))
     stream.write(memoryview(frame(bytes(SMALLEST // 2))), 1, 1)
     stream.write(memoryview(frame(b"small")), 1, 2)
@@ -224,7 +216,6 @@ def test_a_record_beyond_the_quota_is_counted(memory: memoryview) -> None:
 
 
 def test_headers_of_a_host_are_bounded(memory: memoryview) -> None:
-    """A host that opens stream after stream is refused at its limit and counted; another host still finds room."""
     writer = ring(memory)
     assert None in [writer.open(f"/t{index}", "10.0.0.2", HEADER) for index in range(1000)]
     assert RingReader(memory).not_there[1] > 0
@@ -232,7 +223,6 @@ def test_headers_of_a_host_are_bounded(memory: memoryview) -> None:
 
 
 def test_headers_end_with_their_streams(memory: memoryview) -> None:
-    """Closed and displaced streams free their headers: a thousand streams in succession find room."""
     writer = ring(memory)
     for number in range(1000):
         stream = opened(writer, f"/t{number}")
@@ -256,7 +246,6 @@ def test_the_next_writer_continues(memory: memoryview) -> None:
 
 
 def test_old_messages_are_dropped_first(memory: memoryview) -> None:
-    """A topic's old burst makes room for others; a quiet topic keeps all its messages."""
     clock = Clock()
     writer = ring(memory, clock)
     burst, seldom, flood = opened(writer, "/burst"), opened(writer, "/seldom"), opened(writer, "/flood")
@@ -273,7 +262,6 @@ def test_old_messages_are_dropped_first(memory: memoryview) -> None:
 
 
 def test_a_stream_that_lost_its_block_begins_another(memory: memoryview) -> None:
-    """A silent stream that lost its open block never writes into a block of another stream."""
     clock = Clock()
     writer = ring(memory, clock)
     silent, flood = opened(writer, "/silent"), opened(writer, "/flood")
@@ -348,7 +336,6 @@ def test_killed_at_random(tmp_path: Path) -> None:
 
 
 def test_hostile_bytes_do_no_harm(memory: memoryview) -> None:
-    """After any bytes of a compromised relay, reading ends within the ring, and a new writer can continue."""
     chance = random.Random(11)  # noqa: S311 - to find the same again
     for turn in range(60):
         stream = opened(ring(memory))

@@ -14,7 +14,6 @@ MIB = 1 << 20
 
 
 def test_a_relay_writes_its_own_part_and_the_recorder_reads_all() -> None:
-    """The recorder sees each write; all parts together have the configured size."""
     rings = RecorderRings(RecorderRules(memory=ByteSize(32 * MIB), topics=["/a*"], before=7), 2)
     [(given, written)] = rings.messages_for("relay", 1)
     assert [given.terms[name] for name in ("index", "seconds", "topics")] == [1, 7, ["/a*"]]
@@ -30,7 +29,6 @@ def test_a_relay_writes_its_own_part_and_the_recorder_reads_all() -> None:
 
 
 def test_no_process_shrinks_it_and_the_recorder_cannot_write() -> None:
-    """Only its relay can change a part, and no relay can make a read fail."""
     rings = RecorderRings(RecorderRules(memory=ByteSize(16 * MIB)), 1)
     [(_given, written)] = rings.messages_for("relay", 0)
     [(_given, read)] = rings.messages_for("recorder", 0)
@@ -45,7 +43,6 @@ def test_no_process_shrinks_it_and_the_recorder_cannot_write() -> None:
 
 
 def test_another_user_cannot_reopen_it_for_writing() -> None:
-    """The recorder can find the memory in /proc, but the mode of the file forbids writing."""
     rings = RecorderRings(RecorderRules(memory=ByteSize(16 * MIB)), 1)
     [(_given, read)] = rings.messages_for("recorder", 0)
     assert os.fstat(read).st_mode & 0o777 == 0o600
@@ -53,7 +50,6 @@ def test_another_user_cannot_reopen_it_for_writing() -> None:
 
 
 def test_the_memory_is_there_from_the_start() -> None:
-    """If memory is short, the start fails, instead of a recording during an incident."""
     rings = RecorderRings(RecorderRules(memory=ByteSize(16 * MIB)), 1)
     [(_given, written)] = rings.messages_for("relay", 0)
     assert os.fstat(written).st_blocks * 512 == 16 * MIB
@@ -61,6 +57,5 @@ def test_the_memory_is_there_from_the_start() -> None:
 
 
 def test_more_than_the_machines_memory_is_refused() -> None:
-    """The message gives advice before any process starts."""
     with pytest.raises(StartError, match=r"recorder\.memory: 1\.0PiB is more than .* set a smaller value"):
         RecorderRings(RecorderRules(memory=ByteSize(1 << 50)), 1)

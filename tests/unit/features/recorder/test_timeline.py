@@ -58,7 +58,6 @@ def bag(tmp_path: Path) -> Path:
 
 
 def test_flows_and_events_are_in_their_columns(bag: Path) -> None:
-    """Both publishers count together, taps are not events, and a part of the time span has its own columns."""
     found = timeline(RECORDING, bag, columns=10)
     [flow] = found.topics
     assert (flow.topic, flow.counts) == ("/chatter", [20] * 8 + [0, 0])
@@ -75,7 +74,6 @@ def test_flows_and_events_are_in_their_columns(bag: Path) -> None:
 
 
 def test_the_columns_equal_a_naive_count(bag: Path) -> None:
-    """For any number of columns, no message is counted twice or lost at an edge."""
     with BagReader.of(bag) as reader:
         times = [place.time for place, number in reader.messages({0, 1})]
     assert times == sorted(times)
@@ -91,7 +89,6 @@ def test_the_columns_equal_a_naive_count(bag: Path) -> None:
 
 
 def test_messages_around_a_moment_are_read(bag: Path) -> None:
-    """The messages of all publishers are in time order, with their senders; each page continues the last."""
     found = messages_around(RECORDING, bag, BEGAN + 2 * SECOND, neighbours=2)
     assert [(one.time - BEGAN, one.sender.node, one.fields["data"]) for one in found.messages] == [
         (1_900_000_000, "/talker", "0.19"),
@@ -113,14 +110,12 @@ def test_messages_around_a_moment_are_read(bag: Path) -> None:
 
 
 def test_the_chosen_message_of_a_time_is_the_last_until_then(bag: Path) -> None:
-    """A message after that time did not cause what happened then."""
     found = messages_around(RECORDING, bag, BEGAN + 2 * SECOND + SECOND // 50, neighbours=2)
     chosen = found.messages[found.chosen]
     assert (chosen.time - BEGAN, chosen.fields["data"]) == (2 * SECOND, "1.0")
 
 
 def test_the_chosen_message_of_a_record_is_the_one_that_it_is_about(tmp_path: Path) -> None:
-    """Neither a later message of its sender, nor one received together with it, nor another sender's is chosen."""
     path, judged = tmp_path / "a.bag", BEGAN + SECOND + 1_234_567
     happened = datetime.fromtimestamp(judged / 1e9, UTC).isoformat()
     detail = {"happened": happened, "before": body(b"7.5").hex()}
@@ -177,7 +172,6 @@ def test_pages_of_one_moment_end(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["2026-02-30", "10000-01-01", "2026-03-01", "", "1795155949800000000-4109"])
 def test_an_impossible_date_is_refused(text: str) -> None:
-    """An invalid position is rejected instead of showing the beginning."""
     assert MessagePosition.parsed(text) is None
     place = MessagePosition(1795155949800000000, 4109, 2210)
     assert MessagePosition.parsed(str(place)) == place
@@ -196,7 +190,6 @@ def test_publishers_cannot_forge_events(tmp_path: Path) -> None:
 
 
 def test_a_flood_of_events_is_counted(tmp_path: Path) -> None:
-    """Only the first events are listed, or those around a record, but the columns count all of them."""
     writer = BagWriter(tmp_path / "a.bag", {})
     decided = writer.connect(RECORDS)
     writer.write(
@@ -212,7 +205,6 @@ def test_a_flood_of_events_is_counted(tmp_path: Path) -> None:
 
 
 def test_counted_events_are_spread_over_their_time(tmp_path: Path) -> None:
-    """A record that stands for many events counts all of them, in any part of the time exactly once."""
     writer = BagWriter(tmp_path / "a.bag", {})
     detail = {"count": 999, "first_time": BEGAN + SECOND, "last_time": BEGAN + 4 * SECOND - 1}
     said = record(1, event="message dropped", severity="warning", detail=detail)
@@ -232,7 +224,6 @@ def test_counted_events_are_spread_over_their_time(tmp_path: Path) -> None:
 def test_repetitions_counted_after_the_end_are_in_the_lanes(
     bag: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The log counts repetitions up to ten seconds later: those during the recording are in the lanes."""
     ended = RECORDING.ended
     spans = [(ended - SECOND + 1, ended + SECOND), (ended + 1, ended + SECOND), (None, None)]
     later = [
@@ -251,7 +242,6 @@ def test_repetitions_counted_after_the_end_are_in_the_lanes(
 
 @pytest.mark.parametrize("torn", [b"no bag", b"#ROSBAG V2.0\n", None])
 def test_an_incomplete_bag_is_an_error(bag: Path, torn: bytes | None) -> None:
-    """Every kind of damage is reported."""
     bag.write_bytes(bag.read_bytes()[:-50] if torn is None else torn)
     with pytest.raises(ValueError, match="bag"):
         timeline(RECORDING, bag)

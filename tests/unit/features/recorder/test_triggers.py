@@ -27,7 +27,6 @@ KINDS: tuple[TriggerKind, ...] = get_args(TriggerKind)
     ],
 )
 def test_records_are_triggers_of_the_kind_that_is_wanted(record: AuditRecord, what: str | None) -> None:
-    """A record has one kind; an alarm that also has another kind counts as the other kind."""
     trigger = trigger_of(record, KINDS)
     assert (trigger and trigger.what) == what
     if trigger is not None:
@@ -48,11 +47,9 @@ def test_a_trigger_has_no_content_of_messages() -> None:
 
 
 def test_all_kinds_but_orders_can_be_configured() -> None:
-    """The configuration uses the same words for kinds as the recordings."""
     configurable = get_args(get_args(get_type_hints(RecorderRules)["triggers"])[0])
     assert set(configurable) == set(KINDS) - {"order"}
 
 
 def test_a_record_of_each_trigger_of_monitors_says_whether_it_was_recorded() -> None:
-    """`audit why` is never silent about an event that may trigger a recording."""
     assert _BY_EVENT.keys() == _ACTIONS

@@ -83,7 +83,6 @@ def test_a_refused_search_is_repeated(log: Log) -> None:
 
 @pytest.mark.nightly
 def test_an_unreadable_log_is_not_a_defect(log: Log) -> None:
-    """The result says that the record could not be checked, and why."""
     log.answers = [NotRunningError("https://h: too many requests")]
     found, text = outcome(log)
     assert found == "skip"

@@ -84,7 +84,6 @@ def world(tmp_path: Path) -> World:
 
 
 async def test_a_session_has_the_rights_of_its_role_and_is_recorded(world: World) -> None:
-    """Control knows the session by its reading key, requires a proof for a change, and names the person."""
     await world.sign_on(1, _person(doors=("floor",)))
     shown = reading_key(_token(1))
     assert await world.checks.asker(RequestMade(1, StatusWanted(), shown)) == "sso:alice"
@@ -132,7 +131,6 @@ async def test_a_person_signs_out_of_their_own_session_only(world: World) -> Non
 
 
 async def test_a_session_never_replaces_a_token(world: World) -> None:
-    """A browser that chooses the id of a token gets no rights of it, and takes none away."""
     made = await world.tokens.add(TokenAdd("boss", "admin", 3600))
     await world.sign_on(int(made.id, 16))
     assert [kept.name for kept in world.tokens.usable()] == ["boss"]

@@ -63,7 +63,6 @@ async def test_a_state_is_good_once_here_and_for_ten_minutes() -> None:
 
 
 async def test_the_code_of_another_sign_on_gives_nothing() -> None:
-    """The nonce and the verifier bind a code to the browser that began, although a thief knows a state of their own."""
     provider = ScriptedProvider()
     thief = await provider.begin("10.0.0.66")
     await provider.begin()

@@ -110,7 +110,6 @@ def following(holder: str = "a") -> Robot:
 
 
 def test_a_follower_admits_what_the_robot_admits() -> None:
-    """It saves the epoch first; a takeover changes the rules at the next answer."""
     robot = following()
     assert robot.saved == [2]
     robot.claim("b")
@@ -120,7 +119,6 @@ def test_a_follower_admits_what_the_robot_admits() -> None:
 
 
 def test_a_follower_never_admits_an_appliance_whose_lease_may_be_over() -> None:
-    """An answer counts from the time of its request: whenever the robot admits `b`, the follower has shut out `a`."""
     robot = following()
     request = robot.follower.request()
     robot.now += 0.1
@@ -136,7 +134,6 @@ def test_a_follower_never_admits_an_appliance_whose_lease_may_be_over() -> None:
 
 
 def test_without_answers_both_are_shut_out_after_one_expiry() -> None:
-    """The first answer admits the holder again."""
     robot = following()
     robot.now += EXPIRY
     robot.follower.tick()
@@ -146,7 +143,6 @@ def test_without_answers_both_are_shut_out_after_one_expiry() -> None:
 
 
 def test_after_a_reboot_of_the_robot_the_follower_waits_as_the_robot_does() -> None:
-    """The lease has a holder, which the robot does not admit before its renewal."""
     robot = following()
     robot.start_witness(robot.witness.record, boot="two")
     robot.look()
@@ -156,7 +152,6 @@ def test_after_a_reboot_of_the_robot_the_follower_waits_as_the_robot_does() -> N
 
 
 def test_an_answer_is_used_once_and_only_by_the_process_that_asked() -> None:
-    """A repeated answer, an older one and one to an earlier process change nothing."""
     robot = following()
     first, second = robot.answer(), robot.answer()
     assert first is not None and second is not None
@@ -174,7 +169,6 @@ def test_an_answer_is_used_once_and_only_by_the_process_that_asked() -> None:
 
 
 def test_an_older_answer_does_not_replace_a_newer_one() -> None:
-    """The robot was rebooted in between and admits no appliance; the epoch is the same."""
     robot = following()
     first = robot.answer()
     robot.start_witness(robot.witness.record, boot="two")
@@ -186,7 +180,6 @@ def test_an_older_answer_does_not_replace_a_newer_one() -> None:
 
 
 def test_an_answer_that_was_delayed_for_an_expiry_admits_no_appliance() -> None:
-    """An attacker who keeps a packet back gains nothing."""
     robot = following()
     answer = robot.answer()
     assert answer is not None
@@ -196,7 +189,6 @@ def test_an_answer_that_was_delayed_for_an_expiry_admits_no_appliance() -> None:
 
 
 def test_a_smaller_epoch_is_never_accepted() -> None:
-    """A witness that was restored from an older disk shuts out both on the followers, and they report the reason."""
     robot = Robot(epoch=7)
     robot.claim("a")
     robot.look()
@@ -216,7 +208,6 @@ def test_a_smaller_epoch_is_never_accepted() -> None:
 
 
 def test_a_smaller_epoch_is_rejected_whatever_the_witness_says() -> None:
-    """The follower itself compares the epochs."""
     robot = Robot(epoch=7)
     request = unseal(REQUEST, KEY, robot.follower.request())
     assert request is not None
@@ -227,7 +218,6 @@ def test_a_smaller_epoch_is_rejected_whatever_the_witness_says() -> None:
 
 
 def test_an_epoch_that_cannot_be_saved_admits_no_appliance() -> None:
-    """The time of the earlier one passes."""
     robot = following()
     robot.claim("b")
     robot.broken = True
@@ -242,7 +232,6 @@ def test_an_epoch_that_cannot_be_saved_admits_no_appliance() -> None:
 
 
 def test_rules_that_cannot_be_written_are_tried_again() -> None:
-    """Until then their state is unknown."""
     robot = following()
     robot.broken = True
     robot.now += EXPIRY
@@ -257,7 +246,6 @@ def test_rules_that_cannot_be_written_are_tried_again() -> None:
 
 @pytest.mark.parametrize("operation", [name for name in OPERATIONS if name != "look"])
 def test_a_follower_cannot_change_the_lease(operation: str) -> None:
-    """Its key is valid for `look` alone: R1 to R4 do not depend on it."""
     robot = following()
     before = robot.witness.record
     robot.now += EXPIRY
@@ -292,7 +280,6 @@ ANSWERED = {"session": "first", "number": 1, "ok": True, "epoch": 2, "admitted":
     ],
 )
 def test_a_malformed_answer_changes_nothing(change: dict[str, object]) -> None:
-    """Even with a valid authentication code."""
     robot = Robot()
     robot.follower.request()
     robot.follower.receive(seal(ANSWER, "arm", KEY, ANSWERED | change))
@@ -302,7 +289,6 @@ def test_a_malformed_answer_changes_nothing(change: dict[str, object]) -> None:
 
 @pytest.mark.parametrize("datagram", [b"", b"\x03arm", seal(ANSWER, "arm", b"x" * 32, ANSWERED)])
 def test_an_answer_that_is_not_authentic_is_ignored(datagram: bytes) -> None:
-    """The pending request remains, and its own answer counts."""
     robot = Robot()
     robot.follower.request()
     robot.follower.receive(datagram)
@@ -315,7 +301,6 @@ def test_an_answer_that_is_not_authentic_is_ignored(datagram: bytes) -> None:
 
 
 def test_a_restarted_follower_goes_on_with_the_witnesss_numbers() -> None:
-    """Two answers later it admits the holder."""
     robot = following()
     for _ in range(20):
         robot.answer()
@@ -325,7 +310,6 @@ def test_a_restarted_follower_goes_on_with_the_witnesss_numbers() -> None:
 
 
 def test_a_damaged_epoch_accepts_no_answer(tmp_path: Path) -> None:
-    """The log has the reason and the commands; a missing one is that of a new follower."""
     lines: list[str] = []
     log, file = BoundedLog(lines.append, lambda: 0.0), LeaseFile(str(tmp_path / "epoch"), BOTH)
     assert witness.followed_epoch(file, log) == 0
@@ -416,7 +400,6 @@ class RandomHistory:
 
 @pytest.mark.parametrize("seed", range(30))
 def test_robot_and_follower_never_admit_different_appliances(seed: int) -> None:
-    """Whatever is lost, late, repeated or restarted; most of the time the follower admits one."""
     history = RandomHistory(seed)
     for _ in range(3_000):
         history.step()
@@ -445,7 +428,6 @@ def written(folder: Path, **changes: object) -> Path:
 
 
 def test_the_settings_of_a_follower_have_only_its_own_key(tmp_path: Path) -> None:
-    """The keys of the appliances are neither needed nor read."""
     settings = read_settings(str(written(tmp_path)))
     assert settings.follows_as == "arm"
     assert [one.key for one in settings.appliances.values()] == [b"", b""]
@@ -478,13 +460,11 @@ def test_the_settings_of_a_follower_have_only_its_own_key(tmp_path: Path) -> Non
 def test_wrong_settings_of_a_follower_are_rejected(
     tmp_path: Path, changes: dict[str, object], reason: str
 ) -> None:
-    """With the reason."""
     with pytest.raises(WitnessError, match=reason):
         read_settings(str(written(tmp_path, **changes)))
 
 
 def test_each_computer_has_its_own_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A follower neither grants the lease nor begins one, and the witness follows no other."""
     path = written(tmp_path)
     for command in ("serve", "begin"):
         assert main([command, "--settings", str(path), "--in-sync", "a", "--epoch", "5"]) == 1
@@ -497,7 +477,6 @@ def test_each_computer_has_its_own_commands(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_requests_pass_only_from_appliances_and_followers(tmp_path: Path) -> None:
-    """Requests of other addresses are dropped, and all requests of this computer, where no appliance runs."""
     settings = read_settings(str(written(tmp_path)))
     rules = nft_rules(settings, "a")
     assert rules.count('iif "lo" ip daddr 10.0.0.1 udp dport 7411 drop\n        iif "lo" accept') == 1

@@ -141,7 +141,6 @@ def test_a_state_that_was_left_is_void_if_its_appliance_went_on(pairs: Pairs) ->
 
 
 def test_a_failed_switchover_makes_the_state_void(pairs: Pairs) -> None:
-    """The appliance passes messages again, and dies in the same epoch."""
     pairs.active("a")
     pairs.hand_over(b"left by a")
     keep_state(pairs.store, cast(Rollout, Relays()))
@@ -149,7 +148,6 @@ def test_a_failed_switchover_makes_the_state_void(pairs: Pairs) -> None:
 
 
 def test_after_a_failure_a_fresh_copy_is_used(pairs: Pairs) -> None:
-    """Monitors without a copy lose their state; a copy of an earlier epoch is not used."""
     pairs.active("a")
     pairs.copies(b"of relay 0", b"of relay 1")
     lost, left = pairs.active("b")
@@ -160,7 +158,6 @@ def test_after_a_failure_a_fresh_copy_is_used(pairs: Pairs) -> None:
 
 @pytest.mark.parametrize("why", ["old", "none", "a relay is away", "no standby", "no state"])
 def test_a_copy_that_is_not_up_to_date_is_not_used(pairs: Pairs, why: str) -> None:
-    """The monitors may have changed their state since; the copies begin again with all relays."""
     pairs.active("a")
     relays, followed = Relays(b"of relay 0", b"of relay 1"), [True]
     copies = StateCopies(pairs.present, pairs.store, cast(Rollout, relays), lambda: followed[0])
@@ -178,7 +175,6 @@ def test_a_copy_that_is_not_up_to_date_is_not_used(pairs: Pairs, why: str) -> No
 
 
 def test_the_age_of_copies_counts_from_a_new_note() -> None:
-    """The note that a standby finds at its start may be old."""
     with clock.using(VirtualClock(now=100.0)):
         age = CopyAge(lambda _name: "old")
         age.look("old")
@@ -190,7 +186,6 @@ def test_the_age_of_copies_counts_from_a_new_note() -> None:
 
 
 def test_an_epoch_in_between_makes_the_state_void(pairs: Pairs) -> None:
-    """An appliance that was granted an epoch may have passed messages before it could store that."""
     pairs.active("a")
     pairs.hand_over(b"left by a")
     pairs.active("a", taken=False)

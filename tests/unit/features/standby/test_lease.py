@@ -80,7 +80,6 @@ def asked_by(lease: Lease) -> PromiseRequest:
 
 
 def test_a_start_waits_one_expiry_before_it_claims() -> None:
-    """It may have given a promise before it ended."""
     lease = Lease()
     assert lease.operations() == ["look"]
     assert lease.later(EXPIRY - 0.01).operations() == ["look"]
@@ -88,7 +87,6 @@ def test_a_start_waits_one_expiry_before_it_claims() -> None:
 
 
 def test_it_is_passive_after_0_8_of_an_expiry_without_renewal_or_promise() -> None:
-    """The time counts from the request."""
     lease = active_lease()
     assert lease.later(CONFIDENCE - 0.01).active()
     assert lease.lease.next_event(lease.now) <= lease.now + 0.011
@@ -96,7 +94,6 @@ def test_it_is_passive_after_0_8_of_an_expiry_without_renewal_or_promise() -> No
 
 
 def test_a_renewal_counts_from_the_time_when_it_was_sent() -> None:
-    """A late answer is worth less; it makes a holder active again that no other appliance replaced."""
     lease = active_lease().later(0.5)
     renewal = lease.request("renew")
     lease.later(0.9)
@@ -106,7 +103,6 @@ def test_a_renewal_counts_from_the_time_when_it_was_sent() -> None:
 
 
 def test_a_promise_alone_keeps_it_active() -> None:
-    """R3: a dead witness, which answers the other appliance no more than this one, changes nothing."""
     lease = active_lease()
     for number in range(20):
         asked = asked_by(lease.later(0.3))
@@ -118,7 +114,6 @@ def test_a_promise_alone_keeps_it_active() -> None:
 
 
 def test_a_holder_that_only_the_standby_could_replace_gives_up() -> None:
-    """The witness answers the standby alone: its promise ends at once, and not an expiry later."""
     lease, due = active_lease(), list[object]()
     while lease.active():
         due = list(lease.later(0.3).tick())
@@ -133,7 +128,6 @@ def test_a_holder_that_only_the_standby_could_replace_gives_up() -> None:
 
 
 def test_a_promise_makes_no_passive_appliance_active() -> None:
-    """Only the witness does."""
     lease = active_lease()
     asked = asked_by(lease.later(0.9))
     lease.later(0.1)
@@ -143,7 +137,6 @@ def test_a_promise_makes_no_passive_appliance_active() -> None:
 
 
 def test_it_does_not_claim_while_its_promise_lasts() -> None:
-    """A grant that is on its way waits until the promise ends."""
     lease = Lease().later(EXPIRY)
     claim = lease.request("claim")
     (promise,) = lease.lease.received(lease.later(0.2).now, PromiseRequest(1, "theirs", 7))
@@ -159,7 +152,6 @@ def test_it_does_not_claim_while_its_promise_lasts() -> None:
 
 
 def test_it_promises_nothing_after_the_lease_has_expired() -> None:
-    """An active appliance that is cut off from the robot loses the promises, and the robot gets the other one."""
     lease, asked = Lease().later(EXPIRY), PromiseRequest(1, "theirs", 7)
     assert lease.lease.received(lease.now, asked)
     look = lease.request("look")
@@ -171,7 +163,6 @@ def test_it_promises_nothing_after_the_lease_has_expired() -> None:
 
 
 def test_it_promises_nothing_to_an_older_epoch() -> None:
-    """A newer epoch ends its own, once it is no longer active."""
     lease = active_lease()
     assert list(lease.lease.received(lease.now, PromiseRequest(1, "theirs", 1))) == []
     assert lease.active()
@@ -183,7 +174,6 @@ def test_it_promises_nothing_to_an_older_epoch() -> None:
 
 @pytest.mark.parametrize("epoch", [3, 2 + FARTHEST, HIGHEST])
 def test_an_active_appliance_believes_no_later_epoch(epoch: int) -> None:
-    """Only one appliance is active: a datagram with a later epoch is forged, ends no service and is not stored."""
     lease = active_lease()
     assert not lease.lease.received(lease.now, PromiseRequest(epoch, "theirs", 1))
     assert lease.active() and lease.lease.epoch == 2
@@ -192,7 +182,6 @@ def test_an_active_appliance_believes_no_later_epoch(epoch: int) -> None:
 
 
 def test_a_passive_appliance_believes_the_witness_more() -> None:
-    """An epoch that the other appliance claimed counts until the witness answers a later request with a smaller one."""
     lease = Lease(epoch=2)
     look = lease.request("look")
     assert lease.lease.follow(3) and not lease.lease.follow(2)
@@ -203,7 +192,6 @@ def test_a_passive_appliance_believes_the_witness_more() -> None:
 
 
 def test_a_claimed_epoch_lets_no_restored_witness_in() -> None:
-    """After a claim was undone, an epoch below the witness's own greatest one is still ignored."""
     lease = Lease(epoch=5)
     assert lease.lease.follow(6)
     lease.answered(lease.request("look"), epoch=4)
@@ -211,7 +199,6 @@ def test_a_claimed_epoch_lets_no_restored_witness_in() -> None:
 
 
 def test_an_epoch_that_jumps_is_not_believed() -> None:
-    """Neither of the other appliance, nor of the witness; then the reason names the remedy, after which it is."""
     lease = Lease(epoch=7)
     assert not lease.lease.follow(8 + FARTHEST)
     assert lease.lease.follow(7 + FARTHEST)
@@ -224,7 +211,6 @@ def test_an_epoch_that_jumps_is_not_believed() -> None:
 
 
 def test_a_refused_renewal_of_a_replaced_holder_ends_its_epoch() -> None:
-    """It claims like any other."""
     lease = active_lease().later(0.3)
     lease.answered(lease.request("renew"), ok=False, reason="b holds epoch 3", epoch=3, holder="b")
     assert not lease.active() and lease.lease.refusal == "b holds epoch 3"
@@ -232,7 +218,6 @@ def test_a_refused_renewal_of_a_replaced_holder_ends_its_epoch() -> None:
 
 
 def test_a_grant_whose_answer_was_lost_is_claimed_again() -> None:
-    """The witness has a later epoch for this appliance than the appliance knows."""
     lease = active_lease().later(0.3)
     lease.answered(lease.request("renew"), ok=False, reason="a holds epoch 3", epoch=3)
     assert (lease.lease.epoch, lease.lease.held) == (3, None)
@@ -240,14 +225,12 @@ def test_a_grant_whose_answer_was_lost_is_claimed_again() -> None:
 
 
 def test_a_smaller_epoch_is_ignored() -> None:
-    """A witness that lost its lease grants nothing."""
     lease = Lease(epoch=9).later(EXPIRY)
     lease.answered(lease.request("claim"), epoch=2)
     assert not lease.active()
 
 
 def test_it_answers_alone_only_after_the_removal() -> None:
-    """R2: it asks for the removal when an answer has waited for half an expiry."""
     lease = active_lease()
     now = lease.later(0.3).now
     assert lease.operations(waiting_since=now) == ["renew"]
@@ -263,7 +246,6 @@ def test_it_answers_alone_only_after_the_removal() -> None:
 
 
 def test_a_change_that_waits_too_long_does_not_wait_for_the_next_round() -> None:
-    """The removal is requested at once, and again in each round until the witness answers."""
     lease = active_lease()
     assert lease.later(0.3).operations(waiting_since=0.0) == ["renew", "remove"]
     assert lease.later(0.1).operations(waiting_since=0.0) == []
@@ -275,7 +257,6 @@ def test_a_change_that_waits_too_long_does_not_wait_for_the_next_round() -> None
 
 
 def test_a_change_that_waits_is_noticed_between_two_rounds() -> None:
-    """A takeover does not take one more round."""
     lease = active_lease().later(0.3)
     assert lease.operations(waiting_since=lease.now) == ["renew"]
     assert lease.later(0.1).operations(waiting_since=0.0) == ["remove"]
@@ -283,7 +264,6 @@ def test_a_change_that_waits_is_noticed_between_two_rounds() -> None:
 
 
 def test_it_claims_when_its_promise_ends_and_ten_times_a_second() -> None:
-    """The robot has no appliance in that time."""
     lease = Lease().later(EXPIRY)
     lease.lease.received(lease.now, PromiseRequest(1, "theirs", 7))
     end = lease.now + EXPIRY
@@ -295,7 +275,6 @@ def test_it_claims_when_its_promise_ends_and_ten_times_a_second() -> None:
 
 
 def test_it_waits_for_the_standby_before_it_is_added() -> None:
-    """An older answer does not change that."""
     lease = active_lease().later(0.3)
     old = lease.request("renew")
     lease.answered(old, in_sync=ALONE)
@@ -321,7 +300,6 @@ def in_a_switchover() -> tuple[Lease, TakeOver]:
 
 
 def test_a_switchover_ends_the_promises_to_the_old_holder() -> None:
-    """The standby claims at once."""
     _, order = in_a_switchover()
     standby = Lease().later(EXPIRY)
     standby.lease.received(standby.now, PromiseRequest(order.epoch, order.session, order.number))
@@ -331,7 +309,6 @@ def test_a_switchover_ends_the_promises_to_the_old_holder() -> None:
 
 
 def test_a_smaller_epoch_of_the_witness_is_never_taken() -> None:
-    """Its disk was restored: however often it answers, the appliance claims nothing with such an epoch."""
     lease = Lease(epoch=8).later(EXPIRY)
     for _ in range(3):
         lease.answered(lease.later(0.3).request("claim"), ok=False, holder="", epoch=6)
@@ -339,7 +316,6 @@ def test_a_smaller_epoch_of_the_witness_is_never_taken() -> None:
 
 
 def test_a_late_order_does_not_end_a_later_promise() -> None:
-    """The other appliance did not hand over in the end, and relies on the new promise."""
     _, order = in_a_switchover()
     standby = Lease().later(EXPIRY)
     standby.lease.received(standby.now, PromiseRequest(order.epoch, order.session, order.number + 1))
@@ -348,7 +324,6 @@ def test_a_late_order_does_not_end_a_later_promise() -> None:
 
 
 def test_a_late_request_does_not_make_a_late_order_valid() -> None:
-    """The last promise counts, and a request that was overtaken is not the last."""
     _, order = in_a_switchover()
     standby = Lease().later(EXPIRY)
     for number in (order.number + 1, order.number):
@@ -358,7 +333,6 @@ def test_a_late_request_does_not_make_a_late_order_valid() -> None:
 
 
 def test_older_answers_do_not_undo_a_switchover() -> None:
-    """If the other appliance does not claim, the holder renews after a while."""
     lease = active_lease().later(0.3)
     renewal, asked = lease.tick()
     assert isinstance(renewal, WitnessRequest) and isinstance(asked, PromiseRequest)
@@ -374,7 +348,6 @@ def test_older_answers_do_not_undo_a_switchover() -> None:
 
 
 def test_an_impossible_switchover_is_refused_with_the_reason() -> None:
-    """Nothing changes."""
     with pytest.raises(LeaseError, match="not active; give the order to the other one"):
         Lease().lease.switch_over(50.0)
     lease = active_lease()
@@ -395,7 +368,6 @@ def test_an_impossible_switchover_is_refused_with_the_reason() -> None:
 def test_a_lease_is_given_up_only_to_an_appliance_that_could_claim_it(
     able: bool, silence: float, trouble: str, reason: str
 ) -> None:
-    """The standby reports with each promise whether it could serve, and since when the witness is silent."""
     standby = Lease().later(EXPIRY)
     standby.answered(standby.request("claim"), ok=False, holder="a")
     standby.lease.ready = able
@@ -424,7 +396,6 @@ def exchanged(channel: WitnessChannel, robot: Robot, request: WitnessRequest) ->
 
 
 def test_a_new_appliance_learns_nonce_and_number() -> None:
-    """The first answer carries them; a restarted appliance goes on behind the last number."""
     robot, claim = Robot().expired(), WitnessRequest("claim", 1, 1, 0.0)
     for session in ("one", "two"):
         channel = WitnessChannel("a", KEYS["a"], session)
@@ -434,7 +405,6 @@ def test_a_new_appliance_learns_nonce_and_number() -> None:
 
 
 def test_a_recorded_or_forged_answer_counts_for_nothing() -> None:
-    """Answers to an earlier process, repeated answers and damaged answers are ignored."""
     robot, claim = Robot().expired(), WitnessRequest("claim", 1, 1, 0.0)
     channel, restarted = WitnessChannel("a", KEYS["a"], "one"), WitnessChannel("a", KEYS["a"], "two")
     exchanged(channel, robot, claim)
@@ -450,7 +420,6 @@ def test_a_recorded_or_forged_answer_counts_for_nothing() -> None:
 
 
 def test_an_appliance_that_could_not_serve_does_not_claim() -> None:
-    """It asks for the lease's state, and claims once its control is present."""
     lease = Lease().later(EXPIRY)
     lease.lease.ready = False
     assert lease.operations() == ["look"]

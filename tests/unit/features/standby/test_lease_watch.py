@@ -55,8 +55,6 @@ def run(work: Callable[[Role], Awaitable[None]]) -> None:
 
 
 def test_it_is_passive_until_the_lease_is_held() -> None:
-    """Then it is active in the epoch that was reported."""
-
     async def work(role: Role) -> None:
         assert role.orders == []
         role.watch.held(clock.since_boot() + 60, 5)
@@ -67,8 +65,6 @@ def test_it_is_passive_until_the_lease_is_held() -> None:
 
 
 def test_it_stops_when_no_further_report_arrives() -> None:
-    """Not before the reported time, and without any message."""
-
     async def work(role: Role) -> None:
         until = clock.since_boot() + 0.2
         role.watch.held(until, 5)
@@ -80,8 +76,6 @@ def test_it_stops_when_no_further_report_arrives() -> None:
 
 
 def test_a_later_report_extends_the_time() -> None:
-    """An earlier one that is still under way does not shorten it only for a moment: the last report counts."""
-
     async def work(role: Role) -> None:
         role.watch.held(clock.since_boot() + 0.05, 5)
         until = clock.since_boot() + 0.3
@@ -93,8 +87,6 @@ def test_a_later_report_extends_the_time() -> None:
 
 
 def test_a_renewal_in_the_same_epoch_ends_a_lapse() -> None:
-    """No other appliance was active in between: the service goes on with its state, and may lapse again."""
-
     async def work(role: Role) -> None:
         role.watch.held(clock.since_boot() + 0.05, 5)
         for _ in range(2):
@@ -112,8 +104,6 @@ def test_a_renewal_in_the_same_epoch_ends_a_lapse() -> None:
 
 @pytest.mark.parametrize("end", ["ended", "not_renewable", "later epoch", "time"])
 def test_a_lapse_that_no_renewal_ends(end: str) -> None:
-    """The lease is lost, its process has ended, another appliance was active, or too much time has passed."""
-
     async def work(role: Role) -> None:
         role.watch.held(clock.since_boot() + 60, 5)
         role.watch.lapsed()
@@ -144,8 +134,6 @@ def test_a_lapse_that_cannot_be_suspended_ends_the_service(reason: str) -> None:
 
 
 def test_a_report_that_arrives_too_late_does_not_activate() -> None:
-    """The supervisor was stopped for a while, and another appliance may be active by now."""
-
     async def work(role: Role) -> None:
         role.watch.held(clock.since_boot() - 0.001, 5)
         assert role.orders == [] and not role.watch.active
@@ -154,8 +142,6 @@ def test_a_report_that_arrives_too_late_does_not_activate() -> None:
 
 
 def test_a_late_report_of_an_active_appliance_stops_it_at_once() -> None:
-    """Without waiting for a timer."""
-
     async def work(role: Role) -> None:
         role.watch.held(clock.since_boot() + 60, 5)
         role.watch.held(clock.since_boot() - 0.001, 5)
@@ -176,8 +162,6 @@ def test_a_new_epoch_ends_the_state_of_the_old_one() -> None:
 
 
 def test_the_end_of_the_lease_is_reported_once() -> None:
-    """A second end changes nothing."""
-
     async def work(role: Role) -> None:
         role.watch.held(clock.since_boot() + 60, 5)
         role.watch.ended()

@@ -23,7 +23,6 @@ def state(tmp_path: Path) -> Path:
 
 
 def test_each_process_gets_its_own_secrets(state: Path) -> None:
-    """Control gets no key of the lease, and the lease no key of the replication."""
     pairing = pairing_in(state)
     assert pairing is not None
     lease, link = (json.loads(contents) for _name, _user, contents in pairing.files)
@@ -35,7 +34,6 @@ def test_each_process_gets_its_own_secrets(state: Path) -> None:
 
 
 def test_files_of_a_pair_end_with_the_pair(state: Path) -> None:
-    """An appliance that was killed and then left its pair starts as a single one: control finds no membership."""
     assert foreign(state) is None
     link = state / "run" / LINK_FILE
     with closing(StateDirectory(state)) as directory:
@@ -51,7 +49,6 @@ def test_files_of_a_pair_end_with_the_pair(state: Path) -> None:
 
 
 def test_a_damaged_membership_stops_the_start(state: Path) -> None:
-    """The error names the file and the command; a pair also keeps its authority."""
     pairing = pairing_in(state)
     assert pairing is not None
     assert "end the pair first" in pairing.fixed_authority

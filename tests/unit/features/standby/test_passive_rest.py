@@ -94,7 +94,6 @@ async def test_a_new_api_learns_the_tokens_at_once(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 async def test_a_door_is_refused_at_once_and_no_request_is_lost_in_a_takeover(tmp_path: Path) -> None:
-    """A request that arrives while the active control starts waits for it."""
     row, token = made("alice")
     save(tmp_path, row)
     rest = rest_of(tmp_path)

@@ -31,7 +31,6 @@ def test_each_message_arrives(message: PeerMessage) -> None:
 
 @pytest.mark.parametrize("message", ALL)
 def test_a_forged_message_is_not_read(message: PeerMessage) -> None:
-    """Another key, another sender, or the appliance's own datagram sent back."""
     here, there = ends()
     assert there.read(PeerChannel("a", "b", b"\xdd" * 32).write(message)) is None
     assert there.read(PeerChannel("c", "b", KEY).write(message)) is None
@@ -40,7 +39,6 @@ def test_a_forged_message_is_not_read(message: PeerMessage) -> None:
 
 @given(st.integers(0, 200), st.integers(1, 255))
 def test_no_changed_byte_is_read(position: int, change: int) -> None:
-    """Neither in the name, nor in the code, nor in the body."""
     here, there = ends()
     datagram = bytearray(here.write(ALL[0]))
     datagram[position % len(datagram)] ^= change
@@ -49,7 +47,6 @@ def test_no_changed_byte_is_read(position: int, change: int) -> None:
 
 @given(st.binary(max_size=1100))
 def test_garbage_is_not_read(datagram: bytes) -> None:
-    """Also if it begins with the right name."""
     _, there = ends()
     assert there.read(datagram) is None
     assert there.read(b"\x01a" + datagram) is None
@@ -67,14 +64,12 @@ def test_garbage_is_not_read(datagram: bytes) -> None:
     ],
 )
 def test_an_authentic_but_malformed_message_is_not_read(body: dict[str, object]) -> None:
-    """The other appliance is not believed blindly, and never ends the process."""
     _, there = ends()
     for purpose in peer_link.PURPOSES.values():
         assert there.read(seal(purpose, "a", KEY, body)) is None
 
 
 def test_a_request_is_read_once() -> None:
-    """A recorded request never gets a second promise."""
     here, there = ends()
     recorded = [here.write(PromiseRequest(3, "s", number)) for number in (1, 2, 3)]
     assert [there.read(one) is not None for one in recorded] == [True, True, True]
@@ -82,7 +77,6 @@ def test_a_request_is_read_once() -> None:
 
 
 def test_a_request_that_was_overtaken_is_not_read() -> None:
-    """The later one counts; requests of an earlier epoch do not."""
     here, there = ends()
     first, second, old = (
         here.write(PromiseRequest(3, "s", 1)),
@@ -94,7 +88,6 @@ def test_a_request_that_was_overtaken_is_not_read() -> None:
 
 
 def test_a_new_epoch_begins_new_numbers() -> None:
-    """A restarted active appliance needs a new epoch, and then counts from the beginning."""
     here, there = ends()
     assert there.read(here.write(PromiseRequest(3, "s", 50))) is not None
     assert there.read(here.write(PromiseRequest(3, "restarted", 1))) is None

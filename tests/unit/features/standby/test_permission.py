@@ -218,7 +218,6 @@ async def run(pair: Pair, steps: list[str]) -> None:
 def test_a_change_answered_alone_is_not_missing_on_a_standby_in_sync(
     tmp_path_factory: pytest.TempPathFactory, steps: list[str]
 ) -> None:
-    """In whatever order messages, acknowledgements, losses and restarts of control come."""
     machine = VirtualClock()
     with pytest.MonkeyPatch.context() as patch, clock.using(machine):
         pair = Pair(tmp_path_factory.mktemp("pair"), patch, machine)
@@ -229,7 +228,6 @@ def test_a_change_answered_alone_is_not_missing_on_a_standby_in_sync(
 
 
 def test_it_answers_alone_and_waits_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The steps above reach both: the removal of an absent standby, and its return."""
     machine = VirtualClock()
 
     async def story() -> None:

@@ -66,7 +66,6 @@ def names(tmp_path: Path) -> list[str]:
 
 
 def test_changes_and_their_number_are_stored_together(tmp_path: Path) -> None:
-    """The next start continues after them."""
     replica = begun(tmp_path)
     replica.take(changes(thing("a"), thing("b")))
     replica.take(changes(Delete("thing", [("name", "=", "old")]), epoch=4, first=10))
@@ -117,7 +116,6 @@ BAD: list[tuple[FromActive, str]] = [
 def test_an_active_appliance_that_lies_changes_nothing(
     replica: Replica, tmp_path: Path, message: FromActive, reason: str
 ) -> None:
-    """The error has the reason, no change of the message is stored, and the next honest message is."""
     with pytest.raises(ReplicationError, match=reason):
         replica.take(message)
     assert (names(tmp_path), replica.position) == (["old"], Stored(3, "h", 7))
@@ -138,7 +136,6 @@ def test_an_active_appliance_that_lies_changes_nothing(
 def test_a_snapshot_replaces_everything_or_nothing(
     replica: Replica, tmp_path: Path, messages: list[FromActive], reason: str
 ) -> None:
-    """After an error in it, the state is as it was before."""
     replica.take(SnapshotBegin(5, "i", 2))
     for message in messages[:-1]:
         replica.take(message)
@@ -148,7 +145,6 @@ def test_a_snapshot_replaces_everything_or_nothing(
 
 
 def test_a_snapshot_that_ends_early_is_undone(tmp_path: Path) -> None:
-    """Also if the process ends in it. A complete one replaces all rows, the history and the number."""
     replica = begun(tmp_path)
     for end in (replica.abandon_snapshot, replica.close):
         replica.take(SnapshotBegin(5, "i", 2))
@@ -169,8 +165,6 @@ def large(number: int) -> Put:
 
 
 def test_an_active_appliance_cannot_fill_the_disk(replica: Replica, tmp_path: Path) -> None:
-    """The file has a limit, for changes and in a snapshot; all files together stay near it."""
-
     def fill() -> None:
         for number in range(100):
             replica.take(changes(large(number), first=replica.position.number + 1))
@@ -191,7 +185,6 @@ def test_an_active_appliance_cannot_fill_the_disk(replica: Replica, tmp_path: Pa
 
 
 def test_repeated_rows_of_a_snapshot_need_no_further_space(replica: Replica, tmp_path: Path) -> None:
-    """A snapshot without end, of rows that replace each other, does not let the files grow."""
     replica.take(SnapshotBegin(5, "i", 2))
     for number in range(300):
         replica.take(SnapshotRows([large(number % 5)]))
@@ -199,7 +192,6 @@ def test_repeated_rows_of_a_snapshot_need_no_further_space(replica: Replica, tmp
 
 
 def test_a_full_disk_keeps_the_last_good_state(tmp_path: Path) -> None:
-    """The error names the file; once there is space, the same changes are stored."""
     with small_disk(tmp_path / "disk", "1m") as place:
         replica = Replica(place / "state.db", SCHEMA, failed=pytest.fail)
         for message in (BEGIN, SnapshotRows([thing("old")]), SnapshotEnd(1)):
@@ -220,7 +212,6 @@ def test_a_full_disk_keeps_the_last_good_state(tmp_path: Path) -> None:
 
 
 def test_an_appliance_that_was_active_needs_a_snapshot(tmp_path: Path) -> None:
-    """Its own changes began another history, those included that a killed process left."""
     replica = Replica(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
     for message in (BEGIN, SnapshotEnd(0)):
         replica.take(message)
@@ -242,7 +233,6 @@ def test_an_appliance_that_was_active_needs_a_snapshot(tmp_path: Path) -> None:
 
 
 def test_all_tables_of_the_state_can_be_copied(tmp_path: Path) -> None:
-    """Every column has a type that is checked; rows of the state as it is written today are accepted."""
     store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     with contextlib.closing(sqlite3.connect(tmp_path / "state.db")) as reader:
         found = {name for (name,) in reader.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}

@@ -38,13 +38,11 @@ async def complete(replica: Replica, folder: Path, boot: str, *, followed: bool,
 
 
 async def test_a_restarted_process_may_take_over_at_once(replica: Replica, tmp_path: Path) -> None:
-    """The kernel has what a killed process stored; a new standby has nothing to lose."""
     for _ in range(2):
         assert await complete(replica, tmp_path, "boot 1", followed=False, seconds=LIMIT)
 
 
 async def test_after_a_reboot_it_waits_for_the_active_appliance(replica: Replica, tmp_path: Path) -> None:
-    """Until it has followed the active one, or none has appeared for long, the last changes may be missing."""
     assert await complete(replica, tmp_path, "boot 1", followed=False, seconds=LIMIT)
     assert not await complete(replica, tmp_path, "boot 2", followed=False, seconds=0.5)
     assert not await complete(replica, tmp_path, "boot 2", followed=False, seconds=0.5)

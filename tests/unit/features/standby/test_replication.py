@@ -78,7 +78,6 @@ async def require_equal(directory: Path, active: ActiveSide) -> None:
 
 
 async def test_changes_arrive_and_are_acknowledged(tmp_path: Path) -> None:
-    """When `acknowledged` returns, the standby's file has the change, and all changes before it."""
     async with asyncio.timeout(SECONDS), replicated(tmp_path) as (active, standby):
         chosen = random.Random(1)  # noqa: S311  draws examples
         for _ in range(30):
@@ -94,7 +93,6 @@ async def test_changes_arrive_and_are_acknowledged(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 async def test_nothing_is_lost_however_often_the_link_is_cut(tmp_path: Path, seed: int) -> None:
-    """The link is cut in frames, either side restarts, and memory is short; acknowledged changes are at the standby."""
     chosen = random.Random(seed)  # noqa: S311  draws examples
     server, client = certificates(tmp_path)
     active = ActiveSide(tmp_path / "active.db", server, room=20_000)
@@ -126,7 +124,6 @@ async def test_nothing_is_lost_however_often_the_link_is_cut(tmp_path: Path, see
 
 
 async def test_a_standby_that_was_away_for_long_gets_a_snapshot(tmp_path: Path) -> None:
-    """Memory for it is bounded; the snapshot is of a state that changes while it is sent."""
     server, client = certificates(tmp_path)
     active = ActiveSide(tmp_path / "active.db", server, room=10_000)
     chosen = random.Random(2)  # noqa: S311  draws examples
@@ -148,7 +145,6 @@ async def test_a_standby_that_was_away_for_long_gets_a_snapshot(tmp_path: Path) 
 
 
 async def test_a_standby_that_was_away_shortly_gets_only_the_changes(tmp_path: Path) -> None:
-    """No snapshot is sent while the changes are still in memory."""
     server, client = certificates(tmp_path)
     active = ActiveSide(tmp_path / "active.db", server)
     standby = StandbySide(tmp_path / "standby.db", client, lambda: active.port)
@@ -193,7 +189,6 @@ async def take_snapshot(link: ReplicationLink[FromActive]) -> SnapshotBegin:
 
 
 async def test_an_acknowledgement_of_an_unsent_change_is_not_counted(tmp_path: Path) -> None:
-    """The link ends, and a caller who waits gets no answer."""
     server, _client = certificates(tmp_path)
     active = ActiveSide(tmp_path / "active.db", server)
     active.database.put("thing", "a", 1, None)
@@ -228,7 +223,6 @@ async def test_an_acknowledgement_of_an_unsent_change_is_not_counted(tmp_path: P
 
 
 async def test_a_standby_that_lost_what_it_acknowledged_is_not_believed_any_longer(tmp_path: Path) -> None:
-    """It gets what it lost, and the changes count as acknowledged only then."""
     server, _client = certificates(tmp_path)
     active = ActiveSide(tmp_path / "active.db", server)
     history = active.database.history
@@ -254,7 +248,6 @@ async def test_a_standby_that_lost_what_it_acknowledged_is_not_believed_any_long
 
 
 async def test_an_earlier_active_appliance_is_refused(tmp_path: Path) -> None:
-    """A standby that has seen a larger epoch takes nothing, and the active appliance learns the reason."""
     async with asyncio.timeout(SECONDS), replicated(tmp_path, epoch=5) as (active, standby):
         active.database.put("thing", "a", 1, None)
         await active.sender.acknowledged(1)
@@ -272,7 +265,6 @@ async def test_an_earlier_active_appliance_is_refused(tmp_path: Path) -> None:
 
 
 async def test_a_new_link_ends_the_earlier_one(tmp_path: Path) -> None:
-    """A standby that restarts does not wait until its earlier connection times out."""
     server, client = certificates(tmp_path)
     active = ActiveSide(tmp_path / "active.db", server)
     async with asyncio.timeout(SECONDS):
@@ -290,7 +282,6 @@ async def test_a_new_link_ends_the_earlier_one(tmp_path: Path) -> None:
 
 
 async def test_a_quiet_link_stays_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without changes, the active appliance sends a message in each interval, once the earlier ones are answered."""
     monkeypatch.setattr(replication_sender, "_HEARTBEAT_SECONDS", 0.05)
     server, _client = certificates(tmp_path)
     active = ActiveSide(tmp_path / "active.db", server)
@@ -304,7 +295,6 @@ async def test_a_quiet_link_stays_open(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 async def test_a_silent_standby_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that reads nothing, or answers nothing, does not hold the link for ever."""
     monkeypatch.setattr(replication_sender, "_SILENCE_SECONDS", 0.5)
     server, _client = certificates(tmp_path)
     active = ActiveSide(tmp_path / "active.db", server)
@@ -318,7 +308,6 @@ async def test_a_silent_standby_is_given_up(tmp_path: Path, monkeypatch: pytest.
 
 
 async def test_a_caller_who_waits_learns_of_the_end(tmp_path: Path) -> None:
-    """When the sender is closed, `acknowledged` is an error; later changes are not kept."""
     server, _client = certificates(tmp_path)
     active = ActiveSide(tmp_path / "active.db", server)
     async with asyncio.timeout(SECONDS):
@@ -343,7 +332,6 @@ async def test_a_caller_who_waits_learns_of_the_end(tmp_path: Path) -> None:
 async def test_an_appliance_that_reads_nothing_does_not_hold_the_link(
     monkeypatch: pytest.MonkeyPatch, *, receiving: bool
 ) -> None:
-    """The link also ends if the peer sends nothing."""
     monkeypatch.setattr(replication_frames, "_WRITE_SECONDS", 0.1)
     reader, other, writer = await pair_of_links()
     link: ReplicationLink[FromActive] = ReplicationLink(reader, writer, FromActive)
@@ -359,7 +347,6 @@ async def test_an_appliance_that_reads_nothing_does_not_hold_the_link(
 
 
 async def test_only_the_known_certificate_is_accepted(tmp_path: Path) -> None:
-    """Another certificate, none, an older TLS, and no TLS at all get nothing; the standby also checks its side."""
     server, client = certificates(tmp_path)
     active = ActiveSide(tmp_path / "active.db", server)
     homes = {name: tmp_path / name for name in ("strange", "old", "mistrusting")}
@@ -396,7 +383,6 @@ async def test_only_the_known_certificate_is_accepted(tmp_path: Path) -> None:
 async def test_connections_without_a_handshake_are_limited(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They are closed at once beyond a number, and the others after a time; the standby then connects."""
     monkeypatch.setattr(replication_transport, "_HANDSHAKE_SECONDS", 0.5)
     server, client = certificates(tmp_path)
     active = ActiveSide(tmp_path / "active.db", server)
@@ -431,7 +417,6 @@ async def pair_of_links() -> tuple[asyncio.StreamReader, asyncio.StreamWriter, a
 
 
 async def test_a_standby_follows_only_an_accepted_epoch(tmp_path: Path) -> None:
-    """The caller decides; the active appliance gets the reason, for changes and for a snapshot."""
     replica = Replica(tmp_path / "standby.db", SCHEMA, failed=pytest.fail)
     for message in (Changes(7, "", 1, [Put("mark", [(1,)])]), SnapshotBegin(7, "h", 1)):
         ends, others = await pair_of_streams()
@@ -451,7 +436,6 @@ async def test_a_standby_follows_only_an_accepted_epoch(tmp_path: Path) -> None:
 
 
 async def test_a_link_that_ends_in_a_snapshot_leaves_nothing_open(tmp_path: Path) -> None:
-    """The state is as before, and no transaction holds the file."""
     replica = Replica(tmp_path / "standby.db", SCHEMA, failed=pytest.fail)
     ends, others = await pair_of_streams()
     link: ReplicationLink[Stored] = ReplicationLink(*others, Stored)
@@ -471,7 +455,6 @@ async def test_a_link_that_ends_in_a_snapshot_leaves_nothing_open(tmp_path: Path
 
 
 async def test_a_standby_can_take_over_the_whole_state(tmp_path: Path) -> None:
-    """Control finds on the standby what it has saved on the active appliance, by snapshot and by changes."""
     for name in ("active", "standby"):
         (tmp_path / name).mkdir()
     store = StateStore(tmp_path / "active", failed=pytest.fail, kind=InlineDatabase)
@@ -526,7 +509,6 @@ async def test_a_standby_can_take_over_the_whole_state(tmp_path: Path) -> None:
 
 
 async def test_an_obstacle_to_a_takeover_is_reported_while_the_link_is_open(tmp_path: Path) -> None:
-    """The standby learns of each new policy, and the active appliance of an obstacle, its change and its end."""
     (tmp_path / "active").mkdir()
     (tmp_path / "standby").mkdir()
     store = StateStore(tmp_path / "active", failed=pytest.fail, kind=InlineDatabase)
@@ -579,7 +561,6 @@ async def test_an_obstacle_to_a_takeover_is_reported_while_the_link_is_open(tmp_
     ],
 )
 async def test_a_bad_frame_ends_the_link(data: bytes, reason: str) -> None:
-    """The error has the reason."""
     reader, other, writer = await pair_of_links()
     link: ReplicationLink[FromActive] = ReplicationLink(reader, writer, FromActive)
     other.write(data)
@@ -604,7 +585,6 @@ async def test_a_bad_frame_ends_the_link(data: bytes, reason: str) -> None:
     ],
 )
 async def test_a_message_of_another_form_ends_the_link(message: Any) -> None:
-    """It is never carried out."""
     reader, other, writer = await pair_of_links()
     link: ReplicationLink[FromActive] = ReplicationLink(reader, writer, FromActive)
     body = msgspec.msgpack.encode(message)
@@ -618,7 +598,6 @@ async def test_a_message_of_another_form_ends_the_link(message: Any) -> None:
 async def test_a_change_too_large_for_a_frame_is_an_error_with_a_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The standby stays behind, and catches up once the value is smaller."""
     async with asyncio.timeout(SECONDS), replicated(tmp_path) as (active, standby):
         await until(lambda: active.sender.lag().caught_up)
         for module in (replication_frames, replication_sender):
@@ -633,7 +612,6 @@ async def test_a_change_too_large_for_a_frame_is_an_error_with_a_remedy(
 
 
 async def test_the_standby_tells_why_it_refuses(tmp_path: Path) -> None:
-    """A table that only the active appliance has is named on both sides."""
     server, client = certificates(tmp_path)
     more = SCHEMA + "CREATE TABLE IF NOT EXISTS newer (name TEXT PRIMARY KEY) WITHOUT ROWID;"
     active = ActiveSide(tmp_path / "active.db", server, schema=more)
@@ -650,7 +628,6 @@ INTRODUCTION = Introduction(b"request", "0" * 64, "10.0.0.3", "")
 
 
 async def test_a_standby_introduces_itself_once_an_hour(tmp_path: Path) -> None:
-    """The introduction comes as soon as it exists, between acknowledgements, and then not with each message."""
     replica, made = Replica(tmp_path / "standby.db", SCHEMA, failed=pytest.fail), list[Introduction]()
     ends, others = await pair_of_streams()
     link: ReplicationLink[FromStandby] = ReplicationLink(*others, FromStandby)
@@ -676,7 +653,6 @@ async def test_a_standby_introduces_itself_once_an_hour(tmp_path: Path) -> None:
 
 
 async def test_an_introduction_is_not_an_acknowledgement(tmp_path: Path) -> None:
-    """The active appliance passes it on; before the position of the standby it ends the link."""
     database = InlineDatabase(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
     sender, heard = ReplicationSender(database, lambda: 1), list[Introduction]()
     sender.on_introduction(heard.append)
@@ -722,7 +698,6 @@ async def test_an_introduction_cannot_write_into_hosts_files(bad: dict[str, str 
 
 
 async def test_an_order_to_hand_over_is_refused_with_the_reason_or_ends_the_link(tmp_path: Path) -> None:
-    """The operator of the standby need not wait for a takeover that does not come, also after the link was cut."""
     (tmp_path / "active").mkdir()
     (tmp_path / "standby").mkdir()
     store = StateStore(tmp_path / "active", failed=pytest.fail, kind=InlineDatabase)

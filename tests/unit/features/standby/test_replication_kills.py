@@ -60,7 +60,6 @@ def marks_in(path: Path) -> set[int]:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_no_acknowledged_change_is_lost_by_a_kill(tmp_path: Path, seed: int) -> None:
-    """After each kill of either side, the standby's file has the acknowledged marks; at the end both have them."""
     chosen = random.Random(seed)  # noqa: S311  draws examples
     certificates(tmp_path)
     listening = listening_socket()

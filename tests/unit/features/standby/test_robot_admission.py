@@ -6,7 +6,6 @@ from tests.support.virtual_clock import VirtualClock
 
 
 def test_doubt_lasts_until_the_followers_have_asked_again() -> None:
-    """After a takeover, during a gap in the witness's answers, and for some time after it; its end is reported once."""
     machine, doubts, ends = VirtualClock(), list[bool](), list[int]()
     with clock.using(machine):
         admission = RobotAdmission()

@@ -41,7 +41,6 @@ def test_the_active_appliance_has_the_lag_of_the_standby() -> None:
 
 
 def test_a_standby_has_its_own_metrics() -> None:
-    """A standby has only what it can know: neither its lag, nor takeovers before it knows the epoch."""
     state = example(StandbyState, name="b", role="standby", epoch=4, other={"name": "a"})
     assert {name.removeprefix("rosrv_standby_"): value for name, value in numbers(state).items()} == {
         'role{role="active"}': 0,

@@ -32,7 +32,6 @@ def joined(folders: tuple[Path, Path]) -> CertificateAuthority:
 
 
 def test_a_clear_key_never_leaves(folders: tuple[Path, Path]) -> None:
-    """Without a passphrase there is nothing to bring, and a file that has a clear key is not taken."""
     CertificateAuthority(folders[0])
     assert sealed_authority(folders[0]) is None
     clear = SealedAuthority("", (folders[0] / KEY_FILE).read_text())
@@ -57,7 +56,6 @@ def test_the_passphrase_opens_it(folders: tuple[Path, Path]) -> None:
 def test_without_the_passphrase_it_waits(
     folders: tuple[Path, Path], secret: bytes | None, reason: str
 ) -> None:
-    """The appliance starts with its own authority and gives the reason; the sealed key is unchanged."""
     made = joined(folders)
     before = (folders[1] / FOLDER / KEY_FILE).read_bytes()
     found, trouble = open_authority(folders[1], "ecdsa", secret)
@@ -67,7 +65,6 @@ def test_without_the_passphrase_it_waits(
 
 
 def test_a_clear_key_in_its_place_is_not_used(folders: tuple[Path, Path]) -> None:
-    """Such a file was not written by `rosrv standby join`."""
     made = joined(folders)
     CertificateAuthority(folders[1])
     (folders[1] / FOLDER / KEY_FILE).write_bytes((folders[1] / KEY_FILE).read_bytes())

@@ -22,7 +22,6 @@ def serving() -> ServiceWatch:
 
 
 def test_a_start_has_some_seconds() -> None:
-    """After that, another appliance should serve. A passive appliance owes nothing."""
     watch = ServiceWatch()
     assert watch.fault(90.0, active=False) == watch.fault(100.0, active=True) == ""
     assert watch.fault(100.0 + START_SECONDS, active=True) == ""
@@ -31,7 +30,6 @@ def test_a_start_has_some_seconds() -> None:
 
 
 def test_a_lease_that_comes_back_before_control() -> None:
-    """After a lapse, control was killed. The other appliance takes over sooner, but lacks the state of monitors."""
     for keeps_state in (True, False):
         watch = serving()
         watch.reported(102.5, "", keeps_state=keeps_state)
@@ -44,7 +42,6 @@ def test_a_lease_that_comes_back_before_control() -> None:
 
 
 def test_a_control_that_hangs_and_one_that_starts_again() -> None:
-    """A hanging control is noticed before the supervisor kills it; a killed one has more time."""
     watch = serving()
     assert watch.fault(102.0 + SILENT_SECONDS, active=True) == ""
     assert watch.fault(102.1 + SILENT_SECONDS, active=True) == "control has not reported for 4.1 s"
@@ -66,7 +63,6 @@ def test_an_obstacle_that_lasts() -> None:
 
 @pytest.mark.parametrize(("seconds", "factor"), [(STEADY_SECONDS - 1, 2), (STEADY_SECONDS + 1, 1)])
 def test_two_appliances_do_not_pass_the_lease_back_and_forth(seconds: float, factor: int) -> None:
-    """If one serves for a short time only, its limits are doubled the next time, until it has served for longer."""
     watch = serving()
     watch.reported(102.0 + seconds, "", keeps_state=False)
     watch.given_away()

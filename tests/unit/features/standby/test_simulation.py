@@ -10,14 +10,12 @@ from tests.unit.features.standby.simulation import History, Violation
 
 @pytest.mark.parametrize("first", range(0, 300, 50))
 def test_no_history_breaks_a_promise(first: int) -> None:
-    """Each of these seeds is a history of faults; the command of the module runs more."""
     for seed in range(first, first + 50):
         History(seed).run()
 
 
 @pytest.mark.parametrize("name", MUTANTS)
 def test_each_mutant_of_a_rule_is_found(name: str, tmp_path: Path) -> None:
-    """The history of its seed breaks a promise with the mutant, and none with the product."""
     mutant = MUTANTS[name]
     History(mutant.seed, faults=mutant.faults).run()
     with pytest.raises(Violation):
@@ -25,7 +23,6 @@ def test_each_mutant_of_a_rule_is_found(name: str, tmp_path: Path) -> None:
 
 
 def test_a_seed_gives_the_same_history_again() -> None:
-    """A finding can be repeated."""
     traces: list[list[str]] = [[], []]
     for trace in traces:
         History(7, on_event=trace.append).run()

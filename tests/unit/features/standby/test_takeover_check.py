@@ -114,7 +114,6 @@ def standby(tmp_path: Path) -> Iterator[Standby]:
 
 
 async def test_a_standby_without_obstacles(standby: Standby) -> None:
-    """The result is empty; before the first check it is not known."""
     standby.save_specification(TEXTS["a"])
     async with standby.checked() as checked:
         assert checked.check.obstacle == UNCHECKED
@@ -134,7 +133,6 @@ async def test_other_site_keys(standby: Standby) -> None:
 
 
 async def test_a_policy_and_a_specification_that_this_version_cannot_load(standby: Standby) -> None:
-    """The first finding is the reason; the next revision of the active appliance removes it."""
     standby.store.save_revision(standby.revision(f"{OPEN_POLICY}[Tomorrow]\n"))
     async with standby.checked() as checked:
         assert "revision 2:9:" in await checked.next_obstacle()
@@ -148,7 +146,6 @@ async def test_a_policy_and_a_specification_that_this_version_cannot_load(standb
 
 
 async def test_state_that_this_version_does_not_understand(standby: Standby) -> None:
-    """The reason names the remedy: the same version on both appliances."""
     row = IncarnationRow(
         "k", "/n", "10.0.0.7", "http://10.0.0.7:1/", "10.0.0.7", 1, 2, False, "dreaming", 0.0
     )
@@ -162,7 +159,6 @@ async def test_state_that_this_version_does_not_understand(standby: Standby) -> 
 
 
 async def test_an_unreadable_folder_of_specifications(standby: Standby) -> None:
-    """A takeover reads it while the active appliance has no specifications; it is checked again from time to time."""
     standby.monitors.rmdir()
     async with standby.checked(again=0.05) as checked:
         assert await checked.next_obstacle() == (
@@ -185,7 +181,6 @@ async def test_an_unreadable_policy(standby: Standby) -> None:
 
 
 async def test_a_monitor_to_enable_that_does_not_exist(standby: Standby) -> None:
-    """The start refuses it if no operator loaded the specifications."""
     standby.save_specification(TEXTS["a"], who=DISK)
     async with standby.checked(enable="a,other") as checked:
         assert "no monitor is named other; there are: a" in await checked.next_obstacle()
@@ -223,7 +218,6 @@ class OwnCompiler(SpecificationCompiler):
 
 
 async def test_a_takeover_compiles_nothing(standby: Standby) -> None:
-    """The check has compiled the specifications, for each relay and with their switches."""
     files = {f"{name}.rv": TEXTS[name] for name in ("a", "b", "c")}
     standby.store.save_monitor_revision(MonitorRevisionRow(1, text_of(Sources(files)), 0.0, "alice", ""))
     standby.store.save_setting(SWITCHES, json.dumps({"b": "shadow"}))
@@ -252,7 +246,6 @@ async def test_a_takeover_compiles_nothing(standby: Standby) -> None:
 
 
 async def test_the_check_changes_nothing(standby: Standby) -> None:
-    """The state is the same after it, although the check reads it while it is written."""
     before = standby.store.database.number
     async with standby.checked() as checked:
         await checked.next_obstacle()

@@ -124,7 +124,6 @@ def removing(epoch: int) -> str:
 
 
 def test_an_honest_pair_is_proven(pair: Pair) -> None:
-    """Four takeovers of a pair whose clocks differ by an hour have no finding, and each result is as it happened."""
     result = verified(pair.a, pair.b)
     assert result.ok, result.findings
     rows = [(one.epoch, one.appliance, one.other, one.link, one.overlap) for one in result.takeovers]
@@ -137,8 +136,6 @@ def test_an_honest_pair_is_proven(pair: Pair) -> None:
 
 
 def test_a_standby_that_was_never_active_has_no_log(pair: Pair, tmp_path: Path) -> None:
-    """The other log is verified alone; it is a finding if that log names the missing one."""
-
     async def first_hour(a: Member, _b: Member, _world: World) -> None:
         async with a.active(1):
             await a.decide(3, 10)
@@ -171,15 +168,12 @@ def test_the_tail_is_counted(pair: Pair) -> None:
 
 
 def test_signatures_before_the_named_checkpoint_seal_no_tail(pair: Pair) -> None:
-    """If the other log has lost its later signatures, none of its tail counts as sealed."""
     lost = msgspec.structs.replace(verify(pair.a), signed_through=3)
     result = verify_takeovers(VerifiedLog(pair.a, lost), VerifiedLog(pair.b, verify(pair.b)))
     assert [one.tail_signed for one in result.takeovers if one.other == "a"] == [0, 0]
 
 
 def test_an_unsigned_tail_is_counted(tmp_path: Path) -> None:
-    """Records of an appliance that never came back are in the tail, and no checkpoint seals them."""
-
     async def story(a: Member, b: Member, world: World) -> None:
         async with a.active(1):
             await a.decide(3, 3)
@@ -206,7 +200,6 @@ def begun_after(path: Path, removed: int) -> VerifiedLog:
 
 
 def test_retention_leaves_the_rest_proven(pair: Pair) -> None:
-    """A named checkpoint whose records retention removed is not a finding, and is reported as removed."""
     first = verified(pair.a, pair.b).takeovers[1]
     result = verify_takeovers(begun_after(pair.a, first.through), VerifiedLog(pair.b, verify(pair.b)))
     assert result.ok, result.findings
@@ -218,7 +211,6 @@ def test_retention_leaves_the_rest_proven(pair: Pair) -> None:
 
 
 def test_a_takeover_removed_by_retention_is_not_missing(pair: Pair) -> None:
-    """A takeover that retention can have removed is not missing; one after the first that is left is."""
     pair.forge_b(setting("previous", 'json(\'{"epoch": 3, "appliance": "a"}\')', 5))
     assert found(pair) == [(Kind.TAKEOVER_MISSING, 3)]
     b = VerifiedLog(pair.b, verify(pair.b))
@@ -230,7 +222,6 @@ def test_a_takeover_removed_by_retention_is_not_missing(pair: Pair) -> None:
 
 
 def test_records_after_the_verified_part_are_not_read(pair: Pair) -> None:
-    """A takeover that was written after the verification is not part of the result."""
     result = verify(pair.b)
     ((place,),) = read(pair.b, "SELECT max(sequence) FROM record WHERE event = 'took over'")
     part = msgspec.structs.replace(result, last=place - 1)
@@ -242,8 +233,6 @@ def test_records_after_the_verified_part_are_not_read(pair: Pair) -> None:
 
 
 def test_the_tail_reaches_beyond_an_unsealed_takeover(tmp_path: Path) -> None:
-    """A takeover that the other appliance did not get to know of belongs to the tail, and no checkpoint seals it."""
-
     async def story(a: Member, b: Member, world: World) -> None:
         async with a.active(1):
             a.replicate_to(b)
@@ -271,8 +260,6 @@ def test_the_findings_are_limited(pair: Pair, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_logs_without_a_takeover_have_no_link(tmp_path: Path) -> None:
-    """Two logs of appliances that never were a pair have no takeover to report."""
-
     async def story(a: Member, b: Member, _world: World) -> None:
         await a.decide(3, 3)
         await b.decide(3, 3)
@@ -325,13 +312,11 @@ def test_a_removed_takeover(pair: Pair) -> None:
 
 
 def test_a_removed_unsealed_takeover(pair: Pair) -> None:
-    """A takeover that no named checkpoint seals is missed all the same."""
     pair.forge_b(setting("previous", 'json(\'{"epoch": 3, "appliance": "b"}\')', 5))
     assert found(pair) == [(Kind.TAKEOVER_MISSING, 3)]
 
 
 def test_a_log_of_another_pair(pair: Pair, tmp_path: Path) -> None:
-    """The log of another pair, although valid on its own, does not have the named checkpoints."""
     stranger = build(tmp_path / "stranger", four_takeovers)
     kinds = found(pair._replace(b=stranger.b))
     assert (Kind.LOG_REPLACED, 4) in kinds
@@ -339,12 +324,10 @@ def test_a_log_of_another_pair(pair: Pair, tmp_path: Path) -> None:
 
 
 def test_one_log_given_twice(pair: Pair) -> None:
-    """A copy of the same log is not the log of the other appliance."""
     assert found(pair._replace(b=pair.a)) == [(Kind.SAME_LOG, 0)]
 
 
 def test_a_log_signed_with_another_key(pair: Pair) -> None:
-    """A log that was signed again with a new key, also beside the log, is not by the key that takeovers name."""
     key = Ed25519PrivateKey.generate()
     write_anew(pair.b, key, pair.b.parent / "signer", "UPDATE record SET reason = reason")
     write_public_key(pinned_key_path(pair.b), key.public_key().public_bytes_raw())
@@ -352,19 +335,16 @@ def test_a_log_signed_with_another_key(pair: Pair) -> None:
 
 
 def test_a_forged_signature_in_a_takeover(pair: Pair) -> None:
-    """A checkpoint in a takeover that the other key did not sign is not believed."""
     pair.forge_b(setting("checkpoint.signature", "'" + "00" * 64 + "'", 5))
     assert found(pair) == [(Kind.SIGNATURE_WRONG, 5)]
 
 
 def test_a_forged_checkpoint_in_a_takeover(pair: Pair) -> None:
-    """A takeover whose checkpoint was changed accuses the other log of nothing."""
     pair.forge_b(setting("checkpoint.hash", "'" + "00" * 32 + "'", 5))
     assert found(pair) == [(Kind.SIGNATURE_WRONG, 5)]
 
 
 def test_a_different_checkpoint_with_the_same_hash(pair: Pair) -> None:
-    """A checkpoint that was replaced in the log by one of another time is found."""
     number, sequence, text = read(pair.a, "SELECT number, sequence, text FROM checkpoint ORDER BY number")[-2]
     named = verified(pair.a, pair.b).takeovers[-1]
     assert sequence == named.through
@@ -381,7 +361,6 @@ def test_a_different_checkpoint_with_the_same_hash(pair: Pair) -> None:
 
 
 def test_a_takeover_with_an_earlier_epoch(pair: Pair) -> None:
-    """An epoch that was set back contradicts the epochs that the named checkpoint seals."""
     pair.forge_b(setting("epoch", "3", 5))
     assert (Kind.EPOCH_ORDER, 3) in found(pair)
     names = [one.message for one in verified(pair.a, pair.b).findings]
@@ -389,7 +368,6 @@ def test_a_takeover_with_an_earlier_epoch(pair: Pair) -> None:
 
 
 def test_an_epoch_in_both_logs(pair: Pair) -> None:
-    """Two appliances with the same epoch are named."""
     pair.forge_b(setting("epoch", "4", 5))
     assert "epoch 4: both logs have a takeover of epoch 4" in [
         one.message for one in verified(pair.a, pair.b).findings
@@ -398,7 +376,6 @@ def test_an_epoch_in_both_logs(pair: Pair) -> None:
 
 @pytest.mark.parametrize("epoch", [1, 2])
 def test_epochs_that_do_not_increase_in_a_log(pair: Pair, epoch: int) -> None:
-    """An epoch that is repeated or smaller than an earlier one of its log is named."""
     pair.forge_b(setting("epoch", str(epoch), 5))
     message = next(
         one.message for one in verified(pair.a, pair.b).findings if "comes after epoch 2" in one.message
@@ -407,14 +384,12 @@ def test_epochs_that_do_not_increase_in_a_log(pair: Pair, epoch: int) -> None:
 
 
 def test_a_previous_takeover_from_the_future(pair: Pair) -> None:
-    """A takeover that names itself or a later one as the one before it is named."""
     pair.forge_b(setting("previous.epoch", "5", 5))
     assert found(pair) == [(Kind.EPOCH_ORDER, 5)]
 
 
 @pytest.mark.parametrize(("field", "name"), [("other", "c"), ("appliance", "a")])
 def test_a_wrong_name(pair: Pair, field: str, name: str) -> None:
-    """A takeover from an appliance that is not the other one, or under its name, is named."""
     pair.forge_b(setting(field, f"'{name}'", 5))
     assert (Kind.WRONG_NAME, 5) in found(pair)
 
@@ -428,7 +403,6 @@ def test_an_unreadable_takeover(pair: Pair, value: str) -> None:
 
 @pytest.mark.parametrize(("field", "value"), [("epoch", "1"), ("to", "'c'")])
 def test_a_hand_over_that_does_not_fit(pair: Pair, field: str, value: str) -> None:
-    """A hand-over of an epoch that the appliance did not have, or to an unknown one, is named."""
     pair.forge_b(setting(field, value, 2, "handed over"))
     assert Kind.EPOCH_ORDER in {kind for kind, _epoch in found(pair)}
     assert any("hands it over to" in one.message for one in verified(pair.a, pair.b).findings)
@@ -463,7 +437,6 @@ def test_a_replaced_table(pair: Pair, statement: str) -> None:
 
 
 def test_a_log_that_changes_after_its_verification(pair: Pair) -> None:
-    """Hashes that are replaced by other values between two steps are a finding, not a crash."""
     results = VerifiedLog(pair.a, verify(pair.a)), VerifiedLog(pair.b, verify(pair.b))
     execute(
         pair.a,
@@ -478,7 +451,6 @@ def test_a_log_that_changes_after_its_verification(pair: Pair) -> None:
 
 @pytest.mark.parametrize("side", ["a", "b"])
 def test_a_fault_of_either_log_is_one_of_the_pair(pair: Pair, side: str) -> None:
-    """A log that is not valid on its own makes the pair invalid."""
     execute(getattr(pair, side), "UPDATE record SET reason = 'x' WHERE sequence = 3")
     assert not verified(pair.a, pair.b).ok
 
@@ -529,7 +501,6 @@ def overlapping(folder: Path, both: float, *, lasting: float = 60, clock_set: st
     ],
 )
 def test_decisions_of_both_at_once(tmp_path: Path, both: float, lasting: float, findings: list[Any]) -> None:
-    """An appliance that decided for longer than the tolerance while the other one was active is found."""
     made = overlapping(tmp_path, both, lasting=lasting)
     assert found(made) == findings
     assert verified(made.a, made.b).takeovers[1].overlap == ("found" if findings else "excluded")
@@ -537,7 +508,6 @@ def test_decisions_of_both_at_once(tmp_path: Path, both: float, lasting: float, 
 
 @pytest.mark.parametrize("who", ["a", "b"])
 def test_a_clock_that_was_set_proves_no_overlap(tmp_path: Path, who: str) -> None:
-    """Durations are not compared over a recorded change of either clock, and the result says that it is unknown."""
     made = overlapping(tmp_path, 10, clock_set=who)
     assert found(made) == []
     assert verified(made.a, made.b).takeovers[1].overlap == "unknown"
@@ -571,8 +541,6 @@ def test_decisions_after_a_hand_over(tmp_path: Path, seconds: float, event: str,
 
 
 def test_denials_that_retention_wrote_again_are_old(tmp_path: Path) -> None:
-    """A denial that retention writes again after a hand-over was not decided then."""
-
     async def story(a: Member, b: Member, world: World) -> None:
         async with a.active(1):
             await a.decide(5, 5)

@@ -56,7 +56,6 @@ def table(store: StateStore, endpoint: str = FIRST) -> ApplianceTable:
 async def test_the_second_appliance_opens_tunnels_and_issues_nothing(
     tmp_path: Path, store: StateStore
 ) -> None:
-    """It states the first one's authority and last list, although its own signer has another authority."""
     first = SharedAuthority(near(tmp_path, "a"), store.hosts)
     certificate, listed = await first.certificate(), await first.revocations([("1f", 1.0)])
     assert await first.obstacle() == first.waits == ""
@@ -69,7 +68,6 @@ async def test_the_second_appliance_opens_tunnels_and_issues_nothing(
 
 
 async def test_the_end_of_the_last_list_is_shown(tmp_path: Path, store: StateStore) -> None:
-    """Operators see until when tunnels open without the key: as long as charon accepts the list."""
     listed = await SharedAuthority(near(tmp_path, "a"), store.hosts).revocations([])
     end = x509.load_pem_x509_crl(listed).next_update_utc
     assert end is not None
@@ -82,7 +80,6 @@ async def test_the_end_of_the_last_list_is_shown(tmp_path: Path, store: StateSto
 
 
 async def test_a_single_appliance_uses_its_own_key(tmp_path: Path, store: StateStore) -> None:
-    """An authority that is left in the state, from a pair, does not matter any more."""
     await SharedAuthority(near(tmp_path, "a"), store.hosts).revocations([])
     own = near(tmp_path, "b")
     alone = StoredAuthority(own, store.hosts)
@@ -91,7 +88,6 @@ async def test_a_single_appliance_uses_its_own_key(tmp_path: Path, store: StateS
 
 
 async def test_another_authority_is_reported_once(tmp_path: Path, store: StateStore) -> None:
-    """Neither the first start nor a restart reports an authority; the first start with another key does."""
     told: list[str] = []
     for name in ("a", "a", "b", "b"):
         alone = StoredAuthority(near(tmp_path, name), store.hosts, replaced=lambda: told.append("new"))
@@ -109,7 +105,6 @@ async def test_without_a_list_no_tunnel_opens(tmp_path: Path, store: StateStore)
 
 
 async def test_the_standby_finds_its_certificate_in_the_state(tmp_path: Path, store: StateStore) -> None:
-    """The active appliance certifies the key of the introduction, once; kits get its address and pin."""
     authority = SharedAuthority(near(tmp_path, "a"), store.hosts)
     first, given = table(store), introduction()
     await first.introduce(given, authority)
@@ -130,7 +125,6 @@ async def test_the_standby_finds_its_certificate_in_the_state(tmp_path: Path, st
 async def test_a_certificate_is_renewed_long_before_its_end(
     tmp_path: Path, store: StateStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An introduction renews a certificate with less than sixty days left; an ended one is not used."""
     authority, first, given = (
         SharedAuthority(near(tmp_path, "a"), store.hosts), table(store), introduction(),
     )  # fmt: skip
@@ -147,7 +141,6 @@ async def test_a_certificate_is_renewed_long_before_its_end(
 async def test_a_replaced_appliance_is_revoked(
     tmp_path: Path, store: StateStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A new key makes the earlier one worthless, but not several in an hour: each makes the list longer."""
     authority, first = SharedAuthority(near(tmp_path, "a"), store.hosts), table(store)
     stolen, replacement, further = introduction(), introduction(), introduction()
     await first.introduce(stolen, authority)
@@ -165,7 +158,6 @@ async def test_a_replaced_appliance_is_revoked(
 
 
 async def test_an_appliance_with_the_same_address_is_not_taken(tmp_path: Path, store: StateStore) -> None:
-    """Hosts could not choose between the two."""
     authority, first = SharedAuthority(near(tmp_path, "a"), store.hosts), table(store)
     await first.introduce(introduction(FIRST), authority)
     assert first.other is None
@@ -173,7 +165,6 @@ async def test_an_appliance_with_the_same_address_is_not_taken(tmp_path: Path, s
 
 
 async def test_a_flood_of_introductions_is_one_at_a_time(tmp_path: Path, store: StateStore) -> None:
-    """While the authority works on one introduction, others cost nothing."""
     signer, first = near(tmp_path, "a"), table(store)
     authority, issued = SharedAuthority(signer, store.hosts), []
     signer.meanwhile = lambda: issued.append(1)
@@ -182,7 +173,6 @@ async def test_a_flood_of_introductions_is_one_at_a_time(tmp_path: Path, store: 
 
 
 async def test_each_appliance_knows_its_own_row(tmp_path: Path, store: StateStore) -> None:
-    """The pin of REST is stored with the own certificate; for the other appliance this is the second one."""
     signer, key = near(tmp_path, "a"), make_key()
     first = table(store)
     made = await signer.issue(signing_request(key, "rosrv-appliance"), "rosrv-appliance", 90)

@@ -81,7 +81,6 @@ def granted() -> Robot:
 
 
 def test_the_first_grant_comes_one_expiry_after_the_start() -> None:
-    """R4: both are shut out until then."""
     robot = Robot()
     assert robot.admits == [""]
     robot.now += EXPIRY - 0.01
@@ -93,7 +92,6 @@ def test_the_first_grant_comes_one_expiry_after_the_start() -> None:
 
 
 def test_a_claim_waits_until_the_last_renewal_has_expired() -> None:
-    """R1: while the holder renews, a claim is refused."""
     robot = granted()
     robot.now += 1
     assert robot.asks("a", "renew", 2) == ""
@@ -104,7 +102,6 @@ def test_a_claim_waits_until_the_last_renewal_has_expired() -> None:
 
 
 def test_only_an_appliance_in_sync_gets_the_lease() -> None:
-    """R1 and R2: a removed appliance is refused until the holder adds it again."""
     robot = granted()
     assert robot.asks("b", "remove", 2) == "a holds epoch 2"
     assert robot.asks("a", "remove", 2) == ""
@@ -115,7 +112,6 @@ def test_only_an_appliance_in_sync_gets_the_lease() -> None:
 
 
 def test_a_released_lease_is_granted_at_once() -> None:
-    """A planned switchover waits for no expiry."""
     robot = granted()
     assert robot.asks("b", "release", 2) == "a holds epoch 2"
     assert robot.asks("a", "release", 2) == ""
@@ -131,7 +127,6 @@ def test_an_epoch_never_falls() -> None:
 
 
 def test_a_full_disk_grants_nothing_and_keeps_the_holder() -> None:
-    """Renewals continue without the disk."""
     robot = granted()
     robot.disk_full = True
     assert robot.asks("a", "renew", 2) == ""
@@ -142,7 +137,6 @@ def test_a_full_disk_grants_nothing_and_keeps_the_holder() -> None:
 
 
 def test_a_failing_firewall_grants_nothing() -> None:
-    """The earlier holder keeps the lease, and its renewal writes the rules again."""
     robot = granted().expired()
     robot.firewall_fails = True
     assert robot.asks("b", "claim", 2) == "nft: no"
@@ -154,7 +148,6 @@ def test_a_failing_firewall_grants_nothing() -> None:
 
 
 def test_a_restart_of_the_witness_alone_changes_no_rule() -> None:
-    """Within one boot the holder stays admitted; after a reboot only its renewal admits it."""
     record = LeaseRecord(2, "a", BOTH, "one")
     assert Robot(record, "one").admits == ["a"]
     robot = Robot(record, "two")
@@ -165,7 +158,6 @@ def test_a_restart_of_the_witness_alone_changes_no_rule() -> None:
 
 
 def test_without_a_lease_both_are_shut_out() -> None:
-    """Every request is refused with the command that helps."""
     robot = Robot(None).expired()
     for operation in program.OPERATIONS:
         assert "witness.py begin" in robot.asks("a", operation)
@@ -175,7 +167,6 @@ def test_without_a_lease_both_are_shut_out() -> None:
 
 
 def test_rules_that_another_program_removed_are_written_again() -> None:
-    """The holder stays admitted."""
     robot = granted()
     robot.witness.enforce_again()
     assert robot.admits == ["", "a", "a"]
@@ -196,7 +187,6 @@ def answered(robot: Robot, datagram: bytes, address: str = "10.0.0.2") -> dict[s
 
 
 def test_an_answer_repeats_session_and_number() -> None:
-    """It has the lease as it is after the request."""
     assert answered(Robot().expired(), request()) == {
         "boot": "nonce", "session": "mine", "number": 1, "ok": True, "reason": "", "epoch": 2, "holder": "a",
         "in_sync": ["a", "b"], "expired": False, "trouble": "",
@@ -204,7 +194,6 @@ def test_an_answer_repeats_session_and_number() -> None:
 
 
 def test_a_look_changes_nothing() -> None:
-    """It says whether the lease has expired."""
     robot = Robot().expired()
     answers = [
         answered(robot, request(do=operation, number=number, epoch=epoch))
@@ -238,7 +227,6 @@ def test_a_look_changes_nothing() -> None:
 def test_a_request_that_is_not_authentic_and_well_formed_gets_no_answer(
     datagram: bytes, address: str
 ) -> None:
-    """It is counted, and changes nothing."""
     robot = Robot().expired()
     assert robot.gate.answer(datagram, address) is None
     assert robot.gate.rejected == 1
@@ -246,7 +234,6 @@ def test_a_request_that_is_not_authentic_and_well_formed_gets_no_answer(
 
 
 def test_a_replayed_request_changes_nothing() -> None:
-    """Its answer has the last number, with which a restarted appliance goes on."""
     robot = granted()
     removal, addition = (
         request(do="remove", epoch=2, number=5),
@@ -278,7 +265,6 @@ def test_only_a_new_request_moves_the_socket_of_an_appliance() -> None:
 
 
 def test_a_request_to_an_earlier_start_changes_nothing() -> None:
-    """The answer has the nonce of this start."""
     robot = Robot().expired()
     answer = answered(robot, request(boot="earlier"))
     assert answer == {"boot": "nonce", "session": "mine", "number": 1, "stale": True, "last": 0}
@@ -289,7 +275,6 @@ def test_a_request_to_an_earlier_start_changes_nothing() -> None:
 
 
 def test_the_lease_survives_on_the_disk(tmp_path: Path) -> None:
-    """It is readable only by its owner. A change needs no free space: the file stays, with its size."""
     file = LeaseFile(str(tmp_path / "lease"), BOTH)
     assert not file.has_room()
     stats = []
@@ -303,7 +288,6 @@ def test_the_lease_survives_on_the_disk(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("end", "epoch"), [(0, 7), (100, 7), (4096, 8), (4196, 8), (8192, 8)])
 def test_a_crash_leaves_the_old_lease_or_the_new_one(tmp_path: Path, end: int, epoch: int) -> None:
-    """A change overwrites two copies in turn; `end` is where the power was cut."""
     path, made = tmp_path / "lease", []
     file = LeaseFile(str(path), BOTH)
     for number in (7, 8):
@@ -314,7 +298,6 @@ def test_a_crash_leaves_the_old_lease_or_the_new_one(tmp_path: Path, end: int, e
 
 
 def test_the_lease_of_an_earlier_version_is_read_and_gets_room(tmp_path: Path) -> None:
-    """The file had one copy and no padding."""
     file, record = LeaseFile(str(tmp_path / "lease"), BOTH), LeaseRecord(7, "a", BOTH, "x")
     file.write(record)
     (tmp_path / "lease").write_bytes((tmp_path / "lease").read_bytes()[:4096].rstrip())
@@ -324,7 +307,6 @@ def test_the_lease_of_an_earlier_version_is_read_and_gets_room(tmp_path: Path) -
 
 
 def test_a_disk_that_cannot_be_written_is_reported_in_each_answer(tmp_path: Path) -> None:
-    """Before the next takeover needs it; also a disk that does not answer, and a file without room."""
     now = [0.0]
     file = LeaseFile(str(tmp_path / "lease"), BOTH)
     disk = DiskCheck(file, lambda: now[0])
@@ -354,7 +336,6 @@ def test_a_disk_that_cannot_be_written_is_reported_in_each_answer(tmp_path: Path
     ],
 )
 def test_a_damaged_lease_is_refused(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
-    """The error has the file, the reason and the command."""
     file = LeaseFile(str(tmp_path / "lease"), BOTH)
     file.write(LeaseRecord(7, "a", BOTH, "x"))
     (tmp_path / "lease").write_bytes(damage((tmp_path / "lease").read_bytes()))
@@ -372,7 +353,6 @@ def test_a_damaged_lease_is_refused(tmp_path: Path, damage: Callable[[bytes], by
     ],
 )
 def test_a_lease_of_other_appliances_is_refused(tmp_path: Path, record: LeaseRecord) -> None:
-    """A valid checksum is not enough."""
     file = LeaseFile(str(tmp_path / "lease"), BOTH)
     file.write(record)
     with pytest.raises(WitnessError):
@@ -380,7 +360,6 @@ def test_a_lease_of_other_appliances_is_refused(tmp_path: Path, record: LeaseRec
 
 
 def test_a_save_that_fails_keeps_the_lease() -> None:
-    """A full disk is reported with the file."""
     with pytest.raises(WitnessError, match="cannot be saved"):
         LeaseFile("/dev/full/lease", BOTH).write(LeaseRecord(1, "", BOTH, ""))
 
@@ -413,7 +392,6 @@ def settings(tmp_path: Path) -> Path:
 def test_begin_writes_a_lease_with_a_greater_epoch(
     settings: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It refuses an epoch that was used, and names that the settings do not have."""
     command = ["begin", "--settings", str(settings)]
     assert main([*command, "--in-sync", "a,b", "--epoch", "5"]) == 0
     file = LeaseFile(str(settings.parent / "state/lease"), BOTH)
@@ -450,7 +428,6 @@ def test_begin_waits_until_the_witness_is_stopped(settings: Path, capsys: pytest
 def test_wrong_settings_are_rejected_with_the_reason(
     settings: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, reason: str
 ) -> None:
-    """No rule is written."""
     text = settings.read_text()
     changed = text.replace(old, new)
     if old == '"aa':
@@ -462,14 +439,12 @@ def test_wrong_settings_are_rejected_with_the_reason(
 
 
 def test_keys_that_others_can_read_are_rejected(settings: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The error has the command that fixes it."""
     settings.chmod(0o640)
     assert main(["serve", "--settings", str(settings)]) == 1
     assert f"chmod 600 {settings}" in capsys.readouterr().err
 
 
 def test_the_log_is_bounded() -> None:
-    """After some lines only their number is printed."""
     lines: list[str] = []
     now = [0.0]
     log = BoundedLog(lines.append, lambda: now[0])
@@ -481,7 +456,6 @@ def test_the_log_is_bounded() -> None:
 
 
 def test_the_backend_is_nft_from_linux_4_18() -> None:
-    """Without either program the error says which to install."""
     assert chosen_backend("4.18.0-25-generic", lambda name: name) == "nft"
     assert chosen_backend("4.4.0-210", lambda name: name) == "iptables"
     assert chosen_backend("6.1", {"iptables-restore": "/sbin/iptables-restore"}.get) == "iptables"
@@ -490,7 +464,6 @@ def test_the_backend_is_nft_from_linux_4_18() -> None:
 
 
 def test_connections_are_found_in_the_tables_of_the_kernel() -> None:
-    """Java's sockets have mapped addresses; listening and closed sockets are left out."""
     row = "   0: {} {} {} 00000000:00000000 00:00000000 00000000 0 0 1"
     mapped = "0000000000000000FFFF0000"
     table = "\n".join(
@@ -522,7 +495,6 @@ SOURCE = Path(program.__file__).read_text()
 
 @pytest.mark.nightly
 def test_it_runs_on_python_3_5() -> None:
-    """Its syntax and its library are those of Python 3.5: Ubuntu 16.04."""
     ast.parse(SOURCE, feature_version=(3, 5))
     command = [str(Path(sys.executable).with_name("vermin")), "--no-tips", "--target=3.5-", program.__file__]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -530,7 +502,6 @@ def test_it_runs_on_python_3_5() -> None:
 
 
 def test_it_imports_only_the_standard_library() -> None:
-    """It is copied to the robot alone."""
     imported = {
         name.partition(".")[0]
         for node in ast.walk(ast.parse(SOURCE))
@@ -546,7 +517,6 @@ def test_it_imports_only_the_standard_library() -> None:
 
 
 def test_rules_that_change_before_they_are_first_read_are_not_taken_for_ours() -> None:
-    """Another program flushes the filter between our change and our reading of it."""
     settings = WitnessSettings(
         ("10.0.0.1", 7411), "10.0.0.100", ("11311",),
         {name: AppliancePeer(f"10.0.0.{number}", KEYS[name]) for number, name in enumerate("ab", 2)}, "/lease", {}, "",

@@ -39,13 +39,11 @@ def test_a_syslog_receiver(text: str, destination: tuple[str, str, int]) -> None
     ],
 )
 def test_an_invalid_syslog_receiver_is_rejected(syslog: dict[str, object], why: str) -> None:
-    """A useless or impossible setting is an error with its key and the reason."""
     with pytest.raises(ValidationError, match=why):
         read({"audit": {"syslog": syslog}})
 
 
 def test_the_forwarder_runs_only_if_configured() -> None:
-    """The forwarder has its own user, in the group that may read the audit log; no other process depends on it."""
     (forwarder,) = SYSLOG.roles
     wanted = Sections({Syslog: Syslog(to="tls://10.0.0.9:6514")})
     assert forwarder in roles_of(sections=wanted)

@@ -100,7 +100,6 @@ def everything(path: Path) -> list[int]:
 
 
 def test_the_whole_log_is_sent_in_order(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """Every record, old ones included, is sent once and in order; then the forwarder waits."""
     log = make_log()
     record(log, 700)
     one = forwarder(path, kept)
@@ -113,7 +112,6 @@ def test_the_whole_log_is_sent_in_order(make_log: MakeLog, path: Path, kept: Kep
 
 
 def test_a_failed_batch_is_sent_again(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """The same batch is repeated at growing intervals, and no record is skipped."""
     log = make_log()
     record(log, 10)
     kept.failing = 4
@@ -141,7 +139,6 @@ def test_the_interval_is_bounded(make_log: MakeLog, path: Path, kept: Kept) -> N
 
 
 def test_it_continues_after_a_restart(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """A restarted forwarder continues where the previous one ended."""
     log = make_log()
     record(log, 300)
     first = forwarder(path, kept)
@@ -154,7 +151,6 @@ def test_it_continues_after_a_restart(make_log: MakeLog, path: Path, kept: Kept)
 
 
 def test_a_killed_forwarder_repeats_its_batch(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """No record is missing, but some arrive twice."""
     log = make_log()
     record(log, 300)
     first = forwarder(path, kept)
@@ -169,7 +165,6 @@ def test_a_killed_forwarder_repeats_its_batch(make_log: MakeLog, path: Path, kep
 
 
 def test_only_denials_are_sent_if_configured(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """With `denials`, only refusals, warnings, alarms and every checkpoint are sent."""
     log = make_log(checkpoint_every=5)
     record(log, 20)
     log.record(decision(log, decision="deny", severity=Severity.WARNING, resource="/arm"))
@@ -188,7 +183,6 @@ def test_only_denials_are_sent_if_configured(make_log: MakeLog, path: Path, kept
 def test_checkpoints_at_the_receiver_prove_the_log(
     make_log: MakeLog, path: Path, kept: Kept, tmp_path: Path
 ) -> None:
-    """`verify --checkpoints` reads the receiver's file: each checkpoint follows the records it seals."""
     log = make_log(checkpoint_every=50)
     for _ in range(10):
         record(log, 30)
@@ -213,7 +207,6 @@ def test_checkpoints_at_the_receiver_prove_the_log(
 def test_records_removed_before_sending_are_counted(
     make_log: MakeLog, path: Path, kept: Kept, notary: Notary
 ) -> None:
-    """Records that retention removed first are reported, not silently skipped."""
     notary.ago = 2 * _DAY
     log = make_log(checkpoint_every=20, clock=lambda: 1)
     record(log, 100, time=1)
@@ -238,7 +231,6 @@ def test_records_removed_before_sending_are_counted(
 
 
 def test_an_old_log_has_no_missed_records(make_log: MakeLog, path: Path, kept: Kept, notary: Notary) -> None:
-    """Records removed before forwarding was configured do not count as missed."""
     notary.ago = 2 * _DAY
     log = make_log(checkpoint_every=20, clock=lambda: 1)
     record(log, 100, time=1)
@@ -256,7 +248,6 @@ def test_an_old_log_has_no_missed_records(make_log: MakeLog, path: Path, kept: K
 
 
 def test_another_log_is_sent_from_its_start(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """If a new log appears at the same path, the forwarder sends it from its beginning."""
     log = make_log()
     record(log, 20)
     one = forwarder(path, kept)
@@ -272,14 +263,12 @@ def test_another_log_is_sent_from_its_start(make_log: MakeLog, path: Path, kept:
 
 
 def test_a_missing_log_is_waited_for(path: Path, kept: Kept) -> None:
-    """The forwarder reports the missing log and tries again."""
     one = forwarder(path, kept)
     assert one.step() > 0
     assert "no audit log yet" in one.progress.trouble
 
 
 def test_an_unreadable_position_stops_it(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """The forwarder reports the reason and stops; it never silently repeats or skips a record."""
     record(make_log(), 3)
     path.with_name("position.json").write_text("rubbish")
     one = forwarder(path, kept)
@@ -299,7 +288,6 @@ def put_back(path: Path, copy: Path) -> None:
 def test_a_restored_log_is_continued(
     make_log: MakeLog, path: Path, kept: Kept, tmp_path: Path, later: int
 ) -> None:
-    """New records after a restore are sent, even if their sequences were sent before."""
     log = make_log(checkpoint_every=5)
     record(log, 20)
     log.close()
@@ -330,7 +318,6 @@ def test_a_restored_log_is_continued(
 
 
 def test_an_old_position_beyond_the_end_is_corrected(make_log: MakeLog, path: Path, kept: Kept) -> None:
-    """If the position of an earlier version is ahead of the log, it moves back to the log's end."""
     log = make_log()
     record(log, 5)
     (last,) = everything(path)[-1:]
@@ -347,7 +334,6 @@ def test_an_old_position_beyond_the_end_is_corrected(make_log: MakeLog, path: Pa
 def test_records_removed_while_reading_are_counted(
     make_log: MakeLog, path: Path, kept: Kept, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Records removed after the log's range was queried and before they were read count as missed."""
     log = make_log()
     record(log, 30)
     one = forwarder(path, kept)
@@ -366,7 +352,6 @@ def test_records_removed_while_reading_are_counted(
 
 
 def test_a_position_is_stored_and_loaded(tmp_path: Path) -> None:
-    """The loaded position is the last stored one."""
     file = tmp_path / "position.json"
     assert load_position(file) is None
     for position in (ForwardingPosition("a" * 32, 7, 1), ForwardingPosition("a" * 32, 9, 2)):
@@ -377,7 +362,6 @@ def test_a_position_is_stored_and_loaded(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["", "{}", "rubbish", '{"log":1,"sequence":2}'])
 def test_an_unreadable_position_is_an_error(tmp_path: Path, text: str) -> None:
-    """The error has the file and advice; the forwarder neither skips nor repeats records silently."""
     file = tmp_path / "position.json"
     file.write_text(text)
     with pytest.raises(ValueError, match=r"position\.json.*remove it"):

@@ -33,7 +33,6 @@ def server_context(certificates: Certificates, *, clients: bool = False) -> ssl.
 
 @pytest.mark.nightly
 def test_udp_sends_datagrams() -> None:
-    """Each message is one datagram."""
     with DatagramCollector() as collector:
         receiver = DatagramReceiver(HOST, collector.port)
         receiver.send([message(1), message(2)])
@@ -57,7 +56,6 @@ def test_tcp_counts_octets() -> None:
 
 @pytest.mark.nightly
 def test_a_closed_connection_is_an_error() -> None:
-    """The error is raised before further messages count as sent; the next connection works."""
     with StreamCollector() as collector:
         receiver = StreamReceiver(HOST, collector.port)
         receiver.send([message(1)])
@@ -77,7 +75,6 @@ def test_a_closed_connection_is_an_error() -> None:
 
 @pytest.mark.nightly
 def test_a_receiver_that_reads_nothing_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Unacknowledged data does not count as sent: the error is raised within the timeout."""
     monkeypatch.setattr("appliance.features.syslog.receiver._SEND_SECONDS", 0.3)
     with socket.socket() as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -105,7 +102,6 @@ def test_tls_checks_the_receiver(certificates: Certificates) -> None:
 
 @pytest.mark.nightly
 def test_a_wrong_certificate_gets_nothing(certificates: Certificates, tmp_path: Path) -> None:
-    """A certificate of another authority, or for another name, gets no record."""
     other = make_certificates(tmp_path / "other")
     with StreamCollector(context=server_context(certificates)) as collector:
         for ca, name in ((other.ca, None), (certificates.ca, "evil.example")):
@@ -137,7 +133,6 @@ def test_tls_with_client_certificates(certificates: Certificates, monkeypatch: p
 
 
 def test_unreadable_files_are_errors(tmp_path: Path, certificates: Certificates) -> None:
-    """A missing authority or certificate is an error that names the file."""
     with pytest.raises(OSError, match=r"nowhere\.pem.*authority"):
         tls_context(tmp_path / "nowhere.pem", None, None)
     with pytest.raises(OSError, match=r"nowhere\.key.*own certificate"):
@@ -146,7 +141,6 @@ def test_unreadable_files_are_errors(tmp_path: Path, certificates: Certificates)
 
 @pytest.mark.nightly
 def test_a_receiver_without_tls_gets_nothing(certificates: Certificates) -> None:
-    """If TLS is configured, a receiver without TLS is an error and gets no record."""
     with socket.socket() as listener:
         listener.bind((HOST, 0))
         listener.listen(1)

@@ -28,7 +28,6 @@ def formatter(longest: int = 8192) -> Formatter:
 
 
 def test_a_denial_has_all_its_parameters() -> None:
-    """Host, resource, rule and reason have their own parameters; the time has microseconds."""
     message = parse(
         formatter().record(
             entry(
@@ -63,12 +62,10 @@ def test_a_denial_has_all_its_parameters() -> None:
     ],
 )
 def test_severities_are_mapped(severity: Severity, number: int) -> None:
-    """Each severity has its own syslog severity: an alarm is an alert."""
     assert parse(formatter().record(entry(severity=severity))).severity == number
 
 
 def test_the_event_is_the_message_id() -> None:
-    """Spaces in the event's name are replaced."""
     assert parse(formatter().record(entry(event="denials folded"))).event == "denials-folded"
 
 
@@ -79,7 +76,6 @@ def test_the_event_is_the_message_id() -> None:
 def test_names_of_unknown_hosts_are_escaped(
     caller: str, resource: str, reason: str, detail: dict[str, str]
 ) -> None:
-    """The message is printable ASCII whatever the name, and the name ends no parameter or line."""
     record = entry(caller_id=caller, resource=resource, reason=reason, detail=detail)
     data = formatter().record(record)
     assert all(0x20 <= one <= 0x7E for one in data)
@@ -90,7 +86,6 @@ def test_names_of_unknown_hosts_are_escaped(
 
 
 def test_a_name_cannot_inject_fields() -> None:
-    """A name that looks like the end of an element, or like a second message, stays inside its parameter."""
     evil = '/x"] [rosrv@32473 decision="allow"]\n<0>1 - - - - - -'
     message = parse(formatter().record(entry(caller_id=evil, decision="deny")))
     assert message.fields["decision"] == "deny"
@@ -120,7 +115,6 @@ def test_a_message_is_bounded(longest: int) -> None:
 
 
 def test_a_message_fits_a_datagram() -> None:
-    """An ordinary record with large details fits a datagram, with its whole reason."""
     data = formatter(2048).record(entry(reason="why it was so", detail={"before": "00" * 4000}))
     assert len(data) <= 2048
     assert parse(data).text == "why it was so"
@@ -134,12 +128,10 @@ def test_any_time_is_valid(time: int) -> None:
 
 @pytest.mark.parametrize("name", ["", "räuber", "two words", "x" * 300, "\n"])
 def test_any_host_name_is_valid(name: str) -> None:
-    """The header is well-formed for any name of the machine."""
     assert parse(Formatter(facility=0, longest=2048, host_name=name).record(entry())).host
 
 
 def test_a_checkpoint_has_its_signature() -> None:
-    """A checkpoint has all signed fields and the signature, under its own name."""
     one = SignedCheckpoint("a" * 32, 3, 120, "b" * 64, _TIME, "c" * 64, "d" * 128, "e" * 64)
     message = parse(formatter().checkpoint(one))
     assert message.event == "checkpoint-signed"

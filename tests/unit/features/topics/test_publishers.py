@@ -31,7 +31,6 @@ def found(log: list[LogEntry], at: int) -> PastPublishers:
 
 
 def test_gaps_of_the_log_are_reported() -> None:
-    """Removed records, an earlier log, lost records and an empty log are reported; a whole log has no such gap."""
     begun = entry(1, "log begun")
     assert unknown([begun, entry(2, "appliance started")], 5) == ()
     [removed] = unknown([entry(4, "decision")], 5)

@@ -99,7 +99,6 @@ def charon(tmp_path: Path) -> Iterator[tuple[StandIn, ViciClient]]:
 
 
 def test_an_unexpected_answer_names_the_request(charon: tuple[StandIn, ViciClient]) -> None:
-    """A session error of the library becomes a CharonError that names the request."""
     stand_in, vici = charon
     stand_in.events = bytes([Packet.CMD_RESPONSE])
     with pytest.raises(CharonError, match="the list of tunnels"):
@@ -107,7 +106,6 @@ def test_an_unexpected_answer_names_the_request(charon: tuple[StandIn, ViciClien
 
 
 def test_a_list_that_is_too_long_is_an_error(charon: tuple[StandIn, ViciClient]) -> None:
-    """A value over 65,535 bytes is an error that names the list; the lists loaded before stay."""
     _stand_in, vici = charon
     vici.provision(stated(65_535))
     with pytest.raises(CharonError, match="the list of revoked certificates"):
@@ -115,7 +113,6 @@ def test_a_list_that_is_too_long_is_an_error(charon: tuple[StandIn, ViciClient])
 
 
 def test_unwanted_tunnels_are_closed_at_each_check(charon: tuple[StandIn, ViciClient]) -> None:
-    """charon's confirmation is not enough: a host revoked during rekeying stays out."""
     stand_in, vici = charon
     vici.provision(stated(1))
     stand_in.standing = [Standing(connection_name("gone"), 1, 1), Standing("(unnamed)", 2, 2)]
@@ -127,7 +124,6 @@ def test_unwanted_tunnels_are_closed_at_each_check(charon: tuple[StandIn, ViciCl
 def test_tunnels_of_a_replaced_certificate_are_closed_at_each_check(
     charon: tuple[StandIn, ViciClient],
 ) -> None:
-    """Tunnels open at the replacement are found by their numbers, also after rekeying; the new one's tunnel stays."""
     stand_in, vici = charon
     tunnel, certificates = connection_name("laptop"), ("1a", "1b")
     before, other = Standing(tunnel, 3, 7), Standing(connection_name("other"), 4, 8)
@@ -147,7 +143,6 @@ def test_tunnels_of_a_replaced_certificate_are_closed_at_each_check(
 
 
 def test_a_tunnel_is_seen_while_its_keys_are_replaced(charon: tuple[StandIn, ViciClient]) -> None:
-    """It counts in both states; if a list has only the earlier tunnel, another list is asked for."""
     stand_in, vici = charon
     tunnel = connection_name("laptop")
     vici.provision(msgspec.structs.replace(stated(1), hosts=[TunnelHost("laptop", "10.113.11.2", "1a")]))

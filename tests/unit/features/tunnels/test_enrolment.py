@@ -233,7 +233,6 @@ def run(directory: Path, work: Callable[[Bench], Coroutine[Any, Any, None]], **o
 
 
 async def test_addresses_are_given_in_order_and_kept(bench: Bench) -> None:
-    """The first is the appliance's. Declared addresses are reserved; a revoked host's address is not used again."""
     bench.declared.write_text("hosts:\n  - name: laptop\n    address: 10.113.11.3\n")
     await bench.reload()
     assert (await bench.add("a")).address == "10.113.11.2"
@@ -294,8 +293,6 @@ def test_without_a_firewall_no_name_stands_for_an_address(tmp_path: Path) -> Non
 
 
 def test_a_master_that_tunnels_cannot_reach_is_reported(tmp_path: Path) -> None:
-    """An appliance that listens on one address of the network is unreachable for hosts in tunnels."""
-
     async def work(bench: Bench) -> None:
         with pytest.raises(HostRefusedError, match=r"listen: 0\.0\.0\.0:11311"):
             await bench.add("a")
@@ -304,7 +301,6 @@ def test_a_master_that_tunnels_cannot_reach_is_reported(tmp_path: Path) -> None:
 
 
 async def test_a_revoked_host_leaves_the_policy_first(bench: Bench) -> None:
-    """Its connections and tunnel follow; its certificate stays on the list of revoked ones."""
     await bench.add("a")
     bench.order.clear()
     body = await bench.revoke("a")
@@ -326,14 +322,12 @@ async def test_a_new_certificate_revokes_the_one_before(bench: Bench) -> None:
 
 
 async def test_a_bad_request_enrols_no_host(bench: Bench) -> None:
-    """A request that the authority refuses leaves no trace."""
     with pytest.raises(HostRefusedError, match="not a signing request"):
         await bench.hosts.add(HostAdd("a", "rubbish", 90), "tester")
     assert bench.hosts.rows() == []
 
 
 async def test_divergences_from_the_declared_hosts_are_listed(bench: Bench) -> None:
-    """Both declared hosts without enrolment and enrolled hosts without declaration are listed."""
     bench.declared.write_text("hosts:\n  - name: laptop\n")
     await bench.reload()
     await bench.add("a")
@@ -347,7 +341,6 @@ async def test_divergences_from_the_declared_hosts_are_listed(bench: Bench) -> N
 
 
 async def test_a_one_time_token_enrols_once(bench: Bench, tmp_path: Path) -> None:
-    """A used or replaced token is invalid; the stored state does not contain it."""
     first = await bench.token("a")
     second = await bench.token("a")
     for text in (first.token, "rosrv-enrol_000000000000_" + "x" * 43, "rubbish"):
@@ -366,7 +359,6 @@ async def test_a_one_time_token_enrols_once(bench: Bench, tmp_path: Path) -> Non
 
 
 async def test_two_simultaneous_uses_of_a_token_get_one_certificate(bench: Bench) -> None:
-    """The token is used up before the authority is asked."""
     text = (await bench.token("a")).token
     both = await asyncio.gather(
         bench.hosts.itself.enrol(HostEnrol(text, request_of("a"), "10.9.9.8")),
@@ -377,7 +369,6 @@ async def test_two_simultaneous_uses_of_a_token_get_one_certificate(bench: Bench
 
 
 async def test_a_bad_request_does_not_use_the_token_up(bench: Bench) -> None:
-    """The host may try again with a valid request; an expired or revoked token is invalid."""
     text = (await bench.token("a")).token
     with pytest.raises(HostRefusedError, match="not a signing request"):
         await bench.hosts.itself.enrol(HostEnrol(text, "rubbish", "10.9.9.9"))
@@ -393,7 +384,6 @@ async def test_a_bad_request_does_not_use_the_token_up(bench: Bench) -> None:
 
 
 def test_tokens_outlive_a_restart(tmp_path: Path) -> None:
-    """A token that was not used yet is valid after a crash."""
     texts: list[str] = []
 
     async def before(bench: Bench) -> None:
@@ -408,7 +398,6 @@ def test_tokens_outlive_a_restart(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("how", ["kit", "token", "itself"])
 async def test_revoked_while_a_certificate_is_made(bench: Bench, how: str) -> None:
-    """A kit, token or renewal under way for a revoked host comes to nothing; the host stays revoked."""
     key = make_key()
     await bench.add("a", key=key)
     text = (await bench.token("a", new=False)).token
@@ -453,7 +442,6 @@ async def test_a_host_renews_itself(bench: Bench) -> None:
 
 
 def test_renewals_make_a_host_wait_over_restarts(tmp_path: Path) -> None:
-    """A host waits a twentieth of its certificate's life, also across restarts of control; a kit needs no wait."""
     keys = [make_key(), make_key(), make_key()]
 
     async def first(bench: Bench) -> None:
@@ -474,7 +462,6 @@ def test_renewals_make_a_host_wait_over_restarts(tmp_path: Path) -> None:
 
 
 async def test_a_short_life_needs_a_short_wait(bench: Bench) -> None:
-    """A certificate with a short life stays on the list of revoked certificates for as short a time."""
     keys = [make_key(), make_key(), make_key()]
     await bench.hosts.add(HostAdd("a", signing_request(keys[0], "a").decode(), 100 / 86_400), "tester")
     machine = VirtualClock()
@@ -487,7 +474,6 @@ async def test_a_short_life_needs_a_short_wait(bench: Bench) -> None:
 
 
 async def test_a_host_renews_only_its_own_certificate(bench: Bench) -> None:
-    """Another address, tunnel, key or name, or no tunnels at all: the renewal is refused and recorded."""
     key, other = make_key(), make_key()
     await bench.add("a", key=key)
     await bench.add("b", key=other)
@@ -512,7 +498,6 @@ async def test_a_host_renews_only_its_own_certificate(bench: Bench) -> None:
 
 
 async def test_revoking_during_a_renewal_revokes_both_certificates(bench: Bench) -> None:
-    """The new certificate is revoked with the present one, also after a restart."""
     key = make_key()
     first = await bench.add("a", key=key)
     request = request_of("a")
@@ -530,7 +515,6 @@ async def test_revoking_during_a_renewal_revokes_both_certificates(bench: Bench)
 
 
 async def test_the_list_is_signed_once_however_often_it_is_asked_for(bench: Bench) -> None:
-    """Requests without a token cause no signature; a revoked certificate is on the list at once."""
     first = await bench.add("a")
     assert "BEGIN CERTIFICATE" in (await bench.certification.authority(AuthorityWanted())).authority
     assert bench.authority.lists == 0
@@ -546,7 +530,6 @@ async def test_the_list_is_signed_once_however_often_it_is_asked_for(bench: Benc
 
 
 async def test_a_full_list_replaces_no_certificate(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The refusal names the day with space again; a new host needs no space, and revoking a host frees some."""
     monkeypatch.setattr("appliance.hosts.revoked_certificates.ENTRIES_BYTES", 120)
     for name in ("a", "b"):
         await bench.add(name)
@@ -579,7 +562,6 @@ async def test_a_change_for_another_state_is_refused(bench: Bench) -> None:
 
 @pytest.mark.parametrize("name", ["a.b-c_d", "0", "x" * 63, "con.fig", "host-a"])
 async def test_odd_names_that_are_names(bench: Bench, name: str) -> None:
-    """Everything the form allows can be enrolled, listed and revoked."""
     await bench.add(name)
     assert bench.hosts.rows()[0].name == name
     await bench.revoke(name)
@@ -603,7 +585,6 @@ def test_two_hundred_hosts(tmp_path: Path) -> None:
 
 
 async def test_a_tunnel_that_is_not_wanted_stays_closed(bench: Bench) -> None:
-    """A reload takes an unwanted host out of the policy and closes its tunnel; wanted again, it returns."""
     await bench.add("a")
     await bench.add("b")
     bench.order.clear()
@@ -624,8 +605,6 @@ async def test_a_tunnel_that_is_not_wanted_stays_closed(bench: Bench) -> None:
 
 
 def test_the_first_tunnel_that_is_wanted_counts_in_the_policy(tmp_path: Path) -> None:
-    """The policy gets the addresses of `host:NAME` once the firewall is set, here after a reload."""
-
     async def enrol(bench: Bench) -> None:
         await bench.add("a")
 
@@ -647,7 +626,6 @@ def test_the_first_tunnel_that_is_wanted_counts_in_the_policy(tmp_path: Path) ->
 
 
 async def test_a_certificate_that_ends_soon_is_logged_once(bench: Bench) -> None:
-    """The status shows it until it is renewed; a short-lived certificate warns in its last third."""
     await bench.hosts.add(HostAdd("short", request_of("a"), 10), "tester")
     assert bench.hosts.status().troubles == []
     await bench.hosts.renew(HostRenew("short", request_of("a"), 1e-5), "tester")
@@ -660,7 +638,6 @@ async def test_a_certificate_that_ends_soon_is_logged_once(bench: Bench) -> None
 
 
 async def test_scanned_ports_of_a_host_are_kept(bench: Bench) -> None:
-    """A report names a host by name, its address, or a machine's in clear text; an unknown name is refused."""
     await bench.add("a")
     bench.machines = {"10.0.0.7": 3, "127.0.0.1": 1, "10.113.11.2": 2}
     assert (await bench.hosts.ports.tell(HostPorts("10.113.11.2", "open", [40001], 5.0), "eve")).name == "a"
@@ -680,7 +657,6 @@ async def test_scanned_ports_of_a_host_are_kept(bench: Bench) -> None:
 async def test_removing_a_host_answers_once_its_connections_are_closed(
     bench: Bench, order: HostRevoke | HostsReload
 ) -> None:
-    """The answer to `revoke` or `reload` waits for the relays."""
     await bench.add("a")
     bench.relays.clear()
     hosts = bench.hosts
@@ -698,7 +674,6 @@ async def test_removing_a_host_answers_once_its_connections_are_closed(
 async def test_only_configurations_of_this_control_count_as_taken(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After the clock was set back, charon's process may report a greater number from an earlier control."""
     monkeypatch.setattr("appliance.hosts.tunnel_state._TAKEN_SECONDS", 0.05)
     ours, theirs = socket.socketpair()
     link, charon = Channel(ours, TunnelLink), Channel(theirs, TunnelLink)
@@ -727,8 +702,6 @@ async def test_only_configurations_of_this_control_count_as_taken(
 def test_a_full_disk_during_enrolment_names_the_way_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The host is enrolled without a kit: the error names the commands that make the kit or revoke the host."""
-
     async def full() -> None:
         raise StoreError("state.db: full; make room")
 
@@ -763,7 +736,6 @@ class Two(Appliances):
 
 
 def test_without_the_authoritys_key_changes_wait(tmp_path: Path) -> None:
-    """On the second of two appliances, new certificates wait, and so does the replacement of one; hosts are revoked."""
     key, request = make_key(), request_of("a")
 
     async def first(bench: Bench) -> None:
@@ -786,8 +758,6 @@ def test_without_the_authoritys_key_changes_wait(tmp_path: Path) -> None:
 
 
 def test_a_kit_of_two_appliances_has_both(tmp_path: Path) -> None:
-    """It has the address and pin of the other one; until that is known, a warning says what to do."""
-
     async def work(bench: Bench) -> None:
         await bench.add("a")
         kit = await bench.certification.kit("a", None)

@@ -49,7 +49,6 @@ def unpack(kit: Kit) -> dict[str, tuple[str, int]]:
 
 
 def test_a_kit_is_one_folder_with_a_private_key_for_its_owner_only() -> None:
-    """Everything is in `rosrv-NAME`; the key has mode 600, the scripts can be run."""
     found = unpack(KIT)
     assert {path.split("/")[0] for path in found} == {"rosrv-ocu-1"}
     assert found["rosrv-ocu-1/swanctl/private/rosrv.key"] == ("KEY\n", 0o600)
@@ -60,7 +59,6 @@ def test_a_kit_is_one_folder_with_a_private_key_for_its_owner_only() -> None:
 
 
 def test_a_host_that_made_its_key_gets_none() -> None:
-    """Without a key in it, nothing in the archive is private."""
     assert "rosrv-ocu-1/swanctl/private/rosrv.key" not in unpack(replace(KIT, key=None))
 
 
@@ -76,14 +74,12 @@ def test_scripts_are_complete_shell(script: str) -> None:
 
 
 def test_join_prints_the_settings_for_ros() -> None:
-    """The last lines of join.sh have the master and the address of this host."""
     assert (
         "ROS_MASTER_URI=http://10.113.11.1:11311 ROS_IP=10.113.11.2" in unpack(KIT)["rosrv-ocu-1/join.sh"][0]
     )
 
 
 def test_the_tunnel_leads_to_the_appliance_only() -> None:
-    """The selectors are the virtual address and the appliance's; the file has no weaker proposals."""
     text = swanctl_conf(KIT)
     assert "remote_ts = 10.113.11.1/32" in text
     assert "local_ts = dynamic" in text
@@ -97,7 +93,6 @@ def test_the_tunnel_leads_to_the_appliance_only() -> None:
 
 
 def test_the_firewall_of_a_host_names_the_appliance_in_the_tunnel() -> None:
-    """Its ROS ports are open only to the appliance's tunnel address, through IPsec."""
     text = unpack(KIT)["rosrv-ocu-1/protect.nft"][0]
     named = [line.strip() for line in text.splitlines() if " saddr {" in line]
     assert named == [
@@ -120,7 +115,6 @@ def test_the_script_removes_the_rule_that_does_not_apply() -> None:
 
 @pytest.mark.nightly
 def test_a_kit_says_where_its_certificate_is_renewed() -> None:
-    """The kit has URL and pin of REST in the tunnel; where it is unreachable, the script says so instead."""
     host = structs.replace(HOST, rest_url="https://10.113.11.1:8443", pin="sha256//pin=")
     text = unpack(replace(KIT, host=host))["rosrv-ocu-1/renew.sh"][0]
     assert 'rest="https://10.113.11.1:8443"' in text
@@ -135,7 +129,6 @@ TWO = replace(KIT, host=structs.replace(HOST, second="192.168.1.21"))
 
 
 def test_a_kit_for_two_appliances_has_a_connection_to_each() -> None:
-    """The scripts know both."""
     text = swanctl_conf(TWO)
     assert re.findall(r"^  (\S+) \{$", text, re.MULTILINE) == ["rosrv", "rosrv-2"]
     assert re.findall(r"remote_addrs = (\S+)", text) == ["192.168.1.20", "192.168.1.21"]
@@ -154,6 +147,5 @@ def test_charon_opens_no_tunnel_itself(kit: Kit) -> None:
 
 
 def test_a_second_appliance_at_the_same_address_is_not_another_one() -> None:
-    """The kit has one connection, as for one appliance."""
     assert swanctl_conf(KIT).count("remote_addrs") == 1
     assert swanctl_conf(replace(TWO, endpoint="192.168.1.21")).count("remote_addrs") == 1

@@ -32,14 +32,12 @@ def test_the_configured_endpoint_comes_first() -> None:
 
 
 def test_the_address_found_by_the_supervisor_comes_with_its_reason() -> None:
-    """The reason lets a person judge the choice."""
     assert autojump.run(find_endpoint(_settings(), _found)) == Endpoint(
         "10.0.0.5", "the only address of this machine"
     )
 
 
 def test_an_unknown_endpoint_is_refused_with_advice() -> None:
-    """The error has flag, REST field and key; it is not a defect of the appliance (not `ours`)."""
     with pytest.raises(HostRefusedError) as caught:
         autojump.run(find_endpoint(_settings(), _several))
     for words in ("10.0.0.5, 10.0.1.5", "--appliance ADDRESS", "ipsec: {endpoint: ADDRESS}", "`endpoint`"):
@@ -49,7 +47,6 @@ def test_an_unknown_endpoint_is_refused_with_advice() -> None:
 
 @pytest.mark.parametrize("endpoint", [None, "10.0.0.5"])
 def test_without_tunnels_no_endpoint_is_needed(endpoint: str | None) -> None:
-    """The error names the missing requirement."""
     with pytest.raises(HostRefusedError, match="`isolation: netns` or `container`") as caught:
         autojump.run(find_endpoint(_settings(endpoint, isolation="none"), _found))
     assert "--appliance" not in str(caught.value)

@@ -8,14 +8,12 @@ from appliance.features.tunnels.host_requests import HostPorts, HostToken
 
 
 def test_a_kind_of_request_can_have_several_ways() -> None:
-    """A token can be for a new host or for an enrolled one."""
     found = [operation_of(HostToken("laptop", new=new)) for new in (True, False)]
     assert [one.path for one in found if one] == ["/v1/hosts", "/v1/hosts/{name}/token"]
     assert operation_of(admin.TokenAdd("ci", "viewer", 60)) is None
 
 
 def test_a_date_is_seconds() -> None:
-    """A field that is not a whole number gets seconds."""
     body = b'{"state": "open", "checked": "2026-03-01T00:00:00.5Z"}'
     ports = ClientRequest("10.0.0.1", "PUT", "/v1/hosts/laptop/ports", "*", "application/json", "", body)
     assert meant(ports) == HostPorts("laptop", "open", checked=1_772_323_200.5)

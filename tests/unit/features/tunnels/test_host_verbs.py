@@ -47,7 +47,6 @@ def test_a_refused_request_leaves_no_file(monkeypatch: pytest.MonkeyPatch, tmp_p
 
 
 def test_a_kit_on_standard_output(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """With `--output -` standard output has only the archive, and the bytes of the file; messages go elsewhere."""
     monkeypatch.setattr(AdminSocket, "ask", lambda *_: AdminAnswer(True, KIT))
     monkeypatch.chdir(tmp_path)
     done = run("add", "laptop", "--appliance", "10.0.0.1", "--output", "-")

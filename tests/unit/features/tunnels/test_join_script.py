@@ -75,7 +75,6 @@ def test_a_renewed_certificate_stays(tmp_path: Path, openssl: str) -> None:
 @pytest.mark.parametrize("openssl", SPELLINGS)
 @pytest.mark.parametrize(("name", "days"), [("laptop-2", 20), ("my-laptop", 20), ("laptop", 5)])
 def test_any_other_certificate_is_replaced(tmp_path: Path, openssl: str, name: str, days: float) -> None:
-    """One in another name, or that ends before the kit's, gives way to the kit's."""
     machine = Machine(tmp_path, SPELLINGS[openssl])
     machine.put("kit", "laptop", 10)
     machine.put("etc", name, days)
@@ -84,7 +83,6 @@ def test_any_other_certificate_is_replaced(tmp_path: Path, openssl: str, name: s
 
 @pytest.mark.parametrize(("sas", "status"), [("ros{1}: INSTALLED", 0), ("", 1)])
 def test_output_of_charon_is_shown_only_after_a_failure(tmp_path: Path, sas: str, status: int) -> None:
-    """A tunnel that comes up prints none of its two dozen lines; a failed one prints all, and what to do."""
     text = filled(
         "join.sh", defaultdict(str, name="laptop", endpoint="10.0.0.2", connections="rosrv rosrv-2")
     )
@@ -110,7 +108,6 @@ def test_output_of_charon_is_shown_only_after_a_failure(tmp_path: Path, sas: str
 
 
 def test_a_long_log_begins_again(tmp_path: Path) -> None:
-    """Without systemd nothing else rotates it; a program that has it open continues at its new beginning."""
     (line,) = [one.strip() for one in filled("join.sh", defaultdict(str)).splitlines() if "for log in" in one]
     long, short = tmp_path / "charon.log", tmp_path / "keep.log"
     long.write_bytes(b"x" * 1_000_000)

@@ -16,7 +16,6 @@ SCRIPTS = sorted(FOLDER.glob("*.sh"))
 @pytest.mark.nightly
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
 def test_it_is_for_the_plainest_shell(script: Path) -> None:
-    """dash, which is /bin/sh on Debian and Ubuntu, can read it; it uses no feature of bash."""
     text = script.read_text()
     assert text.startswith("#!/bin/sh\n")
     done = subprocess.run(["/bin/dash", "-n", str(script)], capture_output=True, text=True, check=False)
@@ -26,7 +25,6 @@ def test_it_is_for_the_plainest_shell(script: Path) -> None:
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
 def test_it_needs_no_python(script: Path) -> None:
-    """A robot with Python 3.8, or without Python, can be enrolled."""
     assert re.findall(r"python|perl|ruby", script.read_text(), re.IGNORECASE) == []
 
 
@@ -39,7 +37,6 @@ _OPENSSL = (
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
 def test_it_asks_of_its_tools_what_ubuntu_20_04_has(script: Path) -> None:
-    """A laptop with Noetic joins and renews (tests/package/test_noetic.py runs it on a system of that age)."""
     text = re.sub(r"#.*", "", script.read_text()).replace("\\\n", " ")
     calls = re.findall(r"\b(?:curl|call|ask) [^|;&]*", text)
     assert {option for call in calls for option in re.findall(r" --([a-z-]+)", call)} <= set(_CURL.split())

@@ -189,7 +189,6 @@ def failure_of(directory: Path, esp: Esp) -> Failed:
 
 @pytest.mark.nightly
 def test_the_last_output_of_charon_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The supervisor gets charon's exit and its last 40 lines, each up to a length."""
     program = tmp_path / "charon"
     program.write_text("#!/bin/sh\nseq 1 100 >&2\nhead -c 9000 /dev/zero | tr '\\0' x >&2\nkill -SEGV $$\n")
     program.chmod(0o700)

@@ -20,7 +20,6 @@ def refusals(text: str) -> list[Refusal]:
 
 
 def test_the_reason_belongs_to_the_packet_of_its_thread() -> None:
-    """Where lines of two packets are mixed, each refusal has the address and the reasons of its own packet."""
     (found,) = refusals(REVOKED)
     assert found.remote == "10.88.0.20"
     assert found.reason.startswith("authentication failed; ")
@@ -28,13 +27,11 @@ def test_the_reason_belongs_to_the_packet_of_its_thread() -> None:
 
 
 def test_a_successful_handshake_is_not_a_refusal() -> None:
-    """An answer without an error yields nothing."""
     lines = REVOKED.replace("N(AUTH_FAILED)", "IDr CERT AUTH CPRP(ADDR) SA TSi TSr N(MOBIKE_SUP)")
     assert refusals(lines) == []
 
 
 def test_the_answer_may_have_more_than_the_error() -> None:
-    """A refused child or address among other payloads is also a refusal."""
     (found,) = refusals(
         REVOKED.replace("[ N(AUTH_FAILED) ]", "[ IDr CERT AUTH N(MOBIKE_SUP) N(TS_UNACCEPT) ]")
     )
@@ -42,13 +39,11 @@ def test_the_answer_may_have_more_than_the_error() -> None:
 
 
 def test_a_name_chosen_by_an_unknown_host_makes_no_long_reason() -> None:
-    """The reason has a limited length, whatever the certificate contains."""
     (found,) = refusals(REVOKED.replace("unspecified", "x" * 5000))
     assert len(found.reason) <= 400
 
 
 def test_unknown_lines_of_the_log_are_skipped() -> None:
-    """Rubbish, and lines of threads that have no packet, yield nothing."""
     assert refusals("\n\nrubbish\n09[ENC] generating IKE_AUTH response 1 [ N(AUTH_FAILED) ]\n") == []
 
 

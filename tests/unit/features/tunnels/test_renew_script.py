@@ -88,7 +88,6 @@ def host(tmp_path: Path) -> Host:
 
 
 def test_the_authoritys_list_of_revoked_certificates_is_kept(host: Host) -> None:
-    """Each run fetches the list again, in the shorter form; a new certificate is not renewed."""
     done = host.renew()
     assert done.returncode == 0, done.stderr
     assert "nothing to do" in done.stdout
@@ -107,7 +106,6 @@ def test_a_list_of_an_earlier_kit_is_removed(host: Host) -> None:
 
 @pytest.mark.parametrize("forged", ["another authority's", "no list"])
 def test_a_list_that_the_authority_did_not_sign_replaces_nothing(host: Host, forged: str) -> None:
-    """The present list stays if REST returns rubbish, or a list that another key signed."""
     assert host.renew().returncode == 0
     kept = host.list_of_revoked.read_bytes()
     host.answer("revocations", b"rubbish" if forged == "no list" else host.another.revocations([("ab", 1.0)]))
@@ -119,7 +117,6 @@ def test_a_list_that_the_authority_did_not_sign_replaces_nothing(host: Host, for
     ("whose", "said"), [("another key's", "for another key"), ("another's", "not a certificate")]
 )
 def test_a_certificate_that_does_not_fit_replaces_nothing(host: Host, whose: str, said: str) -> None:
-    """A certificate for another key, or of another authority, is not put in place: the tunnel stays as it is."""
     before = host.certificate.read_bytes(), host.key.read_bytes()
     authority = host.authority if whose == "another key's" else host.another
     made = authority.issue(signing_request(make_key(), "laptop"), "laptop", 90).certificate

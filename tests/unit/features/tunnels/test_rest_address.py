@@ -44,24 +44,20 @@ def test_an_unreachable_rest_says_which_setting_helps(settings: dict[str, Any], 
     ],
 )
 def test_the_address_where_hosts_reach_rest(settings: dict[str, Any], port: int, inner: int | None) -> None:
-    """In its own namespace REST is reachable wherever networks are named; bound to one address, not through tunnels."""
     place = rest_address(read(settings))
     assert (place.port, place.trouble, place.inner_port) == (port, "", inner)
 
 
 def test_in_a_namespace_hosts_renew_without_any_setting() -> None:
-    """The defaults are enough for hosts in tunnels; only enrolling themselves needs a network to be named."""
     assert rest_address(Settings(isolation="netns")).inner_port == 8443
 
 
 def test_tunnels_reach_an_unpublished_port() -> None:
-    """Tunnels end in the container, behind the ports that its engine publishes."""
     settings = {"api": "0.0.0.0:8443", "isolation": "container", "api_networks": NET, "api_published": False}
     assert rest_address(read(settings)).inner_port == 8443
 
 
 def test_no_script_is_written_that_cannot_reach_rest() -> None:
-    """While REST is published on loopback, no host can enrol itself by a token; the error says so and gives advice."""
     published = [
         port
         for port in yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]["ports"]

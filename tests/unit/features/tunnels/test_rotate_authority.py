@@ -23,7 +23,6 @@ def state(tmp_path: Path) -> Path:
 
 
 def test_the_next_start_has_another_authority(state: Path) -> None:
-    """Its list of revoked certificates has a higher number; the key of the log stays; the old key is overwritten."""
     before = CertificateAuthority(state / "signer").certificate
     number = int((state / "signer" / "ca.list").read_text())
     key = (state / "signer" / "ca.key").open("rb")

@@ -37,7 +37,6 @@ def held(name: str, host: str, *, own: bool) -> Registry:
     ids=lambda one: one.name,
 )
 def test_no_call_is_made_under_the_name_of_another_hosts_node(call: RosCall[Any]) -> None:
-    """No policy grants such a call; a registration waits until the present holder is probed."""
     sections = ("Nodes", "Publishers", "Subscribers", "Services", "Clients", "Commands")
     text = "".join(f"[{name}]\ndefault = *\n" for name in sections)
     policy = compile_policy(f"{text}getRVState = *\nshutdownMaster = *\n", file="test.ini")
@@ -53,7 +52,6 @@ def test_no_call_is_made_under_the_name_of_another_hosts_node(call: RosCall[Any]
 
 @pytest.mark.parametrize(("path", "allowed"), [(PUBLISHER_PATH, False), ("/", True)])
 def test_no_node_replaces_a_service_of_the_appliance(path: str, allowed: bool) -> None:
-    """As in plain ROS, the last registration of a service wins, except for the appliance's services."""
     policy = compile_policy("[Nodes]\ndefault = *\n", file="test.ini")
     registry = Registry()
     uri, robot = f"http://127.0.0.1:4000{path}", ipaddress.ip_address("10.0.0.5")
@@ -153,7 +151,6 @@ def test_a_host_has_a_limit_of_nodes_and_registrations(
 
 
 def test_a_host_has_as_many_registrations_as_are_left() -> None:
-    """Even if every host registers as many topics as it can, enough remain for the next host."""
     policy = compile_policy("[Nodes]\ndefault = *\n[Publishers]\ndefault = *\n", file="test.ini")
     registry = Registry()
     gate = CallGate(lambda: policy, registry, HostLimits(registrations=60, registrations_in_all=100))

@@ -70,7 +70,6 @@ async def test_the_state_lists_all_live_registrations() -> None:
 
 
 def test_types_of_unused_topics_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The oldest type is dropped. Types from the ROS master are adopted, and forgotten with a new ROS master."""
     monkeypatch.setattr(registry, "_MOST_UNUSED_TYPES", 2)
     site = Site()
     node = site.node("/a", 4000)

@@ -187,7 +187,6 @@ def test_an_unserializable_value_delays_no_other_call() -> None:
 
 
 def test_a_run_beyond_the_bound() -> None:
-    """The limit holds for the total of a run; a replaced value is not counted twice."""
     server = OrderedServer(mirror(whole=1100))
     big = "x" * 400
     answers = ordered(
@@ -203,7 +202,6 @@ def test_a_run_beyond_the_bound() -> None:
 
 
 def test_a_failing_part_and_a_lost_master() -> None:
-    """A fault fails only its own part. Without an answer every part fails, and the mirror is unchanged."""
     server = OrderedServer(mirror())
     answers = ordered(server, ("deleteParam", "/fault"), ("setParam", "/a", 1))
     assert isinstance(answers[0], CallFailedError)

@@ -208,8 +208,6 @@ async def test_calls_after_a_run_wait_for_it(following: Value, site: Site) -> No
 
 
 async def test_writes_after_a_waiting_read_are_decided_again() -> None:
-    """These writes see a new policy, a broken audit log or a new holder of their name."""
-
     async def scene(change: Callable[[Site], None], *, denied: bool = True) -> None:
         site, keys = Site(), RUNS[0][:7]
         asked = await held(site, [part("hasParam", "/leg"), *sets(*keys)])

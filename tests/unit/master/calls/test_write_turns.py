@@ -84,7 +84,6 @@ async def test_a_cancelled_write_delays_no_other() -> None:
 
 
 async def test_registering_calls_of_a_name_are_served_in_order_of_arrival() -> None:
-    """Calls of other names, even of names below it, do not wait; a failed call leaves nothing behind."""
     names, order = KeyTurns(), list[str]()
     first, at_once = asyncio.Event(), asyncio.Event()
     at_once.set()

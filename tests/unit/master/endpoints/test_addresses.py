@@ -31,8 +31,6 @@ def test_the_appliance_listens_on_the_address_in_answers(listen: str, local: str
 
 
 def test_configured_and_translated_addresses_come_first() -> None:
-    """`advertise` for the peer's network comes first, then the address that the supervisor knows for this peer."""
-
     async def route(host: str) -> str | None:
         return "192.168.1.7" if host == "10.0.0.5" else None
 

@@ -105,7 +105,6 @@ async def test_a_call_that_a_node_answers_with_a_fault_has_arrived() -> None:
 
 
 async def test_a_publisher_is_added_some_time_after_its_removal() -> None:
-    """rospy uses only the last of lists that arrive together; other topics and growing lists do not wait."""
     post = Post()
     post.node.answers.set()
     for publishers in ([], ["a"], ["a", "b"], ["a"], ["a", "b", "c"]):

@@ -53,7 +53,6 @@ class _Door:
 
 
 async def test_the_name_of_a_dead_node_is_registered_again() -> None:
-    """The order to shut down the earlier incarnation does not end the node that now uses its port."""
     street = Street()
     dead, heir = await street.two_at_one_address()
     await street.register(street.node("/first", 2), Kind.SUBSCRIPTION, "/t")
@@ -86,7 +85,6 @@ async def test_the_answer_of_another_process_does_not_revive_a_node() -> None:
 
 
 async def test_a_node_that_restarts_at_its_address() -> None:
-    """When the new process registers, it becomes the node."""
     street = Street()
     node, _other = await street.two_at_one_address()
     street.process = 2
@@ -100,7 +98,6 @@ async def test_a_node_that_restarts_at_its_address() -> None:
     "telling", [NodeCall("publisherUpdate", ("/t", [])), NodeCall("shutdown", ("by hand",))]
 )
 async def test_programs_that_serve_two_nodes_with_one_api(telling: NodeCall) -> None:
-    """Both nodes are live, and each receives its own calls."""
     street = Street()
     nodes = await street.two_at_one_address()
     for node in nodes:

@@ -292,7 +292,6 @@ async def test_a_grant_that_is_revoked_after_a_move_is_invalid_everywhere(world:
 async def test_a_subscriber_that_lost_its_connection(
     world: World, ended: Kind | None, cut_off: list[tuple[str, str]]
 ) -> None:
-    """It counts as cut off only while it and the publisher are still registered."""
     uri = "http://10.0.0.5:4001/"
     ear = Incarnation("ear", "/ear", HOST, parse_node_uri(uri), uri, "10.0.0.1", 4, 5, more_relay_ports=(6,))
     world.registry.add(ear)

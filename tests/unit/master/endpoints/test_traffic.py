@@ -28,7 +28,6 @@ class Kept:
     [("10.0.0.2", "/rosout", False), ("10.0.0.2", "/camera", True), ("10.0.0.66", "/rosout", True)],
 )
 def test_a_late_connection_of_our_own_node_is_not_an_attack(host: str, topic: str, attack: bool) -> None:
-    """If rosout connects to a node that has gone, it is not a denial; if another host uses rosout's name, it is."""
     kept = Kept()
     registry = Registry()
     for key, name, own in (("k", "/talker", False), ("o", "/rosout", True)):
@@ -47,7 +46,6 @@ def test_a_late_connection_of_our_own_node_is_not_an_attack(host: str, topic: st
 
 
 def test_a_refusal_without_a_name_has_no_category() -> None:
-    """A host that is refused before it sends a header has not yet requested a topic or a service."""
     kept = Kept()
     told = RelayTraffic(cast(Any, kept), Registry(), 1, lambda _node, _topic: None)
     told.refused(ConnectionRefused("k", "", "", "10.0.0.66", "", "said nothing", 2))

@@ -29,7 +29,6 @@ async def test_the_next_control_repeats_the_news_of_a_lost_topic() -> None:
 
 
 async def test_subscribers_without_a_connection_are_absent() -> None:
-    """A subscriber is absent if its publisher is on the relay and it has no connection, with or without a grant."""
     world = await ControlParts.begun()
     talker, ear, other = world.node("/talker", 1), world.node("/ear", 2), world.node("/other", 3)
     await world.register(talker, Kind.PUBLICATION, "/a")
@@ -42,7 +41,6 @@ async def test_subscribers_without_a_connection_are_absent() -> None:
 
 
 async def test_no_subscriber_is_absent_without_the_relay() -> None:
-    """If the relay does not carry a topic, only the appliance's own nodes, which always use it, can be absent."""
     world = await ControlParts.begun()
     cast(Any, world.mediation).carries_topic = lambda _topic: False
     talker, ear, own = world.node("/talker", 1), world.node("/ear", 2), world.node("/rosout", 3)

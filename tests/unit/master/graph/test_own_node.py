@@ -45,7 +45,6 @@ def decide(caller_id: str, method: str, resource: str) -> Decision:
 
 @pytest.mark.parametrize(("method", "resource"), ROSOUTS)
 def test_rosout_may_start_and_end(method: str, resource: str) -> None:
-    """The calls of rosout at its start and end are granted, under its own name only."""
     assert decide("/rosout", method, resource).allowed
     for other in ("/talker", "/rosrv", ""):
         decision = decide(other, method, resource)
@@ -55,7 +54,6 @@ def test_rosout_may_start_and_end(method: str, resource: str) -> None:
 
 @pytest.mark.parametrize("method", MASTER_CALLS)
 def test_rosout_may_make_no_other_call(method: str) -> None:
-    """No other topic, service or parameter is granted, and most calls of the Master API are never granted."""
     for resource in ("/cmd_vel", "/secret", "/", "/talker/set_logger_level"):
         decision = decide("/rosout", method, resource)
         assert not decision.allowed

@@ -125,7 +125,6 @@ def test_a_node_without_registrations_makes_room_first() -> None:
 
 
 def test_forgetting_one_incarnation_keeps_the_next() -> None:
-    """If two incarnations have the same identity (name, host and URI), dropping the first keeps the second."""
     registry = Registry()
     first, second = incarnation(0), incarnation(0)
     registry.add(first)
@@ -139,7 +138,6 @@ def test_forgetting_one_incarnation_keeps_the_next() -> None:
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_a_name_is_restored_to_the_node_with_registrations(order: tuple[int, int]) -> None:
-    """A restart does not give the name to an idle incarnation, even if that one is still live."""
     known = [incarnation(0), incarnation(3)]
     known[1].registrations[Kind.PUBLICATION, "/x"] = NodeRegistration(Kind.PUBLICATION, "/x", "t", 1)
     registry = Registry()

@@ -92,7 +92,6 @@ async def test_simultaneous_arrivals_do_not_take_each_others_room(
 
 
 async def test_a_node_of_another_machine_is_refused() -> None:
-    """multimaster_fkie registers nodes of other masters: the port is closed on its own host, and it gets the reason."""
     world = await world_with(SlowFaces())
     world.clients.gone |= {"/far", "/here"}
     call = ("/t", "std_msgs/String")

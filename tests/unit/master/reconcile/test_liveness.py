@@ -50,7 +50,6 @@ async def test_a_node_that_was_lost_for_a_moment_returns_soon(monkeypatch: pytes
 
 
 async def test_a_refusal_of_a_robot_that_shuts_out_loses_no_node(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It keeps its registrations, is asked again soon, and gets what it missed; a later refusal counts."""
     monkeypatch.setattr(liveness, "_LOOK_AGAIN_SECONDS", 0.0)
     world = ControlParts(silent=3600.0)
     await world.round()

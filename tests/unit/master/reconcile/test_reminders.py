@@ -64,7 +64,6 @@ async def test_reminded_until_back(
 
 
 async def test_a_lasting_absence_ends_with_a_reminder() -> None:
-    """However long it lasts: a subscriber that is absent is reminded at growing intervals, a new one not at once."""
     registry = Registry()
     for name, kind in (
         ("/ear", Kind.SUBSCRIPTION),

@@ -40,7 +40,6 @@ FULL = FirewallSettings(
 
 
 def test_no_other_machine_uses_or_reaches_the_own_network() -> None:
-    """Both come before every rule that lets a packet from outside on; the ports of doors have a limit per host."""
     settings = replace(FULL, own_network="198.19.240.0/20", own_ports=(PortRange.one(9091),))
     rules = appliance_rules(settings)
     added = [rule for rule in rules if rule not in appliance_rules(FULL)]
@@ -62,7 +61,6 @@ def test_the_rules_only_ever_refuse() -> None:
 
 
 def test_hosts_are_counted_after_the_handshake_only() -> None:
-    """Packets count towards a host's limit only after the handshake: the source of a first packet may be forged."""
     limited = [rule for rule in appliance_rules(FULL) if rule.above is not None]
     assert len(limited) == 3
     assert all(rule.answered and not rule.opening for rule in limited)
@@ -71,7 +69,6 @@ def test_hosts_are_counted_after_the_handshake_only() -> None:
 
 
 def test_the_owner_passes_before_all_others_are_refused() -> None:
-    """For an inner port, from the first packet on, the owner's RETURN precedes the rule that refuses all users."""
     outside, owner, others = inner_port("ROS master port", 11312, "control", 61011)
     assert (outside.chain, outside.arrives_on, outside.verdict) == (
         Chain.IN,
@@ -86,13 +83,11 @@ def test_the_owner_passes_before_all_others_are_refused() -> None:
 
 
 def test_unknown_ports_and_empty_lists_make_no_rule() -> None:
-    """A port that is not known yet, or a REST port or rate limit that is off, makes no rule."""
     bare = FirewallSettings(control_uid=1, rosmaster_uid=2, new_connections=None)
     assert appliance_rules(bare) == ()
 
 
 def test_an_address_of_the_machine_is_for_its_own_packets() -> None:
-    """A packet from a router with one of the machine's addresses is dropped before any other rule, in both families."""
     first, second, *_ = appliance_rules(replace(FULL, neighbours=("10.111.0.1", "fd52::1")))
     assert [rule.families() for rule in (first, second)] == [(4,), (6,)]
     assert all(
@@ -101,7 +96,6 @@ def test_an_address_of_the_machine_is_for_its_own_packets() -> None:
 
 
 def test_a_tunnelled_address_is_refused_both_ways_before_all_else() -> None:
-    """The rules of tunnelled hosts come first, by IPsec policy or by the tunnel's interface."""
     first, second = appliance_rules(FULL)[:2]
     assert (first.source, first.clear_text, first.verdict) == ("10.9.9.1", True, PacketVerdict.DROP)
     assert (second.destination, second.clear_text, second.chain) == ("10.9.9.1", True, Chain.OUT)
@@ -114,7 +108,6 @@ def test_a_tunnelled_address_is_refused_both_ways_before_all_else() -> None:
 
 
 def test_the_rest_port_is_limited_before_its_networks_pass() -> None:
-    """The REST port's rate limit precedes the RETURN of the allowed networks; its refusal follows."""
     purposes = [rule.purpose for rule in appliance_rules(FULL) if rule.purpose.startswith("REST")]
     assert purposes == [
         "REST port: new connections per host",
@@ -132,7 +125,6 @@ def test_purposes_tell_rules_of_a_chain_apart() -> None:
 
 
 def test_families_follow_the_addresses() -> None:
-    """A rule with an address has that address's family; any other rule has both families."""
     assert PacketRule(
         chain=Chain.IN, purpose="x", verdict=PacketVerdict.DROP, source="fd00::/8"
     ).families() == (6,)
@@ -177,14 +169,12 @@ def test_families_follow_the_addresses() -> None:
     ],
 )
 def test_wrong_values_are_named(make: object, words: str) -> None:
-    """An impossible setting or rule is an error that names it."""
     assert callable(make)
     with pytest.raises(ValueError, match=words):
         make()
 
 
 def test_a_rule_is_in_force_only_with_all_its_families() -> None:
-    """The counters of both families are added up; a rule that is missing in one family is not in force."""
     rule = PacketRule(chain=Chain.IN, purpose="p", verdict=PacketVerdict.DROP)
     four = RuleCounter("ROSRV-IN", 4, "p", 3, 300)
     six = RuleCounter("ROSRV-IN", 6, "p", 1, 100)
@@ -196,7 +186,6 @@ def test_a_rule_is_in_force_only_with_all_its_families() -> None:
 
 
 def test_a_kernel_without_a_family_lacks_no_rule_of_it() -> None:
-    """Without IPv6, a rule for both families is in force with IPv4 alone; an IPv6 rule has nothing to refuse."""
     both = PacketRule(chain=Chain.IN, purpose="p", verdict=PacketVerdict.DROP)
     six = PacketRule(chain=Chain.IN, purpose="six", verdict=PacketVerdict.DROP, source="fd00::/8")
     four = RuleCounter("ROSRV-IN", 4, "p", 3, 300)
@@ -212,7 +201,6 @@ def test_a_rule_describes_itself() -> None:
 
 
 def test_ports_of_the_own_nodes_are_closed_from_outside() -> None:
-    """Ports chosen by the kernel are closed to other hosts; our own ports in that range stay open."""
     bare = FirewallSettings(
         control_uid=1, rosmaster_uid=2, new_connections=None, client_ports=PortRange(32768, 60999)
     )
@@ -233,7 +221,6 @@ def test_ports_of_the_own_nodes_are_closed_from_outside() -> None:
 
 
 def test_the_own_node_is_called_by_control_alone() -> None:
-    """Control reaches the node at one address, the relay at its message ports; no other connection is answered."""
     of_node = [rule for rule in appliance_rules(FULL) if "own node" in rule.purpose]
     calls = [rule for rule in of_node if rule.destination == "127.87.79.1"]
     assert [(rule.uid, rule.verdict) for rule in calls] == [
@@ -252,7 +239,6 @@ def test_the_own_node_is_called_by_control_alone() -> None:
 
 
 def test_rosmaster_and_the_own_node_open_no_way_out() -> None:
-    """Foreign programs connect only to their own peers, and none of their packets leaves the machine."""
     rules = appliance_rules(FULL)
     for uid, port in ((61012, 4444), (61018, 5555)):
         opened = [rule for rule in rules if rule.uid == uid and rule.opening]
@@ -270,7 +256,6 @@ def test_rosmaster_and_the_own_node_open_no_way_out() -> None:
 
 
 def test_a_rule_is_for_tcp_or_for_udp() -> None:
-    """A port's rule is for TCP or for UDP, never both; the rule's description names UDP."""
     with pytest.raises(ValueError, match="TCP or UDP"):
         PacketRule(
             chain=Chain.IN,
@@ -284,7 +269,6 @@ def test_a_rule_is_for_tcp_or_for_udp() -> None:
 
 
 def test_the_forwarder_reaches_its_receiver_only() -> None:
-    """The forwarder's user may send to one address and port only; other users are not affected."""
     for datagrams in (False, True):
         to = ForwarderAccess(61017, "10.0.0.9", 6514, "log", datagrams=datagrams)
         settings = FirewallSettings(control_uid=1, rosmaster_uid=2, forwarders=(to,), new_connections=None)
@@ -300,7 +284,6 @@ def test_the_forwarder_reaches_its_receiver_only() -> None:
 
 @pytest.mark.parametrize("wrong", [(-1, "10.0.0.9", 1), (1, "logs.example.com", 1), (1, "10.0.0.9", 0)])
 def test_an_invalid_forwarder_is_an_error(wrong: tuple[int, str, int]) -> None:
-    """An invalid user, address or port is an error."""
     with pytest.raises(ValueError, match=r"is not a|port"):
         ForwarderAccess(*wrong, "log")
 
@@ -321,7 +304,6 @@ CONDITIONS: dict[str, tuple[PacketRule, Any]] = {
 
 
 def test_replication_and_lease_are_for_the_other_appliance() -> None:
-    """Only it connects to the replication and sends datagrams; all others are refused."""
     access = PeerAccess("10.0.0.3", 7412)
     rules = appliance_rules(
         FirewallSettings(control_uid=1, rosmaster_uid=2, peer=access, new_connections=None)

@@ -20,7 +20,6 @@ SYN = ("tcp-flags", ("SYN,ACK", "SYN"))
 
 
 def test_the_owner_rule_in_words_of_xtables() -> None:
-    """The owner match has the SYN flag and the port, once for each family."""
     _, owner, others = inner_port("ROS master port", 11312, "control", 61011)
     header = HeaderMatch(protocol="tcp", out_interface="lo")
     assert render_rule(owner) == [
@@ -41,7 +40,6 @@ def test_the_owner_rule_in_words_of_xtables() -> None:
 
 
 def test_a_rate_limit_is_a_hashlimit_that_ports_share() -> None:
-    """Rules of one limit share a table of buckets, whatever their ports; ranges are written with a colon."""
     rules = [
         PacketRule(
             chain=Chain.IN,
@@ -64,7 +62,6 @@ def test_a_rate_limit_is_a_hashlimit_that_ports_share() -> None:
 
 
 def test_ipsec_is_matched_by_policy_in_both_directions() -> None:
-    """Clear text is `--pol none` in the direction of the chain; a rule with an address has one family."""
     for chain, direction in ((Chain.IN, "in"), (Chain.OUT, "out")):
         rule = PacketRule(
             chain=chain, purpose="p", verdict=PacketVerdict.DROP, source="fd77::1", clear_text=True
@@ -76,7 +73,6 @@ def test_ipsec_is_matched_by_policy_in_both_directions() -> None:
 
 
 def test_ports_of_udp_are_matched_as_udp() -> None:
-    """The protocol and the match are those of UDP."""
     rule = PacketRule(chain=Chain.IN, purpose="p", verdict=PacketVerdict.DROP, udp_ports=PortRange(500, 501))
     rendered = render_rule(rule)[0]
     assert rendered.header.protocol == "udp"
@@ -84,7 +80,6 @@ def test_ports_of_udp_are_matched_as_udp() -> None:
 
 
 def test_a_missing_module_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a checkout, `scripts/setup --run` leaves out iptc: the advice is not the Debian package, which is there."""
     monkeypatch.setitem(sys.modules, "iptc", None)
     with pytest.raises(BackendMissingError, match=r"iptc\): run scripts/setup in a checkout"):
         _library()

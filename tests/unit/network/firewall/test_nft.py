@@ -34,7 +34,6 @@ SYN = {
 
 
 def test_the_owner_rule_in_libnftables_json() -> None:
-    """One rule serves both families: interface, port, SYN, user, counter, verdict."""
     _, owner, others = inner_port("ROS master port", 11312, "control", 61011)
     assert render_rule(owner) == [
         {
@@ -54,7 +53,6 @@ def test_the_owner_rule_in_libnftables_json() -> None:
 
 
 def test_each_chain_is_jumped_to_from_its_hooks() -> None:
-    """Every chain with rules is reached from a base chain with the policy accept; no other base chain is made."""
     commands = render(appliance_rules(FirewallSettings(control_uid=1, rosmaster_uid=2, rosmaster_port=11312)))
     added = [one["add"] for one in commands]
     chains = {body["chain"]["name"]: body["chain"] for body in added if "chain" in body}
@@ -71,7 +69,6 @@ def test_each_chain_is_jumped_to_from_its_hooks() -> None:
 
 
 def test_translation_is_hooked_for_the_network_and_for_the_host_itself() -> None:
-    """ROSRV-NAT is reached from prerouting and from output; the address has the rule's family."""
     rule = PacketRule(
         chain=Chain.NAT, purpose="p", verdict=PacketVerdict.DNAT, tcp_ports=PortRange(5, 9), to="fd00::2"
     )
@@ -84,7 +81,6 @@ def test_translation_is_hooked_for_the_network_and_for_the_host_itself() -> None
 
 
 def test_a_rate_limit_has_one_set_for_each_family() -> None:
-    """Two rules of one limit share their buckets; buckets are separate for each family and limited in number."""
     rules = tuple(
         PacketRule(
             chain=Chain.IN,
@@ -127,7 +123,6 @@ def listed(rules: tuple[PacketRule, ...], *, without: int | None = None) -> str:
 
 @pytest.mark.nightly
 def test_a_rate_limit_is_in_force_with_all_its_rules_only() -> None:
-    """Each family has a rule for hosts with a bucket and a rule for hosts without; the report joins both."""
     rule = PacketRule(
         chain=Chain.IN,
         purpose="p",
@@ -144,7 +139,6 @@ def test_a_rate_limit_is_in_force_with_all_its_rules_only() -> None:
 
 
 def test_ipsec_is_matched_as_each_hook_knows_it() -> None:
-    """Incoming packets are matched by their security path, outgoing packets by that of their route."""
     keys = []
     for chain in (Chain.IN, Chain.OUT):
         rule = PacketRule(
@@ -181,7 +175,6 @@ class Machine(Namespace):
     ],
 )
 def test_an_nft_that_does_not_run_is_an_error_of_the_firewall(nft: OSError | str, said: str) -> None:
-    """A missing program or file, or an unreadable answer, raises the error that callers expect."""
     with pytest.raises(FirewallError, match=said) as caught:
         NftBackend(Machine(nft)).counters()
     assert not isinstance(caught.value, BackendMissingError)

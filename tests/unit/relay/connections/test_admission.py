@@ -22,27 +22,23 @@ SERVICE = {"service": "/mode", "md5sum": "*", "callerid": "/client"}
     ("fields", "asked"), [(TOPIC, ("topic", "/chatter")), (SERVICE, ("service", "/mode")), ({}, ("", ""))]
 )
 def test_a_header_names_its_topic_or_service(fields: dict[str, str], asked: tuple[str, str]) -> None:
-    """The report of a refusal names the topic or service of the header."""
     assert asked_for(fields) == asked
 
 
 @pytest.mark.parametrize("fields", [TOPIC, SERVICE])
 @pytest.mark.parametrize("field", ["md5sum", "callerid"])
 def test_a_required_field_is_named_when_it_is_missing(fields: dict[str, str], field: str) -> None:
-    """The error has rospy's words, which users search for."""
     assert flaw(fields, b"") == ""
     less = {name: value for name, value in fields.items() if name != field}
     assert flaw(less, b"") == f"Missing required '{field}' field"
 
 
 def test_a_client_may_send_its_request_with_the_header_a_subscriber_nothing() -> None:
-    """A client may append its request to its header; a subscriber may send nothing after its header."""
     assert flaw(SERVICE, b"request") == ""
     assert "one topic" in flaw(TOPIC, b"more")
 
 
 def test_the_reason_says_what_is_missing_until_nothing_is() -> None:
-    """A missing publication or service is reported first, then a missing grant."""
     table = GrantTable()
     table.state(NodePlaced("k", "/talker", "10.0.0.1"))
     assert missing(table, "k", "10.0.0.2", TOPIC) == "[/talker] is not a publisher of [/chatter]"
@@ -66,14 +62,12 @@ def test_an_invalid_callerid_is_refused(kind: dict[str, str], name: str) -> None
 
 
 def test_a_peer_has_the_canonical_form_of_its_name() -> None:
-    """A grant has the canonical name; rosgo's peers send `//name`. An invalid name stays as it is, to be refused."""
     assert canonical(TOPIC | {"callerid": "//listener/"}) == TOPIC | {"callerid": "/listener"}
     assert canonical(SERVICE | {"callerid": "listener"}) == SERVICE | {"callerid": "listener"}
     assert canonical({"topic": "/chatter"}) == {"topic": "/chatter"}
 
 
 def test_a_client_calls_under_the_name_of_its_lookup() -> None:
-    """Another name has no grant. A probe may use another name; the service then gets the name that was looked up."""
     table = GrantTable()
     for message in (
         NodePlaced("k", "/server", "10.0.0.1"),

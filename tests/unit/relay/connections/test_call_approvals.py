@@ -44,7 +44,6 @@ class Relay:
 
 
 def test_a_held_request_reaches_the_service_only_when_approved() -> None:
-    """The next request of the connection waits, and is asked about on its own."""
     relay = Relay()
     relay.request(b"\x01", b"\x02")
     assert not relay.service and not relay.exchange.may_read

@@ -31,7 +31,6 @@ class Conversation:
 
 
 def test_a_call_is_one_request_and_one_reply() -> None:
-    """The request and the reply pass unchanged and are counted; then the connection ends."""
     call = Conversation()
     call.ask(encode_frame(b"ask"))
     assert (call.service, call.exchange.done) == ([encode_frame(b"ask")], False)
@@ -42,7 +41,6 @@ def test_a_call_is_one_request_and_one_reply() -> None:
 
 
 def test_a_persistent_connection_goes_on() -> None:
-    """A persistent connection carries one call after the other."""
     call = Conversation(persistent=True)
     for text in (b"1", b"2", b"3"):
         call.ask(encode_frame(text))
@@ -52,7 +50,6 @@ def test_a_persistent_connection_goes_on() -> None:
 
 
 def test_a_service_error_is_passed_on_with_its_text() -> None:
-    """The caller gets the error text of the service."""
     call = Conversation()
     call.ask(encode_frame(b""))
     call.exchange.from_service(encode_service_error("no such bolt"))
@@ -60,7 +57,6 @@ def test_a_service_error_is_passed_on_with_its_text() -> None:
 
 
 def test_bytes_may_come_one_by_one() -> None:
-    """Only whole requests and replies are passed on."""
     call = Conversation()
     for byte in encode_frame(b"ask"):
         assert call.service == []
@@ -72,7 +68,6 @@ def test_bytes_may_come_one_by_one() -> None:
 
 
 def test_a_second_request_waits_for_the_first_reply() -> None:
-    """While a request waits, the client is not read."""
     call = Conversation(persistent=True)
     readable = [call.exchange.may_read]
     call.ask(encode_frame(b"1") + encode_frame(b"2"))
@@ -94,7 +89,6 @@ def test_a_reply_without_a_request_is_the_services_fault() -> None:
 
 @pytest.mark.parametrize("length", [(1 << 20) + 1, 0xFFFFFFFF])
 def test_lengths_beyond_the_limit_are_refused(length: int) -> None:
-    """The limit applies to both sides, as soon as a length is declared."""
     call = Conversation()
     with pytest.raises(LimitExceededError):
         call.exchange.from_client(struct.pack("<I", length))

@@ -42,17 +42,14 @@ def _shown(introductions: Introductions) -> str:
 def test_a_publisher_is_asked_with_each_known_type(
     claims: list[dict[str, str]], registered: str, expected: list[str]
 ) -> None:
-    """First any type, then each claim once, with the registered type for an unknown one."""
     assert asked(claims, registered) == expected
 
 
 def test_subscribers_do_not_choose_how_often_a_publisher_is_asked() -> None:
-    """Any number of subscribers with different md5sums are at most eight claims."""
     assert len(asked([{"type": "a/B", "md5sum": f"{number}"} for number in range(100)], "*")) == 1 + 8 + 1
 
 
 def test_an_accepted_header_is_used_again() -> None:
-    """Later connections to the publisher, also those with a subscriber's name, begin with the accepted header."""
     introductions = Introductions(lambda: [SUBSCRIBER], lambda: STRING)
     assert introductions.refused()
     introductions.accepted()

@@ -79,7 +79,6 @@ def denied(calls: Calls) -> None:
 def test_each_call_that_does_not_succeed_is_one_fault(
     connected: bool, happens: Callable[[Calls], None], reason: str
 ) -> None:
-    """Whatever comes later, a call fails once, and the next one can be made."""
     calls = Calls(connected=connected)
     calls.calls.call(wanted())
     happens(calls)
@@ -91,7 +90,6 @@ def test_each_call_that_does_not_succeed_is_one_fault(
 
 
 def test_the_number_of_calls_under_way_is_bounded() -> None:
-    """A monitor that calls with each message takes no calls of other monitors, and all together are bounded."""
     calls = Calls()
     for _ in range(MOST_OF_MONITOR + 3):
         calls.calls.call(wanted())
@@ -139,7 +137,6 @@ def grant(world: Monitored) -> None:
 
 @pytest.mark.nightly
 def test_the_response_of_a_call_is_an_event(world: Monitored) -> None:
-    """An error of the service, or a missing grant, is a fault."""
     publisher, _subscriber = world.typed()
     world.push(publisher, string("x"))
     grant(world)
@@ -153,7 +150,6 @@ def test_the_response_of_a_call_is_an_event(world: Monitored) -> None:
 
 @pytest.mark.nightly
 def test_a_service_that_goes_away_is_a_fault(world: Monitored) -> None:
-    """The call ends with the connection."""
     publisher, _subscriber = world.typed()
     world.push(publisher, string("x"))
     grant(world)

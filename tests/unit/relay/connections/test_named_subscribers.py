@@ -96,7 +96,6 @@ def ended(sock: socket.socket) -> bool:
 def test_each_subscriber_is_seen_under_its_own_name_and_goes_when_it_leaves(
     loop: EventLoop, presences: NamedSubscribers, publisher: socket.socket
 ) -> None:
-    """Each name has one connection. When a subscriber leaves, its connection closes and the others stay."""
     presences.open(publisher.getsockname(), ACCEPTED)
     presences.announce(lambda: frozenset({"/one", "/other"}), GOAL)
     seen = dict(
@@ -114,7 +113,6 @@ def test_each_subscriber_is_seen_under_its_own_name_and_goes_when_it_leaves(
 def test_a_presence_that_breaks_is_made_again(
     loop: EventLoop, presences: NamedSubscribers, publisher: socket.socket
 ) -> None:
-    """If the publisher closes the connection, it is opened again under the same name."""
     presences.open(publisher.getsockname(), ACCEPTED)
     presences.announce(lambda: frozenset({"/one"}), GOAL)
     first, _header = accept(loop, publisher)
@@ -134,5 +132,4 @@ def test_a_presence_that_breaks_is_made_again(
     ],
 )
 def test_only_the_topics_of_actions_need_names(type_name: str, named: bool) -> None:
-    """These are goals and cancellations; no other topic is sent twice."""
     assert looks_for_names(type_name) is named

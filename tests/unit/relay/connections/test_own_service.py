@@ -61,7 +61,6 @@ def reply(success: bool, text: str) -> bytes:
 
 
 def test_the_header_is_that_of_the_type() -> None:
-    """A client with the type std_srvs/Trigger may call."""
     definitions = standard_definitions()
     assert HEADER["md5sum"] == definitions.service_md5sum("std_srvs/Trigger")
 
@@ -84,7 +83,6 @@ def test_control_answers_a_call(scene: Scene) -> None:
 
 
 def test_a_flood_of_one_host_is_one_call_to_control(scene: Scene) -> None:
-    """Calls that arrive during an open call get its answer; a call from another host reaches control at once."""
     flood = [scene.client(persistent="1") for _one in range(5)]
     for client in flood:
         client.send(encode_frame(b""))
@@ -107,7 +105,6 @@ def test_a_flood_of_one_host_is_one_call_to_control(scene: Scene) -> None:
 
 
 def test_an_answer_that_does_not_repeat_is_asked_for_again(scene: Scene) -> None:
-    """Calls in the second after it wait, and get the answer to one new call: a host that lost a group learns it."""
     first, second, gone = (scene.client(persistent="1") for _one in range(3))
     first.send(encode_frame(b""))
     asked = scene.hears(OwnServiceCalled)
@@ -129,7 +126,6 @@ def test_an_answer_that_does_not_repeat_is_asked_for_again(scene: Scene) -> None
 
 
 def test_a_call_is_answered_when_control_ends(scene: Scene) -> None:
-    """The answer is false with the reason; a call that the next control receives gets that control's answer."""
     client = scene.client()
     client.send(encode_frame(b""))
     scene.hears(OwnServiceCalled)
@@ -153,7 +149,6 @@ def test_a_client_with_another_type_gets_an_error(scene: Scene) -> None:
 
 @pytest.mark.parametrize("scene", [IMPATIENT], indirect=True)
 def test_without_a_grant_no_client_calls(scene: Scene) -> None:
-    """The policy decides at lookupService, as for every service."""
     client = scene.connect(encode_header(CALL | {"callerid": "/unknown"}))
     assert "no grant for [/unknown]" in scene.gets_header(client)["error"]
     assert scene.called() == []

@@ -39,7 +39,6 @@ class Peer:
 
 
 def test_unknown_hosts_make_room_before_hosts_with_a_grant() -> None:
-    """A waiting unknown host is closed first; a host with a grant is safe for a second."""
     world = World()
     world.granted |= {"robot", "guest"}
     granted, unknown = world.guest("guest"), world.guest("nobody")
@@ -53,7 +52,6 @@ def test_unknown_hosts_make_room_before_hosts_with_a_grant() -> None:
 
 
 def test_a_grant_counts_for_a_waiting_peer() -> None:
-    """If a peer arrives before its grant, the grant protects the waiting peer."""
     world = World()
     early, unknown = world.guest("robot"), world.guest("nobody")
     world.granted.add("robot")
@@ -62,7 +60,6 @@ def test_a_grant_counts_for_a_waiting_peer() -> None:
 
 
 def test_long_headers_make_room_for_short_ones() -> None:
-    """Even when all long headers of unknown hosts and guests wait, a normal header has room."""
     world = World()
     world.granted |= {"robot", *(f"guest{number}" for number in range(200))}
     for number in range(200):
@@ -79,7 +76,6 @@ def test_long_headers_make_room_for_short_ones() -> None:
 
 
 def test_a_host_at_its_quota_of_long_headers_ends_no_other() -> None:
-    """A further long header is refused, and the host's earlier ones stay."""
     world = World()
     peers = [world.guest("greedy") for _ in range(300)]
     refusals = [world.room.hold(peer, 64 << 10) for peer in peers]

@@ -157,7 +157,6 @@ class Story:
 
 
 def test_subscribers_wait_for_the_publishers_header_and_get_it_with_the_true_name() -> None:
-    """The publisher is connected when the first subscriber arrives; the header has the node's true name."""
     story = Story()
     member = story.join()
     assert (story.upstream.asked, member.header) == (["want"], {})
@@ -166,7 +165,6 @@ def test_subscribers_wait_for_the_publishers_header_and_get_it_with_the_true_nam
 
 
 def test_all_subscribers_get_every_message_in_order() -> None:
-    """A subscriber gets all messages from the time at which it is served."""
     story = Story()
     first = story.join()
     story.topic.upstream_opened(HEADER)
@@ -178,7 +176,6 @@ def test_all_subscribers_get_every_message_in_order() -> None:
 
 
 def test_messages_beyond_a_limit_reach_no_monitor_or_subscriber() -> None:
-    """The last message of a latching publisher is delivered later, to monitors and subscribers."""
     story, judged = Story(), []
     member = story.join()
     story.topic.monitor(lambda batch: judged.append(batch.first) or batch, wanted=True)  # type: ignore[func-returns-value]  # the call is noted
@@ -197,7 +194,6 @@ def test_messages_beyond_a_limit_reach_no_monitor_or_subscriber() -> None:
 
 
 def test_a_subscriber_whose_limit_kept_the_latched_message_from_it_gets_it_later() -> None:
-    """The subscriber gets the latched message at the next `tidy`, once."""
     story = Story()
     member = story.join()
     story.topic.upstream_opened(HEADER | {"latching": "1"})
@@ -250,7 +246,6 @@ def test_a_withheld_latched_message_is_given_when_the_topic_is_free() -> None:
 
 
 def test_messages_are_numbered_as_they_come() -> None:
-    """Numbers continue over batches and connections: a record names a message by its number in the publication."""
     story = Story()
     story.topic.upstream_opened(HEADER)
     batches = [batch(b"1", b"2"), batch(b"3"), batch(b"4")]
@@ -263,7 +258,6 @@ def test_messages_are_numbered_as_they_come() -> None:
 
 
 def test_the_publisher_is_let_go_with_the_last_subscriber() -> None:
-    """The publisher stays connected as long as a subscriber is left."""
     story = Story()
     first, second = story.join(), story.join()
     story.topic.upstream_opened(HEADER)
@@ -274,7 +268,6 @@ def test_the_publisher_is_let_go_with_the_last_subscriber() -> None:
 
 
 def test_a_latched_message_is_given_once_to_each() -> None:
-    """The first subscriber gets it from the publisher, later subscribers from the relay; none gets it twice."""
     story = Story()
     first = story.join()
     story.topic.upstream_opened(HEADER | {"latching": "1"})
@@ -285,7 +278,6 @@ def test_a_latched_message_is_given_once_to_each() -> None:
 
 
 def test_nothing_is_latched_for_a_publisher_that_does_not_latch() -> None:
-    """A late subscriber of an ordinary topic starts with the next message."""
     story = Story()
     story.join()
     story.topic.upstream_opened(HEADER)
@@ -302,7 +294,6 @@ def monitored(*, latching: str = "0", fresh: bool = True) -> Story:
 
 
 def test_the_first_messages_of_a_publisher_are_replayed() -> None:
-    """Subscribers that are still connecting get them once and without a gap; later subscribers do not get them."""
     story = monitored()
     story.receive(batch(b"0"))
     story.now += 0.2
@@ -321,7 +312,6 @@ def test_the_first_messages_of_a_publisher_are_replayed() -> None:
 
 @pytest.mark.parametrize("seconds", [0.3, 2.0, 60.0])
 def test_a_later_subscriber_gets_no_old_messages(seconds: float) -> None:
-    """As in plain ROS, it gets only later messages: a restarted actuator acts on no old command."""
     story = monitored()
     for _ in range(int(seconds * 20) + 1):
         story.receive(batch(b"old"))
@@ -352,7 +342,6 @@ def test_a_publisher_that_has_been_there_said_nothing_first(case: str) -> None:
 
 
 def test_first_messages_without_subscribers_are_dropped_soon() -> None:
-    """They are dropped at the next `tidy`, even if no further message arrives."""
     story = monitored()
     story.receive(batch(b"1"))
     story.topic.tidy()
@@ -363,7 +352,6 @@ def test_first_messages_without_subscribers_are_dropped_soon() -> None:
 
 
 def test_a_latched_message_beyond_the_quota_is_not_kept() -> None:
-    """Such a message is delivered and reported once; later subscribers get it from the publisher when there is room."""
     story = Story(memory=100)
     early = story.join()
     story.topic.upstream_opened(HEADER | {"latching": "1"})
@@ -387,7 +375,6 @@ def test_a_latched_message_beyond_the_quota_is_not_kept() -> None:
 
 
 def test_a_monitor_makes_nothing_up_for_a_latched_topic_or_one_that_had_a_subscriber() -> None:
-    """A latched topic gives its last message. A topic that had a subscriber gives only the next message."""
     story = monitored(latching="1")
     story.receive(batch(b"1"))
     story.receive(batch(b"2"))
@@ -401,7 +388,6 @@ def test_a_monitor_makes_nothing_up_for_a_latched_topic_or_one_that_had_a_subscr
 
 
 def test_a_latched_message_is_forgotten_with_the_connection() -> None:
-    """The publisher sends the message again after it reconnects; until then no subscriber gets the old one."""
     story = Story()
     story.join()
     story.topic.upstream_opened(HEADER | {"latching": "1"})
@@ -414,7 +400,6 @@ def test_a_latched_message_is_forgotten_with_the_connection() -> None:
 
 
 def test_subscribers_survive_the_loss_of_the_publisher() -> None:
-    """When the publisher is connected again, messages continue on the same connections."""
     story = Story()
     member = story.join()
     story.topic.upstream_opened(HEADER)
@@ -436,7 +421,6 @@ def test_a_publisher_that_comes_back_with_another_type_loses_its_subscribers() -
 
 
 def test_an_old_header_is_dropped_with_its_last_subscriber() -> None:
-    """A subscriber that arrives after the publisher and all subscribers have left waits for a new header."""
     story = Story()
     first = story.join()
     story.topic.upstream_opened(HEADER)
@@ -449,7 +433,6 @@ def test_an_old_header_is_dropped_with_its_last_subscriber() -> None:
 
 
 def test_a_subscriber_of_another_type_is_not_served() -> None:
-    """The subscriber is refused and gets no message."""
     story = Story()
     member = RecordedMember(fits=False)
     story.topic.join(member)
@@ -459,7 +442,6 @@ def test_a_subscriber_of_another_type_is_not_served() -> None:
 
 
 def test_the_publisher_is_paused_only_while_all_are_behind() -> None:
-    """A subscriber that keeps up is never delayed by the others; a full subscriber loses messages."""
     story = Story()
     slow, quick = story.join(), story.join()
     story.topic.upstream_opened(HEADER)
@@ -474,7 +456,6 @@ def test_the_publisher_is_paused_only_while_all_are_behind() -> None:
 
 
 def test_a_stuck_subscriber_is_not_waited_for() -> None:
-    """After the grace period its oldest messages are dropped and counted, and the publisher is read again."""
     story = Story()
     member = story.join()
     story.topic.upstream_opened(HEADER)
@@ -487,7 +468,6 @@ def test_a_stuck_subscriber_is_not_waited_for() -> None:
 
 
 def test_traffic_is_reported_once() -> None:
-    """Without new traffic there is no report."""
     story = Story()
     assert story.topic.traffic() is None
     story.join()
@@ -498,7 +478,6 @@ def test_traffic_is_reported_once() -> None:
 
 
 def test_delays_of_a_later_turn_are_reported_without_new_messages() -> None:
-    """The frames that monitors left were counted when they arrived, and their delays are counted when they pass."""
     story = Story()
     story.join()
     story.topic.upstream_opened(HEADER)
@@ -509,7 +488,6 @@ def test_delays_of_a_later_turn_are_reported_without_new_messages() -> None:
 
 
 def test_a_withdrawn_topic_cuts_served_and_waiting_subscribers() -> None:
-    """Each subscriber is cut with the reason."""
     story = Story()
     served = story.join()
     story.topic.upstream_opened(HEADER)
@@ -534,8 +512,6 @@ class LeavingMember(RecordedMember):
 
 @pytest.mark.parametrize("served", [True, False], ids=["served", "waiting"])
 def test_a_subscriber_costs_the_same_among_thousands(served: bool) -> None:
-    """Joining and leaving do not scan the others; many ends at once delay the loop in proportion to their number."""
-
     def work(many: int) -> int:
         story = Story()
         if served:
@@ -557,7 +533,6 @@ def test_a_subscriber_costs_the_same_among_thousands(served: bool) -> None:
 
 
 def test_the_upstream_hears_who_is_served() -> None:
-    """The connection gets name and type of the served subscribers when one is served and when one leaves."""
     scene = Story()
     topic, upstream = scene.topic, scene.upstream
     one, other = RecordedMember(caller_id="/one"), RecordedMember(caller_id="/other")
@@ -570,7 +545,6 @@ def test_the_upstream_hears_who_is_served() -> None:
 
 
 def test_a_host_with_hundreds_of_names_is_seen_by_a_few() -> None:
-    """Each name needs a connection to the publisher; another host's subscriber always gets one."""
     scene = Story()
     for number in range(300):
         scene.topic.join(RecordedMember(caller_id=f"/guest_{number}", host="10.0.0.66"))
@@ -582,7 +556,6 @@ def test_a_host_with_hundreds_of_names_is_seen_by_a_few() -> None:
 
 
 def test_the_server_of_an_action_is_seen_first() -> None:
-    """A client waits for the node that publishes the action's status, behind however many subscribers of its host."""
     servers = ActionServers()
     scene = Story("/arm/cancel", servers=servers.of)
     for number in range(20):
@@ -602,7 +575,6 @@ def test_the_server_of_an_action_is_seen_first() -> None:
 
 
 def test_the_delay_of_messages_is_counted_for_those_who_are_served() -> None:
-    """The delay is counted from receiving a batch to sending each message; without subscribers there is none."""
     story = Story()
     story.topic.upstream_opened(HEADER)
     story.receive(batch(b"1"), late=0.003)
@@ -630,7 +602,6 @@ def test_the_delay_of_messages_is_counted_for_those_who_are_served() -> None:
 def test_an_answer_to_the_pump_holds_for_one_version(
     operations: list[tuple[int, bool]],
 ) -> None:
-    """If the topic says that frames need only the common work, this holds until `plain` changes."""
     story = Story()
     topic, members = story.topic, [story.join(f"/listener{number}") for number in range(3)]
     for number, member in enumerate(members):

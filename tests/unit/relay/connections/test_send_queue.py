@@ -57,7 +57,6 @@ steps = st.lists(st.one_of(batches, st.floats(0, 1), st.none()), max_size=30)
 @settings(max_examples=examples(300))
 @given(steps)
 def test_the_outbox_does_what_a_list_of_frames_does(script: list[list[int] | float | None]) -> None:
-    """For anything queued, partly sent and trimmed, bytes, counts and used memory are the same."""
     budget = share(1 << 30)
     queue, naive, number = SendQueue(LIMITS, budget), NaiveOutbox(), 0
     for step in script:
@@ -85,7 +84,6 @@ def test_the_outbox_does_what_a_list_of_frames_does(script: list[list[int] | flo
 
 
 def test_the_memory_of_a_message_that_is_nearly_sent_is_given_back() -> None:
-    """The memory in use is close to the counted memory, even if the subscriber reads in small pieces."""
     queue, whole = SendQueue(LIMITS, share(1 << 30)), frame(1 << 20)
     queue.append(memoryview(whole), 1, 1)
     while queue:
@@ -96,7 +94,6 @@ def test_the_memory_of_a_message_that_is_nearly_sent_is_given_back() -> None:
 
 
 def test_a_message_that_has_been_started_is_never_dropped() -> None:
-    """The oldest messages are dropped, but a message that the subscriber has begun to read is completed."""
     queue = SendQueue(LIMITS, share(1 << 30))
     queue.append(memoryview(b"".join(frame(4, index) for index in range(20))), 20, 3)
     assert queue.full
@@ -105,7 +102,6 @@ def test_a_message_that_has_been_started_is_never_dropped() -> None:
 
 
 def test_one_message_larger_than_the_queue_is_dropped_whole() -> None:
-    """The limit in bytes also holds for a single message."""
     queue = SendQueue(LIMITS, share(1 << 30))
     queue.append(memoryview(frame(500)), 1)
     assert queue.trim() == 1
@@ -113,7 +109,6 @@ def test_one_message_larger_than_the_queue_is_dropped_whole() -> None:
 
 
 def test_nothing_is_queued_when_the_process_is_out_of_memory() -> None:
-    """The limit of the whole process comes before the subscriber's own limit."""
     budget = share(10)
     queue = SendQueue(LIMITS, budget)
     queue.append(memoryview(frame(4) + frame(4)), 2)
@@ -122,7 +117,6 @@ def test_nothing_is_queued_when_the_process_is_out_of_memory() -> None:
 
 
 def test_the_rest_of_a_connection_header_goes_first() -> None:
-    """If the socket accepts only a part of a header, the rest precedes all messages and is not counted as one."""
     queue = SendQueue(LIMITS, share(1 << 30))
     queue.begin(memoryview(b"header"))
     queue.append(memoryview(frame(4)), 1)

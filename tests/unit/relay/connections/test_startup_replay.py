@@ -26,7 +26,6 @@ def test_never_more_than_the_bounds(added: list[tuple[int, int]]) -> None:
 
 
 def test_nothing_is_kept_when_the_quota_of_its_host_is_spent() -> None:
-    """Two messages fit, but the third does not."""
     memory = share(16)
     words = StartupReplay(memory, 0.0)
     assert [words.add(frames(1), 0.0) for _ in range(3)] == [True, True, False]
@@ -34,7 +33,6 @@ def test_nothing_is_kept_when_the_quota_of_its_host_is_spent() -> None:
 
 
 def test_the_time_ends_for_speech_for_keeping_and_for_appearing() -> None:
-    """Messages are collected for `SPEECH` seconds and kept for `SECONDS`. A publisher is new for `APPEARED` seconds."""
     words = StartupReplay(share(), 10.0)
     assert (words.over(10.0 + APPEARED), words.over(10.1 + APPEARED)) == (False, True)
     assert words.add(frames(1), 12.0)

@@ -17,7 +17,6 @@ OFFERED = {"type": "std_msgs/String", "md5sum": "aaa"}
     ],
 )
 def test_the_md5sum_decides_and_an_asterisk_fits_all(wanted: dict[str, str]) -> None:
-    """The rule is that of rospy and roscpp publishers."""
     assert describe_mismatch(wanted, OFFERED) == ""
     assert describe_mismatch(wanted | {"md5sum": "bbb"}, OFFERED | {"md5sum": "*"}) == ""
 

@@ -57,7 +57,6 @@ class Relay:
 
 @pytest.mark.parametrize(("unsettled", "seconds"), [(False, 0.0), (True, RelayLimits().linger)])
 def test_a_lazy_publisher_learns_at_once_that_it_has_no_subscriber(unsettled: bool, seconds: float) -> None:
-    """Its connection stays only during a reload or a restart, and only until its subscriber may have returned."""
     relay = Relay()
     publisher = PublisherConnection(
         cast(RelayContext, relay),

@@ -197,7 +197,6 @@ def random_case(seed: int) -> tuple[dict[str, str], list[Traffic]]:
 @settings(max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow], derandomize=True)
 @given(st.integers(0, 1 << 40))
 def test_random_monitors_do_the_same_together(seed: int) -> None:
-    """A batch has the effect of its single messages, whatever the monitors do."""
     texts, traffic = random_case(seed)
     try:
         agree(texts, definitions(), traffic, ("drop", "pass")[seed % 2], (2, "s1") if seed % 3 == 0 else None)
@@ -214,7 +213,6 @@ HARD = {
 @pytest.mark.parametrize("name", HARD)
 @pytest.mark.parametrize("on_fault", ["drop", "pass"])
 def test_hard_cases_are_the_same_together(name: str, on_fault: str) -> None:
-    """Covers changes that are undone, faults in the middle, and drops after changes."""
     for seed in range(examples(18)):
         messages = Messages(seed)
         agree({"x.rv": HARD[name]}, definitions(), [messages.traffic() for _ in range(10)], on_fault)
@@ -247,7 +245,6 @@ def _shipped_traffic(seed: int) -> list[Traffic]:
 
 
 def test_shipped_monitors_do_the_same_together() -> None:
-    """All specifications in `monitors/` are in force, on traffic of the LandShark."""
     known = definitions().extended(
         Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": "Header header\nuint8 trigger\n"})
     )
@@ -257,7 +254,6 @@ def test_shipped_monitors_do_the_same_together() -> None:
 
 
 def test_the_engine_sees_only_reported_requests_and_replies(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In each second the engine handles the first verdict, the first change, and all refusals."""
     text = """s() { int n = 0; bool b = false;
         event ask(bool wish) service /mode std_srvs/SetBool request '{data:wish}' {
             n++; ROS_INFO("%d", n); if (n % 10 == 9) { return; } if (wish) { wish = false; } }
@@ -298,7 +294,6 @@ def test_the_engine_sees_only_reported_requests_and_replies(monkeypatch: pytest.
 
 
 def test_most_messages_are_taken_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A monitor that reads, writes and steps handles only the first message of a second singly."""
     text = """s() { event e(int count, double x) /plain own/Plain '{count:count, x:x}' { x = count + 0.5; }
                   fsm: a [ e -> b ] b [ e -> a ] @fail { } }"""
     monitored = Monitored({"x.rv": text}, definitions(), together=True)
@@ -324,7 +319,6 @@ def test_most_messages_are_taken_together(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_lines_describe_the_received_message() -> None:
-    """The message has a header that is changed as well, or is shorter than a header."""
     text = """s() { event e(unsigned int n) /h geometry_msgs/PointStamped '{header.seq:n}' { n = 3; } }
         t() { int k = 0; event e() /h geometry_msgs/PointStamped '{}' { k++; ROS_INFO("came %d", k); } }
         u() { event e(std::string f) /j geometry_msgs/PointStamped '{header.frame_id:f}' {
@@ -341,7 +335,6 @@ def test_lines_describe_the_received_message() -> None:
 
 @pytest.mark.parametrize("does", ["count = 3;", 'count = 3; } @fail { puts("never");', 'puts("came");'])
 def test_a_batch_is_prepared_once_until_an_event_happens(does: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports of a monitor are sent, and the next batch uses the prepared function again."""
     event, _, handler = does.partition("}")
     logic = f"fsm: one [ e -> other ] other [ e -> one ] {handler} }}" if handler else ""
     text = f"s() {{ event e(int count) /plain own/Plain '{{count:count}}' {{ {event} }} {logic} }}"
@@ -368,7 +361,6 @@ def test_a_batch_is_prepared_once_until_an_event_happens(does: str, monkeypatch:
 
 
 def test_a_change_by_several_monitors_counts_for_each() -> None:
-    """A message counts for each monitor that changed it, in a batch (by bits and runs) as well as singly."""
     body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
     quiet = struct.pack("<BidfBII3qI", 1, 17, 2.0, 1.0, 0, 5, 7, 1, 2, 3, 0)
     far = struct.pack("<BidfBII3qI", 2, 5, 9.0, 1.0, 0, 5, 7, 1, 2, 3, 0)
@@ -382,7 +374,6 @@ def test_a_change_by_several_monitors_counts_for_each() -> None:
 def test_a_defect_of_the_walk_is_reported_once_and_the_engine_goes_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Messages continue one by one; the batch function of this topic is not tried again."""
     monitored = Monitored(
         {"x.rv": "s() { event e(int count) /plain own/Plain '{count:count}' { count = 3; } }"},
         definitions(),

@@ -362,11 +362,9 @@ OUTCOMES = {
 
 @pytest.mark.parametrize("name", OUTCOMES)
 def test_the_outcome_of_an_event(name: str) -> None:
-    """Covers every kind of event with every outcome."""
     check(OUTCOMES[name], together=True)
 
 
 @pytest.mark.parametrize("name", [name for name in OUTCOMES if name not in ("what is held",)])
 def test_the_outcome_in_shadow_mode(name: str) -> None:
-    """In shadow mode the same specification judges copies and holds nothing."""
     check(OUTCOMES[name], together=False, shadow=True)

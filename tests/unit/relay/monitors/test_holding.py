@@ -25,7 +25,6 @@ def monitors() -> Iterator[QuietMonitors]:
 def test_a_monitor_whose_file_has_an_error_holds_its_topics(
     monitors: QuietMonitors, modifier: str, held: bool
 ) -> None:
-    """Its own modifier decides; only an operator releases the topics, also when control is restarted."""
     because = {"s": f"its file has an error: {ERROR}"} if held else {}
     for _ in range(2):
         assert monitors.load(f"{modifier}s() {{ {EVENT} }}", unbuilt={"s": ERROR}).because == because
@@ -37,7 +36,6 @@ def test_a_monitor_whose_file_has_an_error_holds_its_topics(
 
 
 def test_a_disabled_monitor_whose_file_has_an_error_holds_nothing(monitors: QuietMonitors) -> None:
-    """It guarded nothing before."""
     assert not monitors.load(f"s() {{ {EVENT} }}", unbuilt={"s": ERROR}, enabled={"s": False}).held
 
 
@@ -46,7 +44,6 @@ DRIVE = "event d() /cmd_vel geometry_msgs/Twist '{}' { if (near) { return; } }"
 
 
 def test_a_monitor_that_holds_after_a_fault_is_reported_once(monitors: QuietMonitors) -> None:
-    """With the reason; then no further message of its topics reaches it."""
     monitors.load(f"s() {{ bool near; {SENSOR} {DRIVE} }}")
     told = len(monitors.reports.sent)
     twist, zero = message("geometry_msgs/Twist"), message("std_msgs/Int32")

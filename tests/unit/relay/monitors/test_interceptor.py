@@ -74,7 +74,6 @@ def passes_by(relayed: RelayedTopic) -> bool:
 
 
 def test_a_topic_without_an_enabled_event_never_goes_through_monitors(world: Monitored) -> None:
-    """Neither specifications for other topics nor a disabled monitor touch its messages."""
     world.load(GUARD.replace("/chatter", "/other"))
     publisher, subscriber = world.subscribed()
     relayed, _publisher = world.engine.topics["k", "/chatter"]
@@ -88,7 +87,6 @@ def test_a_topic_without_an_enabled_event_never_goes_through_monitors(world: Mon
 
 
 def test_the_first_specifications_delay_only_their_topics(world: Monitored) -> None:
-    """However long compiling takes, the loop still answers, and no message bypasses the monitors."""
     world.loop.holds = True
     late = GUARD.replace("/chatter", "/late")
     world.state(stated(1, [("0.rv", late)], {}, {}, True, statement=7))
@@ -109,7 +107,6 @@ def test_the_first_specifications_delay_only_their_topics(world: Monitored) -> N
 
 
 def test_statements_that_come_while_the_first_is_compiled_come_into_force_in_order(world: Monitored) -> None:
-    """The statements that waited may have other specifications, and then the first ones again."""
     other = GUARD.replace("/chatter", "/other")
     for revision, text in enumerate((GUARD, other, GUARD, "nonsense", other, other), 1):
         world.control.send(stated(revision, [("0.rv", text)], {}, {}, True, statement=revision))
@@ -129,7 +126,6 @@ def test_statements_that_come_while_the_first_is_compiled_come_into_force_in_ord
 def test_specifications_of_a_new_control_are_in_force_before_its_placements(
     world: Monitored, text: str
 ) -> None:
-    """If control crashed during a change, the next control may begin with another revision, or a refused one."""
     world.load(GUARD)
     world.loop.holds = True
     world.state(stated(2, [("0.rv", text)], {}, {}, True, ahead=True))
@@ -160,7 +156,6 @@ def test_ticks_that_take_longer_than_their_period_do_not_starve_the_relay(world:
 
 
 def test_messages_that_do_not_fit_into_a_quantum_are_left_for_the_next_turn(world: Monitored) -> None:
-    """These messages stay in order and unchanged; the messages before them are delivered."""
     world.load(COSTLY)
     lane = TopicPipeline(world.engine.interceptor, ObservationPoint("k", "/chatter"))
     frames = bytearray(string("x" * 3000) + string("last") * 3)
@@ -176,7 +171,6 @@ def test_messages_that_do_not_fit_into_a_quantum_are_left_for_the_next_turn(worl
 
 
 def test_hosts_that_the_policy_does_not_name_have_one_pace(world: Monitored) -> None:
-    """If such a host's message uses its whole time, the messages of all such hosts slow down, and no others."""
     interceptor = world.engine.interceptor
     for key, host, named in (("a", "10.9.0.1", False), ("b", "10.9.0.2", False), ("c", "10.0.0.1", True)):
         world.state(NodePlaced(key, "/node", host), world.listen())
@@ -192,7 +186,6 @@ def test_hosts_that_the_policy_does_not_name_have_one_pace(world: Monitored) -> 
 
 
 def test_waiting_messages_survive_new_specifications_in_order(world: Monitored) -> None:
-    """Waiting messages are judged by the specifications in force at their turn; none is lost or overtaken."""
     world.load(COSTLY)
     publisher, subscriber = world.typed()
     many = [string(f"{number:05}" + "x" * 100) for number in range(3000)]
@@ -204,7 +197,6 @@ def test_waiting_messages_survive_new_specifications_in_order(world: Monitored) 
 
 
 def test_waiting_messages_end_with_the_publication(world: Monitored) -> None:
-    """Withdrawing a publication drops its waiting messages and frees their memory."""
     world.load(COSTLY)
     publisher, subscriber = world.typed()
     world.engine.interceptor.over = lambda: True
@@ -218,7 +210,6 @@ def test_waiting_messages_end_with_the_publication(world: Monitored) -> None:
 def test_a_defect_of_the_monitors_drops_the_message_and_nothing_else(
     world: Monitored, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The message is dropped even if the defect is our own; the relay continues."""
     world.load(GUARD)
     publisher, subscriber = world.typed()
     monitors = world.engine.interceptor.monitors
@@ -232,7 +223,6 @@ def test_a_defect_of_the_monitors_drops_the_message_and_nothing_else(
 
 
 def test_a_large_message_goes_through_a_monitor(world: Monitored) -> None:
-    """A large message may be passed unchanged, changed or dropped."""
     spec = GUARD.replace('text == "bad"', "text.size() == 300000").replace(
         'text == "one"', "text.size() == 400000"
     )
@@ -256,7 +246,6 @@ alarm() {
 
 
 def test_publications_of_monitors_are_served_and_not_monitored(world: Monitored) -> None:
-    """Subscribers with a grant get the header of the specification's definition; timers go on without messages."""
     hearer = GUARD.replace("/chatter", "/alarm")
     world.load(ALARM, hearer)
     port = world.listen()
@@ -290,7 +279,6 @@ latch() {
 
 
 def test_a_verdict_is_reported_with_its_property_logic_and_category(world: Monitored) -> None:
-    """The verdict is also counted in the state of the monitors."""
     world.load(BUTTON.replace("/mode", "/chatter"))
     publisher, subscriber = world.typed()
     publisher.send(string("a") * 3)
@@ -382,7 +370,6 @@ def _replies(world: Monitored) -> tuple[Peer, Peer, bytes]:
 def test_state_is_written_before_its_effect(
     world: Monitored, begin: Callable[[Monitored], tuple[Peer, Peer, bytes]]
 ) -> None:
-    """A relay that is killed at the write has not sent any effect of the new state."""
     memory = Mortal(1 << 20)
     world.engine.interceptor.remember(StateKeeper(StateGiven(True, "boot", 0), memory))
     sender, receiver, message = begin(world)
@@ -394,7 +381,6 @@ def test_state_is_written_before_its_effect(
 
 
 def test_the_client_of_a_service_reads_why_its_request_could_not_be_judged(world: Monitored) -> None:
-    """The client gets the fault, as it gets a monitor's message; services with disabled monitors are not judged."""
     world.load(LATCH.replace("open = wish;", "int zero = 0; open = 1 / zero;"))
     interceptor = world.engine.interceptor
     refused = interceptor.judge(ObservationPoint("k", "/mode"), "request", b"\0").refused
@@ -404,7 +390,6 @@ def test_the_client_of_a_service_reads_why_its_request_could_not_be_judged(world
 
 
 def test_events_without_a_control_reach_the_next_one(world: Monitored) -> None:
-    """No event is lost."""
     world.load(GUARD)
     publisher, subscriber = world.typed()
     world.engine.attach(None)
@@ -419,7 +404,6 @@ def test_events_without_a_control_reach_the_next_one(world: Monitored) -> None:
 
 
 def test_nothing_is_lost_while_specifications_come_and_go(world: Monitored) -> None:
-    """Specifications compile in a thread and are swapped between two messages: each message arrives once, in order."""
     specification = (
         "mark() { event said(std::string t) /chatter std_msgs/String '{data:t}' { t = \"%s\" + t; } }"
     )
@@ -449,7 +433,6 @@ def test_nothing_is_lost_while_specifications_come_and_go(world: Monitored) -> N
 
 
 def test_a_replaced_monitor_counts_from_zero(world: Monitored) -> None:
-    """Counts of its predecessor that were not yet added up are dropped; a monitor that stays keeps counting."""
     other = "other() { event e() /chatter std_msgs/String '{}' { } }"
     world.load(other, GUARD)
     publisher, subscriber = world.typed()
@@ -470,7 +453,6 @@ def test_a_replaced_monitor_counts_from_zero(world: Monitored) -> None:
 def test_a_monitor_that_comes_from_another_relay_holds_its_topics_if_it_is_declared_so(
     world: Monitored,
 ) -> None:
-    """A monitor declared `hold` holds its topics on the new relay until it is resumed; other monitors do not."""
     held = "hold gate() { event e() /chatter std_msgs/String '{}' { } }"
     free = "free() { event e() /other std_msgs/String '{}' { } }"
     world.load(free)
@@ -491,7 +473,6 @@ def test_a_monitor_that_comes_from_another_relay_holds_its_topics_if_it_is_decla
 def test_a_text_that_changes_while_a_state_is_to_lose_holds_the_topics(
     world: Monitored, modifier: str, said: list[str], held: bool
 ) -> None:
-    """So no load forgets an emergency stop. A monitor in its initial state, or declared `begin`, holds nothing."""
     world.load(GUARD)
     publisher, subscriber = world.typed()
     for text in said:
@@ -508,7 +489,6 @@ def test_a_text_that_changes_while_a_state_is_to_lose_holds_the_topics(
 
 
 def test_a_verdict_names_its_senders_and_messages(world: Monitored) -> None:
-    """The verdict names only the messages that cause it, even if others arrived in between."""
     world.load("""latch() {
     event on(std::string text) /chatter std_msgs/String '{data:text}' when (text == "on") { }
     event off(std::string text) /chatter std_msgs/String '{data:text}' when (text == "off") { }
@@ -534,7 +514,6 @@ def test_a_verdict_names_its_senders_and_messages(world: Monitored) -> None:
 
 
 def test_slices_are_charged_to_the_host_that_publishes(world: Monitored) -> None:
-    """A registered host is charged alone; all other hosts count as one."""
     interceptor = world.engine.interceptor
     world.state(NodePlaced("robot", "/robot", "10.0.0.1"), world.listen())
     numbers = [
@@ -545,7 +524,6 @@ def test_slices_are_charged_to_the_host_that_publishes(world: Monitored) -> None
 
 
 def test_given_constants_are_set_between_two_messages_and_on_a_new_relay(world: Monitored) -> None:
-    """By an order, and by the first or a repeated statement; the state stays."""
     text = """s() given { int most = 1 in 0..9; } { int n; event e(std::string t) /chatter std_msgs/String '{data:t}' {
         n++; if (n > most) { t = "late"; } else { t = std::to_string(n); } } }"""
     files = [("s.rv", text)]
@@ -564,7 +542,6 @@ def test_given_constants_are_set_between_two_messages_and_on_a_new_relay(world: 
 
 
 def test_a_safe_message_is_sent_while_a_monitor_holds_its_topic(world: Monitored) -> None:
-    """At once, with one record for the whole series; a command that equals it passes."""
     guard = GUARD.strip().replace(
         "int seen", 'safe std_msgs/String {data:"stop"} on /chatter every 1s; int seen'
     )

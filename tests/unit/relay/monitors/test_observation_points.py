@@ -11,7 +11,6 @@ class Pipeline:
 
 
 def test_many_new_senders_do_not_make_a_live_one_unknown() -> None:
-    """A monitor that decides by the host sees that of a connected publisher, however many others come and go."""
     senders, held = Senders(), Pipeline(ObservationPoint("k", "/cmd_vel", "10.0.0.7", "/teleop"))
     number, other = senders.number(held.point), senders.number(ObservationPoint("k", "/a", "10.0.0.9", "/a"))
     senders.hold(number, held)

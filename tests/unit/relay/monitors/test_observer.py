@@ -58,7 +58,6 @@ def told(request: pytest.FixtureRequest) -> Iterator[Told]:
 
 
 def test_a_change_is_recorded_under_the_monitor_that_made_it(told: Told) -> None:
-    """The record names this monitor even if events of two other monitors follow without a change."""
     told.send((5, 0, 0))
     [change] = told.events("change")
     assert (change.monitor, change.text) == ("stop", "stop changed a message")
@@ -73,7 +72,6 @@ def test_a_change_is_recorded_under_the_monitor_that_made_it(told: Told) -> None
 
 
 def test_a_change_of_two_monitors_names_both_and_counts_for_both(told: Told) -> None:
-    """One record names the last monitor, and the others with it; the counts of that second name both."""
     told.send((5, 0, 5), *[(0, 0, 5)] * 3, *[(0.5, 0, 3), (4, 0, 3)] * 2)
     full, *summed = told.events("change")
     assert (full.monitor, full.text) == ("turn", "stop and turn changed a message")
@@ -86,7 +84,6 @@ def test_a_change_of_two_monitors_names_both_and_counts_for_both(told: Told) -> 
 
 
 def test_a_drop_is_recorded_under_the_monitor_that_dropped(told: Told) -> None:
-    """The record has only the text of the monitor that dropped, not of another one, and lists no change."""
     told.send((5, 5, 5))
     [drop] = told.events("drop")
     assert (drop.monitor, drop.text) == ("look", "look.drive dropped it")
@@ -94,14 +91,12 @@ def test_a_drop_is_recorded_under_the_monitor_that_dropped(told: Told) -> None:
 
 
 def test_a_publication_is_recorded_under_its_monitor(told: Told) -> None:
-    """The record names this monitor even if events of other monitors follow."""
     told.send((5, 0, 0))
     [published] = told.events("publish")
     assert (published.monitor, published.resource) == ("stop", "/alarm")
 
 
 def test_a_fault_that_was_passed_over_is_not_what_dropped() -> None:
-    """With `on_fault: pass`, the drop has the reason and the name of the monitor that dropped."""
     faulty = STOP.replace("v = 1;", "v = 1 / (int) (v - 5);")
     told = Told(together=False, on_fault="pass", texts=(faulty, LOOK))
     told.send((5, 5, 0))
@@ -111,7 +106,6 @@ def test_a_fault_that_was_passed_over_is_not_what_dropped() -> None:
 
 
 def test_a_fault_drops_under_the_name_of_its_monitor() -> None:
-    """The drop names this monitor even if the last event was another monitor's."""
     faulty = LOOK.replace("'{linear:{y:y}}'", "'{linear:{y:y}}' when (1 / (int) (y - 5) == 0)")
     told = Told(together=False, texts=(STOP, faulty))
     told.send((5, 5, 0))
@@ -123,7 +117,6 @@ def test_a_fault_drops_under_the_name_of_its_monitor() -> None:
 
 @pytest.mark.parametrize("together", [False, True])
 def test_changes_of_very_many_sets_of_monitors_are_few_records_and_exact_counts(together: bool) -> None:
-    """If each message is changed by another set of monitors, the log does not fill and every change is counted."""
     texts = {
         f"{bit}.rv": f"m{bit}() {{ event e(double v) /pose geometry_msgs/PoseWithCovariance '{{covariance[{bit}]:v}}'"
         " { if (v > 1) { v = 1; } } }"
@@ -149,7 +142,6 @@ def test_changes_of_very_many_sets_of_monitors_are_few_records_and_exact_counts(
 
 
 def test_counters_come_with_the_event_that_they_count_not_a_second_later(told: Told) -> None:
-    """When the audit log has a drop, the counters already include it and its events."""
     told.send((1, 5, 0))
     told.monitored.interceptor.observations.flush()
     *_before, events, counters = told.monitored.heard.messages
@@ -163,7 +155,6 @@ def test_counters_come_with_the_event_that_they_count_not_a_second_later(told: T
 @pytest.mark.parametrize("together", [False, True], ids=["one by one", "together"])
 @pytest.mark.parametrize("equal", [False, True], ids=["of any length", "equally long"])
 def test_reports_name_publisher_and_message(together: bool, equal: bool) -> None:
-    """A report has the publisher's name and host, the message's number, and the header as received."""
     look = """look() { event far(int seq) /scan geometry_msgs/PoseStamped '{header:{seq:seq}}' {
         if (seq == 7 || seq == 9) { seq = 0; return; } if (seq == 8) { int zero = 0; seq = 1 / zero; } } }"""
     told = Told(together=together, texts=(look,), on_fault="pass")
@@ -188,7 +179,6 @@ def test_reports_name_publisher_and_message(together: bool, equal: bool) -> None
 
 
 def test_clients_of_one_host_are_counted_together_and_those_of_two_are_not() -> None:
-    """A client that keeps changing its name makes no record for each name; the first is named, per host."""
     told = Told(together=True)
     observations = told.monitored.interceptor.observations
     for number in range(50):
@@ -210,7 +200,6 @@ def test_clients_of_one_host_are_counted_together_and_those_of_two_are_not() -> 
 
 @pytest.mark.parametrize("together", [False, True])
 def test_a_verdict_names_its_binding(together: bool) -> None:
-    """The verdict of each binding is reported in full, and not counted with another binding's."""
     turns = (
         "turns(double x) { event on(double x) /cmd geometry_msgs/Twist '{linear.x:x}' { } "
         'ere: on on @match { ROS_INFO("twice"); } }'
@@ -226,7 +215,6 @@ def test_a_verdict_names_its_binding(together: bool) -> None:
 
 
 def test_how_many_slices_there_are() -> None:
-    """The number of slices is reported with its limit, but not for monitors without parameters."""
     told = Told(together=False, texts=(AGAIN, TURNED))
     told.send((5, 0, 0), (6, 0, 0), (5, 0, 0))
     rows = {row.name: (row.slices, row.slice_limit) for row in told.monitored.rows()}
@@ -245,7 +233,6 @@ TURNED = """turned() { event on(double z) /cmd geometry_msgs/Twist '{angular.z:z
 def test_counted_events_have_no_explanation(
     together: bool, bindings: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Repeated and excess bindings are only counted: the next full report has the explanation."""
     monkeypatch.setattr(observations, "_DISTINCT", 2)
     told = Told(together=together, texts=(AGAIN, TURNED))
     told.send(*[(x, 0, 0) for x in bindings], (5.0, 0, 2))
@@ -261,7 +248,6 @@ SAYS = """says() { event drive(double v, double w) /cmd geometry_msgs/Twist '{li
 
 @pytest.mark.parametrize("together", [False, True])
 def test_lines_that_differ_only_in_numbers_are_one_count(together: bool) -> None:
-    """The count has the last line as text, its level, and the first and last line and time."""
     told = Told(together=together, texts=(SAYS,))
     told.send(*[(speed, 0, 0) for speed in (0.25, 0.5, 0.75, 1)], (0, 0, 5))
     first, warning, more = told.events("log")
@@ -286,7 +272,6 @@ def test_further_drops_have_a_number_and_times(together: bool) -> None:
 
 
 def test_a_count_of_different_words_has_no_text() -> None:
-    """Beyond the number of distinctions, a count has the number of lines, and no line stands for the others."""
     told = Told(together=True)
     observations, point = told.monitored.interceptor.observations, ObservationPoint("k", "/t", "h", "/n")
     for number, words in enumerate(["a" * (length + 1) for length in range(110)]):

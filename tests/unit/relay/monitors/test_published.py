@@ -24,7 +24,6 @@ def monitors() -> Iterator[QuietMonitors]:
 
 
 def test_a_published_command_is_capped_dropped_and_recorded(monitors: QuietMonitors) -> None:
-    """Nothing faster than the cap leaves, and the records name the monitor that changed or dropped it."""
     monitors.load(MUX, CAP)
     for speed in (9.0, 0.5, 0.1):
         monitors.process("/joy", message("geometry_msgs/TwistStamped", twist__linear__x=speed))

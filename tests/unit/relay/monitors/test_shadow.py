@@ -60,7 +60,6 @@ def world() -> Iterator[Trying]:
 def test_waiting_messages_are_judged_before_it_is_promoted(
     world: Trying, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Judging them first makes the monitor's state complete."""
     world.state_shadows(GUARD, shadowed=("guard",))
     publisher, subscriber = world.typed()
     interceptor = world.engine.interceptor
@@ -75,7 +74,6 @@ def test_waiting_messages_are_judged_before_it_is_promoted(
 
 
 def test_a_loop_without_end_delays_and_drops_nothing(world: Trying, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The loop ends at a tenth of the normal budget, once a second; the monitor then begins again."""
     world.state_shadows(GUARD, shadowed=("guard",))
     publisher, subscriber = world.typed()
     monkeypatch.setattr(shadow.ShadowMonitors, "tick", lambda _self: None)  # the second is not over
@@ -95,7 +93,6 @@ def test_a_loop_without_end_delays_and_drops_nothing(world: Trying, monkeypatch:
 
 
 def test_ticks_without_end_rest_for_the_second(world: Trying, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One tick is tried and the relay continues; the next tick is tried when the second is over."""
     monkeypatch.setattr(shadow.ShadowMonitors, "tick", lambda _self: None)
     text = "s() { int n = 0; event tick() every 1ms { while (true) { n = n; } } }"
     world.state_shadows(text, shadowed=("s",))
@@ -112,7 +109,6 @@ def test_ticks_without_end_rest_for_the_second(world: Trying, monkeypatch: pytes
 def test_shadow_mode_has_a_bounded_part_of_the_processor(
     world: Trying, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Shadow monitors miss messages beyond their part of the processor time; the messages pass."""
     world.state_shadows(GUARD, shadowed=("guard",))
     publisher, subscriber = world.typed()
     thread_time, more = time.thread_time, [0.0]
@@ -145,7 +141,6 @@ def test_waiting_messages_are_bounded(world: Trying, monkeypatch: pytest.MonkeyP
 
 
 def test_a_defect_in_it_ends_no_message(world: Trying) -> None:
-    """An unexpected exception is reported, and the relay continues."""
     world.state_shadows(GUARD, shadowed=("guard",))
     publisher, subscriber = world.typed()
     assert world.engine.interceptor.monitors is not None

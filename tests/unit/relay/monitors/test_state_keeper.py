@@ -61,7 +61,6 @@ def unexplained(outcome: Outcome) -> Outcome:
 @FEW
 @given(seed=st.integers(0, 1 << 30), step_ns=st.sampled_from([1, 700_000]))
 def test_random_specifications_go_on_where_a_killed_process_was(seed: int, step_ns: int) -> None:
-    """With every logic, type of variable, timer and deadline, a kill at any point changes nothing."""
     random = Random(seed)  # noqa: S311  draws examples, not keys
     sources = {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())}
     messages = Messages(seed)
@@ -116,7 +115,6 @@ OTHERS = {
 @pytest.mark.parametrize("other", OTHERS)
 @pytest.mark.parametrize("modifier", ["", "hold", "begin"])
 def test_a_state_that_may_be_stale_is_not_used(other: str, modifier: str) -> None:
-    """A monitor that acts by a state then holds its topics with the reason; a monitor declared `begin` starts again."""
     memory = bytearray(SIZE)
     first = stop(modifier)
     press(first, begun(first, memory))
@@ -128,7 +126,6 @@ def test_a_state_that_may_be_stale_is_not_used(other: str, modifier: str) -> Non
 
 
 def test_an_orderly_end_outlives_the_machine() -> None:
-    """After an orderly end, a restarted machine uses the state again."""
     memory = bytearray(SIZE)
     first = stop()
     press(first, begun(first, memory))
@@ -140,7 +137,6 @@ def test_an_orderly_end_outlives_the_machine() -> None:
 
 
 def test_another_text_loses_the_state_and_says_so() -> None:
-    """A specification that changed while the relay was stopped holds its topics; one never loaded before begins."""
     memory = bytearray(SIZE)
     first = stop()
     press(first, begun(first, memory))
@@ -159,7 +155,6 @@ def test_another_text_loses_the_state_and_says_so() -> None:
 
 
 def test_held_topics_are_held_by_the_next_process() -> None:
-    """A killed process never releases held topics; only an operator does."""
     memory = bytearray(SIZE)
     first = stop()
     press(first, begun(first, memory))
@@ -187,7 +182,6 @@ def test_an_unreadable_memory_does_not_start_monitors_over() -> None:
 
 
 def test_a_newer_state_that_is_lost_is_not_replaced_by_an_older_one() -> None:
-    """Only the last process that had a monitor counts, whatever earlier processes left."""
     older, newer = bytearray(SIZE), bytearray(SIZE)
     first = stop()
     begun(first, older)
@@ -224,7 +218,6 @@ PROPERTIES = (
 @pytest.mark.parametrize("shown", PROPERTIES)
 @pytest.mark.parametrize("seed", range(12))
 def test_slices_go_on_where_a_killed_process_had_them(shown: str, seed: int) -> None:
-    """Covers variables, automata, deadlines, ended slices, and the order in which slices began."""
     random = Random(seed)  # noqa: S311  draws examples, not keys
     monitors = MonitorSet.of(
         compiled_from({"s.rv": SLICED.replace("PROPERTY", shown)}, standard_definitions())
@@ -251,7 +244,6 @@ def test_slices_go_on_where_a_killed_process_had_them(shown: str, seed: int) -> 
 
 
 def test_many_slices_are_kept_and_a_message_writes_a_part_of_them() -> None:
-    """With two thousand slices, a message writes a hundredth; without room none is restored, and topics stay held."""
     text = SLICED.replace("PROPERTY", PROPERTIES[0]).replace("event look() every 3ms", "void look()")
     monitors = MonitorSet.of(compiled_from({"s.rv": text}, standard_definitions()))
     memory = bytearray(8 * SIZE)
@@ -278,7 +270,6 @@ def test_many_slices_are_kept_and_a_message_writes_a_part_of_them() -> None:
 
 
 def test_the_other_appliance_goes_on_with_the_state_that_was_left() -> None:
-    """After a planned switchover the latched stop stays latched, whatever boots the machines are in."""
     first = stop()
     keeper = begun(first, bytearray(SIZE))
     press(first, keeper)
@@ -295,7 +286,6 @@ COPY = StateWanted(7, copy=True)
 
 @pytest.mark.parametrize("modifier", ["", "hold"])
 def test_the_other_appliance_goes_on_with_a_copy(modifier: str) -> None:
-    """Monitors without a copy hold their topics, as do monitors with the modifier `hold`."""
     first = stop(modifier)
     keeper = begun(first, bytearray(SIZE))
     press(first, keeper)
@@ -316,7 +306,6 @@ def other_stop() -> MonitorSet:
 
 
 def test_only_a_changed_state_of_a_bounded_size_is_copied(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each copy has the present time of the monitors; without a time there is no copy."""
     monitors = stop()
     keeper = begun(monitors, bytearray(SIZE))
     for _ in range(2):
@@ -338,7 +327,6 @@ def test_only_a_changed_state_of_a_bounded_size_is_copied(monkeypatch: pytest.Mo
 
 
 def test_a_damaged_state_is_lost() -> None:
-    """A monitor that acts by it holds its topics, with the reason."""
     first = stop()
     keeper = begun(first, bytearray(SIZE))
     press(first, keeper)

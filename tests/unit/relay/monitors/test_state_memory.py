@@ -82,13 +82,11 @@ def test_a_kill_leaves_what_was_before_or_after(act: str, rounds: int) -> None:
 
 
 def test_the_first_kill_leaves_nothing_or_all() -> None:
-    """A process that is killed while it writes for the first time leaves an empty memory."""
     found = killed_anywhere(bytearray(SIZE), lambda one: StateMemory(one).lay_out(b"head", [(b"one", 0)]))
     assert set(map(repr, found)) == {"None", repr(StoredState(b"head", [(b"one", None)]))}
 
 
 def test_a_state_without_room_changes_nothing() -> None:
-    """A state that is too large is refused and the previous one stays; so is a set of monitors that is too large."""
     data = bytearray(SIZE)
     memory = StateMemory(data)
     assert memory.lay_out(b"head", [(b"one", 0)])

@@ -51,7 +51,6 @@ class Relay:
 
 @pytest.mark.parametrize("ahead", [0.0, 120.0, -120.0, 3600.0, -3600.0])
 def test_bounds_are_ages_over_a_switchover_and_a_crash(ahead: float) -> None:
-    """However the clocks differ, a halt is remembered for 60 s of time that passed, not longer and not shorter."""
     one, other = VirtualClock(wall=WALL, now=5.0), VirtualClock(wall=WALL + ahead, now=7000.0)
 
     def let_pass(seconds: float) -> None:
@@ -78,7 +77,6 @@ def test_bounds_are_ages_over_a_switchover_and_a_crash(ahead: float) -> None:
 
 
 def test_a_copy_is_as_old_as_its_last_note() -> None:
-    """An unchanged state is not copied again, but the time of its monitors went on until the takeover."""
     one, other = VirtualClock(wall=WALL, now=5.0), VirtualClock(wall=WALL + 3600.0, now=7000.0)
     first = Relay(one, bytearray(SIZE), "one")
     first.send("/halt", "std_msgs/Bool", data=True)

@@ -20,13 +20,11 @@ def reductions(budget: TimeBudget, seconds: float) -> list[float]:
 
 
 def test_a_sender_of_costly_messages_has_the_whole_budget_ever_more_rarely() -> None:
-    """The whole budget is available again after 4, then 8, and then every 16 seconds."""
     cut = reductions(TimeBudget(), 64)
     assert [after - before for before, after in pairwise(cut)] == [4, 8, 16, 16, 16]
 
 
 def test_one_costly_message_reduces_the_budget_for_four_seconds() -> None:
-    """Another such message eight seconds earlier does not lengthen the time."""
     budget = TimeBudget()
     for begin in (5 * _SECOND, 13 * _SECOND, 30 * _SECOND):
         budget.cut(begin)

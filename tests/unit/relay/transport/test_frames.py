@@ -60,7 +60,6 @@ cut_sizes = st.lists(st.integers(1, 2 * LARGE), min_size=1, max_size=20)
 @settings(max_examples=examples(150))
 @given(sizes, cut_sizes)
 def test_every_way_of_cutting_the_stream_gives_the_same_frames(lengths: list[int], cuts: list[int]) -> None:
-    """No frame is lost, repeated or torn, and each batch knows where its last frame begins."""
     data = b"".join(frame(size, index) for index, size in enumerate(lengths))
     one, budget = receiver()
     batches = feed(
@@ -83,7 +82,6 @@ def test_a_torn_frame_is_never_part_of_a_batch() -> None:
 
 
 def test_receivers_share_the_scratch_area_without_mixing_their_bytes() -> None:
-    """A torn frame of one connection survives the data that another connection receives before its rest."""
     scratch, budget = Scratch(), share(1 << 30)
     one, other = FrameReceiver(scratch, LIMIT, budget), FrameReceiver(scratch, LIMIT, budget)
     data = frame(100, 1)
@@ -93,7 +91,6 @@ def test_receivers_share_the_scratch_area_without_mixing_their_bytes() -> None:
 
 
 def test_the_scratch_area_moves_between_two_reads() -> None:
-    """A torn frame continues in the new area; the old one receives no more bytes."""
     scratch, first, other = Scratch(), bytearray(SCRATCH), bytearray(SCRATCH)
     one = FrameReceiver(scratch, LIMIT, share(1 << 30))
     scratch.move(memoryview(first))
@@ -105,7 +102,6 @@ def test_the_scratch_area_moves_between_two_reads() -> None:
 
 @pytest.mark.parametrize("size", [LIMIT + 1, 0xFFFFFFFF])
 def test_a_length_beyond_the_limit_is_refused_at_its_first_bytes(size: int) -> None:
-    """The connection is closed before any byte of the message is stored."""
     one, budget = receiver()
     with pytest.raises(LimitExceededError, match=str(size)):
         feed(one, struct.pack("<I", size), [4])
@@ -113,7 +109,6 @@ def test_a_length_beyond_the_limit_is_refused_at_its_first_bytes(size: int) -> N
 
 
 def test_the_limit_holds_for_a_frame_after_a_large_one() -> None:
-    """The limit also holds when reading continues in the large frame's own area."""
     one, _budget = receiver()
     with pytest.raises(LimitExceededError):
         feed(one, frame(2 * LARGE) + struct.pack("<I", LIMIT + 1), [SCRATCH])
@@ -129,7 +124,6 @@ def test_a_declared_length_costs_nothing_until_its_bytes_come() -> None:
 
 
 def test_a_large_message_is_given_up_when_the_process_is_out_of_memory() -> None:
-    """The error does not blame the peer, and the receiver can be abandoned."""
     one, budget = receiver(memory=2 * LARGE)
     with pytest.raises(PeerError, match="no memory"):
         feed(one, frame(4 * LARGE), [LARGE])
@@ -139,7 +133,6 @@ def test_a_large_message_is_given_up_when_the_process_is_out_of_memory() -> None
 
 @pytest.mark.parametrize("size", [2 * LARGE, 3 << 20, 9 << 20])
 def test_a_kept_large_frame_is_not_overwritten_by_the_next(size: int) -> None:
-    """A queue that holds a frame keeps its bytes, whatever follows, even when all spare areas are in use."""
     one, _budget = receiver(limit=16 << 20)
     kept = []
     for fill in (1, 2, 3):
@@ -157,7 +150,6 @@ def test_a_kept_large_frame_is_not_overwritten_by_the_next(size: int) -> None:
 
 
 def test_a_kept_batch_survives_the_reuse_of_its_buffer() -> None:
-    """`keep` copies once, and returns the same copy to all callers."""
     area = bytearray(frame(4, 1) + frame(4, 2))
     batch = Batch(memoryview(area), 2, 8)
     kept, last = batch.keep(), batch.keep_last()
@@ -168,7 +160,6 @@ def test_a_kept_batch_survives_the_reuse_of_its_buffer() -> None:
 
 
 def test_for_little_of_a_large_frame_its_memory_is_not_kept() -> None:
-    """The next frame reuses the large area; if much of it is kept, or all areas are in use, nothing is copied."""
     view = memoryview(bytearray(frame(1 << 20)))
     batch = Batch(view, 1, 0, owned=True)
     little, kept = batch.rest(len(view) - 1000), batch.kept
@@ -180,7 +171,6 @@ def test_for_little_of_a_large_frame_its_memory_is_not_kept() -> None:
 
 
 def test_boundary_at_finds_the_frame_a_send_stopped_in() -> None:
-    """The result is the number of frames sent, and the end of the frame in progress."""
     view = memoryview(frame(6) + frame(0) + frame(10))
     assert [boundary_at(view, offset) for offset in (0, 3, 10, 11, 14, 15, 28)] == [
         (0, 0),
@@ -196,7 +186,6 @@ def test_boundary_at_finds_the_frame_a_send_stopped_in() -> None:
 @given(st.lists(st.sampled_from([0, 5, 5, 5, 252, 256, 65_536]), max_size=12), st.integers(0, 9))
 @example([5, 5, 5, 5, 0], 0)
 def test_equal_frames_are_seen_at_once_exactly_if_all_are_equal(lengths: list[int], torn: int) -> None:
-    """The result for the whole buffer equals the result of a walk from frame to frame."""
     data = b"".join(frame(length) for length in lengths) + frame(20)[:torn]
     stride, count = equal_frames(memoryview(data), len(data))
     if count:
@@ -208,7 +197,6 @@ def test_equal_frames_are_seen_at_once_exactly_if_all_are_equal(lengths: list[in
 
 
 def test_a_batch_of_equal_frames_says_so() -> None:
-    """A reader can then read all fields at once; a frame of another size ends this."""
     one, _ = receiver()
     data = frame(6) * 5 + frame(6)[:3]
     one.buffer()[: len(data)] = data
@@ -223,7 +211,6 @@ def test_a_batch_of_equal_frames_says_so() -> None:
 
 
 def test_the_last_frame_is_looked_for_where_it_is_not_known() -> None:
-    """A batch from which frames were removed can still be latched."""
     view = memoryview(frame(6) + frame(0) + frame(10, 3))
     assert last_frame(view) == 14
     assert bytes(Batch(view, 3, None).keep_last().view) == frame(10, 3)

@@ -72,14 +72,12 @@ def test_thousands_of_messages_are_carried_out_a_quantum_at_a_time_and_in_order(
 
 
 def test_catch_up_carries_out_everything_that_was_sent(ends: Ends) -> None:
-    """Catching up ensures that peers are judged by the latest grants."""
     send(ends.raw, 1000)
     ends.link.catch_up()
     assert len(ends.received) == 1000
 
 
 def test_messages_sent_before_the_end_are_read(ends: Ends) -> None:
-    """The end is reported once, after these messages."""
     send(ends.raw, 600)
     ends.other.close()
     for _ in range(4):
@@ -89,7 +87,6 @@ def test_messages_sent_before_the_end_are_read(ends: Ends) -> None:
 
 
 def test_closing_closes_descriptors_that_were_not_taken(ends: Ends) -> None:
-    """A replaced control leaves no descriptor open."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         for number in range(40):
             ends.other.send(NodePlaced(str(number), "/n", "h"), (listening.fileno(),))
@@ -99,7 +96,6 @@ def test_closing_closes_descriptors_that_were_not_taken(ends: Ends) -> None:
 
 
 def test_while_messages_wait_no_more_is_read(ends: Ends) -> None:
-    """Waiting messages are limited while reports are still sent. Later all are handled in order, the end last."""
     ends.waits = True
     body = msgspec.msgpack.encode(NodeWithdrawn("k"))
     frame, sent = struct.pack(">I", len(body)) + body, 0
@@ -124,7 +120,6 @@ def test_while_messages_wait_no_more_is_read(ends: Ends) -> None:
 
 
 def test_an_end_that_does_not_read_yet_gets_everything_later(ends: Ends) -> None:
-    """While the socket is full no message is lost, and no call blocks."""
     for number in range(20_000):
         ends.link.send(UpstreamWanted(str(number), "/topic"))
     keys: list[str] = []

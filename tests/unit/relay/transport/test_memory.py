@@ -19,7 +19,6 @@ def take_all(pool: MemoryPool, host: str, step: int = 1) -> int:
 
 
 def test_a_host_may_have_as_much_as_is_left() -> None:
-    """A host alone gets half, the next host half of the rest; released memory is available to all."""
     pool = shares(96)
     assert [take_all(pool, host) for host in "abc"] == [48, 24, 12]
     assert pool.of("a").refusal() == (
@@ -31,7 +30,6 @@ def test_a_host_may_have_as_much_as_is_left() -> None:
 
 
 def test_however_many_hosts_take_all_they_can_the_next_finds_room() -> None:
-    """If hosts are cut back to their quotas, even two hundred of them leave a part."""
     pool = shares(1 << 20)
     hosts = [f"10.0.0.{number}" for number in range(200)]
     for _ in range(3000):
@@ -46,7 +44,6 @@ def test_however_many_hosts_take_all_they_can_the_next_finds_room() -> None:
 
 
 def test_the_memory_of_a_relay_is_parted_as_the_table_says() -> None:
-    """For any size, queues and latched messages leave half of the memory for messages in transit."""
     memory = RelayMemory.of(RelayLimits(memory_bytes=1 << 28), lambda _host: QuotaClass.REGISTERED)
     wholes = [one.bounds.whole >> 20 for one in (memory.frames, memory.queues, memory.latched)]
     assert wholes == [128, 64, 64]
@@ -55,7 +52,6 @@ def test_the_memory_of_a_relay_is_parted_as_the_table_says() -> None:
 
 
 def test_a_host_that_is_gone_leaves_nothing() -> None:
-    """A host without memory is not in the pool."""
     pool = shares(100)
     pool.of("a").add(5)
     pool.of("a").add(-5)
@@ -63,7 +59,6 @@ def test_a_host_that_is_gone_leaves_nothing() -> None:
 
 
 def test_a_stall_is_what_does_not_change() -> None:
-    """Growing or completed messages are not stalled."""
     stall = StallDetector(10)
     assert not any(stall.seen(held, now) for held, now in ((5, 0), (5, 10), (6, 11), (6, 21)))
     assert stall.seen(6, 21.5)

@@ -95,7 +95,6 @@ def pumped() -> Iterator[Pumped]:
 
 
 def test_whole_frames_pass_without_python(pumped: Pumped) -> None:
-    """Several frames of one read are passed on and counted; `wait` returns nothing."""
     data = frame(b"one") + frame(b"") + frame(b"three")
     pumped.publisher.send(data)
     assert pumped.wait() == []
@@ -108,7 +107,6 @@ def test_whole_frames_pass_without_python(pumped: Pumped) -> None:
 
 
 def test_each_subscriber_gets_every_frame() -> None:
-    """The most subscribers that a step serves get the same bytes; more are refused."""
     pumped = Pumped(SUBSCRIBERS)
     pumped.publisher.send(frame(b"x"))
     pumped.wait()
@@ -121,7 +119,6 @@ def test_each_subscriber_gets_every_frame() -> None:
 
 
 def test_without_subscribers_messages_are_counted(pumped: Pumped) -> None:
-    """A topic that only monitors need has no delays to count."""
     pumped.connection.arm(pumped.ours.fileno(), pumped.topic, [], None, b"")
     pumped.publisher.send(frame(b"x"))
     pumped.wait()
@@ -130,7 +127,6 @@ def test_without_subscribers_messages_are_counted(pumped: Pumped) -> None:
 
 @pytest.mark.parametrize("cut", [1, 3, 4, 6, 8])
 def test_an_incomplete_frame_waits_for_its_rest(pumped: Pumped, cut: int) -> None:
-    """A frame cut anywhere is passed on whole when its rest arrives; the frame before it is not delayed."""
     before, torn = frame(b"before"), frame(b"torn!")
     pumped.publisher.send(before + torn[:cut])
     pumped.wait()
@@ -142,7 +138,6 @@ def test_an_incomplete_frame_waits_for_its_rest(pumped: Pumped, cut: int) -> Non
 
 
 def test_disarming_returns_the_incomplete_frame_and_arming_takes_it(pumped: Pumped) -> None:
-    """Python can continue an incomplete frame of the pump, and the pump one of Python."""
     pumped.publisher.send(frame(b"torn!")[:6])
     pumped.wait()
     assert pumped.connection.disarm() == frame(b"torn!")[:6]
@@ -167,7 +162,6 @@ def test_disarming_returns_the_incomplete_frame_and_arming_takes_it(pumped: Pump
     ids=["large", "largest", "long rest", "too many", "large second"],
 )
 def test_other_frames_are_left_to_python_unread(pumped: Pumped, data: bytes) -> None:
-    """Nothing of the read is passed on, counted or kept: all bytes are in the scratch area."""
     pumped.publisher.send(data)
     assert pumped.left() == Left(RECEIVED, len(data))
     assert bytes(pumped.scratch.area[: len(data)]) == data
@@ -177,7 +171,6 @@ def test_other_frames_are_left_to_python_unread(pumped: Pumped, data: bytes) -> 
 
 
 def test_a_rest_that_python_must_take_includes_its_beginning(pumped: Pumped) -> None:
-    """The incomplete frame of an earlier read comes first in the scratch area."""
     data = struct.pack("<I", LARGE)
     pumped.publisher.send(data[:2])
     pumped.wait()
@@ -187,7 +180,6 @@ def test_a_rest_that_python_must_take_includes_its_beginning(pumped: Pumped) -> 
 
 
 def test_a_large_batch_passes_only_while_its_rest_could_be_kept(pumped: Pumped) -> None:
-    """Small frames of more than `LARGE` bytes together depend on the subscribers' memory."""
     pumped.ours.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
     pumped.publisher.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
     pumped.pairs[1][0].setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
@@ -201,7 +193,6 @@ def test_a_large_batch_passes_only_while_its_rest_could_be_kept(pumped: Pumped) 
 
 
 def test_the_end_and_errors_of_a_publisher_are_left(pumped: Pumped) -> None:
-    """The end of the connection is 0; an error is its number, negative."""
     pumped.publisher.close()
     found = pumped.wait(10)
     assert found[0][0] == pumped.ours.fileno()
@@ -212,7 +203,6 @@ def test_the_end_and_errors_of_a_publisher_are_left(pumped: Pumped) -> None:
 
 
 def test_a_subscriber_that_takes_a_part_is_left_with_the_later_ones() -> None:
-    """Earlier subscribers have the frames; the number of accepted bytes is exact, and nothing is sent twice."""
     pumped = Pumped(3)
     slow = pumped.pairs[2][0]
     slow.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
@@ -239,7 +229,6 @@ def test_a_subscriber_that_takes_a_part_is_left_with_the_later_ones() -> None:
 
 
 def test_a_subscriber_that_is_gone_is_an_error_number() -> None:
-    """A closed peer does not raise SIGPIPE."""
     pumped = Pumped(2)
     pumped.pairs[1][1].close()
     pumped.publisher.send(frame(b"x") + b"\x02")
@@ -251,7 +240,6 @@ def test_a_subscriber_that_is_gone_is_an_error_number() -> None:
 
 
 def test_after_a_change_python_gets_the_event(pumped: Pumped) -> None:
-    """Nothing is received for a topic that has changed since the connection was armed."""
     pumped.topic.plain.change()
     pumped.publisher.send(frame(b"x"))
     assert pumped.left() == Left(UNARMED)
@@ -259,7 +247,6 @@ def test_after_a_change_python_gets_the_event(pumped: Pumped) -> None:
 
 
 def test_several_ready_descriptors_are_left_to_python(pumped: Pumped) -> None:
-    """Python divides the time among them, and its handler performs the step."""
     ours, theirs = socket.socketpair()
     pumped.epoll.register(ours.fileno(), READ)
     theirs.send(b"x")
@@ -276,7 +263,6 @@ def test_several_ready_descriptors_are_left_to_python(pumped: Pumped) -> None:
 
 
 def test_a_flood_does_not_delay_a_timer(pumped: Pumped) -> None:
-    """`wait` returns at its deadline although every `epoll_wait` finds the publisher ready."""
     pumped.pump.put(pumped.ours.fileno(), None)
     endless, ours = socket.socketpair()
     endless.send(frame(b"x") * 1000)
@@ -294,7 +280,6 @@ def test_a_flood_does_not_delay_a_timer(pumped: Pumped) -> None:
 
 
 def test_a_connection_in_a_crowd_is_pumped_if_it_is_ready_alone(pumped: Pumped) -> None:
-    """Connections may be in an epoll within the epoll."""
     crowd = select.epoll()
     pumped.epoll.unregister(pumped.ours.fileno())
     crowd.register(pumped.ours.fileno(), READ)
@@ -317,7 +302,6 @@ def test_a_connection_in_a_crowd_is_pumped_if_it_is_ready_alone(pumped: Pumped) 
 
 
 def test_a_scratch_area_may_be_replaced_between_two_reads(pumped: Pumped) -> None:
-    """The incomplete frame moves to the new area; a tiny area is refused."""
     pumped.publisher.send(frame(b"torn")[:5])
     pumped.wait()
     pumped.scratch.move(memoryview(bytearray(b"\xff" * 4 * SMALL)))
@@ -329,7 +313,6 @@ def test_a_scratch_area_may_be_replaced_between_two_reads(pumped: Pumped) -> Non
 
 
 def test_a_descriptor_without_a_connection_is_returned(pumped: Pumped) -> None:
-    """Forgotten and unknown descriptors are the loop's; a closed epoll is an error."""
     pumped.pump.put(pumped.ours.fileno(), None)
     pumped.pump.put(100_000, None)
     pumped.publisher.send(frame(b"x"))

@@ -45,7 +45,6 @@ def sent(flow: RateAllowance, *batches: tuple[float, Batch]) -> int:
 @pytest.mark.parametrize("rate", [0.1, 1.0, 5.0, 10.0, 1000.0])
 @pytest.mark.parametrize("jitter", [0.0, 0.3])
 def test_a_publisher_within_the_limit_loses_nothing(rate: float, jitter: float) -> None:
-    """This also holds for messages that are a little early or late, and for slow rates."""
     times = [(number + jitter * (number % 2)) / rate for number in range(1000)]
     assert sent(alone(FlowLimit(messages=rate)), *((now, frames(8)) for now in times)) == 1000
 
@@ -59,7 +58,6 @@ def test_a_publisher_within_the_limit_loses_nothing(rate: float, jitter: float) 
 def test_no_more_passes_than_the_rate_and_a_burst(
     rate: float, size: int, gaps: list[tuple[float, int]]
 ) -> None:
-    """This holds however the messages arrive; a message is never held back longer than the rate requires."""
     now, batches = 0.0, []
     for gap, count in gaps:
         now += gap
@@ -71,13 +69,11 @@ def test_no_more_passes_than_the_rate_and_a_burst(
 
 
 def test_a_message_that_is_larger_than_the_limit_passes_and_is_made_up_for() -> None:
-    """A map of a megabyte over a link of 100 kB/s passes every ten seconds, instead of never."""
     flow, map_ = alone(FlowLimit(bytes=100_000)), frames(1_000_000)
     assert sent(flow, *((now / 2, map_) for now in range(200))) == 10
 
 
 def test_the_first_of_a_batch_pass() -> None:
-    """The number is limited by messages and by bytes, for frames of one length and of several."""
     flow = alone(FlowLimit(messages=20, bytes=200))
     assert flow.room(frames(*[4] * 30), 30, 0.0) == 10
     assert flow.room(frames(50, 30, 30, 4), 4, 0.0) == 3
@@ -87,7 +83,6 @@ def test_the_first_of_a_batch_pass() -> None:
 
 
 def test_another_limit_counts_at_once() -> None:
-    """A looser limit gives no second burst; a limit after none begins with a full burst."""
     flow = SharedRateLimit(FlowLimit(messages=10), 0.0)
     share = flow.of("")
     assert sent(share, (0.0, frames(*[4] * 9))) == 5
@@ -100,7 +95,6 @@ def test_another_limit_counts_at_once() -> None:
 
 
 def test_connections_with_the_same_names_have_one_flow() -> None:
-    """Several connections of one subscriber share one limit."""
     flows = RateLimits(lambda: 0.0)
     one = flows.of(FlowLimit(5), "/scan", "10.0.0.1", "/ear")
     assert one is not None
@@ -110,7 +104,6 @@ def test_connections_with_the_same_names_have_one_flow() -> None:
 
 
 def test_unused_flows_are_forgotten_once_they_are_paid() -> None:
-    """However many names appear and whatever they owe, the number of flows is limited."""
     now = 0.0
     flows = RateLimits(lambda: now)
 
@@ -141,7 +134,6 @@ def passed(events: list[tuple[float, RateAllowance, Batch]]) -> dict[RateAllowan
 
 @pytest.mark.parametrize("guests", [1, 2, 20])
 def test_a_host_within_its_part_loses_nothing_because_of_others(guests: int) -> None:
-    """Whatever the guests send on the topic, the robot's messages pass up to its equal part of the limit."""
     flow = SharedRateLimit(FlowLimit(messages=40), 0.0)
     robot, *others = (flow.of(name) for name in ["robot", *map(str, range(guests))])
     part = 40 / (guests + 1)
@@ -152,7 +144,6 @@ def test_a_host_within_its_part_loses_nothing_because_of_others(guests: int) -> 
 
 
 def test_the_unused_part_of_a_host_goes_to_the_others() -> None:
-    """A publisher that sends alone has the whole limit; two have equal parts, whatever the silent ones do not use."""
     flow = SharedRateLimit(FlowLimit(messages=100), 0.0)
     idle = [flow.of(str(number)) for number in range(8)]
     one, other = flow.of("one"), flow.of("other")
@@ -169,7 +160,6 @@ def test_the_unused_part_of_a_host_goes_to_the_others() -> None:
 
 @given(st.lists(st.tuples(st.floats(0, 0.2), st.integers(0, 4), st.integers(1, 30)), max_size=60))
 def test_holders_together_get_no_more_than_the_limit(sends: list[tuple[float, int, int]]) -> None:
-    """This holds for any number of holders and any times of sending."""
     flow = SharedRateLimit(FlowLimit(messages=10), 0.0)
     shares = [flow.of(str(number)) for number in range(5)]
     now, count = 0.0, 0
@@ -180,7 +170,6 @@ def test_holders_together_get_no_more_than_the_limit(sends: list[tuple[float, in
 
 
 def test_a_large_message_is_made_up_for_by_its_host_alone() -> None:
-    """A guest's message far above the byte limit delays none of the robot's messages."""
     flow = SharedRateLimit(FlowLimit(bytes=1000), 0.0)
     robot, guest = flow.of("robot"), flow.of("guest")
     assert sent(guest, (0.0, frames(1_000_000))) == 1
@@ -189,7 +178,6 @@ def test_a_large_message_is_made_up_for_by_its_host_alone() -> None:
 
 
 def test_a_holder_that_leaves_and_comes_back_wins_nothing() -> None:
-    """A publisher's use still counts after it registers again, alone or with others, under any name."""
     flows = RateLimits(lambda: 0.0)
     limit = FlowLimit(messages=20)
     counts = 0
@@ -211,7 +199,6 @@ def test_names_of_a_host_share_its_limit() -> None:
 
 
 def test_a_publication_has_its_own_limit_and_a_part_of_its_topics() -> None:
-    """Besides its own limit, each gets its part of the topic's limit plus the unused rest."""
     told: list[tuple[str, int, int]] = []
     together = SharedRateLimit(FlowLimit(messages=8), 0.0)
     flow, other = (PublicationRateLimit(share(), lambda *row: told.append(row)) for _ in range(2))

@@ -77,7 +77,6 @@ async def later(seconds: float = 1.0) -> None:
 
 
 async def test_messages_arrive_in_order_with_the_publishers_header() -> None:
-    """A subscriber that registers first or last gets every message, and each connection leaves from its address."""
     async with nodes() as world:
         talker, listener = await world.node("10.0.0.2"), await world.node("10.0.0.3")
         heard: list[tuple[bytes, str]] = []
@@ -110,7 +109,6 @@ async def test_a_latched_message_reaches_a_late_subscriber() -> None:
 
 
 async def test_a_node_hears_its_own_topic_without_a_connection() -> None:
-    """As with rospy and roscpp; a latched message also reaches a later subscription."""
     async with nodes() as world:
         node = await world.node("10.0.0.2")
         heard: list[tuple[str, bytes, str]] = []
@@ -136,7 +134,6 @@ async def test_a_node_hears_its_own_topic_without_a_connection() -> None:
 
 @pytest.mark.parametrize(("wait", "heard"), [(0.5, [b"early", b"next"]), (1.5, [])])
 async def test_early_messages_are_replayed_only_for_a_while(wait: float, heard: list[bytes]) -> None:
-    """A subscriber that connects within the time of the replay gets them; a later one gets no old command."""
     async with nodes() as world:
         talker, listener = await world.node("10.0.0.2"), await world.node("10.0.0.3")
         publisher = await talker.advertise("/cmd_vel", STRING, latched=False, queue=2, replay=1)
@@ -164,7 +161,6 @@ async def test_early_messages_take_no_memory_after_the_replay() -> None:
 
 
 async def test_a_slow_subscriber_loses_the_oldest_messages() -> None:
-    """The publisher keeps at most its queue for a subscriber that does not read, and serves others without delay."""
     async with nodes() as world:
         talker, listener = await world.node("10.0.0.2"), await world.node("10.0.0.3")
         heard: list[bytes] = []
@@ -370,7 +366,6 @@ async def test_the_node_api_answers_the_master_and_other_nodes() -> None:
     ],
 )
 async def test_a_peer_that_breaks_the_protocol_is_disconnected(sent: bytes) -> None:
-    """The connection ends within the time limit, with the reason if a header was read, and the node serves on."""
     async with nodes() as world:
         node = await world.node("10.0.0.2")
         await node.advertise("/chatter", STRING, latched=False, queue=1)

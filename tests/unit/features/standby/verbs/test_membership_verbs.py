@@ -126,7 +126,6 @@ def test_an_epoch_of_another_pair_does_not_count() -> None:
 
 @pytest.mark.parametrize("leaves", [False, True])
 def test_the_epoch_of_the_same_pair_is_kept(leaves: bool) -> None:
-    """An appliance that forgot a greater epoch could give the old holder a promise."""
     join_first()
     command = ("standby", "join", "kit/standby-b.json", "--state", "second")
     assert rosrv(*command).returncode == 0
