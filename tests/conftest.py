@@ -30,7 +30,6 @@ settings.load_profile("no clock")
 
 @pytest.fixture
 def lab() -> Iterator[Lab]:
-    """An empty Ethernet to put hosts on."""
     need_root()
     with Lab("rosrv-test") as lab:
         yield lab
@@ -38,7 +37,6 @@ def lab() -> Iterator[Lab]:
 
 @pytest.fixture(scope="module")
 def common_lab() -> Iterator[Lab]:
-    """An Ethernet that the tests of a file share."""
     need_root()
     with Lab("rosrv-test") as lab:
         yield lab
@@ -65,7 +63,6 @@ def robot(lab: Lab) -> Host:
 
 @pytest.fixture(scope="session")
 def masters(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Masters]:
-    """The masters that the tests of a worker share."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with contextlib.closing(Masters(tmp_path_factory.mktemp)) as masters:
         yield masters

@@ -40,7 +40,6 @@ _REACHED = "__reached_mutant__"
 
 
 def modules_of(part: str) -> dict[str, Path]:
-    """Return the modules of the kernel, or with a part of a path all modules of the appliance that it is in."""
     paths = _KERNEL
     if part:
         found = (ROOT / "appliance").rglob("*.py")
@@ -138,12 +137,10 @@ class MutantLoader(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     def find_spec(
         self, fullname: str, _path: Sequence[str] | None, _target: types.ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
-        """Return how to load one of the modules."""
         file = self.modules.get(fullname)
         return None if file is None else importlib.machinery.ModuleSpec(fullname, self, origin=str(file))
 
     def exec_module(self, module: types.ModuleType) -> None:
-        """Load a module with its switches."""
         file = self.modules[module.__name__]
         module.__file__ = str(file)
         tree = ast.parse(file.read_text(encoding="utf-8"))
@@ -174,7 +171,6 @@ class Hunt:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_logstart(self, nodeid: str) -> None:
-        """Remember which test runs."""
         self._test = nodeid
 
     @pytest.hookimpl(tryfirst=True)

@@ -53,7 +53,6 @@ class Stage:
     workers: str = ""
 
     def options(self) -> list[str]:
-        """Return the options for pytest."""
         return ["-n", self.workers, "--dist", "loadfile", "--no-loadscope-reorder"] if self.workers else []
 
 

@@ -34,7 +34,6 @@ def stamped(
 
 
 def frames(bodies: Iterable[bytes]) -> bytes:
-    """Return messages as frames."""
     return b"".join(struct.pack("<I", len(body)) + body for body in bodies)
 
 
@@ -51,15 +50,12 @@ class BothWays:
                 monitor.seen = True
         self.came: Counter[str] = Counter()
         self.told: list[Verdict] = []
-        """Each verdict, and why, in order."""
         self.interpreted: list[Verdict] = []
-        """The same of the interpreter."""
         self.counts: Counter[str] = Counter()
         """Return the number of each verdict, of both runs."""
         self.lines: list[LogLine] = []
         """Return the output since the last check."""
         self.published: list[Published] = []
-        """The same of what was published."""
         self.counting = False
         """Whether verdicts are only counted."""
         self._inside = False
@@ -98,7 +94,6 @@ class BothWays:
         return expected
 
     def state(self) -> list[str]:
-        """Return the same as `state_of`, from the fast path."""
         return state_of(self.monitors)
 
     def _fed(self, given: bytes, topic: str, time: int) -> bytes:
@@ -156,5 +151,4 @@ def state_of(monitors: MonitorSet) -> list[str]:
 def event(
     body: str, parameters: str = "int count", pattern: str = "count:count", before: str = "int n = 0;"
 ) -> str:
-    """Return a specification with one event on `/plain`."""
     return f"s() {{ {before} event e({parameters}) /plain own/Plain '{{{pattern}}}' {{ {body} }} }}"

@@ -11,7 +11,6 @@ from rosmop.run.outcomes import Fault, Outcome
 
 
 def sent(functions: Mapping[str, nodes.Function]) -> dict[str, nodes.Function]:
-    """Return the form as another process reads it."""
     return msgspec.msgpack.decode(msgspec.msgpack.encode(functions), type=dict[str, nodes.Function])
 
 

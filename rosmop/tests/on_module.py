@@ -9,5 +9,4 @@ from rosmop.run.execution import OnFault
 
 
 def on_module(compiled: Compiled, on_fault: OnFault = "drop", shadows: Collection[str] = ()) -> MonitorSet:
-    """Return the compiled set with its own module; not started."""
     return MonitorSet.of(compiled, on_fault, fast=fast_path_of(compiled.without(shadows)), shadows=shadows)

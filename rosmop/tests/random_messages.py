@@ -28,7 +28,6 @@ class RandomMessages:
         self._random = random
 
     def whole(self, kind: str) -> bytes:
-        """Return a message of this type."""
         return b"".join(map(self._field, self._definitions.message(kind).fields))
 
     def read(self, kind: str) -> list[bytes]:
@@ -74,12 +73,10 @@ class RandomMessages:
 
 
 def cuts(whole: bytes) -> list[bytes]:
-    """Return a message cut after each byte, with whole messages in between."""
     return [body for end in range(len(whole)) for body in (whole, whole[:end])]
 
 
 def lie(whole: bytes, at: int, length: int) -> bytes:
-    """Return a message with another number at an offset."""
     return whole[:at] + struct.pack("<I", length) + whole[at + 4 :]
 
 

@@ -79,7 +79,6 @@ class Traffic:
     messages: int
 
     def bodies(self) -> Iterator[bytes]:
-        """Yield the messages one by one."""
         position = 0
         while position < len(self.frames):
             first = position + 4
@@ -99,7 +98,6 @@ class Specifications:
         self._ways = ways(seed)
 
     def texts(self) -> list[str]:
-        """Return one to three specifications."""
         return [self._specification(number) for number in range(self._random.choice((1, 1, 1, 2, 3)))]
 
     def _specification(self, number: int) -> str:

@@ -11,6 +11,5 @@ from roswire.definitions import Definitions
 def replaced(
     before: MonitorSet, sources: Mapping[str, str], definitions: Definitions, time_ns: int
 ) -> tuple[MonitorSet, Outcome]:
-    """Return the set that replaces another one, started, and the effects of the start."""
     following = MonitorSet.of(compiled_from(sources, definitions), before.on_fault, before.patience)
     return following, following.succeed(before, time_ns)

@@ -45,8 +45,6 @@ class Step:
 
 @dataclass(frozen=True)
 class Story:
-    """A story in a file."""
-
     title: str
     options: dict[str, str]
     text: str
@@ -54,7 +52,6 @@ class Story:
 
 
 def stories(path: Path) -> pytest.MarkDecorator:
-    """Run a test with each `story` of a file."""
     found = [
         _story(text) for text in re.split(r"^# ", path.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
     ]
@@ -86,7 +83,6 @@ def files_of(text: str) -> dict[str, str]:
 
 
 def tell(story: Story) -> Iterator[tuple[Step, list[str]]]:
-    """Yield each step with the lines of its outcome."""
     options = story.options
     compiled = compiled_from(files_of(story.text), definitions())
     on_fault: Any = options.get("on_fault", "drop")
@@ -240,5 +236,4 @@ def nanoseconds(text: str) -> int:
 
 
 def shown(time: int) -> str:
-    """Return a time in its largest unit."""
     return next(f"{time // size}{unit}" for unit, size in UNITS.items() if time % size == 0)

@@ -21,12 +21,10 @@ SHORT = message("sensor_msgs/JointState", name=["pan", "tilt"], position=[0.0])
 
 
 def guard(*members: str, head: str = "guard()") -> str:
-    """Return a specification."""
     return f"{head} {{ {' '.join(members)} }}"
 
 
 def drives(monitors: MonitorSet) -> bool:
-    """Whether a command to drive is passed."""
     return monitors.process("/cmd_vel", TWIST, 9).result == "passed"
 
 

@@ -81,7 +81,6 @@ def test_helpers_that_return_any_type_are_loaded(kind: str) -> None:
 
 
 def row(head: str) -> str:
-    """Return a row of the tables."""
     return next(line for line in PAGE.splitlines() if line.startswith(f"| {head} "))
 
 

@@ -33,7 +33,6 @@ def on(topic: str, name: str = "e", body: str = "", parameters: str = "") -> str
 
 
 def printed(outcome: Outcome) -> list[str]:
-    """Return the printed lines."""
     assert not outcome.faults, outcome.faults
     return [line.text for line in outcome.log]
 

@@ -1,5 +1,3 @@
-"""For strings kept in variables, the module has the results of the interpreter."""
-
 from random import Random
 
 import pytest

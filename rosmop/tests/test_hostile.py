@@ -1,5 +1,3 @@
-"""Hostile specifications are refused, or fault, in bounded time and memory."""
-
 import time
 import tracemalloc
 

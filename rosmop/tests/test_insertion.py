@@ -33,7 +33,6 @@ class Phase:
     tried: list[int] = field(default_factory=list)
 
     def text(self, name: str) -> str:
-        """Return the specification."""
         parts = [
             f"event {one}() /{one} std_msgs/Empty '{{}}' {{ {self._publish(self.echoes.get(one))} }}"
             f" void f_{one}() {{ {self._publish(one)} }}"
@@ -90,7 +89,6 @@ class Naive:
             self.judge(time, one, behind)
 
     def wait(self, until: int) -> None:
-        """Insert everything that is due before a time."""
         while True:
             waiting = [
                 (time, place, number)
@@ -107,7 +105,6 @@ class Naive:
 
 
 def drawn(random: Random) -> Phase:
-    """Draw a random phase."""
     due = {
         (random.choice(ABC), random.choice(ABC)): random.randint(1, 4) for _ in range(random.randint(0, 2))
     }

@@ -88,7 +88,6 @@ def test_data_that_is_not_a_form_is_rejected(wrong: list[object]) -> None:
 
 
 def shipped() -> MonitorSet:
-    """Return all specifications of `monitors/`."""
     trigger = MONITORS / "msg" / "landshark_msgs" / "PaintballTrigger.msg"
     own = Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": trigger.read_text()})
     sources = {path.name: path.read_text() for path in sorted(MONITORS.glob("*.rv"))}
@@ -96,7 +95,6 @@ def shipped() -> MonitorSet:
 
 
 def a_value(values: ValueCodec, kind: value_types.Type) -> st.SearchStrategy[Any]:
-    """Draw any value of a type."""
     if isinstance(kind, value_types.RecordType):
         return st.tuples(*(a_value(values, field) for field in values.fields(kind))).map(list)
     if isinstance(kind, value_types.VectorType):

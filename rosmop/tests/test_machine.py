@@ -36,17 +36,14 @@ TRAPS = {
 
 
 def run(code: bytes, limit: int = LIMIT) -> WasmInstance:
-    """Return a machine of this module."""
     return WasmInstance(translated(code, limit), limit)
 
 
 def made(text: str, limit: int = LIMIT, pages: str = "1") -> WasmInstance:
-    """Return a machine of these functions."""
     return run(bytes(wasmtime.wat2wasm(f'(module (memory (export "memory") {pages}) {text})')), limit)
 
 
 def trap_of(one: WasmInstance, name: str | int, *arguments: int, fuel: int = FUEL) -> WasmTrap:
-    """Return the trap that ends this call."""
     with pytest.raises(WasmTrap) as caught:
         one.call(name, *arguments, fuel=fuel)
     return caught.value

@@ -51,12 +51,10 @@ def rule(name: str) -> str:
 
 
 def compiled(*names: str) -> Compiled:
-    """Compile a set of such specifications."""
     return compiled_from({f"{name}.rv": rule(name) for name in names}, definitions())
 
 
 def story(outcome: Outcome, names: set[str]) -> Iterator[object]:
-    """Yield all effects of these specifications."""
     for earlier in outcome.before:
         yield from story(earlier, names)
     yield [one for one in outcome.events if one.partition(".")[0] in names]

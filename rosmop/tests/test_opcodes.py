@@ -1,5 +1,3 @@
-"""The generator of modules has its opcodes in one file, and they are the opcodes that the proofs decode."""
-
 import ast
 from collections.abc import Iterator
 from pathlib import Path

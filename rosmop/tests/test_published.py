@@ -17,7 +17,6 @@ FAST = message("geometry_msgs/TwistStamped", twist__linear__x=9.0)
 
 
 def speeds(outcome: Outcome) -> list[float]:
-    """Return the published speeds as subscribers get them."""
     return [fields("geometry_msgs/Twist", one.data).linear.x for one in outcome.sent()]
 
 

@@ -61,7 +61,6 @@ def test_a_run_goes_on_where_it_was(name: str, seed: int) -> None:
 
 
 def again(formula: Any, run: Any) -> Any:
-    """Return the run as another process reads it."""
     return run_of(formula, msgspec.msgpack.decode(msgspec.msgpack.encode(kept(run))), 0)
 
 

@@ -26,7 +26,6 @@ NEAR, EMPTY = (message("sensor_msgs/LaserScan", ranges=ranges) for ranges in ([0
 
 
 def guard(*members: str, head: str = "guard()") -> str:
-    """Return a specification."""
     return f"{head} {{ double near = 9; {' '.join(members or (SAFE, SCAN, DRIVE))} }}"
 
 
@@ -46,7 +45,6 @@ def drive(monitors: MonitorSet, data: bytes, time: int = 5) -> bytes:
 
 
 def sent(outcomes: list[Outcome]) -> list[Any]:
-    """Return the messages that are published, decoded."""
     return [fields(one.type, one.data) for outcome in outcomes for one in outcome.sent()]
 
 

@@ -78,7 +78,6 @@ class Both:
                 assert bytes(would.buffer) == bytes(done.buffer)
 
     def promote(self, time: int) -> None:
-        """Promote the specification in shadow mode, with its state."""
         self.check(time)
         following = MonitorSet.of(compiled_from(self.texts, definitions()), self.on_fault)
         following.succeed(self.with_shadow, time)
@@ -99,7 +98,6 @@ class Both:
         return self.stories[0]
 
     def story(self, outcome: Outcome) -> list[object]:
-        """Return all effects of the specification, in order."""
         before = [told for earlier in outcome.before for told in self.story(earlier)]
         did: list[object] = [one for one in outcome.events if one.startswith(f"{self.shadowed}.")]
         did += [one for one in outcome.verdicts if one.monitor == self.shadowed]
@@ -232,7 +230,6 @@ NUMBER = "int n) /n std_msgs/UInt8 '{data:n}'"
 
 
 def shadow(*texts: str, shadowed: Collection[str]) -> MonitorSet:
-    """Return a started set."""
     found = MonitorSet.of(
         compiled_from({f"{at}.rv": text for at, text in enumerate(texts)}, definitions()), shadows=shadowed
     )

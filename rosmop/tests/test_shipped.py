@@ -43,7 +43,6 @@ def joints(tilt: float) -> bytes:
 
 
 def drive(forward: float) -> bytes:
-    """Return a velocity command."""
     return message("geometry_msgs/TwistStamped", twist__linear__x=forward, twist__angular__z=0.5)
 
 
@@ -77,13 +76,11 @@ def test_the_gun_is_watched_all_the_time() -> None:
 
 
 def odometry(x: float, y: float = 0.0, speed: float = 0.0) -> bytes:
-    """Return an odometry message with position and speed."""
     return message("nav_msgs/Odometry", pose__pose__position__x=x, pose__pose__position__y=y,
                    twist__twist__linear__x=speed, child_frame_id="base_link")  # fmt: skip
 
 
 def fix(latitude: float, longitude: float) -> bytes:
-    """Return a GPS message."""
     return message("sensor_msgs/NavSatFix", latitude=latitude, longitude=longitude)
 
 
@@ -111,7 +108,6 @@ def test_the_robot_stays_in_its_zone(topic: str, inside: bytes, outside: bytes) 
 
 
 def scan(distance: float, beams: int = 61) -> bytes:
-    """Return a laser scan with one object straight ahead."""
     ranges = [math.inf] * beams
     ranges[beams // 2] = distance
     step = math.radians(120) / (beams - 1)
@@ -119,7 +115,6 @@ def scan(distance: float, beams: int = 61) -> bytes:
 
 
 def commanded(monitors: MonitorSet, time: int, forward: float = 1.0) -> Outcome:
-    """Return the outcome of a velocity command."""
     return monitors.process("/landshark_control/base_velocity", drive(forward), time)
 
 

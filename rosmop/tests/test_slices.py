@@ -55,7 +55,6 @@ class Made:
     actions: dict[str, str]
 
     def text(self, binding: bool) -> str:
-        """Return the specification, with or without its parameters."""
         head = ", ".join(f"{FIELDS[one][0]} {one}" for one in self.parameters)
         lines = [f"s({head if binding else ''}) {{ int n = 0;"]
         for event, bound in self.binds.items():
@@ -69,7 +68,6 @@ class Made:
 
 
 def a_property(random: Random) -> str:
-    """Draw a random formula with handlers."""
     logic = random.choice(list(FORMULAS))
     body = ['ROS_INFO("%d", n);', "n = n * 2;", 'ROS_INFO("%d", n); __RESET;', ""]
     handlers = [
@@ -79,7 +77,6 @@ def a_property(random: Random) -> str:
 
 
 def made(random: Random) -> Made:
-    """Draw a valid random specification."""
     parameters = random.choice(["p", "p", "q", "pq", "pq", "rp", "pqr"])
     while True:
         binds = {event: "".join(one for one in parameters if random.random() < 0.7) for event in "abc"}
@@ -111,7 +108,6 @@ def trace(random: Random, length: int) -> Trace:
 
 
 def body(values: dict[str, object]) -> bytes:
-    """Return the message of an event."""
     return message("std_msgs/Header", frame_id=values["p"], seq=values["q"], stamp__sec=values["r"])
 
 
@@ -244,12 +240,10 @@ ANSWERED = GOALS.replace('@fail { ROS_WARN("%s", id.c_str()); DROP; }', "")
 
 
 def text(value: str) -> bytes:
-    """Return a `std_msgs/String`."""
     return message("std_msgs/String", data=value)
 
 
 def live(monitors: MonitorSet) -> int:
-    """Return the number of slices."""
     slices = monitors.monitors[0].slices
     assert slices is not None
     return slices.live

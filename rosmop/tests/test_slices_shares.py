@@ -34,19 +34,16 @@ def begun(text: str, slices: int) -> MonitorSet:
 
 
 def send(monitors: MonitorSet, topic: str, name: str, sender: MessageSender, time: int = 1) -> Outcome:
-    """Send a message about a goal."""
     return monitors.process(topic, message("std_msgs/String", data=name), time, sender)
 
 
 def live(monitors: MonitorSet) -> int:
-    """Return the number of slices."""
     slices = monitors.monitors[0].slices
     assert slices is not None
     return slices.live
 
 
 def of_host(slices: Slices, host: str) -> list[Binding]:
-    """Return the bindings of a host's slices, the oldest first."""
     return [binding for holder, binding in slices.quota.all() if holder == host]
 
 
@@ -127,7 +124,6 @@ STOPPED = """goals(std::string id) {
 
 
 def states(monitors: MonitorSet) -> list[object]:
-    """Return the states and variables of all slices."""
     slices = monitors.monitors[0].slices
     assert slices is not None
     found = [slices.state(binding) for _host, binding in slices.quota.all()]

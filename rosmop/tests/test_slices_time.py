@@ -44,7 +44,6 @@ HANDLED = {
 
 @functools.cache
 def compiled(text: str) -> Compiled:
-    """Compile a specification once."""
     return compiled_from({"x.rv": text}, definitions())
 
 
@@ -141,7 +140,6 @@ def joined(found: Iterable[Entry]) -> list[Entry]:
 
 
 def a_timed_property(random: Random) -> str:
-    """Draw a random formula with time bounds and handlers."""
     logic = random.choice(list(TIMED))
     handled = random.sample(HANDLED[logic], 2)
     formula = random.choice(TIMED[logic])
@@ -207,7 +205,6 @@ STOP = """goals(std::string id) {
 
 
 def text(value: str) -> bytes:
-    """Return a `std_msgs/String`."""
     return message("std_msgs/String", data=value)
 
 

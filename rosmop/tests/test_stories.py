@@ -1,5 +1,3 @@
-"""The language as its users see it: stories of specifications and messages (`rosmop/tests/stories.py`)."""
-
 from pathlib import Path
 
 from rosmop.tests.stories import Story, stories, tell

@@ -47,7 +47,6 @@ def guard(formula: str, handler: str = "DROP;", name: str = "s", event: str = ""
 
 
 def passed(monitors: MonitorSet, trace: Timed) -> list[bool]:
-    """Return whether each message of a trace passes."""
     return [monitors.process(f"/{event}", b"", time).result == "passed" for time, event in trace]
 
 
@@ -83,7 +82,6 @@ def projected(property_: CompiledProperty, trace: Timed) -> list[bool]:
 
 
 def timed(random: Random, length: int, most: int = 2) -> Timed:
-    """Draw a random timed trace."""
     time, trace = 1, []
     for _ in range(length):
         time += random.randint(0, most)

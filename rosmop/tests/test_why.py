@@ -35,7 +35,6 @@ _PTLTL = Printer(
 
 
 def machine(random: Random, *, timed: bool) -> str:
-    """Draw a random machine of four states."""
     text = ""
     for state in range(4):
         moves = [f"{event} -> s{random.randrange(4)}" for event in EVENTS if random.random() < 0.8]
@@ -47,7 +46,6 @@ def machine(random: Random, *, timed: bool) -> str:
 
 
 def expression(random: Random, depth: int) -> str:
-    """Draw a random regular expression."""
     if depth == 0:
         return random.choice(EVENTS)
     one, other = expression(random, depth - 1), expression(random, depth - 1)
@@ -55,7 +53,6 @@ def expression(random: Random, depth: int) -> str:
 
 
 def past(random: Random) -> str:
-    """Draw a formula of ptltl."""
     return _PTLTL.show(draw(random, 4, _PAST, _UNARY, EVENTS), random)
 
 
@@ -70,8 +67,6 @@ def caret(random: Random) -> str:
 
 
 def metric(random: Random) -> str:
-    """Draw a formula of mtl about the past."""
-
     def part(depth: int) -> str:
         if depth == 0:
             return random.choice(EVENTS)
@@ -87,7 +82,6 @@ def metric(random: Random) -> str:
 
 
 def ahead(random: Random) -> str:
-    """Draw a formula of mtl about the future."""
     one, other = random.sample(EVENTS, 2)
     bounds = f"[{random.choice([0, 1])}ms,{random.randrange(2, 6)}ms]"
     return random.choice([
@@ -97,14 +91,12 @@ def ahead(random: Random) -> str:
 
 
 def pattern(random: Random) -> str:
-    """Draw a pattern, with or without a time bound."""
     scope = random.choice(["globally", "after a", "until b", "after a until b"])
     body = random.choice(["no c", "some c", "c causes b", "c requires a", "c forbids c", "a causes c"])
     return f"{scope}: {body}{random.choice(['', ' within 3ms'])}"
 
 
 def grammar(random: Random) -> str:
-    """Draw a context-free grammar."""
     return random.choice([
         "S -> a S b | epsilon", "S -> a S b S | c", "S -> S S | a b | c", "S -> a S a | b S b | c",
         "S -> A B, A -> a A | epsilon, B -> b B c | epsilon",
@@ -112,7 +104,6 @@ def grammar(random: Random) -> str:
 
 
 def rewriting(random: Random) -> str:
-    """Draw a rewriting system."""
     return random.choice([
         "a b -> #epsilon . ^ b -> #fail .", "a a -> b . b b -> #fail . c -> #epsilon .",
         "a c -> #epsilon . ^ c -> #fail . b b b -> #succeed .", "^ a $ -> a a . a a a a -> #fail . c -> #succeed .",
@@ -120,7 +111,6 @@ def rewriting(random: Random) -> str:
 
 
 def future(random: Random) -> str:
-    """Draw a formula of ltl."""
     return random.choice([
         "[] (a => o b)", "[] !(a and b) and <> c", "!b U a", "[](a => <> b)", "<> c", "[] (c => !a U b)",
     ])  # fmt: skip

@@ -23,25 +23,19 @@ ARROW = "==>"
 
 @dataclass(frozen=True)
 class Case:
-    """One source of a table."""
-
     place: str
-    """The file and the line at which it begins."""
     section: str
     frame: str
     source: str
     beside: str
-    """Its lines that begin with `+`, without it."""
     expected: tuple[str, ...]
 
     @property
     def text(self) -> str:
-        """Return the source in its frame."""
         return self.frame.replace("‥", self.beside).replace("…", self.source)
 
 
 def cases(path: Path) -> Iterator[Case]:
-    """Yield all sources of a table, in order."""
     section, frame, begins = "", list[str](), 0
     source, beside, expected = list[str](), list[str](), list[str]()
 
@@ -71,5 +65,4 @@ def cases(path: Path) -> Iterator[Case]:
 
 
 def table(path: Path) -> pytest.MarkDecorator:
-    """Run a test with each `case` of a table."""
     return pytest.mark.parametrize("case", list(cases(path)), ids=lambda case: case.place)

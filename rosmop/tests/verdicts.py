@@ -36,7 +36,6 @@ from rosmop.tests.logics.driving import ABC, compiled, play, seeded, told, trace
 from rosmop.tests.logics.temporal import draw
 
 _EACH = 50
-"""Random traces of one property."""
 
 
 @dataclass(frozen=True)
@@ -290,7 +289,6 @@ def differing(
 
 
 def main(arguments: list[str]) -> int:
-    """See the head of this file."""
     parser = argparse.ArgumentParser(usage=__doc__)
     parser.add_argument("traces", type=int, nargs="?", default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)

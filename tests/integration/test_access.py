@@ -36,7 +36,6 @@ shutdown = first
 
 @pytest.fixture(scope="module")
 def appliance(common_lab: Lab) -> Iterator[Appliance]:
-    """Run an appliance with the policy of this file."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     host = common_lab.host("appliance", "10.77.0.2/24")
     with Appliance(host, policy=POLICY, options=("--api", "off")) as running:
@@ -45,7 +44,6 @@ def appliance(common_lab: Lab) -> Iterator[Appliance]:
 
 @pytest.fixture(scope="module")
 def second(common_lab: Lab) -> Host:
-    """Return the machine with fewer rights."""
     return common_lab.host("second", "10.77.0.66/24")
 
 

@@ -1,5 +1,3 @@
-"""The asyncio node of `roswire.node` with unmodified rospy and roscpp nodes, behind both masters."""
-
 import asyncio
 import struct
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
@@ -27,8 +25,6 @@ def ros(site: Site, tmp_path: Path) -> Iterator[RosSession]:
 
 
 def on(host: Host, work: Callable[[], Awaitable[None]]) -> None:
-    """Run a coroutine on a host."""
-
     async def limited() -> None:
         async with asyncio.timeout(3 * SECONDS):
             await work()
@@ -39,7 +35,6 @@ def on(host: Host, work: Callable[[], Awaitable[None]]) -> None:
 
 @asynccontextmanager
 async def node(site: Site) -> AsyncIterator[RosNode]:
-    """Yield a node on the robot."""
     made = RosNode(
         "/door",
         site.master_uri,

@@ -79,18 +79,15 @@ class SmallDisk:
         return AdminSocket(self.appliance.state).ask(request)
 
     def fill(self) -> None:
-        """Fill the disk."""
         with self.filler.open("wb", buffering=0) as file, pytest.raises(OSError, match="No space"):
             while True:
                 file.write(bytes(1 << 16))
 
     def revoked(self) -> set[str]:
-        """Return the revoked tokens."""
         known = self.ask(admin.TokenList()).body
         return {token.name for token in known.tokens if token.revoked is not None} if known else set()
 
     def all(self) -> list[object]:
-        """Return all visible state that requests change."""
         return [msgspec.to_builtins(self.ask(look).body) for look in LOOKS]
 
 

@@ -18,13 +18,11 @@ SOME = 15
 
 @pytest.fixture(scope="module")
 def appliance(own_appliance: Appliance) -> Appliance:
-    """Return the appliance of this file."""
     return own_appliance
 
 
 @pytest.fixture(scope="module")
 def tablet(common_lab: Lab) -> Host:
-    """The host that is blocked."""
     return common_lab.host("tablet", f"{TABLET}/24")
 
 
@@ -35,7 +33,6 @@ class Robot(NamedTuple):
     tablet: RosSession
 
     def hears(self, name: str) -> None:
-        """Wait for a new message of a talker."""
         self.listener.wait_for(event="received", publisher=name, since=self.listener.mark())
 
     def heard(self) -> set[str]:

@@ -42,7 +42,6 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
 
 @pytest.fixture(scope="module")
 def operator(stage: Stage) -> Actor:
-    """Return the operator's unit, connected to the robot."""
     stage.start_robot()
     operator = stage.start_operator()
     operator.expect("connected")

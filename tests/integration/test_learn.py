@@ -1,5 +1,3 @@
-"""A policy learned from a real run allows the same nodes, and no others."""
-
 import xmlrpc.client
 from pathlib import Path
 

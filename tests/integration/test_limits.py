@@ -28,7 +28,6 @@ LIMITED = (
 
 @pytest.fixture(scope="module")
 def lab() -> Iterator[Lab]:
-    """Make hosts in namespaces."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with Lab("rosrv-limits") as lab:
@@ -45,13 +44,11 @@ def appliance(lab: Lab) -> Iterator[Appliance]:
 
 @pytest.fixture(scope="module")
 def hosts(lab: Lab) -> tuple[Host, Host]:
-    """Return the robot's machine, and the operator's."""
     return lab.host("robot", "10.77.0.10/24"), lab.host("ocu", "10.77.0.20/24")
 
 
 @pytest.fixture
 def ros(appliance: Appliance, hosts: tuple[Host, Host], tmp_path: Path) -> Iterator[RosSession]:
-    """Provide the robot's nodes."""
     with RosSession(appliance.master_uri, tmp_path, hosts[0]) as session:
         yield session
 

@@ -31,7 +31,6 @@ begin words() {
 
 @pytest.fixture(scope="module")
 def common_appliance() -> Iterator[Appliance]:
-    """Run an appliance with the monitor `words` on /chatter."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     policy, options = OPEN_POLICY + "getRVState = *\n", ("--api", "127.0.0.1:0")
     with Appliance(policy=policy, monitors={"words": WORDS}, options=options) as appliance:

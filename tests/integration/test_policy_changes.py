@@ -14,7 +14,6 @@ NO_EARS = OPEN_POLICY.replace("[Commands]", "/chatter =\n[Commands]", 1)
 
 @pytest.fixture(scope="module")
 def appliance(own_appliance: Appliance) -> Appliance:
-    """Return the appliance of this file."""
     return own_appliance
 
 

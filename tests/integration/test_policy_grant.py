@@ -28,7 +28,6 @@ HERE = "http://127.0.0.1:4000/"
 
 @pytest.fixture(scope="module")
 def common_appliance() -> Iterator[Appliance]:
-    """Run an appliance with REST."""
     with Appliance(policy=POLICY, options=("--api", "127.0.0.1:0")) as appliance:
         yield appliance
 

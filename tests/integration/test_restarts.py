@@ -13,7 +13,6 @@ ROLES = ["control", "relay", "rosmaster", "signer", "rosout"]
 
 @pytest.fixture(scope="module")
 def appliance(own_appliance: Appliance) -> Appliance:
-    """Return the appliance of this file."""
     return own_appliance
 
 

@@ -1,5 +1,3 @@
-"""`scripts/setup`: where another program installs packages, and with an environment that exists."""
-
 import os
 import shutil
 import subprocess

@@ -1,5 +1,3 @@
-"""With a site key, every way to change the appliance requires a signature of the site."""
-
 import contextlib
 import json
 import signal
@@ -40,7 +38,6 @@ def started() -> Iterator[Appliance]:
 
 
 def sign(file: Path) -> None:
-    """Sign the current contents of a file."""
     file.with_name(f"{file.name}.sig").write_text(signed(file.read_text()))
 
 

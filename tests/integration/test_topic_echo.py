@@ -17,7 +17,6 @@ censor() {
 
 
 def echoed(appliance: Appliance, *arguments: str) -> list[dict[str, object]]:
-    """Return the output of `rosrv topic echo --json`."""
     done = appliance.rosrv("topic", "echo", *arguments, "--json")
     return [json.loads(line) for line in done.stdout.splitlines()]
 

@@ -73,7 +73,6 @@ def upgraded() -> Iterator[Upgraded]:
 
 
 def call(appliance: Appliance, method: str, *parameters: str) -> Any:
-    """Call RVMaster; return the answer."""
     with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
         return getattr(master, method)("/tester", *parameters)
 

@@ -37,7 +37,6 @@ OFFLINE = "apt: {preserve_sources_list: true}\nnetwork: {config: disabled}\nloca
 
 
 def write(machine: Machine, path: str, text: str) -> None:
-    """Write a file in the machine."""
     machine.run("sh", "-euc", 'mkdir -p "$(dirname "$1")"; printf %s "$2" > "$1"', "sh", path, text)
 
 

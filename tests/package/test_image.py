@@ -89,7 +89,6 @@ def unpacked(engine: Engine, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def parts(unpacked: Path) -> list[dict[str, Any]]:
-    """Return the components of the list."""
     components: list[dict[str, Any]] = json.loads(next(unpacked.glob("*.cdx.json")).read_text())["components"]
     return components
 
@@ -228,14 +227,12 @@ def differences(first: Path, second: Path) -> list[str]:
 
 
 def content(archive: tarfile.TarFile, name: str) -> bytes:
-    """Return the content of a member of an archive."""
     file = archive.extractfile(name)
     assert file is not None, name
     return file.read()
 
 
 def entries(layer: bytes) -> dict[str, dict[str, object]]:
-    """Return the metadata of each file in a layer."""
     found: dict[str, dict[str, object]] = {}
     with tarfile.open(fileobj=io.BytesIO(layer)) as members:
         for member in members:

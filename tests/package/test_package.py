@@ -26,7 +26,6 @@ EVERYWHERE = {"ROS_MASTER_URI": "http://localhost:11311"}
 
 @pytest.fixture
 def newer(package: Path, tmp_path: Path) -> Path:
-    """Return the same package as a later version."""
     tree = tmp_path / "newer"
     subprocess.run(["dpkg-deb", "--raw-extract", str(package), str(tree)], check=True)
     control = tree / "DEBIAN/control"

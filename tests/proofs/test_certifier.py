@@ -25,7 +25,6 @@ def _run(folder: Path, *command: str, given: str = "") -> str:
 
 
 def _proved(folder: Path, name: str) -> Path:
-    """Return the program extracted from what Coq has proved."""
     for file in (f"{name}.v", f"{name}_driver.ml"):
         shutil.copy(PROOFS / file, folder)
     said = _run(folder, need_program("coqc", "coq"), f"{name}.v")
@@ -38,13 +37,11 @@ def _proved(folder: Path, name: str) -> Path:
 
 @pytest.fixture(scope="module")
 def past(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Check `ptltl` with the proved program."""
     return _proved(tmp_path_factory.mktemp("past"), "past")
 
 
 @pytest.fixture(scope="module")
 def words(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Check `ere` and `fsm` with the proved program."""
     return _proved(tmp_path_factory.mktemp("words"), "words")
 
 
@@ -59,7 +56,6 @@ def _automaton(events: list[str], tables: AutomatonTables, verdict: Callable[[Ve
 
 
 def _written(node: formula_reader.Node, events: list[str]) -> str:
-    """Write operators first, and a power as repetitions."""
     kind = str(node[0])
     if kind == "event":
         return f"event {events.index(str(node[1]))}"

@@ -1,5 +1,3 @@
-"""Check the model of the insertion within bounds that take minutes."""
-
 from pathlib import Path
 
 import pytest

@@ -51,7 +51,6 @@ def steps(appliance: Appliance) -> Trace:
 
 
 def number(event: Event) -> int:
-    """Return the number of a received message."""
     return int(event["data"].split()[-1]) if event["event"] == "received" else 0
 
 
@@ -130,7 +129,6 @@ def past_its_monitor(trace: Trace) -> Trace:
 
 
 def undecided(trace: Trace) -> Trace:
-    """Add a connection without a request."""
     place = trace.index(("decided_call", 0, 0))
     return [*trace[:place], *trace[place + 1 : trace.index(("opened", 0, 0)) + 1]]
 
@@ -141,7 +139,6 @@ def after_the_end(trace: Trace) -> Trace:
 
 
 def twice(trace: Trace) -> Trace:
-    """Make two connections for one request."""
     return [*trace[: trace.index(("opened", 0, 0)) + 1], ("opened", 0, 0)]
 
 

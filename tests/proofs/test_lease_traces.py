@@ -1,5 +1,3 @@
-"""An execution of the rules of the lease is one of the model (`proofs/lease.pml`); a tampered one is not."""
-
 from pathlib import Path
 
 import pytest

@@ -1,5 +1,3 @@
-"""Verdicts of all logics match their definitions: a part of the cases of `rosmop/tests/verdicts.py`."""
-
 import pytest
 
 from rosmop.tests.verdicts import LOGICS, differing

@@ -1,5 +1,3 @@
-"""Test the container as a user starts it: `docker compose --profile demo up`, one denial, one reload, one search."""
-
 import ssl
 from collections.abc import Iterator
 from pathlib import Path

@@ -91,7 +91,6 @@ class Appliance:
 
     @property
     def master_uri(self) -> str:
-        """The URI of the master for nodes."""
         return str(self.ready["master"])
 
     def start(self) -> Self:
@@ -197,7 +196,6 @@ class Appliance:
         return eventually(found, lambda: f"{count} records {flags} {fields}\n{self.story()}")
 
     def reload(self, policy: str) -> None:
-        """Write the policy file and reload it."""
         self.policy_file.write_text(policy)
         self.rosrv("policy", "reload")
 
@@ -252,7 +250,6 @@ class Appliance:
         self.close()
 
     def close(self) -> None:
-        """Stop the appliance and remove its state."""
         with self._turn:
             self.stop()
         subprocess.run(["/bin/rm", "-rf", str(self.directory)], check=True)

@@ -8,7 +8,6 @@ from tests.support.inline_loop import run
 
 
 async def sent(app: Any, method: str, path: str, host: str = "10.0.0.1", **given: Any) -> httpx.Response:
-    """Return the answer to one request from a host."""
     transport = httpx.ASGITransport(app, client=(host, 4))
     async with httpx.AsyncClient(transport=transport, base_url="http://api") as client:
         return await client.request(method, path, **given)

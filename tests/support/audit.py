@@ -18,13 +18,11 @@ class RecordingTrail(AuditTrail):
         self.heard: list[tuple[str, dict[str, Any]]] = []
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:
-        """Keep the record."""
         self.heard.append((event, {"reason": reason, **fields}))
         return super().happened(event, reason, **fields)
 
 
 def decision(log: AuditLog, number: int = 0, **changes: Any) -> AuditRecord:
-    """Return a decision of RVMaster; `changes` replace fields."""
     fields: dict[str, Any] = {
         "id": log.ids.next(),
         "time": clock.wall_ns(),

@@ -103,13 +103,11 @@ class AutojumpLoop(asyncio.BaseEventLoop):
             asyncio._set_running_loop(self)
 
     def remove_reader(self, _fd: object) -> bool:
-        """Return that there was no reader."""
         return False
 
     remove_writer = remove_signal_handler = remove_reader  # type: ignore[assignment]  # parameters' names differ
 
     def _refuse(self, *_args: object, **_options: object) -> Never:
-        """Say what the test has to do."""
         raise RealLoopError(
             "this test uses a socket, a signal, a program or a thread, which a loop with virtual time does not have:"
             " replace it, or mark the test `real` or `nightly`"

@@ -31,7 +31,6 @@ Lie = Callable[["http.server.BaseHTTPRequestHandler"], None]
 
 
 def bundle_files(policy: str = POLICY, **more: str) -> dict[str, bytes]:
-    """Return the files of a bundle; `more` are further files, with `__` for `/` and `_dot_` for `.`."""
     files = {"policy.ini": policy, "hosts.yaml": "hosts: []\n"}
     files |= {name.replace("__", "/").replace("_dot_", "."): text for name, text in more.items()}
     return {name: text.encode() for name, text in files.items()}
@@ -71,13 +70,11 @@ class BundleSite:
 
     @property
     def root(self) -> bytes:
-        """Return the root metadata that robots trust first."""
         return (self.repository.folder / "root.json").read_bytes()
 
     def add(
         self, files: Mapping[str, bytes] | None = None, terms: Terms | None = None, keep: int = 2
     ) -> BundlePath:
-        """Sign a bundle, publish it and select it."""
         path = self.repository.add(SITE, GROUP, files or bundle_files(), terms or everywhere(), keep=keep)
         self.publish()
         self.selection = str(path)
@@ -85,14 +82,12 @@ class BundleSite:
         return path
 
     def publish(self) -> None:
-        """Sign the timestamp of the newest snapshot."""
         publication = read_publication(self.repository.folder)
         key = load_online_key(self.repository.folder / TIMESTAMP_KEY)
         made = next_timestamp(publication, self.timestamp, key, self.now())
         self.timestamp = made or self.timestamp
 
     def wake(self) -> None:
-        """Send an event to all robots."""
         for event in self.wakes:
             event.set()
 

@@ -26,7 +26,6 @@ class Certificates:
 def make_certificates(
     folder: Path, address: str = "127.0.0.1", authority: str = "test authority"
 ) -> Certificates:
-    """Make an authority with this name, and a certificate for a server or client with this address."""
     folder.mkdir(parents=True)
     keys = {name: ec.generate_private_key(ec.SECP256R1()) for name in ("ca", "peer")}
     issuer = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, authority)])

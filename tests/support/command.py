@@ -50,7 +50,6 @@ def rosrv(*arguments: str, **environment: str) -> subprocess.CompletedProcess[st
 
 
 def table(verbs: Verbs | None = None) -> Iterator[tuple[str, Verb]]:
-    """Yield every entry of the command table."""
     for name, one in (main.all_verbs() if verbs is None else verbs).items():
         if isinstance(one, Group):
             yield from ((f"{name} {inner}", verb) for inner, verb in table(one.verbs))
@@ -59,6 +58,5 @@ def table(verbs: Verbs | None = None) -> Iterator[tuple[str, Verb]]:
 
 
 def commands() -> Iterator[tuple[str, Any]]:
-    """Yield every verb, loaded."""
     for name, verb in table():
         yield name, loaded(verb, name.split()[-1])

@@ -154,7 +154,6 @@ class HiddenMaster:
         return self.carry_out(method, *params)
 
     def carry_out(self, method: str, *params: Value) -> Answer:
-        """Carry out one call."""
         self.calls.append((method, *params))
         for beginning in ("register", "unregister"):
             kind = _TABLES.get(method.removeprefix(beginning))
@@ -219,13 +218,11 @@ class HiddenMaster:
         return [1, "", int(table.pop(name, None) is not None)]
 
     def restart(self) -> None:
-        """Replace `rosmaster` by a new one without registrations."""
         self.pid += 1
         self.tables = {kind: {} for kind in _TABLES.values()}
         self.nodes, self.parameters = {}, {}
 
     def has(self, kind: Kind, resource: str) -> list[str]:
-        """Return the nodes that have registered it."""
         return list(self.tables[kind].get(resource, {}))
 
 
@@ -410,7 +407,6 @@ class ControlParts:
         """Place other parts around control, before it is connected with them."""
 
     def arrivals(self) -> Any:
-        """Return the part that makes incarnations."""
         return self.faces
 
     def redecide_for(self, host: Address, caller_id: str) -> int:
@@ -421,14 +417,12 @@ class ControlParts:
 
     @classmethod
     async def begun(cls) -> Self:
-        """Return control after its first round."""
         world = cls()
         await world.round()
         return world
 
     @property
     def lives(self) -> list[Life]:
-        """Return the state of each incarnation."""
         return [one.life for one in self.registry.all()]
 
     def node(self, name: str, number: int = 1, host: Address = HOST) -> Incarnation:
@@ -452,7 +446,6 @@ class ControlParts:
         return parse_response(await serve(HttpRequest(peer, "/", build_call(method, params), 0)))
 
     async def register(self, node: Incarnation, kind: Kind, resource: str, detail: str = "t") -> None:
-        """Register in control's registry, and at `rosmaster`."""
         self.enactor.carry_out(self.graph.registered(node, kind, resource, detail))
         await self.settle()
 
@@ -476,7 +469,6 @@ class ControlParts:
         return revoked(effects)
 
     async def round(self) -> None:
-        """Run one round of the reconcile loop."""
         await self.reconciler.round()
 
     async def look(self, node: Incarnation) -> None:

@@ -98,7 +98,6 @@ class Conversation:
         self._held = False  # changes wait for the ROS master
 
     async def say(self, line: str) -> list[str]:
-        """Return the effects of one line."""
         given = line.removeprefix("given ")
         effects = await self._effects(given)
         return effects if line == given else []
@@ -144,7 +143,6 @@ class Conversation:
         ]
 
     async def _call_by(self, line: str) -> list[str]:
-        """Make a call; return the lines of its answer."""
         call = call_of(line)
         answer = await self._ask(call)
         if not call.parts:
@@ -189,7 +187,6 @@ class Conversation:
         return []
 
     def _part(self, part: Any) -> list[str]:
-        """Return the lines of one answer of a multicall."""
         return self._answered("", part[0] if isinstance(part, list) else part, raw=True)
 
     def _denied(self, text: str) -> list[str]:
@@ -237,7 +234,6 @@ class Conversation:
         return []
 
     async def _master_event(self, happening: list[str]) -> None:
-        """Apply an event to the ROS master."""
         hidden = self.parts.hidden
         match happening:
             case ["starts", "anew"]:
@@ -260,7 +256,6 @@ class Conversation:
                 raise ValueError(f"unknown action: ROSMaster {' '.join(happening)!r}")
 
     async def _node_event(self, node: Incarnation, happening: list[str]) -> None:
-        """Apply an event to a node, and have control check the node."""
         match happening:
             case ["misses", "the", "list", "of", topic]:
                 missed = NodeCall("publisherUpdate", (topic, []))
@@ -297,7 +292,6 @@ class Conversation:
         ]
 
     def _owner(self, name: str) -> str:
-        """Return the node that `rosmaster` has under this name."""
         node = self.parts.faces.by_inner_uri(self.parts.hidden.nodes[name])
         return name if node is None else self._names[node.key]
 
@@ -378,7 +372,6 @@ class ConversationFile(NamedTuple):
 
 
 def conversations_of(text: str) -> ConversationFile:
-    """Return the contents of a file."""
     head, *conversations = f"\n{text}".split("\n# ")
     policies: dict[str, str] = {}
     for part in head.split("\npolicy ")[1:]:
@@ -390,7 +383,6 @@ def conversations_of(text: str) -> ConversationFile:
 
 
 async def taken_place(file: ConversationFile, title: str) -> str:
-    """Return a conversation with the effects that its actions have."""
     conversation = Conversation(await ControlParts.begun(), file.policies, only_answers=file.only_answers)
     lines: list[str] = []
     for line in file.conversations[title].splitlines():

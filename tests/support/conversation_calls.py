@@ -46,12 +46,10 @@ class WrittenCall:
 
 
 def is_call(line: str) -> bool:
-    """Whether a line is a call, and not an event."""
     return line[0].isdigit() or line.startswith(f"{OWN} ")
 
 
 def call_of(line: str) -> WrittenCall:
-    """Return the call in a line."""
     raw = _RAW.fullmatch(line)
     if raw is not None:
         host, method, text, node = raw.groups()

@@ -86,13 +86,11 @@ class Engine:
 
     @property
     def address(self) -> str:
-        """The address for its clients."""
         return f"unix://{self.directory}/sock"
 
     def docker(
         self, *arguments: str, check: bool = True, timeout: float = 120, text: str | None = None
     ) -> Output:
-        """Run `docker …`; `text` is its standard input."""
         return self._run([self._client, *arguments], check=check, timeout=timeout, text=text)
 
     def inspect(self, name: str) -> dict[str, Any]:
@@ -123,7 +121,6 @@ class Engine:
         self.docker("volume", "prune", "--force")
 
     def start(self) -> Self:
-        """Start the engine and return when it answers."""
         self._data.mkdir(parents=True, exist_ok=True)
         self._lock = os.open(self._data.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         fcntl.flock(self._lock, fcntl.LOCK_EX)  # the data is for one engine at a time
@@ -163,7 +160,6 @@ class Engine:
             self._lock = None
 
     def story(self) -> str:
-        """Return the end of its output."""
         lines = self._log.read_text(errors="backslashreplace").splitlines() if self._log.exists() else []
         return "\n".join(["--- dockerd", *(line for line in lines[-200:] if "level=info" not in line)][-40:])
 
@@ -243,12 +239,10 @@ class Compose:
             self._options += ["--file", file]
 
     def __call__(self, *arguments: str, check: bool = True, timeout: float = 180) -> Output:
-        """Run `docker-compose …`."""
         command = [shutil.which("docker-compose") or "docker-compose", *self._options, *arguments]
         return self.engine.run_client(command, self.environment, self.directory, check=check, timeout=timeout)
 
     def container(self, service: str) -> str:
-        """Return the id of a service's container."""
         labels = (f"com.docker.compose.project={self.project}", f"com.docker.compose.service={service}")
         filters = [part for label in labels for part in ("--filter", f"label={label}")]
         found = self.engine.docker("ps", "--all", "--quiet", "--no-trunc", *filters).stdout.split()
@@ -256,7 +250,6 @@ class Compose:
         return found[0]
 
     def exec(self, service: str, *command: str, check: bool = True, timeout: float = 60) -> Output:
-        """Run a command in a service's container."""
         return self.engine.docker("exec", self.container(service), *command, check=check, timeout=timeout)
 
     def wait_healthy(self, service: str = "appliance", timeout: float = HEALTHY_SECONDS) -> None:
@@ -322,7 +315,6 @@ class Compose:
         return row_of(self.exec(service, "rosrv", *arguments, "--json", check=False))
 
     def story(self) -> str:
-        """Return the end of the containers' output."""
         return self("--profile", "demo", "logs", "--no-color", "--tail", "40", check=False).stdout
 
 
@@ -338,7 +330,6 @@ def build_fleet() -> None:
 
 
 def build_images() -> None:
-    """Build the images of the appliance and of the demonstration from this checkout."""
     with builder() as engine:
         engine.build("appliance", APPLIANCE)
         engine.build("demo", DEMO)

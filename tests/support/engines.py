@@ -43,7 +43,6 @@ class Inline(ByHand):
     """Calls a turn with new work, before the call that brought the work returns."""
 
     def wake(self) -> None:
-        """Call the turns that are due."""
         super().hurry()
 
     def hurry(self) -> None:

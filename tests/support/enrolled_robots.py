@@ -12,7 +12,6 @@ from appliance.signing.own_certificate import make_own_certificate
 
 
 def enrolled_robots(data: Path, *names: str) -> Robots:
-    """Enrol robots with keys of their own; return all robots."""
     robots = Robots(data / "robots")
     for name in names:
         public = Ed25519PrivateKey.generate().public_key()

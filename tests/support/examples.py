@@ -9,5 +9,4 @@ import os
 
 
 def examples(many: int) -> int:
-    """Return the part of `many` that this run tries."""
     return many if os.environ.get("TESTS_EXAMPLES") == "all" else many // 6

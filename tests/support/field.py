@@ -66,7 +66,6 @@ class Field:
 
     @property
     def master(self) -> str:
-        """Return the URI of RVMaster."""
         return self.appliance.master_uri
 
     # --- actions of the rogue ---
@@ -76,8 +75,6 @@ class Field:
         return self.call(self.attacker, method, *parameters, uri=uri)
 
     def call(self, host: Host, method: str, *parameters: Any, uri: str | None = None) -> Any:
-        """Make one XML-RPC call from a host."""
-
         def call() -> Any:
             with xmlrpc.client.ServerProxy(uri or self.master, allow_none=True) as server:
                 try:
@@ -104,13 +101,11 @@ class Field:
         return received
 
     def connect(self, host: Host | None = None, port: int = 11311) -> socket.socket:
-        """Open a TCP connection to the appliance."""
         return (host or self.attacker).run(lambda: socket.create_connection(("10.77.0.2", port), LIMIT))
 
     # --- promises that must hold afterwards ---
 
     def recorded(self, reason: str = "", **fields: Any) -> Event:
-        """Wait for the first record with these fields and with this text in its reason."""
         return self.trail.wait_for(lambda event: reason in (event.get("reason") or ""), **fields)
 
     def unharmed(self, messages: int = 3) -> None:
@@ -190,7 +185,6 @@ class Impostor:
 
 
 def whole(message: bytes) -> bool:
-    """Whether an HTTP message is complete (by its Content-Length)."""
     head, end, body = message.partition(b"\r\n\r\n")
     found = re.search(rb"(?i)content-length: *(\d+)", head)
     return bool(end) and found is not None and len(body) >= int(found[1])
@@ -206,6 +200,5 @@ def answering(value: Any) -> Callable[[socket.socket, bytes], None]:
 
 
 def response(value: Any) -> bytes:
-    """Return an HTTP response with an XML-RPC answer."""
     body = xmlrpc.client.dumps((value,), methodresponse=True).encode()
     return b"HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\nContent-Length: %d\r\n\r\n" % len(body) + body

@@ -29,7 +29,6 @@ def syn(source: str, target: str, port: int, from_port: int) -> bytes:
 
 
 def send_syn(source: str, target: str, port: int, from_port: int = 40000) -> None:
-    """Send one SYN from the calling thread's network namespace."""
     with _raw(target) as out:
         out.sendto(syn(source, target, port, from_port), (target, 0))
 

@@ -37,11 +37,9 @@ class Forking:
 
     @property
     def address(self) -> str:
-        """The host's address."""
         return self.host.address
 
     def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
-        """Start a program."""
         arguments = _of_python([str(one) for one in args], options["env"]["PATH"])
         if arguments is None or not isinstance(self.host, ThisMachine | lab.Host):
             return self.host.popen(args, **options)
@@ -95,7 +93,6 @@ class Fork(subprocess.Popen[Any]):
         return self.returncode
 
     def wait(self, timeout: float | None = None) -> int:
-        """Return the exit status, once it has ended."""
         with selectors.PollSelector() as selector:
             selector.register(self._report, selectors.EVENT_READ)
             if not selector.select(timeout):

@@ -20,7 +20,6 @@ class Heard:
         self._changed.set()
 
     async def until(self, count: int) -> list[Any]:
-        """Return the messages, once there are `count` of them."""
         async with asyncio.timeout(20):
             while len(self.messages) < count:
                 self._changed.clear()

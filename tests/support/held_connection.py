@@ -27,19 +27,16 @@ def connected(master: str, own: str) -> socket.socket | None:
 
 
 def ask(connection: socket.socket) -> None:
-    """Send the request once a line comes in."""
     if sys.stdin.readline():
         with contextlib.suppress(OSError):
             connection.sendall(REQUEST)
 
 
 def tell(event: str) -> None:
-    """Print an event."""
     print(json.dumps({"event": event}), flush=True)  # noqa: T201  the tests read it
 
 
 def main(master: str, own: str) -> None:
-    """Open the connection and print what happens to it."""
     connection = eventually(lambda: connected(master, own), "the master accepts a connection")
     connection.settimeout(None)
     tell("opened")

@@ -55,7 +55,6 @@ class Shares:
 
 
 def post(body: bytes, *headers: str, path: str = "/", length: int | None = None) -> bytes:
-    """Return a request as a ROS client sends it."""
     lines = [
         f"POST {path} HTTP/1.1",
         "Host: master",
@@ -65,15 +64,12 @@ def post(body: bytes, *headers: str, path: str = "/", length: int | None = None)
 
 
 def fault(body: bytes) -> str:
-    """Return the text of a fault."""
     with pytest.raises(FaultReceived) as received:
         parse_response(body)
     return received.value.text
 
 
 class Client:
-    """One connection, read with limits."""
-
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.reader, self.writer = reader, writer
 
@@ -82,7 +78,6 @@ class Client:
         await self.writer.drain()
 
     async def response(self) -> tuple[int, dict[str, str], bytes]:
-        """Return status, headers and body of the next response."""
         async with asyncio.timeout(WAIT):
             head = (await self.reader.readuntil(b"\r\n\r\n")).decode()
             status, *lines = head.strip().split("\r\n")
@@ -99,7 +94,6 @@ class Client:
                 return b""
 
     async def close(self) -> None:
-        """Close the connection."""
         self.writer.close()
         with contextlib.suppress(ConnectionError):
             await self.writer.wait_closed()
@@ -171,7 +165,6 @@ class Server:
         return client
 
     async def trouble(self) -> str:
-        """Return the first complaint."""
         async with asyncio.timeout(WAIT):
             await self.complained.wait()
         return self.troubles[0]

@@ -13,7 +13,6 @@ class InlineLoop(asyncio.SelectorEventLoop):
     def run_in_executor(  # type: ignore[override]  # typeshed knows the variadic types of Python 3.11 only
         self, _executor: Any, function: Callable[..., T], *arguments: Any
     ) -> "asyncio.Future[T]":
-        """Call the function, and return a future that is done."""
         done: asyncio.Future[T] = self.create_future()
         try:
             done.set_result(function(*arguments))
@@ -23,6 +22,5 @@ class InlineLoop(asyncio.SelectorEventLoop):
 
 
 def run(play: Coroutine[Any, Any, T]) -> T:
-    """Run a coroutine in such a loop, and return its result."""
     with asyncio.Runner(loop_factory=InlineLoop) as runner:
         return runner.run(play)

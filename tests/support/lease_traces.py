@@ -56,12 +56,10 @@ class TraceBounds:
 
     @property
     def model(self) -> Model:
-        """Return the model of the lease."""
         return LEASE
 
     @property
     def defined(self) -> list[str]:
-        """Return the definitions for the model."""
         return [f"-DFIRST={self.first}", f"-DGRANTS={self.last}"]
 
 

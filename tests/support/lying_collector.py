@@ -19,7 +19,6 @@ class Visitor:
         self.ending = ending
 
     def request(self) -> bytes:
-        """Return the head of the next request."""
         head = b""
         while not head.endswith(b"\r\n\r\n"):
             received = self.stream.recv(1)
@@ -29,7 +28,6 @@ class Visitor:
         return head
 
     def body(self, head: bytes) -> bytes:
-        """Return the body of the request with this head."""
         found = re.search(rb"Content-Length: (\d+)", head)
         left, parts = int(found[1]) if found else 0, []
         while left and (part := self.stream.recv(left)):
@@ -38,7 +36,6 @@ class Visitor:
         return b"".join(parts)
 
     def give(self, body: bytes, status: str = "200 OK", *headers: str) -> None:
-        """Answer a request."""
         lines = [f"HTTP/1.1 {status}", f"Content-Length: {len(body)}", *headers]
         self.stream.sendall("\r\n".join(lines).encode() + b"\r\n\r\n" + body)
 

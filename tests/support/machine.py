@@ -84,7 +84,6 @@ class Machine:
         self._number = 0
 
     def start(self) -> Self:
-        """Boot, and return when the machine takes orders."""
         need_root()
         program = need_program("qemu-system-x86_64", "qemu-system-x86")
         kernel = newest_kernel()
@@ -151,7 +150,6 @@ class Machine:
         return orderly
 
     def run_detached(self, *argv: str) -> None:
-        """Start a program without waiting for its outcome."""
         assert self._line is not None
         order = {"number": 0, "argv": ["systemd-run", "--quiet", *argv], "seconds": 20}
         self._line.sendall(json.dumps(order).encode() + b"\n")
@@ -179,7 +177,6 @@ class Machine:
         ]
 
     def _connect(self, path: Path) -> socket.socket:
-        """Connect to the socket that QEMU makes before it starts the machine."""
         assert self._process is not None
         deadline = time.monotonic() + 20
         line = socket.socket(socket.AF_UNIX)

@@ -57,7 +57,6 @@ class Kernel:
 
     @property
     def modules(self) -> Path:
-        """The folder of its modules."""
         return Path("/lib/modules") / self.release
 
 

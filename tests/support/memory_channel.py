@@ -25,10 +25,8 @@ class MemoryChannel(Channel):
         self.peer = self
         self.closed = False
         self.messages: list[Any] = []
-        """All messages that this end has got."""
 
     def send(self, message: Message, descriptors: tuple[int, ...] = (), *, soon: bool = False) -> None:
-        """Send a message to the other end."""
         assert not descriptors, "a file descriptor needs a socket"
         self.send_raw(self._encode(message))
 
@@ -45,7 +43,6 @@ class MemoryChannel(Channel):
         closed: Callable[[], None],
         refused: Callable[[str], None] | None = None,
     ) -> None:
-        """Begin to pass on messages, as `Channel.attach`."""
         self._received, self._ended = received, closed
         self._refused = refused if refused is not None else lambda _reason: closed()
         self._runs_in = loop
@@ -81,7 +78,6 @@ class MemoryChannel(Channel):
 
 
 def memory_link(union: Any) -> tuple[MemoryChannel, MemoryChannel]:
-    """Return both ends of a link."""
     here, there = MemoryChannel(union), MemoryChannel(union)
     here.peer, there.peer = there, here
     return here, there

@@ -19,11 +19,9 @@ class MemoryNetwork:
         self._open: list[MemoryWriter] = []
 
     def at(self, source: str) -> "MemoryHost":
-        """Return the network as a host sees it."""
         return MemoryHost(self, source)
 
     def listen(self, host: str, serve: Serve, port: int = 0) -> "MemoryServer":
-        """Serve a port of an address."""
         self._port += 1
         server = MemoryServer(self, (host, port or self._port))
         self.servers[server.address] = serve
@@ -65,24 +63,19 @@ class MemoryHost:
         return self.network.connect(self.source, (host, port))
 
     async def serve(self, serve: Serve) -> "MemoryServer":
-        """Serve a free port."""
         return self.network.listen(self.source, serve)
 
 
 @dataclass
 class MemoryServer:
-    """A server of the network."""
-
     network: MemoryNetwork
     address: tuple[str, int]
 
     @property
     def port(self) -> int:
-        """Return the port."""
         return self.address[1]
 
     def close(self) -> None:
-        """Accept no further connection."""
         self.network.servers.pop(self.address, None)
 
 
@@ -107,13 +100,11 @@ class MemoryWriter:
             self.peer.reader.feed_data(data)
 
     async def drain(self) -> None:
-        """Wait while the peer does not read."""
         await self.peer.has_room.wait()
         if self.closed or self.peer.closed:
             raise ConnectionResetError("the connection ended")
 
     def close(self) -> None:
-        """End the connection."""
         if not self.closed:
             self.closed = True
             self.has_room.set()
@@ -122,13 +113,10 @@ class MemoryWriter:
                     end.reader.feed_eof()
 
     def pause_reading(self) -> None:
-        """Make the peer wait."""
         self.has_room.clear()
 
     def resume_reading(self) -> None:
-        """Let the peer go on."""
         self.has_room.set()
 
     def is_closing(self) -> bool:
-        """Return whether this end is closed."""
         return self.closed

@@ -22,7 +22,6 @@ class NearAuthority(Authority):
         self.trouble = ""
 
     async def stated(self) -> AuthorityStated:
-        """Return the authority's certificate."""
         return AuthorityStated(0, self._near.certificate, self.trouble)
 
     async def issue(
@@ -38,7 +37,6 @@ class NearAuthority(Authority):
         return CertificateMade(0, issued.certificate, issued.serial, issued.expires)
 
     async def revocations(self, revoked: list[tuple[str, float]]) -> bytes:
-        """Return the list; the signatures of it are counted."""
         self.lists += 1
         await asyncio.sleep(0)
         return self._near.revocations(revoked)

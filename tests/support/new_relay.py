@@ -17,7 +17,6 @@ from tests.support.idle import idle
 def told_to_a_new_relay(
     registry: Registry, grants: Grants, policy: Callable[[], Policy]
 ) -> list[messages.Message]:
-    """Return the messages to a relay that starts again."""
     link = _Link()
     relay = RelayControl(
         registry,
@@ -37,8 +36,6 @@ def told_to_a_new_relay(
 
 
 class _Ports:
-    """`Places` without real ports."""
-
     def socket(self, port: int) -> "_Ports":
         self._port = port
         return self

@@ -43,7 +43,6 @@ class RosSession:
         self.processes: list[Process] = []
 
     def on(self, host: Host) -> "RosSession":
-        """Return the same session for another host."""
         other = RosSession(self.master_uri, self.home, host)
         other.processes = self.processes
         return other
@@ -66,7 +65,6 @@ class RosSession:
         }
 
     def start(self, command: Sequence[str], *, label: str | None = None, **environment: str) -> Process:
-        """Start any program in the environment of a node."""
         process = Process(
             forks.Forking(self.host),
             command,

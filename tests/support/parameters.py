@@ -26,7 +26,6 @@ class Owners:
 
 
 def registered(_host: Address) -> QuotaClass:
-    """Return every host: all have nodes."""
     return QuotaClass.REGISTERED
 
 

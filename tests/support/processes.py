@@ -37,7 +37,6 @@ class ThisMachine:
     address = "127.0.0.1"
 
     def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
-        """Start a process on this machine."""
         return subprocess.Popen(list(args), **options)
 
 
@@ -88,12 +87,10 @@ class Process:
 
     @property
     def pid(self) -> int:
-        """The process id on this machine."""
         return int(self.popen.pid)
 
     @property
     def running(self) -> bool:
-        """Whether the process is still running."""
         return self.popen.poll() is None
 
     def wait_for(
@@ -168,12 +165,10 @@ class Process:
             return len(self.events)
 
     def seen(self, **fields: Any) -> list[Event]:
-        """Return all events so far that have these fields."""
         with self._changed:
             return [event for event in self.events if all(event.get(k) == v for k, v in fields.items())]
 
     def send(self, line: str) -> None:
-        """Write one line to the program's standard input."""
         assert self.popen.stdin is not None
         self.popen.stdin.write(line + "\n")
         self.popen.stdin.flush()
@@ -228,7 +223,6 @@ class Process:
         return status
 
     def kill(self) -> None:
-        """Kill the process and its children at once, as a crash does."""
         if self.running:
             with contextlib.suppress(ProcessLookupError):  # it has just ended
                 os.killpg(self.popen.pid, signal.SIGKILL)

@@ -112,7 +112,6 @@ class PumpFuzzer:
                 self._replace()
 
     def close(self) -> None:
-        """Close all descriptors."""
         self._epoll.close()
         self._crowd.close()
         for end in (end for pair in self._subscribers for end in pair):
@@ -252,7 +251,6 @@ class PumpFuzzer:
         self._waiting.crowd(self._random.choice((-1, self._crowd.fileno(), descriptor)))
 
     def _misuse(self) -> None:
-        """Use objects that are not complete."""
         pump, call = self._pump, self._module()
         one = self._random.choice((
             lambda: pump.PumpedConnection().step(),

@@ -88,7 +88,6 @@ class ChannelPeer:
         self._thread.start()
 
     def send(self, message: Message, descriptors: tuple[int, ...] = ()) -> None:
-        """Send to the relay."""
         with self._lock:
             self._channel.send(message, descriptors)
         self._wake.send(b"x")
@@ -169,7 +168,6 @@ class RelayProcess:
         self.ready: Ready = self.lifeline.wait_for(lambda message: isinstance(message, Ready))
 
     def open_link(self, received: Callable[[Any], None] | None = None) -> ChannelPeer:
-        """Become the control of this relay."""
         ours, theirs = socket.socketpair()
         link = ChannelPeer(ours, RelayLink, received)
         self.lifeline.send(LinkOpened("control", 0), (theirs.fileno(),))
@@ -195,7 +193,6 @@ class RelayProcess:
         return status
 
     def kill(self) -> None:
-        """Kill the relay as a crash does."""
         self.process.send_signal(signal.SIGKILL)
         self.process.wait(LIMIT)
         self.lifeline.close()
@@ -233,7 +230,6 @@ class Face:
         return call(self.real_uri, method, *parameters)
 
     def statements(self) -> list[tuple[Message, tuple[int, ...]]]:
-        """Return all statements of control about this incarnation."""
         return [
             (NodePlaced(self.key, self.name, LOOPBACK), (self.listening.fileno(),)),
             *((PublicationPlaced(self.key, topic, kind), ()) for topic, kind in self.publications.items()),
@@ -243,7 +239,6 @@ class Face:
         ]
 
     def close(self) -> None:
-        """Close the endpoint."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join(5)
@@ -384,7 +379,6 @@ class RelayDriver:
 
 
 def call(uri: str, method: str, *arguments: Any) -> Any:
-    """Make one XML-RPC call on its own connection."""
     with xmlrpc.client.ServerProxy(uri, allow_none=True) as proxy:
         return getattr(proxy, method)(*arguments)
 

@@ -22,7 +22,6 @@ def needs(condition: object, text: str) -> None:
 
 
 def need_root() -> None:
-    """Require root, for network namespaces and the firewall."""
     needs(has_privileges(), "root (CAP_SYS_ADMIN and CAP_NET_ADMIN): run the tests with sudo")
 
 

@@ -104,7 +104,6 @@ class Rest:
             threading.Event().wait(float(response.headers["Retry-After"]))
 
     def get(self, path: str, **headers: str) -> Answer:
-        """GET; header names with _ for -."""
         return self.request(
             "GET", path, None, {name.replace("_", "-"): text for name, text in headers.items()}
         )

@@ -79,7 +79,6 @@ class Carried:
     def __init__(self) -> None:
         self.answers = dict(_ANSWERS)
         self.orders: list[tuple[AdminRequest[Any], str | None]] = []
-        """The orders that took effect, each with its author."""
         self.error: Exception | None = None
 
     async def out(self, request: AdminRequest[Any], who: str | None = None) -> Any:
@@ -91,8 +90,6 @@ class Carried:
 
 
 class Tokens:
-    """A token of each role."""
-
     def __init__(self) -> None:
         made = {role: make_token(f"a-{role}", role, now=_NOW, seconds=6000) for role in ROLES}
         self.rows = {row.id: row for row, _text in made.values()}

@@ -91,7 +91,6 @@ class Robot:
         self._stack = contextlib.ExitStack()
 
     def api(self, node: str) -> str:
-        """Return the URI of a node."""
         return self._machines[self._machine[node]].uri
 
     def call(self, node: str, method: str, *arguments: Any) -> Any:

@@ -72,12 +72,10 @@ class RolloutCollector:
         return asyncio.run_coroutine_threadsafe(work, self.loop).result(60)
 
     def start(self) -> None:
-        """Start, and return when robots are served."""
         self._thread.start()
         assert self._started.wait(30)
 
     def stop(self) -> None:
-        """Stop serving."""
         self._server.should_exit = True
         self._thread.join(20)
         self.loop.close()
@@ -122,7 +120,6 @@ class RolloutCollector:
 
 @contextmanager
 def serving(made: RolloutCollector) -> Iterator[RolloutCollector]:
-    """Run a collector in a `with` block."""
     made.start()
     try:
         yield made
@@ -132,6 +129,5 @@ def serving(made: RolloutCollector) -> Iterator[RolloutCollector]:
 
 @contextmanager
 def collector(folder: Path, authority: FleetAuthority, address: str) -> Iterator[RolloutCollector]:
-    """Run a collector that publishes a folder."""
     with serving(RolloutCollector(folder, authority, address)) as made:
         yield made

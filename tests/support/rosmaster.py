@@ -37,7 +37,6 @@ class PlainMaster:
         return self
 
     def stop(self) -> None:
-        """Stop both programs."""
         for process in reversed(self.processes):
             process.stop()
 
@@ -69,13 +68,10 @@ def call_on(host: Host, uri: str, method: str, *parameters: Any) -> Any:
 
 
 def await_master(uri: str, host: Host, process: Process) -> None:
-    """Return once the master accepts connections."""
     _await(lambda: call_on(host, uri, "getPid", "/test"), f"no master answers at {uri}", process)
 
 
 def await_node(uri: str, host: Host, name: str) -> None:
-    """Return once a node of this name is registered."""
-
     def lookup() -> None:
         status, message, _ = call_on(host, uri, "lookupNode", "/test", name)
         if status != 1:

@@ -82,17 +82,14 @@ class ScriptHost:
         return not programs
 
     def command(self, args: Sequence[str]) -> list[str]:
-        """Return the command line that runs this command on the host."""
         return ["nsenter", "-t", str(self._holder.pid), "-m", "-n", "-r", "--", *args]
 
     def popen(self, args: Sequence[Any], **options: Any) -> "subprocess.Popen[Any]":
-        """Start a program on the host."""
         return self.outer.popen(self.command([str(one) for one in args]), **options)
 
     def run(
         self, *args: str, check: bool = True, timeout: float = 90, **environment: str
     ) -> subprocess.CompletedProcess[str]:
-        """Run a program on the host to its end."""
         command = self.command(["env", *(f"{name}={text}" for name, text in environment.items()), *args])
         done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
         if check and done.returncode:
@@ -102,7 +99,6 @@ class ScriptHost:
         return done
 
     def log(self) -> str:
-        """Return charon's log on this host."""
         return self.run("sh", "-c", "tail -n 40 /run/rosrv/charon.log 2>/dev/null; true").stdout
 
     def files(self) -> list[str]:

@@ -28,7 +28,6 @@ class ScriptedMaster:
         )
 
     async def answer(self, call: MethodCall) -> Value:
-        """Answer a call of the Master API."""
         self.calls.append(call.method)
         if self.before_answer is not None:
             await self.before_answer(call)
@@ -62,12 +61,10 @@ class ScriptedMaster:
         return [1, "", 1]
 
     async def notify(self, topic: str) -> None:
-        """Send the subscribers of a topic its publishers."""
         for uri in self.subscribers.get(topic, []):
             await self.call(uri, "publisherUpdate", topic, [*self.publishers[topic]])
 
     async def call(self, uri: str, method: str, *params: Value) -> Value:
-        """Call the API of a node."""
         return await call_xmlrpc(
             self.network.at("10.0.0.1"), parse_node_uri(uri), method, ("/master", *params), seconds=5.0
         )

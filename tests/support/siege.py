@@ -117,7 +117,6 @@ class Crowd:
         return int(answer[2][2])
 
     def leave(self) -> None:
-        """Close every connection."""
         for sock in self.held:
             sock.close()
         self.held.clear()
@@ -131,7 +130,6 @@ class Crowd:
             return fault
 
     def ask(self, address: str, method: str, *parameters: Any, port: int = 11311) -> bytes:
-        """Make the same call, and return the raw answer."""
         body = xmlrpc.client.dumps(parameters, method).encode()
         data = b"POST / HTTP/1.1\r\nConnection: close\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body)
 
@@ -196,8 +194,6 @@ class Siege:
         return self.robot.run(lambda: max(each() for _ in range(count)))
 
     def call(self, method: str, *parameters: Any) -> Any:
-        """Make one call from the robot."""
-
         def make() -> Any:
             with xmlrpc.client.ServerProxy(self.appliance.master_uri) as server:
                 return server.__getattr__(method)(*parameters)
@@ -241,7 +237,6 @@ class Siege:
         return int(status.partition("VmRSS:")[2].split()[0]) << 10
 
     def reload(self) -> None:
-        """Reload the policy during the attack."""
         self.appliance.rosrv("policy", "reload")
 
     def throughout(self, attack: Callable[[], None], *, slowest: float) -> None:

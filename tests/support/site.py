@@ -52,18 +52,15 @@ class Site:
 
     @property
     def master_uri(self) -> str:
-        """The value of ROS_MASTER_URI."""
         return self.master.master_uri
 
     @property
     def appliance(self) -> Appliance:
-        """The appliance of a site in this mode."""
         assert isinstance(self.master, Appliance)
         return self.master
 
     @property
     def lab(self) -> Lab:
-        """The Ethernet of a site that is not on the loopback."""
         assert self._lab is not None
         return self._lab
 
@@ -155,7 +152,6 @@ class Masters:
             raise
 
     def close(self) -> None:
-        """Stop all masters."""
         with contextlib.ExitStack() as closing:
             for _site, running in self._running.values():
                 closing.push(running)

@@ -12,5 +12,4 @@ NAME = "SHA256:lbmsoA0yIEcEiVDRnMWuzm+nV+3ZEEpVIURqFoeSspg (site 2026)"
 
 
 def signed(text: str, key: Ed25519PrivateKey = KEY) -> str:
-    """Return the signature of a text."""
     return sign(text, key)

@@ -64,12 +64,10 @@ class LeaseBounds:
 
     @property
     def model(self) -> Model:
-        """Return the model of the lease."""
         return LEASE
 
     @property
     def defined(self) -> list[str]:
-        """Return the definitions for the model."""
         return [f"-DGRANTS={self.grants}"] + ["-DLAST_FAULT"] * self.last_fault
 
 
@@ -96,12 +94,10 @@ class Bounds:
 
     @property
     def model(self) -> Model:
-        """Return the model of the insertion."""
         return INSERTION
 
     @property
     def defined(self) -> list[str]:
-        """Return the definitions for the model."""
         numbers = {
             "PUBLISHERS": self.publishers,
             "SUBSCRIBERS": self.subscribers,

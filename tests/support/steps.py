@@ -7,7 +7,6 @@ from typing import Any
 
 
 def steps(work: Callable[[], object]) -> int:
-    """Return the number of lines that `work()` executes."""
     count = 0
 
     def trace(_frame: FrameType, event: str, _argument: Any) -> Any:

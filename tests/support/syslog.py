@@ -27,8 +27,6 @@ _ELEMENT = re.compile(rb"\[(" + _NAME + rb")((?: " + _NAME + rb'="(?:[^"\\\]]|\\
 
 @dataclass(frozen=True)
 class Message:
-    """One parsed message."""
-
     facility: int
     severity: int
     time: str
@@ -41,7 +39,6 @@ class Message:
 
     @property
     def fields(self) -> dict[str, str]:
-        """The parameters of the first element."""
         return next(iter(self.elements.values()))
 
 
@@ -78,8 +75,6 @@ def parse(data: bytes) -> Message:
 
 
 class _Collector:
-    """Received messages; a context manager."""
-
     def __init__(self) -> None:
         self.messages: list[Message] = []
         self.problems: list[str] = []
@@ -112,8 +107,6 @@ class _Collector:
 
 
 class DatagramCollector(_Collector):
-    """Receive datagrams at `port`."""
-
     def __init__(self, host: str = "127.0.0.1") -> None:
         super().__init__()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -152,11 +145,9 @@ class StreamCollector(_Collector):
 
     @property
     def port(self) -> int:
-        """The listening port, also while it is closed."""
         return self._place[1]
 
     def open(self) -> None:
-        """Listen (again)."""
         self._listener = socket.socket()
         self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self._listener.bind(self._place)
@@ -165,7 +156,6 @@ class StreamCollector(_Collector):
         threading.Thread(target=self._accept, args=(self._listener,), daemon=True).start()
 
     def close(self) -> None:
-        """Close the port and every connection."""
         listener, self._listener = self._listener, None
         if listener is not None:
             with contextlib.suppress(OSError):

@@ -24,7 +24,6 @@ class Translator:
 
     @property
     def chain(self) -> str:
-        """The name of its translating chain, as shown to operators."""
         if self.form == "nft":
             table = self.rules.split(" {")[0].removeprefix("table ")
             chains = self.rules.split("\n    chain ")[1:]
@@ -36,7 +35,6 @@ class Translator:
 
     @property
     def name(self) -> str:
-        """The name in test ids."""
         return f"{self.program}, {self.form.removesuffix('-restore')}"
 
 

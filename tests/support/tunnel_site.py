@@ -68,7 +68,6 @@ class TunnelSite:
         return path
 
     def join(self, kit: Path, host: Host | None = None, *, log: str = "") -> JoinedHost:
-        """Return a host with a kit, not started."""
         return JoinedHost(host or self.ocu, kit, self.home / f"joined-{time.monotonic_ns()}", log=log)
 
     @contextlib.contextmanager
@@ -112,7 +111,6 @@ class TunnelSite:
         return bool(changes) and changes[-1]["event"] == "tunnel up"
 
     def hosts(self) -> list[dict[str, Any]]:
-        """Return `rosrv host list`."""
         return list(map(json.loads, self.appliance.rosrv("host", "list", "--json").stdout.splitlines()))
 
     def state(self, name: str = "ocu-1") -> str:
@@ -153,7 +151,6 @@ class TunnelSite:
 
     @property
     def mark(self) -> int:
-        """Return the number of records."""
         return len(self.trail.events)
 
     def __enter__(self) -> Self:
@@ -170,7 +167,6 @@ class TunnelSite:
         self.appliance.close()
 
     def watch(self) -> None:
-        """Read the audit log from now on."""
         command = [ROSRV, "audit", "tail", "--json", "--state", str(self.appliance.state)]
         self.trail = Process(
             ThisMachine(), command, env={"PYTHONUNBUFFERED": "1"}, label="audit tail"

@@ -77,7 +77,6 @@ class JoinedHost:
         self.keeper: Process | None = None
 
     def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
-        """Start a program on the host."""
         return self.outer.popen(args, **options)
 
     def start(self) -> Self:
@@ -125,7 +124,6 @@ class JoinedHost:
         self.charon.wait_for_text(f"vici terminate IKE_SA #{_established(first)}")
 
     def events(self) -> int:
-        """Return the number of lines that charon has printed."""
         assert self.charon is not None
         return len(self.charon.events)
 
@@ -142,7 +140,6 @@ class JoinedHost:
         )
 
     def stop(self) -> None:
-        """Stop charon, which closes the tunnel."""
         if self.keeper is not None:
             self.keeper.kill()
             self.keeper.stop()

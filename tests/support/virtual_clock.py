@@ -17,11 +17,9 @@ class VirtualClock:
         self._asleep = 0
 
     def now_ns(self) -> int:
-        """Return the monotonic time."""
         return self._now
 
     def wall_ns(self) -> int:
-        """Return the system time."""
         return self._wall
 
     def since_boot_ns(self) -> int:
@@ -29,16 +27,13 @@ class VirtualClock:
         return self._now + self._asleep
 
     def advance(self, seconds: float) -> None:
-        """Let time pass."""
         self.advance_ns(round(seconds * _SECOND))
 
     def advance_ns(self, nanoseconds: int) -> None:
-        """Let time pass."""
         self._now += nanoseconds
         self._wall += nanoseconds
 
     def sleep(self, seconds: float) -> None:
-        """Suspend the machine."""
         self._asleep += round(seconds * _SECOND)
         self._wall += round(seconds * _SECOND)
 
@@ -57,7 +52,6 @@ class ShiftedClock:
 
 
 def let_time_pass(seconds: float) -> None:
-    """Advance the virtual clock of the present context."""
     present = clock.source()
     assert isinstance(present, VirtualClock)
     present.advance(seconds)

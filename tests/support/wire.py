@@ -19,8 +19,6 @@ _RCVBUFFORCE = 33  # SO_RCVBUFFORCE: beyond the limit of the system, for root
 
 @dataclass(frozen=True)
 class Frame:
-    """An Ethernet frame."""
-
     data: bytes
 
     @property
@@ -30,7 +28,6 @@ class Frame:
 
     @property
     def arp(self) -> bool:
-        """Whether the frame is an ARP request or reply."""
         return self.data[12:14] == b"\x08\x06"
 
     @property
@@ -71,7 +68,6 @@ class Frame:
 
     @property
     def udp_payload(self) -> bytes:
-        """Return the payload of a UDP packet."""
         start = self.header
         length = int.from_bytes(self.data[start + 4 : start + 6])
         return self.data[start + 8 : start + length]
@@ -115,7 +111,6 @@ class Capture:
         self._thread = threading.Thread(target=self._read, name="capture", daemon=True)
 
     def wait_for(self, wanted: Callable[[Frame], bool], *, since: int = 0, timeout: float = LIMIT) -> Frame:
-        """Return the first frame from index `since` on that is wanted."""
         with self._changed:
             found = self._changed.wait_for(
                 lambda: next((one for one in self.frames[since:] if wanted(one)), None), timeout
@@ -144,7 +139,6 @@ class Capture:
 
 
 def hardware_address(host: Host) -> bytes:
-    """Return the Ethernet address of a host's interface."""
     with host.entered(), socket.socket(socket.AF_PACKET, socket.SOCK_RAW) as raw:
         raw.bind((INTERFACE, 0))
         return bytes(raw.getsockname()[4])

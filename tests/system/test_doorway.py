@@ -1,5 +1,3 @@
-"""Test `examples.landshark.doorway`: a loopback port of this machine that leads to a host of a lab."""
-
 import socket
 import threading
 from collections.abc import Iterator

@@ -81,7 +81,6 @@ class Cluster:
         return sorted(found)
 
     def kill(self, node: str = "") -> int:
-        """Kill the processes of a node, or of all; return their number."""
         found = self.processes(node)
         for pid in found:
             with suppress(ProcessLookupError):

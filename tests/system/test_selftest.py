@@ -1,5 +1,3 @@
-"""Test `rosrv selftest` with isolation container (a container's namespace) and netns (its own on a bare host)."""
-
 import json
 import subprocess
 

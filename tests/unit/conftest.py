@@ -11,7 +11,6 @@ from tests.support.determinism import may_depend_on_chance
 
 @pytest.fixture
 def anyio_backend(request: pytest.FixtureRequest) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Give anyio the loop for the test and its fixtures."""
     if may_depend_on_chance(request.node):
         yield "asyncio", {}
     else:

@@ -1,5 +1,3 @@
-"""Tests that Dockerfile, compose.yaml and documentation match the processes; system tests cover the rest."""
-
 import re
 from pathlib import Path
 
@@ -16,7 +14,6 @@ TRUE = Path("/bin/true")
 
 
 def granted() -> set[str]:
-    """Return the capabilities in compose.yaml."""
     return set(yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]["cap_add"])
 
 

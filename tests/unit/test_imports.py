@@ -1,5 +1,3 @@
-"""Rules for imports between modules."""
-
 from graphlib import TopologicalSorter
 
 import grimp
@@ -10,7 +8,6 @@ _MOST_IMPORTS = 25
 
 @pytest.fixture(scope="module")
 def imports() -> dict[str, set[str]]:
-    """Return the modules of the project that each module imports."""
     graph = grimp.build_graph("appliance", "roswire", "rosmop", "rosrv_fleet", cache_dir=None)
     return {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
 

@@ -1,5 +1,3 @@
-"""Tests that the Debian package matches the program, the container image and the list of packages."""
-
 import re
 from dataclasses import fields
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""The pages: each is listed, their links lead to pages and headings, and generated pages are current."""
-
 import re
 from dataclasses import is_dataclass
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""The models in `proofs/` name the code that they model, and that code exists."""
-
 import ast
 import re
 from collections.abc import Collection

@@ -21,8 +21,6 @@ LANGUAGE_TESTS = "rosmop/tests/"
 
 
 class Source(NamedTuple):
-    """A parsed file."""
-
     path: str
     text: str
     nodes: Sequence[ast.AST]
@@ -40,8 +38,6 @@ Judge = Callable[[Sequence[Seen]], Iterable[str]]
 
 
 class Rule(NamedTuple):
-    """A rule on the source."""
-
     folders: tuple[str, ...]
     see: Callable[[Source], Iterator[tuple[int, str]]]
     judge: Judge
@@ -82,7 +78,6 @@ def exactly(listed: Iterable[str], instead: str) -> Judge:
 
 
 def code_from_text(source: Source) -> Iterator[tuple[int, str]]:
-    """Yield each call that makes code of text."""
     for node in source.nodes:
         match node:
             case ast.Call(func=ast.Name(id="eval" | "exec" | "compile" | "__import__" as name)):
@@ -333,7 +328,6 @@ DIRECT = {
     "appliance/base/clock.py": "offers the clocks of the operating system to the rest",
     "appliance/features/standby/witness.py": "is copied to a machine without the appliance",
 }
-"""The files that read a clock other than by `base/clock.py`."""
 _CLOCKS = {"time", "time_ns", "localtime", "gmtime", "ctime"} | {
     f"{clock}{unit}" for clock in ("monotonic", "perf_counter", "clock_gettime") for unit in ("", "_ns")
 }
@@ -552,7 +546,6 @@ def applies(rule: Rule, path: str) -> bool:
 
 
 def findings(rule: Rule, *texts: str) -> list[str]:
-    """Return what a rule finds in examples."""
     sources = [parsed(f"example{number}.py", text) for number, text in enumerate(texts)]
     seen = [Seen(one.path, line, what) for one in sources for line, what in rule.see(one)]
     return [finding for finding in rule.judge(seen) if "example" in finding]

@@ -9,7 +9,6 @@ from pathlib import Path
 
 
 def transcripts(file: Path) -> dict[str, list[str]]:
-    """Return the lines of each transcript in the file, by title."""
     texts = file.read_text(encoding="utf-8").strip().removeprefix("# ").split("\n\n# ")
     return {title: lines for title, *lines in (text.splitlines() for text in texts)}
 

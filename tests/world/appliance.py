@@ -63,7 +63,6 @@ class Relay:
         self.attach(link)
 
     def attach(self, link: LinkEnd) -> None:
-        """Use the link to a new control."""
         self.link = link
         self.process.run(link.attach, None, self._received, lambda: None)
 
@@ -130,7 +129,6 @@ class Relay:
             self.link.send(messages.ConnectionClosed(number, reason))
 
     def grants(self) -> Iterator[messages.GrantInstalled]:
-        """Return the grants for topics in the table."""
         for key, topic, host, name in self._granted:
             grant = self.table.grant(key, topic, host, name)
             if grant is not None:
@@ -181,7 +179,6 @@ class Appliance:
         self._boot()
 
     def _boot(self) -> None:
-        """Start the supervisor and all processes without control."""
         self.supervisor = self.world.process("supervisor", self.machine)
         self._announced = False
         self._lifeline = self._lease_lifeline = None
@@ -195,14 +192,12 @@ class Appliance:
         )
 
     def start(self) -> None:
-        """Start control, and on one of two appliances the lease."""
         if self.membership is not None:
             self.start_lease()
         self.start_control()
 
     @property
     def active(self) -> bool:
-        """Whether the appliance may serve."""
         return self.supervisor.alive and self.watch.active
 
     def crash(self) -> None:
@@ -220,7 +215,6 @@ class Appliance:
             self.start()
 
     def start_lease(self) -> None:
-        """Start the process `lease`."""
         assert self.membership is not None
         self.lease = self.world.process("lease", self.machine)
         mine, its = LinkEnd.pair(self.supervisor, self.lease)
@@ -273,7 +267,6 @@ class Appliance:
         self.start_rosmaster()
 
     def start_rosmaster(self) -> None:
-        """Start `rosmaster`."""
         self.rosmaster = RosMaster(
             self.world, self.world.process("rosmaster", self.machine), self.rosmaster_port
         )
@@ -287,7 +280,6 @@ class Appliance:
         self.start_relay()
 
     def start_relay(self) -> None:
-        """Start the relay."""
         process = self.world.process("relay", self.machine)
         end, _unused = LinkEnd.pair(process, self.supervisor)
         self.relay = Relay(self.world, process, end)
@@ -295,7 +287,6 @@ class Appliance:
             self._link_relay()
 
     def start_control(self) -> None:
-        """Start control with the kept sockets."""
         self.lives += 1
         self.control = self.world.process("control", self.machine)
         mine, its = LinkEnd.pair(self.supervisor, self.control)
@@ -327,7 +318,6 @@ class Appliance:
         self._lifeline.send(messages.LinkOpened("relay", 0), (controls,))
 
     def kill_control(self) -> None:
-        """Kill control, and start it again after some time."""
         if self.control is not None and self.control.alive:
             self._end_lapse()
             self.control.kill()

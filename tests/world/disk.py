@@ -33,21 +33,18 @@ class EngineSteps:
         self._step()
 
     def wake(self) -> None:
-        """Call a turn soon."""
         if not self._wanted:
             self._wanted = True
             loop = self._process.machine.loop
             self._process.call(self._gather * loop.random.choice(_SOON), self._step)
 
     def hurry(self) -> None:
-        """Call a turn at once, or soon."""
         if self._at_once:
             self._step()
         else:
             self.wake()
 
     def end(self, _seconds: float | None) -> bool:
-        """Call the last turns."""
         while self._due is not None:
             self._step()
         return True

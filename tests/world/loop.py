@@ -39,21 +39,17 @@ class Machine:
     speed: float = 1.0
 
     def local(self, present: float) -> float:
-        """Return the time of this machine at a time of the world."""
         return present * self.speed + self.ahead
 
     def present(self, local: float) -> float:
-        """Return the time of the world at a time of this machine."""
         return (local - self.ahead) / self.speed
 
     def now_ns(self) -> int:
-        """Return the monotonic time."""
         return round(self.local(self.loop.present) * _SECOND)
 
     since_boot_ns = now_ns
 
     def wall_ns(self) -> int:
-        """Return the system time."""
         return round((_EPOCH + self.local(self.loop.present)) * _SECOND)
 
 
@@ -77,11 +73,9 @@ class Process:
         _process.reset(token)
 
     def start(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
-        """Start a task of this process."""
         return self.machine.loop.create_task(work, context=self.context.copy())
 
     def run(self, act: Callable[..., T], *given: Any) -> T:
-        """Call a function in this process now."""
         return self.context.copy().run(act, *given)
 
     def call(self, seconds: float, act: Callable[..., object], *given: Any) -> None:
@@ -90,7 +84,6 @@ class Process:
         loop.at(loop.present + seconds, act, given, self.context.copy())
 
     def step(self) -> None:
-        """Count a callback."""
         if self.doom is not None:
             left, happen = self.doom
             self.doom = (left - 1, happen) if left > 1 else None
@@ -110,7 +103,6 @@ _process: contextvars.ContextVar[Process] = contextvars.ContextVar("process")
 
 
 def present_process() -> Process:
-    """Return the process whose callback runs."""
     return _process.get()
 
 
@@ -128,19 +120,16 @@ class WorldLoop(asyncio.BaseEventLoop):
         self.set_task_factory(self._make_task)
 
     def time(self) -> float:
-        """Return the time of the machine whose process runs."""
         return self._machine().local(self.present)
 
     def call_at(  # type: ignore[override]  # the types of arguments do not matter here
         self, when: float, callback: Any, *args: Any, context: contextvars.Context | None = None
     ) -> asyncio.TimerHandle:
-        """Call at a time of the present machine."""
         return self.at(self._machine().present(when), callback, args, context)
 
     def at(
         self, when: float, callback: Any, args: tuple[Any, ...], context: contextvars.Context | None
     ) -> asyncio.TimerHandle:
-        """Call at a time of the world."""
         return super().call_at(when, callback, *args, context=context)
 
     def run_in_executor(self, _executor: Any, func: Callable[..., T], *args: Any) -> asyncio.Future[T]:  # type: ignore[override]  # no executor
@@ -172,7 +161,6 @@ class WorldLoop(asyncio.BaseEventLoop):
         file.readable = lambda: process.run(partial(act, *arguments))
 
     def remove_reader(self, file: Any) -> None:  # type: ignore[override]  # wider than asyncio's
-        """Do not call it any more."""
         file.readable = lambda: None
 
     def discard(self) -> None:
@@ -218,7 +206,6 @@ class WorldLoop(asyncio.BaseEventLoop):
         self._run_some()
 
     def _queues(self) -> list[Process]:
-        """Return the processes that can run."""
         self._waiting = [process for process in self._waiting if process.ready]
         return [process for process in self._waiting if not process.paused]
 

@@ -144,7 +144,6 @@ NOT_SEEN = {
 
 @contextlib.contextmanager
 def instead_of(place: Any, name: str, other: object) -> Iterator[None]:
-    """Replace an existing attribute during the block."""
     before = getattr(place, name)
     setattr(place, name, other)
     try:
@@ -166,7 +165,6 @@ def first_broken(mutant: str, seeds: Sequence[int]) -> tuple[int, str] | None:
 
 
 def main(arguments: list[str]) -> None:
-    """Run the command line."""
     number, *words = arguments
     for mutant in MUTANTS | PAIR_MUTANTS:
         if all(word in mutant for word in words):

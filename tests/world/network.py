@@ -48,11 +48,9 @@ class Network:
         self._open: dict[asyncio.Future[bytes], Process] = {}
 
     def reaches(self, source: str, target: str) -> bool:
-        """Whether packets of a host reach another one."""
         return frozenset((source, target)) not in self.cut
 
     def free_port(self) -> int:
-        """Return a port that no process has."""
         self._port += 1
         return self._port
 
@@ -62,11 +60,9 @@ class Network:
         self._servers[address] = _Served(process, answer)
 
     def stop(self, address: Address) -> None:
-        """Serve an address no longer."""
         self._servers.pop(address, None)
 
     def broken(self, process: Process) -> None:
-        """Break off the exchanges that a killed process served."""
         for future, server in list(self._open.items()):
             if server is process:
                 del self._open[future]
@@ -139,7 +135,6 @@ class LinkEnd:
 
     @classmethod
     def pair(cls, one: Process, two: Process) -> "tuple[LinkEnd, LinkEnd]":
-        """Return both ends of a new link."""
         ends = cls(one), cls(two)
         ends[0].other, ends[1].other = ends[1], ends[0]
         for end in ends:
@@ -153,7 +148,6 @@ class LinkEnd:
         closed: Callable[[], None],
         _invalid: Callable[[str], None] | None = None,
     ) -> None:
-        """Receive messages from now on, first those that wait."""
         self._received, self._ended = received, closed
         waiting, self._waiting = self._waiting, []
         for message, descriptors in waiting:
@@ -175,7 +169,6 @@ class LinkEnd:
         loop.at(self.last, act, given, self.other.process.context.copy())
 
     def take(self, message: Any, descriptors: tuple[Any, ...]) -> None:
-        """Receive a message."""
         if self.closed:
             return
         if self._received is None:
@@ -184,12 +177,10 @@ class LinkEnd:
             self._received(message, descriptors)
 
     def end(self) -> None:
-        """Learn that the other end is closed."""
         if not self.closed and self._ended is not None:
             self._ended()
 
     def close(self) -> None:
-        """End the link, after the messages that were sent."""
         if not self.closed:
             self.closed = True
             self._carry(self.other.end)
@@ -197,7 +188,6 @@ class LinkEnd:
     killed = close
 
     def fileno(self) -> "LinkEnd":
-        """Return the end as its descriptor."""
         return self
 
     detach = fileno

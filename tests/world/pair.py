@@ -77,7 +77,6 @@ class PairWorld(World):
         return Appliance(self, machine, folder / name, self.durability, port, membership)
 
     def start(self) -> None:
-        """Start both appliances."""
         for appliance in self.appliances:
             appliance.start()
 
@@ -98,7 +97,6 @@ class PairWorld(World):
     # --- promises ---
 
     def activated(self, appliance: Appliance, epoch: int) -> None:
-        """Assert that no other appliance is active, and that the epoch is new."""
         self.say(f"{appliance.address} is active in epoch {epoch}")
         if any(other.active for other in self.appliances if other is not appliance):
             self.fail("both appliances are active")
@@ -126,7 +124,6 @@ class PairWorld(World):
         return found
 
     async def settled(self) -> None:
-        """Find the active appliance and its policy."""
         active = [one for one in self.appliances if one.active]
         if len(active) != 1 or not active[0].ready:
             raise BrokenPromiseError(f"{len(active)} appliances are active after all faults have ended")
@@ -140,7 +137,6 @@ class PairWorld(World):
     # --- faults ---
 
     def faults(self) -> list[Callable[[], None]]:
-        """Return the kinds of faults."""
         return [
             self.crashes, self.crashes, self.crashes, self.link_is_cut, self.link_is_cut, self.link_is_cut,
             self.switches_over, self.lease_stalls, self.witness_ends, self.control_dies, self.rosmaster_dies,
@@ -154,7 +150,6 @@ class PairWorld(World):
         appliance.crash()
 
     def link_is_cut(self) -> None:
-        """Cut a link of the appliances or of the witness, or connect it again."""
         pair = frozenset(self.random.sample([*ADDRESSES.values(), WITNESS], 2))
         self.network.cut ^= {pair}
         self.say(f"{sorted(pair)} {'are cut off' if pair in self.network.cut else 'reach each other'}")
@@ -168,7 +163,6 @@ class PairWorld(World):
             self.say(f"{host} {'is cut off' if pairs <= self.network.cut else 'reaches the appliances'}")
 
     def switches_over(self) -> None:
-        """Order a switchover."""
         self.say("a switchover is ordered")
         self.loop.outside.start(self.order(standby_requests.StandbyPromote()))
 
@@ -179,6 +173,5 @@ class PairWorld(World):
         self.appliance.pause_lease(seconds)
 
     def witness_ends(self) -> None:
-        """Kill the witness, which starts again."""
         self.say("the witness starts again")
         self.robot.restart()

@@ -30,7 +30,6 @@ class Robot:
         self.start()
 
     def start(self) -> None:
-        """Start the witness."""
         self.process = self._world.process("witness", self._machine)
         self.process.run(self._serve, self._world.streams)
 
@@ -69,7 +68,6 @@ class Robot:
         return self._rules
 
     def admits(self, address: str) -> bool:
-        """Whether the robot accepts packets of an appliance."""
         return f"ip saddr {address} drop" not in self._rules
 
     def translated(self, address: Address) -> Address | None:

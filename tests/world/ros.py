@@ -57,7 +57,6 @@ class Node:
 
     @property
     def alive(self) -> bool:
-        """Whether the node runs."""
         return self.process.alive
 
     # --- the node's API ---
@@ -165,7 +164,6 @@ class Node:
                 subscription.known.remove(uri)
 
     async def connect(self) -> None:
-        """Connect to each publisher, and again after a connection has ended."""
         while True:
             await asyncio.sleep(_AGAIN_SECONDS)
             if self.answers:
@@ -176,7 +174,6 @@ class Node:
     # --- services and parameters ---
 
     async def use_service(self, service: str) -> None:
-        """Look a service up, and call it once."""
         try:
             answer = await self.call(self.world.master_uri, "lookupService", service)
         except LOST:
@@ -187,7 +184,6 @@ class Node:
             self.world.call_service(self, service, parse_service_uri(answer[2]).port)
 
     async def set_parameter(self, key: str, value: int) -> None:
-        """Set a parameter once; an unknown outcome stays unknown."""
         try:
             answer = await self.call(self.world.master_uri, "setParam", key, value)
         except LOST:

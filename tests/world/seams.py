@@ -39,17 +39,13 @@ from tests.world.streams import Streams
 
 
 class Socket:
-    """A listening socket."""
-
     def __init__(self, host: str, port: int) -> None:
         self.address = host, port
 
     def getsockname(self) -> tuple[str, int]:
-        """Return the address and the port."""
         return self.address
 
     def dup(self) -> "Socket":
-        """Return the socket: the world counts no references."""
         return self
 
     detach = fileno = dup
@@ -72,7 +68,6 @@ class _Server:
         self._network.serve(self._address, self._answer)
 
     def close(self) -> None:
-        """Stop serving."""
         self._network.stop(self._address)
 
     async def _answer(self, peer: Peer, body: bytes) -> bytes:
@@ -89,7 +84,6 @@ class _AdminServer:
         self._administration = administration
 
     async def start(self, sock: Any) -> "_AdminServer":
-        """Serve from now on."""
         sock.administration = self._administration, present_process()
         return self
 
@@ -106,7 +100,6 @@ def _assemble(base: Any) -> Any:
 
 @contextlib.contextmanager
 def _listening(address: tuple[str, int], **_options: Any) -> Iterator[Socket]:
-    """Return a listening socket for the replication."""
     yield Socket(*address)
 
 
@@ -121,8 +114,6 @@ def _handle(descriptor: Any = None, *_given: Any, **named: Any) -> Any:
 
 
 class _Listener:
-    """`ReplicationListener`, over the world's connections."""
-
     def __init__(self, streams: Streams, sender: ReplicationSender, _context: object) -> None:
         self._streams = streams
         self._sender = sender
@@ -138,8 +129,6 @@ class _Listener:
 
 @contextlib.contextmanager
 def joined(network: Network, streams: Streams, random: Random) -> Iterator[None]:
-    """Join the product to a world."""
-
     async def exchange(client: Any, request: bytes, seconds: float) -> bytes:
         body = request.partition(b"\r\n\r\n")[2]
         source = present_process().machine.name

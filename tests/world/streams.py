@@ -46,7 +46,6 @@ class StreamEnd:
         await asyncio.sleep(0)
 
     def abort(self) -> None:
-        """End the connection, after what was sent."""
         if not self.closed:
             self.closed = True
             self._sent.append(b"")
@@ -111,15 +110,12 @@ class Streams:
         return DatagramSocket(self) if kind else fileno
 
     def free_port(self) -> int:
-        """Return a port that no socket had before."""
         return _FIRST_FREE_PORT + len(self._sockets)
 
     def bind(self, address: Address, sock: "DatagramSocket") -> None:
-        """Pass on the datagrams to this address."""
         self._sockets[address] = sock
 
     def send(self, data: bytes, source: Address, target: Address) -> None:
-        """Send a datagram, which may be lost or late."""
         loop = self._network.loop
         if frozenset((source[0], target[0])) not in self._network.cut:
             loop.outside.call(loop.random.choice(_SECONDS), self._arrive, data, source, target)
@@ -148,12 +144,10 @@ class DatagramSocket:
         """Do nothing: no call blocks."""
 
     def bind(self, address: Address) -> None:
-        """Receive the datagrams to this port of the machine."""
         self._address = self.process.machine.name, address[1]
         self._streams.bind(self._address, self)
 
     def fileno(self) -> "DatagramSocket":
-        """Return the socket as its descriptor."""
         return self
 
     def sendto(self, data: bytes, target: Address) -> None:
@@ -169,7 +163,6 @@ class DatagramSocket:
         return self._waiting.popleft()
 
     def take(self, data: bytes, source: Address) -> None:
-        """Receive a datagram."""
         self._waiting.append((data, source))
         self.readable()
 

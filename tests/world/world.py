@@ -63,11 +63,9 @@ class Policy:
         self.text = POLICY.format(*rules)
 
     def may_publish(self, topic: str, host: str) -> bool:
-        """Whether a host may publish a topic."""
         return host in self.publish.get(topic, HOSTS)
 
     def may_use(self, resource: str, host: str) -> bool:
-        """Whether a host may subscribe to a topic."""
         return host in self.use.get(resource, HOSTS)
 
 
@@ -129,7 +127,6 @@ class World:
         return "strict" if self.strict else "batched"
 
     def start(self) -> None:
-        """Start the appliance."""
         self.appliance.start()
 
     def activated(self, appliance: Appliance, epoch: int) -> None:
@@ -153,11 +150,9 @@ class World:
         return self._numbers
 
     def say(self, line: str) -> None:
-        """Report an event."""
         self._say(f"{self.loop.present:9.3f}  {line}")
 
     def fail(self, text: str) -> None:
-        """Note a broken promise."""
         self.say(f"BROKEN: {text}")
         self.errors.append(BrokenPromiseError(text))
 
@@ -181,7 +176,6 @@ class World:
     # --- what nodes do and see ---
 
     def ends(self, node: Node) -> None:
-        """End a node and its connections."""
         if node.alive:
             self.say(f"{node} ends")
             node.process.kill()
@@ -237,19 +231,16 @@ class World:
                 self.fail(f"{node} was told {uri}, which bypasses the relay")
 
     def connect(self, node: Node, topic: str, port: int) -> None:
-        """Connect a subscriber to a port of the relay."""
         connection = self.appliance.relay.connect(port, "topic", topic, node.host, node.name)
         if connection is not None:
             self.carries(connection)
 
     def disconnect(self, node: Node, topic: str, port: int) -> None:
-        """Close a connection of a subscriber."""
         relay = self.appliance.relay
         key = relay.keys.get(port, "")
         relay.disconnect(Connection(key, "topic", topic, node.host, node.name), "closed")
 
     def call_service(self, node: Node, service: str, port: int) -> None:
-        """Call a service once, over the relay."""
         relay = self.appliance.relay
         connection = relay.connect(port, "service", service, node.host, node.name)
         if connection is not None:
@@ -257,7 +248,6 @@ class World:
             relay.disconnect(connection, "closed")
 
     def parameter_set(self, key: str, *, known: bool) -> None:
-        """Remember the values that a parameter may have."""
         setting = self._setting[key]
         setting.under_way -= 1
         setting.known |= known
@@ -348,7 +338,6 @@ class World:
         return None if answer is None else answer.body
 
     async def reload(self) -> None:
-        """Put another policy in force, as an operator does."""
         name = self.random.choice(list(POLICIES))
         self.say(f"policy: {name}")
         self.possible = self.possible | {name}
@@ -379,7 +368,6 @@ class World:
         return self.random.choice(there) if there else None
 
     def starts(self) -> None:
-        """Start a node; with the name of another node it replaces that one."""
         host = self.random.choice(HOSTS)
         self._ports += 1
         name = self.random.choice(NAMES)
@@ -397,17 +385,14 @@ class World:
                 node.register("registerService", service)
 
     def publishes(self, node: Node, topic: str) -> None:
-        """Make a node publish a topic."""
         node.publishes.add(topic)
         node.register("registerPublisher", topic)
 
     def subscribes(self, node: Node, topic: str) -> None:
-        """Make a node subscribe to a topic."""
         node.subscribes.setdefault(topic, Subscription())
         node.register("registerSubscriber", topic)
 
     def changes_its_mind(self) -> None:
-        """Make a node register or unregister something."""
         node, topic = self._living(), self.random.choice(TOPICS)
         if node is None or any(one[1] == topic for one in node.calling):
             return
@@ -425,13 +410,11 @@ class World:
             self.subscribes(node, topic)
 
     def uses_service(self) -> None:
-        """Make a node call a service."""
         node = self._living()
         if node is not None:
             node.process.start(node.use_service(self.random.choice(SERVICES)))
 
     def sets_parameter(self) -> None:
-        """Make a node set a parameter."""
         node, key, value = self._living(), self.random.choice(KEYS), self.number()
         if node is not None:
             if not self._setting[key].under_way:
@@ -443,20 +426,17 @@ class World:
             node.process.start(node.set_parameter(key, value))
 
     def dies(self) -> None:
-        """Kill a node, without an unregistration."""
         node = self._living()
         if node is not None:
             self.ends(node)
 
     def hangs(self) -> None:
-        """Make a node hang, or continue."""
         node = self._living()
         if node is not None:
             node.answers = not node.answers
             self.say(f"{node} {'answers' if node.answers else 'hangs'}")
 
     def is_cut_off(self) -> None:
-        """Cut a host off from the appliance, or connect it again."""
         pair = frozenset((self.random.choice(HOSTS), APPLIANCE))
         self.network.cut ^= {pair}
         self.say(f"{sorted(pair)} {'are cut off' if pair in self.network.cut else 'reach each other'}")
@@ -467,7 +447,6 @@ class World:
             self.loop.outside.start(self.reload())
 
     def rosmaster_dies(self) -> None:
-        """Replace `rosmaster` by a new one without state."""
         self.say("rosmaster starts again")
         self.appliance.restart_rosmaster()
 
@@ -477,12 +456,10 @@ class World:
         self.network.flaky = ("127.0.0.1", ROSMASTER_PORT)
 
     def relay_dies(self) -> None:
-        """Replace the relay by a new one without state."""
         self.say("the relay starts again")
         self.appliance.restart_relay()
 
     def control_dies(self) -> None:
-        """Kill control after some of its steps."""
         steps = self.random.choice((1, 10, 100, 1000))
         control = self.appliance.control
         if control is not None:
@@ -517,7 +494,6 @@ class World:
         self.quiet()
 
     def faults(self) -> list[Callable[[], None]]:
-        """Return the kinds of faults."""
         return [
             self.dies, self.hangs, self.is_cut_off, self.rosmaster_dies, self.rosmaster_breaks_off,
             self.relay_dies, self.control_dies,

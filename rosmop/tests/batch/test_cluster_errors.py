@@ -1,5 +1,3 @@
-"""Tests of the errors of a cluster: one line, with the cause that Ray hides in a traceback."""
-
 import pytest
 
 from rosmop.batch.ray_cluster import _reason

@@ -37,7 +37,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def rows_of(path: str) -> list[dict[str, object]]:
-    """Return the rows of a report."""
     return [json.loads(line) for line in Path(path).read_text(encoding="ascii").splitlines()]
 
 
@@ -229,7 +228,6 @@ def test_a_report_without_a_folder_is_refused_first(folder: Path) -> None:
 
 
 def children(pid: int) -> list[int]:
-    """Return the child processes of a process."""
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 

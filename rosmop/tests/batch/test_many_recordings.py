@@ -1,5 +1,3 @@
-"""The commands over many recordings, as a user runs them."""
-
 import json
 import os
 import shutil
@@ -29,7 +27,6 @@ ROSMOP = [sys.executable, "-P", "-c", "from rosmop.tool.command import app; app(
 
 
 def make_bag(path: Path, seed: int, count: int = 400, step: int = 10**8) -> Path:
-    """Write a bag of numbers, each `step` nanoseconds after the one before."""
     definitions = standard_definitions()
     with Writer(path) as writer:
         connection = writer.add_connection(

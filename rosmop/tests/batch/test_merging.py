@@ -1,5 +1,3 @@
-"""Facts learned from recordings are merged in any order, as they come from workers."""
-
 import math
 import random
 from collections.abc import Iterator
@@ -60,7 +58,6 @@ def recorded(number: int, rows: list[tuple[tuple[str, bytes], int]]) -> Recorded
 
 
 def through_bytes(facts: Facts) -> Facts:
-    """Return facts as they come from a worker."""
     result = unpacked(msgspec.msgpack.encode(facts))
     assert isinstance(result, TimeFacts | ContentFacts | AlarmFacts)
     assert result == facts
@@ -68,7 +65,6 @@ def through_bytes(facts: Facts) -> Facts:
 
 
 def merged(facts: list[Facts], chance: random.Random) -> Facts:
-    """Merge facts in random order and grouping."""
     while len(facts) > 1:
         one, other = (facts.pop(chance.randrange(len(facts))) for _ in range(2))
         facts.append(one.merged(other))  # type: ignore[arg-type] # facts of one kind

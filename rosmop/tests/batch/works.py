@@ -8,7 +8,6 @@ from rosmop.batch.jobs import work
 
 
 def double(job: bytes) -> bytes:
-    """Return a job twice."""
     return job + job
 
 

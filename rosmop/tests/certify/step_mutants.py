@@ -22,7 +22,6 @@ class _Reader(decoding.Reader):
         self.found: list[tuple[int, int, decoding.WasmInstruction]] = []
 
     def instruction(self, code: int) -> decoding.WasmInstruction:
-        """Read one instruction and record its position."""
         begin = self.at - 1
         one = super().instruction(code)
         if not one.body and not one.otherwise:

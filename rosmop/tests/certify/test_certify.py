@@ -1,5 +1,3 @@
-"""The certifier proves the output of the compilers, and rejects the output of a broken compiler."""
-
 import ast
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -41,7 +39,6 @@ def drawn(unary: Sequence[str], binary: Sequence[str], leaves: Sequence[str]) ->
 
 
 def expression(random: Random, depth: int, events: Sequence[str]) -> str:
-    """Draw a regular expression."""
     if depth == 0 or random.random() < 0.15:
         return random.choice([*events, *events, "epsilon", "empty"])
     inner = f"({expression(random, depth - 1, events)})"
@@ -59,7 +56,6 @@ def pattern(random: Random, _depth: int, events: Sequence[str]) -> str:
 
 
 def machine(random: Random, _depth: int, events: Sequence[str]) -> str:
-    """Draw a state machine."""
     states = [f"s{number}" for number in range(random.randint(1, 5))]
     text = ""
     for state in states:
@@ -106,7 +102,6 @@ LOGICS: dict[str, Draw] = {
 
 
 def properties(logic: str, seed: int, count: int) -> list[CompiledProperty]:
-    """Draw random properties that the compiler accepts."""
     random = Random(seed)  # noqa: S311  no secret
     found: list[CompiledProperty] = []
     while len(found) < count:
@@ -267,7 +262,6 @@ guard() {
 
 
 def certified() -> tuple[dict[str, list[str]], list[str]]:
-    """Return the certificates and the errors of `SPECIFICATION`."""
     compiled = compiled_from({"guard.rv": SPECIFICATION}, standard_definitions())
     lines, wrong = certificates_of(compiled.specifications)
     return lines, [str(finding) for finding in wrong]

@@ -35,14 +35,12 @@ GUARD = """s() { int n = 0;
 
 
 def compiled(*texts: str) -> Compiled:
-    """Compile specifications as one set."""
     return MonitorSet.of(
         compiled_from({f"{place}.rv": text for place, text in enumerate(texts)}, definitions())
     ).compiled
 
 
 def module(of: Compiled) -> WasmModule:
-    """Return their module before its translation to machine code."""
     return written(
         of.functions, [each.component for each in groups(of.specifications)], ValueCodec(of.messages)
     )

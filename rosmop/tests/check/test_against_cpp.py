@@ -49,7 +49,6 @@ HEADERS = (
 
 
 def expression(random: Random, depth: int) -> str:
-    """Return a random expression over the variables."""
     if depth == 0 or random.random() < 0.15:
         return random.choice((random.choice(NAMES), random.choice(LITERALS)))
     a, b, c = (expression(random, depth - 1) for _ in range(3))
@@ -207,7 +206,6 @@ def in_module(body: str) -> list[str]:
 
 
 def printed(body: str, before: str, directory: Path, *options: str) -> list[str]:
-    """Return the output of the program compiled by g++."""
     compiler = compiler_of_cpp()
     source, program = directory / "program.cpp", str(directory / "program")
     source.write_text(f"{HEADERS}{before}int main() {{\n{body}\n}}\n")

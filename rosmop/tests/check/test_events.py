@@ -1,5 +1,3 @@
-"""Events: the messages for which they happen, the values of parameters, and the effect of assigning to parameters."""
-
 # ruff: noqa: E501  the rows of tables
 
 import struct
@@ -14,12 +12,10 @@ from roswire.definitions import Definitions
 
 
 def event(kind: str, parameters: str, pattern: str, body: str, rest: str = "") -> str:
-    """Return a specification with one event on `/t`."""
     return f"s() {{ {rest} event e({parameters}) /t {kind} '{{{pattern}}}' {{ {body} }} }}"
 
 
 def process(text: str, data: bytes | bytearray) -> Outcome:
-    """Return the outcome of one message on `/t`."""
     return load(text).process("/t", data, 10**9)
 
 

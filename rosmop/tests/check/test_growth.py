@@ -1,5 +1,3 @@
-"""The time to compile a text grows linearly with its length."""
-
 import sys
 from collections import Counter
 from collections.abc import Callable

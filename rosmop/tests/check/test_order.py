@@ -61,14 +61,12 @@ class Programs:
     """Random programs: of numbers, of numbers and vectors, or of all types. Each has statements of numbers only."""
 
     def __init__(self, seed: int, kind: Kind, *, orders: bool = True) -> None:
-        """Prepare a program; with `orders`, C++ specifies every order."""
         self._random = Random(seed)  # noqa: S311  draws examples, not keys
         self._kind = kind
         self._plain = False  # whether the next statement has numbers only
         self._orders = orders
 
     def declarations(self) -> str:
-        """Return variables, and functions that change them."""
         others, random = self._kind == "others", self._random
         changes = [*CHANGES, *(OF_TEXTS + OF_MESSAGES if others else ())]
         text = NUMBERS + VECTORS + (TEXTS + MESSAGES if others else "")

@@ -1,5 +1,3 @@
-"""Findings of the check, and values of actions, from tables of sources and results (`rosmop/tests/transcripts.py`)."""
-
 import re
 from contextlib import suppress
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Coverage of specifications by recordings, by line."""
-
 from collections.abc import Sequence
 
 import pytest
@@ -50,7 +48,6 @@ def recorded(name: str, messages: Sequence[tuple[str, int]]) -> Recorded:
 
 
 def exercised(*recordings: Recorded) -> dict[str, int]:
-    """Return how often each `line kind what` was exercised."""
     found = counted(TEXT, recordings)
     return {f"{item.position.line} {item.kind} {item.what}": count for item, count in found.items()}
 

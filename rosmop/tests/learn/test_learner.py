@@ -1,5 +1,3 @@
-"""Learning from known recordings, and the warnings of the learnt specification."""
-
 import math
 import random
 import re
@@ -28,20 +26,16 @@ Row = tuple[str, int, bytes]
 
 @dataclass(frozen=True)
 class Recorded:
-    """A recording in memory."""
-
     name: str
     rows: tuple[Row, ...]
     topics: Mapping[str, str]
 
     @property
     def began(self) -> int:
-        """Return the time of the first message."""
         return self.rows[0][1]
 
     @property
     def ended(self) -> int:
-        """Return the time of the last message."""
         return self.rows[-1][1]
 
     def messages(self) -> Iterator[Row]:
@@ -78,12 +72,10 @@ DRIVES = [drive(seed) for seed in range(1, 9)]
 
 @pytest.fixture(scope="module")
 def learnt() -> LearningResult:
-    """Return the result of learning from eight drives."""
     return learnt_from(DRIVES, 0.3)
 
 
 def learnt_from(recordings: Sequence[Recorded], held_out: float) -> LearningResult:
-    """Learn in this process."""
     definitions = standard_definitions()
     return learn(recordings, definitions, held_out, run_here(recordings, definitions))
 

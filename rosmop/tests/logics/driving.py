@@ -48,7 +48,6 @@ def _expired(run: Run, time: int) -> list[tuple[int, tuple[str, ...]]]:
 
 
 def traces(events: Sequence[str], longest: int) -> Iterator[tuple[str, ...]]:
-    """Yield all traces of up to ``longest`` events."""
     for length in range(1, longest + 1):
         yield from product(events, repeat=length)
 

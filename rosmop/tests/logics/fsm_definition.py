@@ -33,7 +33,6 @@ class Written:
         return "\n".join(parts)
 
     def after(self, trace: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the categories after a trace."""
         state = self.states[0]
         for event in trace:
             if state != "fail":

@@ -52,7 +52,6 @@ class Printer:
         self._once = set(once)
 
     def show(self, tree: Tree, random: Random) -> str:
-        """Return the text of a formula."""
         operator = tree[0]
         if operator == "event":
             return str(tree[1])

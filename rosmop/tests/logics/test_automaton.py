@@ -1,5 +1,3 @@
-"""Automata as tables: the smallest automaton with the same verdicts, and components of graphs."""
-
 from random import Random
 
 import pytest
@@ -32,7 +30,6 @@ def classes_by_refinement(automaton: Automaton) -> list[int]:
 
 
 def reached(automaton: Automaton) -> set[int]:
-    """Return the initial state and all its successors."""
     found = {automaton.initial}
     while fresh := {target for state in found for target in automaton.table[state]} - found:
         found |= fresh

@@ -24,7 +24,6 @@ PRINTER = Printer(
     ["implies", "iff"],
 )
 OVER = 10**6
-"""A time at which nothing is open any more."""
 
 Truth = bool | None
 
@@ -125,7 +124,6 @@ def expected(tree: Tree, trace: Timed, end: int) -> list[tuple[int, str]]:
 
 
 def told(text: str, trace: Timed, end: int) -> list[tuple[int, str]]:
-    """Return the verdicts of the monitor with their events."""
     record = play(compiled("mtl", text).start(0), ABC, trace, end)
     return [(time, category) for time, categories in record for category in categories]
 
@@ -141,7 +139,6 @@ def with_bounds(tree: Tree, random: Random) -> Tree:
 
 
 def is_about_the_future(tree: Tree) -> bool:
-    """Whether the formula has an operator about the future."""
     return tree[0] in FUTURE or any(is_about_the_future(part) for part in tree[1:] if isinstance(part, tuple))
 
 

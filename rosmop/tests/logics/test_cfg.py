@@ -26,7 +26,6 @@ def draw(random: Random) -> Rules:
 
 
 def show(rules: Rules, random: Random) -> str:
-    """Return the grammar in the syntax of the logic."""
     comma = random.choice([",", ""])
     return f"{comma}\n".join(
         f"{head} -> {' | '.join(' '.join(body) or 'epsilon' for body in bodies)}"
@@ -81,7 +80,6 @@ def productive(rules: Rules) -> Rules:
 
 
 def expected(rules: Rules, word: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the categories after a trace, by definition."""
     useful = productive(rules)
     if "S" not in useful:
         return ("fail",)

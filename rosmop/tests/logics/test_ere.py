@@ -15,7 +15,6 @@ Tree = tuple[Any, ...]
 
 
 def draw(random: Random, depth: int) -> Tree:
-    """Draw a random expression as a tree."""
     if depth == 0 or random.random() < 0.15:
         return (random.choice(["a", "b", "c", "a", "b", "c", "epsilon", "empty"]),)
     kind = random.choice(["|", "&", "cat", "cat", "~", "*", "+", "^"])

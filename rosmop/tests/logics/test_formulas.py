@@ -49,7 +49,6 @@ def judged(case: Case) -> tuple[str, ...]:
 
 
 def verdicts(monitor: CompiledProperty, trace: str) -> str:
-    """Return the verdicts on a trace of events, or of events with their times."""
     if not trace[0].isdigit():
         return ", ".join("+".join(categories) or "-" for categories in told(monitor, trace.split()))
     steps = [step.partition(" ") for step in trace.split(", ")]
@@ -61,13 +60,11 @@ def verdicts(monitor: CompiledProperty, trace: str) -> str:
 
 
 def nanoseconds(text: str) -> int:
-    """Return a time as a number."""
     number = text.rstrip("msn")
     return int(number) * UNITS[text.removeprefix(number)]
 
 
 def shown(time: int) -> str:
-    """Return a time in its largest unit."""
     return next(f"{time // size}{unit}" for unit, size in UNITS.items() if time % size == 0)
 
 

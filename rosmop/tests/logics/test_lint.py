@@ -1,5 +1,3 @@
-"""Facts about a property before it runs, and its picture."""
-
 from itertools import accumulate, product
 
 import pytest

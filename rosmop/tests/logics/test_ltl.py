@@ -122,7 +122,6 @@ def unrolled(lasso: Lasso, turns: int) -> Lasso:
 
 
 def has(tree: Tree, operators: tuple[str, ...]) -> bool:
-    """Whether the formula has one of these operators."""
     return tree[0] in operators or any(has(part, operators) for part in tree[1:] if isinstance(part, tuple))
 
 

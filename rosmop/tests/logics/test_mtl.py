@@ -1,5 +1,3 @@
-"""``mtl`` over the past: compared with the definition of its operators, and with another monitor."""
-
 from copy import copy
 from random import Random
 from typing import Any
@@ -83,12 +81,10 @@ def holds(tree: Tree, trace: Timed, i: int) -> bool:  # noqa: PLR0911, PLR0912  
 
 
 def verdicts(run: Run, trace: Timed, events: tuple[str, ...] = ABC) -> list[bool]:
-    """Return whether the formula holds, for each event."""
     return [run.step(events.index(event), time) == ("validation",) for time, event in trace]
 
 
 def timed_trace(random: Random, length: int, gap: int) -> Timed:
-    """Return events at random times, some of them at the same time."""
     time, trace = random.randint(0, 5), []
     for _ in range(length):
         time += random.choice([0, 1, random.randint(0, gap)])

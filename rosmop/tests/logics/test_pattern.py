@@ -22,7 +22,6 @@ class Meaning:
     within: int | None
 
     def text(self) -> str:
-        """Return the pattern in the syntax of the logic."""
         scope = {
             (False, False): "globally",
             (True, False): f"after {self.opens}",
@@ -167,7 +166,6 @@ def test_a_published_remedy_counts_as_the_answer() -> None:
 
 
 def with_answers(trace: list[tuple[int, str]], remedies: list[int], answer: str) -> list[tuple[int, str]]:
-    """Return the trace with an answer at each remedy, after the events of that time."""
     return sorted([*trace, *((time, answer) for time in remedies)], key=lambda one: one[0])
 
 
@@ -181,5 +179,4 @@ def check_remedies(
 
 
 def first(record: list[tuple[int, tuple[str, ...]]]) -> tuple[int, tuple[str, ...]] | None:
-    """Return the first verdict, which is final."""
     return next((one for one in record if one[1]), None)

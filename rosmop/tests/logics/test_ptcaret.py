@@ -22,7 +22,6 @@ TEMPORAL = [name for name in SIGNS if name not in ("not", "implies", "iff")]
 
 
 def show(tree: Tree) -> str:
-    """Return the formula with all parentheses."""
     operator, *operands = tree
     if operator == "event":
         return str(operands[0])
@@ -44,7 +43,6 @@ def before(trace: Sequence[str], place: int) -> int:
 
 
 def holds(tree: Tree, trace: Sequence[str], place: int) -> bool:
-    """Whether a formula holds at a position of a trace."""
     operator, *operands = tree
     if operator in ("event", "true", "false"):
         return bool(operator == "true" or (operator == "event" and trace[place] == operands[0]))
@@ -71,7 +69,6 @@ def holds(tree: Tree, trace: Sequence[str], place: int) -> bool:
 
 
 def verdicts(tree: Tree, trace: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return the verdict of the definition after each event."""
     return [("validation",) if holds(tree, trace, place) else ("violation",) for place in range(len(trace))]
 
 

@@ -1,5 +1,3 @@
-"""``ptltl``: compared with the definition of its operators."""
-
 import pytest
 
 from rosmop.logics import past_monitors

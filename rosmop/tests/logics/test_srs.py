@@ -35,7 +35,6 @@ def show(rules: list[Rule]) -> str:
 
 
 def rewritten(rules: list[Rule], string: list[str]) -> tuple[list[str], tuple[str, ...]]:
-    """Return the rewritten string, and the verdict."""
     while True:
         found = next(
             (

@@ -26,7 +26,6 @@ class Ticking:
         self.timeouts.setdefault(self.states[0], (2, self.states[-1]))
 
     def text(self) -> str:
-        """Return the machine in the syntax of the logic."""
         parts = []
         for state in self.states:
             clauses = [f"{event} -> {target}" for event, target in self.moves[state].items()]
@@ -36,7 +35,6 @@ class Ticking:
         return "\n".join(parts)
 
     def play(self, trace: list[tuple[int, str]], start: int, end: int) -> list[tuple[int, tuple[str, ...]]]:
-        """Return the categories at each time from ``start`` to before ``end``."""
         state, entered = self.states[0], start
         record: list[tuple[int, tuple[str, ...]]] = []
         for instant in range(start, end):

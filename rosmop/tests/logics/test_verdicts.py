@@ -1,5 +1,3 @@
-"""Random properties of each logic have the verdicts of its definition (`rosmop/tests/verdicts.py`)."""
-
 import pytest
 
 from rosmop.logics import past_monitors

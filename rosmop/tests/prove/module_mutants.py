@@ -122,7 +122,6 @@ def mutants(code: Code) -> Iterator[tuple[str, Code]]:
 
 
 def event(body: str, parameters: str, pattern: str, before: str = "") -> str:
-    """Return a specification with one event on `/plain`."""
     return f"s() {{ {before} event e({parameters}) /plain own/Plain '{{{pattern}}}' {{ {body} }} }}"
 
 
@@ -143,7 +142,6 @@ FAULTY = {
 
 
 def compiled(text: str, known: Definitions | None = None) -> Compiled:
-    """Compile one specification."""
     known = definitions() if known is None else known
     return MonitorSet.of(compiled_from({"a.rv": text}, known)).compiled
 

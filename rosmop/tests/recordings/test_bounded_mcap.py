@@ -32,7 +32,6 @@ def make_mcap(
 
 
 def refusal(path: Path) -> str:
-    """Return the reason why a file is rejected."""
     with pytest.raises(RecordingError) as ended:
         list(RecordedFile(path, ["*"]).messages())
     return str(ended.value)

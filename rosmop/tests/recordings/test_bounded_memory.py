@@ -1,5 +1,3 @@
-"""A long recording needs no more memory than a short one."""
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Text in another language is an error that states what to write instead."""
-
 import pytest
 
 from rosmop.check.sources import compiled_from
@@ -13,7 +11,6 @@ EVENT = "event e(int n) /t std_msgs/Int32 '{data:n}' {"
 
 
 def refused(text: str) -> tuple[int, str]:
-    """Return the position and the text of the first error."""
     with pytest.raises(SpecificationError) as caught:
         MonitorSet.of(compiled_from({"x.rv": text}, DEFINITIONS))
     finding = caught.value.findings[0]

@@ -17,13 +17,11 @@ def parsed(text: str) -> tree.Specification:
 
 
 def event(body: str = "", head: str = "event e() /t std_msgs/Empty '{}'") -> tree.EventDefinition:
-    """Return the event of a specification with one event."""
     [found] = parsed(f"s() {{ {head} {{ {body} }} }}").events
     return found
 
 
 def refusal(text: str) -> tuple[int, int, str]:
-    """Return line, column and text of the first error."""
     with pytest.raises(SpecificationError) as caught:
         parse(text, "x.rv")
     finding = caught.value.findings[0]

@@ -15,7 +15,6 @@ SPECIFICATION = "m() { event e() /t std_msgs/Empty '{}' {} }\n"
 
 
 def huge(path: Path) -> None:
-    """Make a sparse file beyond the limit."""
     path.touch()
     os.truncate(path, MAX_FILE + 1)
 

@@ -1,5 +1,3 @@
-"""`pip install ./rosmop`: the command works without the appliance."""
-
 import re
 import subprocess
 import sys
@@ -19,7 +17,6 @@ MONITORS = sorted((FOLDER.parent / "monitors").glob("*.rv"))
 
 
 def run(*command: object, folder: Path = FOLDER) -> subprocess.CompletedProcess[str]:
-    """Run a command."""
     return subprocess.run([*map(str, command)], cwd=folder, capture_output=True, text=True, check=False)
 
 

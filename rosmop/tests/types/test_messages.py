@@ -1,5 +1,3 @@
-"""Tests of errors about unknown names."""
-
 import time
 
 from rosmop.types.messages import nearest

@@ -1,5 +1,3 @@
-"""Access to REST, with the appliance as a user starts it."""
-
 import contextlib
 import http.client
 import json

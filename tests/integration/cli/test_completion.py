@@ -1,5 +1,3 @@
-"""The shell completes names of the running appliance; without one it completes nothing, without an error."""
-
 import os
 import re
 import subprocess

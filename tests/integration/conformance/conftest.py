@@ -21,14 +21,12 @@ def local(request: pytest.FixtureRequest, masters: Masters) -> Iterator[Site]:
 
 @pytest.fixture
 def ros(local: Site, tmp_path: Path) -> Iterator[RosSession]:
-    """Provide the nodes and tools of one test."""
     with RosSession(local.master_uri, tmp_path) as session:
         yield session
 
 
 @pytest.fixture(scope="module")
 def fakes() -> Iterator[tuple[FakeNodes, FakeNodes]]:
-    """Run the fake nodes of both masters."""
     with FakeNodes() as plain, FakeNodes() as appliance:
         yield plain, appliance
 

@@ -73,7 +73,6 @@ class FakeNodes:
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
 
     def uri(self, node: str) -> str:
-        """Return the API URI of a node; each name has its own URI."""
         return self.base + node
 
     def calls(self, node: str, method: str) -> list[tuple[Any, ...]]:
@@ -94,7 +93,6 @@ class FakeNodes:
             return True
 
     def forget(self) -> None:
-        """Forget the calls so far."""
         with self._changed:
             self._calls.clear()
 

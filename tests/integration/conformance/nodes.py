@@ -30,7 +30,6 @@ def roscpp_node(ros: RosSession, program: str, name: str, *arguments: str) -> Pr
 
 
 def order(node: Process, do: str, **told: Any) -> dict[str, Any]:
-    """Give an order to `rospy_nodes/orders.py`, and return its answer."""
     mark = node.mark()
     node.send(json.dumps({"do": do, **told}))
     return node.wait_for(event="done", do=do, since=mark)

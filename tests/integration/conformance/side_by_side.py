@@ -72,14 +72,12 @@ class MasterSide:
         self._names: dict[str, str] = {rosout: "<rosout>"}
 
     def call(self, method: str, params: Sequence[Any]) -> Any:
-        """Return the unchanged answer, or `Fault`."""
         try:
             return getattr(self._server, method)(*self.given(params))
         except xmlrpc.client.Fault as fault:
             return Fault(fault.faultCode, fault.faultString)
 
     def given(self, value: Any) -> Any:
-        """Replace `Api` and `ServiceApi` by this master's URIs."""
         match value:
             case Api():
                 return self.nodes.uri(f"{value.node}-{value.life}-{self.epoch}")
@@ -92,7 +90,6 @@ class MasterSide:
         return value
 
     def named(self, value: Any) -> Any:
-        """Replace URIs by names, also within strings."""
         match value:
             case str():
                 text = _HTTP_URI.sub(lambda found: self._name(found.group()), value)
@@ -118,7 +115,6 @@ class MasterSide:
         return self._names[uri]
 
     def close(self) -> None:
-        """Close the connection."""
         self._server("close")()
 
 
@@ -133,7 +129,6 @@ class BothMasters:
         self.reset()
 
     def call(self, method: str, *params: Any) -> Answers:
-        """Make the same call to both masters."""
         plain, appliance = self.plain.call(method, params), self.appliance.call(method, params)
         if method in _UNDO and isinstance(plain, list) and plain[0] == 1:
             undo, positions = _UNDO[method]
@@ -141,7 +136,6 @@ class BothMasters:
         return Answers(self.plain.named(plain), self.appliance.named(appliance))
 
     def reset(self) -> None:
-        """Undo all registrations and parameters."""
         for method, params in reversed(self._registered):
             self.plain.call(method, params)
             self.appliance.call(method, params)

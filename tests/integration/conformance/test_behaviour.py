@@ -19,7 +19,6 @@ TOPIC_TOOLS = "/usr/lib/topic_tools"
 
 
 def texts(node: Process) -> list[str]:
-    """Return the messages a node received, in order."""
     return [event["data"] for event in node.seen(event="received")]
 
 

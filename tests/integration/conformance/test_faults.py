@@ -70,11 +70,9 @@ class RobotAtWork:
         return robot
 
     def master(self) -> Any:
-        """Return the Master API, as tools see it."""
         return ServerProxy(self.appliance.master_uri)
 
     def state(self) -> tuple[Any, Any]:
-        """Return the graph (sorted) and the parameters."""
         with self.master() as master:
             graph = [
                 sorted([name, sorted(nodes)] for name, nodes in rows)
@@ -109,7 +107,6 @@ class RobotAtWork:
 
 
 def _later(name: str, number: int, event: dict[str, Any]) -> bool:
-    """Whether the message is from `name` and later than its message `number`."""
     return event.get("publisher") == name and int(event["data"].split()[-1]) > number
 
 

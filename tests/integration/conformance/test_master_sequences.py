@@ -46,7 +46,6 @@ def node_with_api(draw: st.DrawFn) -> tuple[str, Api]:
 
 @st.composite
 def registrations(draw: st.DrawFn) -> Step:
-    """Generate a call that changes the graph."""
     node, api = draw(node_with_api())
     method = draw(
         st.sampled_from(

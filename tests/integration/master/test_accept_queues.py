@@ -30,7 +30,6 @@ SOMAXCONN = Path("/proc/sys/net/core/somaxconn")
 
 @pytest.fixture
 def lab() -> Iterator[Lab]:
-    """Make a lab of hosts."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with Lab("rosrv-test") as lab:
@@ -38,19 +37,16 @@ def lab() -> Iterator[Lab]:
 
 
 def call(host: Host, target: str, source: str = "") -> Value:
-    """Read a parameter on a new connection."""
     with connect(host, target, source, WAIT) as sock:
         return ask(sock)
 
 
 def connect(host: Host, target: str, source: str, seconds: float) -> socket.socket:
-    """Connect to RVMaster."""
     with host.entered():
         return socket.create_connection((target, 11311), seconds, source_address=(source, 0))
 
 
 def ask(sock: socket.socket) -> Value:
-    """Read a parameter, and return the answer."""
     body = build_call("getParam", ("/looker", "/rosdistro"))
     sock.settimeout(WAIT)
     sock.sendall(b"POST / HTTP/1.0\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body))

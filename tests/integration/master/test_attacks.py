@@ -146,7 +146,6 @@ def test_service_of_a_third_machine(field: Field) -> None:
 
 
 def header(**fields: str) -> bytes:
-    """Return a TCPROS connection header."""
     body = b"".join(
         len(one).to_bytes(4, "little") + one
         for one in (f"{key}={value}".encode() for key, value in fields.items())
@@ -271,14 +270,12 @@ def silent(_connection: socket.socket, _request: bytes) -> None:
 
 
 def endless(connection: socket.socket, _request: bytes) -> None:
-    """Send two gigabytes."""
     connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Type: text/xml\r\nContent-Length: 2147483648\r\n\r\n")
     for _ in range(2048):
         connection.sendall(b" " * (1 << 20))
 
 
 def twice(connection: socket.socket, _request: bytes) -> None:
-    """Send two answers to one request."""
     connection.sendall(response([1, "", 1]) + response([1, "", 2]))
 
 
@@ -288,14 +285,12 @@ def rubbish(connection: socket.socket, _request: bytes) -> None:
 
 
 def redirect(connection: socket.socket, _request: bytes) -> None:
-    """Redirect the caller to a third machine."""
     connection.sendall(
         b"HTTP/1.1 302 Found\r\nLocation: http://10.77.0.99:4444/\r\nContent-Length: 0\r\n\r\n"
     )
 
 
 def drip(connection: socket.socket, _request: bytes) -> None:
-    """Send one byte at a time, slowly, without end."""
     connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 100000\r\n\r\n")
     pause = threading.Event()
     for _ in range(600):
@@ -304,7 +299,6 @@ def drip(connection: socket.socket, _request: bytes) -> None:
 
 
 def bomb(connection: socket.socket, _request: bytes) -> None:
-    """Send XML with an entity that expands."""
     body = b'<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;">]><methodResponse/>'
     connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n" % len(body) + body)
 

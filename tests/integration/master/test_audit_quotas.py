@@ -29,7 +29,6 @@ def siege(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Siege]:
 
 
 def log_bytes(siege: Siege) -> int:
-    """Return the size of the log on disk."""
     return sum(one.stat().st_size for one in (siege.appliance.state / "control").glob("audit.db*"))
 
 

@@ -1,5 +1,3 @@
-"""Tests of which nodes count as lost."""
-
 import os
 import signal
 import xmlrpc.client

@@ -15,7 +15,6 @@ CALL = "<methodCall><methodName>{}</methodName><params>{}</params></methodCall>"
 
 
 def post(body: str) -> bytes:
-    """Return a request with this body."""
     data = body.encode()
     return b"POST /RPC2 HTTP/1.1\r\nHost: m\r\nContent-Length: %d\r\n\r\n%b" % (len(data), data)
 

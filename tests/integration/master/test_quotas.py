@@ -51,7 +51,6 @@ def siege(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Siege]:
 
 @pytest.fixture(autouse=True)
 def close_connections_first(siege: Siege) -> Iterator[None]:
-    """Start each attack without open connections."""
     yield
     siege.crowd.leave()
 

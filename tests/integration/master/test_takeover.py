@@ -55,18 +55,15 @@ def pair(masters: Masters, tmp_path: Path) -> Iterator[Pair]:
 
 
 def unplugged(pair: Pair, _voice: Process) -> None:
-    """Unplug the cable."""
     pair.lab.unplug(pair.first)
 
 
 def dropped(pair: Pair, _voice: Process) -> None:
-    """Drop packets silently, as behind a router."""
     nft = pair.first.popen(["nft", DROPPING])
     assert nft.wait() == 0
 
 
 def deleted(pair: Pair, voice: Process) -> None:
-    """Delete the machine and its network without notice."""
     pair.lab.unplug(pair.first)
     voice.popen.send_signal(signal.SIGKILL)
     voice.wait()

@@ -44,7 +44,6 @@ def beside(version: int) -> str:
 
 @pytest.fixture
 def appliance() -> Iterator[Appliance]:
-    """Run an appliance with two relays and no monitors."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with Appliance(options=("--api", "off"), relays=2) as appliance:
         yield appliance
@@ -57,12 +56,10 @@ def relays(appliance: Appliance) -> list[int]:
 
 
 def load(appliance: Appliance, **files: str) -> Replacement:
-    """Load or replace files of these names."""
     return appliance.ask(MonitorLoad({f"{name}.rv": text for name, text in files.items()}, {}))
 
 
 def counted(listener: Process) -> Event:
-    """Return the messages of a counting listener so far."""
     since = listener.mark()
     listener.send("")
     return listener.wait_for(event="counted", since=since)

@@ -53,7 +53,6 @@ def press(appliance: Appliance, ros: RosSession) -> None:
 
 
 def kill_relays(appliance: Appliance) -> None:
-    """Send SIGKILL to both relays at once."""
     for pid in appliance.pids("relay"):
         os.kill(pid, signal.SIGKILL)
 
@@ -71,7 +70,6 @@ def kill_everything(appliance: Appliance) -> None:
 
 
 def restart(appliance: Appliance) -> None:
-    """Stop cleanly and start again."""
     assert appliance.stop() == 0
     appliance.start()
 

@@ -58,7 +58,6 @@ def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
 
 
 def rows(appliance: Appliance) -> dict[str, dict[str, object]]:
-    """Return the rows of `rosrv monitor list`, by name."""
     lines = appliance.rosrv("monitor", "list", "--json").stdout.splitlines()
     return {row["name"]: row for row in map(json.loads, lines)}
 

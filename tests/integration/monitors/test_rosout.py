@@ -1,5 +1,3 @@
-"""With the setting for it, the output of monitors appears on /rosout."""
-
 from collections.abc import Iterator
 
 import pytest

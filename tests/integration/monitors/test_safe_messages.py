@@ -24,7 +24,6 @@ guard() given { int least = 1 in 0..9; } {
 
 @pytest.fixture(scope="module")
 def guarded(common_lab: Lab) -> Iterator[Appliance]:
-    """Run an appliance with the guard loaded."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     host = common_lab.host("guarded", "10.77.0.4/24")
     with Appliance(host, options=("--api", "off")) as running:
@@ -34,7 +33,6 @@ def guarded(common_lab: Lab) -> Iterator[Appliance]:
 
 
 def scan(_: Appliance, ros: RosSession, ranges: str) -> None:
-    """Publish a scan once."""
     ros.run("rostopic", "pub", "-1", "/scan", "std_msgs/Int32MultiArray", f"data: [{ranges}]")
 
 
@@ -52,7 +50,6 @@ def tighten(appliance: Appliance, ros: RosSession) -> None:
 
 
 def restart(appliance: Appliance, _: RosSession) -> None:
-    """Stop the whole appliance, and start it again."""
     assert appliance.stop() == 0
     appliance.start()
 
@@ -64,7 +61,6 @@ def kill_control(appliance: Appliance, _: RosSession) -> None:
 
 
 def held(appliance: Appliance) -> list[str]:
-    """Return the monitors that hold their topics."""
     return [str(row["name"]) for row in appliance.rows("monitor", "list") if row["held"]]
 
 

@@ -27,26 +27,22 @@ Record = dict[str, Any]
 
 
 def specification(name: str) -> tuple[Path, ...]:
-    """Return the text of a shipped specification."""
     return (MONITORS / f"{name}.rv",)
 
 
 @pytest.fixture(scope="module")
 def unguarded() -> Drive:
-    """Return the mission without monitors."""
     return Simulation().run()
 
 
 @pytest.fixture(scope="module")
 def bag(unguarded: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the recording of the mission."""
     path = tmp_path_factory.mktemp("bags") / "drive.bag"
     record(unguarded, path)
     return path
 
 
 def replayed(bag: Path, *files: Path, output: Path | None = None) -> list[Record]:
-    """Return the records of `rosrv monitor run --json`."""
     written = ("--output", str(output)) if output else ()
     done = rosrv("monitor", "run", *map(str, files), "--bag", str(bag), "--json", *written)
     assert done.returncode == 0, done.stderr
@@ -158,7 +154,6 @@ def test_a_recording_gives_the_same_records_every_time(bag: Path) -> None:
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """Run an appliance with the shipped monitors."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     options = ("--monitors", str(MONITORS), "--api", "off")
     with Appliance(policy=OPEN_POLICY, options=options) as appliance:
@@ -175,7 +170,6 @@ def robot(appliance: Appliance, tmp_path_factory: pytest.TempPathFactory) -> Ite
 
 
 def told(robot: RosSession, *command: str) -> Record:
-    """Return the output of the node `command.py`."""
     said = robot.run(PYTHON, str(NODES / "command.py"), *command, timeout=120).stdout
     answer: Record = json.loads(said.splitlines()[-1])
     return answer

@@ -1,5 +1,3 @@
-"""The monitors' publisher is a node of the graph; the stock tools treat it as any other node."""
-
 import json
 import re
 import signal

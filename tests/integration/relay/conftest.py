@@ -12,7 +12,6 @@ from tests.support.requirements import needs
 
 @pytest.fixture
 def driver() -> Iterator[RelayDriver]:
-    """Run rosmaster, the relay, and a minimal control."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with RelayDriver() as driver:
         yield driver

@@ -1,5 +1,3 @@
-"""The relay as a process under its supervisor."""
-
 import signal
 import socket
 from collections.abc import Iterator
@@ -15,7 +13,6 @@ from tests.support.relay_driver import LOOPBACK, RelayProcess
 
 @pytest.fixture
 def relay() -> Iterator[RelayProcess]:
-    """Start a relay process without a control."""
     relay = RelayProcess()
     yield relay
     if relay.process.poll() is None:
@@ -24,7 +21,6 @@ def relay() -> Iterator[RelayProcess]:
 
 
 def refuses(port: int) -> bool:
-    """Whether the port refuses connections."""
     with socket.socket() as sock:
         return sock.connect_ex((LOOPBACK, port)) != 0
 

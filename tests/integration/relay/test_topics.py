@@ -54,7 +54,6 @@ def _refused(message: object, resource: str, caller_id: str) -> bool:
 
 
 def read_frame(stream: BinaryIO) -> bytes:
-    """Return the body of the next frame."""
     (length,) = struct.unpack("<I", stream.read(4))
     return stream.read(length)
 

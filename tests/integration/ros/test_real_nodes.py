@@ -25,7 +25,6 @@ CLIENTS: list[Client] = ["rospy", "roscpp"]
 
 @pytest.fixture(scope="module")
 def ros(masters: Masters, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosSession]:
-    """Provide real nodes behind a plain master."""
     home = tmp_path_factory.mktemp("ros")
     with masters.lend("plain", "loopback") as site, RosSession(site.master_uri, home) as session:
         yield session
@@ -33,7 +32,6 @@ def ros(masters: Masters, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 @pytest.fixture(scope="module")
 def standard() -> Definitions:
-    """Return ROS's own definitions."""
     return standard_definitions()
 
 

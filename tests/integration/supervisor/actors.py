@@ -57,7 +57,6 @@ def crowded(lifeline_fd: int, config: Path) -> None:
 
 
 def signer(lifeline_fd: int, directory: Path, passphrase: int | None) -> None:
-    """Act as the signer."""
     asyncio.run(_Actor("signer", lifeline_fd, SignerLink).run())
 
 
@@ -68,7 +67,6 @@ def stubborn(lifeline_fd: int, index: int, config: Path) -> None:
 
 
 def failing(lifeline_fd: int, config: Path) -> None:
-    """Act as a control with an invalid policy."""
     asyncio.run(_Failing("control", lifeline_fd, RelayLink).run())
 
 
@@ -84,7 +82,6 @@ def failing_again(lifeline_fd: int, config: Path) -> None:
 
 
 def dying(lifeline_fd: int, config: Path) -> None:
-    """Act as a control that dies at its start."""
     sys.exit(3)
 
 

@@ -31,7 +31,6 @@ class Leaky(NoIsolation):
     probes = True
 
     def probe(self) -> str | None:
-        """Return a probe's result."""
         return "ROSMaster can be reached by another user"
 
 
@@ -42,12 +41,10 @@ class Interrupted(NoIsolation):
         self.when = when
 
     def build(self) -> None:
-        """Report the build."""
         self._interrupt("build")
         _say(event="built")
 
     def remove(self) -> None:
-        """Report the removal."""
         self._interrupt("remove")
         _say(event="removed")
 

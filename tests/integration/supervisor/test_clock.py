@@ -1,5 +1,3 @@
-"""The running appliance and the machine's clock."""
-
 import json
 import os
 import time
@@ -18,7 +16,6 @@ _HOUR = 3_600_000_000_000
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """Provide an appliance that still runs after each test."""
     with Appliance() as running:
         yield running
 

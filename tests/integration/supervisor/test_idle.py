@@ -1,5 +1,3 @@
-"""The libraries that the processes of an idle appliance have loaded, read from the kernel."""
-
 import re
 from pathlib import Path
 from typing import Final

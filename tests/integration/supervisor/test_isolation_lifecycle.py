@@ -1,5 +1,3 @@
-"""Test `appliance.supervisor.isolation_lifecycle` on a host of the lab, with the real kernel and firewall."""
-
 import os
 import socket
 import threading
@@ -26,7 +24,6 @@ OWN_NODE = range(18000, 18064)
 
 @pytest.fixture
 def host() -> Iterator[Host]:
-    """Provide a separate host."""
     need_root()
     need_program("nft", "nftables")
     with Lab("rosrv-enclosure") as lab:

@@ -1,5 +1,3 @@
-"""Access of each process's user to the state directory, tested as that user."""
-
 import ctypes
 import os
 import shutil

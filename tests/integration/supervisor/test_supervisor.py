@@ -32,8 +32,6 @@ ALL = (*OURS, "rosmaster", "rosout")
 
 
 class Running:
-    """A supervisor with its children."""
-
     def __init__(self, state: Path, *actors: str) -> None:
         self.state = state
         environment = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
@@ -52,7 +50,6 @@ class Running:
         return int(self.process.wait_for(event="process started", role=role, restarts=restarts)["pid"])
 
     def restarts(self, role: str) -> int:
-        """Return the number of restarts of a role so far."""
         return len(self.process.seen(event="process started", role=role)) - 1
 
     def next_pid(self, role: str, pid: int) -> int:
@@ -80,7 +77,6 @@ class Running:
             return int(connection.recv(20))
 
     def children(self) -> list[int]:
-        """Return every running process that the supervisor started."""
         started = [event["pid"] for event in self.process.seen(event="process started")]
         return [pid for pid in started if Path(f"/proc/{pid}").exists()]
 
@@ -123,14 +119,12 @@ def state_directory() -> Iterator[Path]:
 
 @pytest.fixture
 def state() -> Iterator[Path]:
-    """Provide a state directory for one test."""
     with state_directory() as state:
         yield state
 
 
 @pytest.fixture
 def start(state: Path) -> Iterator[Any]:
-    """Start a supervisor; it ends with the test."""
     started: list[Running] = []
 
     def start(*actors: str) -> Running:

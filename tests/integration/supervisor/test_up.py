@@ -1,5 +1,3 @@
-"""`rosrv up` as a user or a script starts it, with the real processes."""
-
 import contextlib
 import json
 import os

@@ -140,7 +140,6 @@ def _run(program: str) -> None:
 
 
 def _execute_later() -> None:
-    """Write memory, then execute it, as compiled code needs."""
     libc = ctypes.CDLL(None, use_errno=True)
     libc.mmap.restype = ctypes.c_void_p
     private_anonymous = 0x22

@@ -35,7 +35,6 @@ def serve():
 
 
 def ask():
-    """Send one goal and wait for its result."""
     client = actionlib.SimpleActionClient("/count", TestAction)
     report("ready", name=rospy.get_name())
     client.wait_for_server()
@@ -53,7 +52,6 @@ def ask():
 
 
 def main():
-    """Run one end."""
     end = rospy.myargv()[1]
     init_node(f"action_{end}")
     {"server": serve, "client": ask}[end]()

@@ -15,8 +15,6 @@ from std_msgs.msg import String
 
 
 class Count:
-    """The messages so far."""
-
     def __init__(self, slow):
         self.slow = slow
         self.first = self.last = self.came = 0
@@ -26,7 +24,6 @@ class Count:
         self.words = []
 
     def heard(self, message):
-        """Count one message."""
         parts = message.data.split(" ")
         number, word = int(parts[0]), " ".join(parts[2:])
         if not self.came:
@@ -44,7 +41,6 @@ class Count:
             self.never.wait(self.slow)
 
     def tell(self):
-        """Report the count for each line of the input."""
         for _line in sys.stdin:
             report(
                 "counted",

@@ -25,7 +25,6 @@ CLONE_NEWNET = 0x40000000
 
 
 def serve(orders):
-    """Fork for each order; the fork returns with the order."""
     with selectors.PollSelector() as selector:
         selector.register(orders, selectors.EVENT_READ)
         while True:
@@ -77,7 +76,6 @@ def become(order, descriptors, report):
 
 
 def main():
-    """Serve; in the fork, run the ordered program."""
     for module in LOADED:
         importlib.import_module(module)
     gc.freeze()  # keep loaded objects out of collections, so that their pages are not copied

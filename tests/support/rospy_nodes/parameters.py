@@ -23,7 +23,6 @@ DO = {
 
 
 def main():
-    """Carry out each line."""
     init_node("parameters")
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
     watched = get_param_server_cache()

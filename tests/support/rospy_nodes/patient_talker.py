@@ -8,7 +8,6 @@ from std_msgs.msg import String
 
 
 def main():
-    """Wait, publish once, stay."""
     arguments = argparse.ArgumentParser()
     arguments.add_argument("topic")
     options = arguments.parse_args(rospy.myargv()[1:])

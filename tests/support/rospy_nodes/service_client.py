@@ -13,7 +13,6 @@ from std_srvs.srv import SetBool, Trigger
 
 
 def main():
-    """Call once for each line of the input."""
     arguments = argparse.ArgumentParser()
     arguments.add_argument("service")
     arguments.add_argument("--persistent", action="store_true")

@@ -8,7 +8,6 @@ from std_srvs.srv import SetBool, SetBoolResponse
 
 
 def answer(request):
-    """Return the negation."""
     report("called", data=request.data, client=request._connection_header["callerid"])
     return SetBoolResponse(success=not request.data, message="negated")
 

@@ -12,11 +12,9 @@ class Watch(rospy.SubscribeListener):
     """Report subscribers that connect and leave."""
 
     def peer_subscribe(self, topic_name, topic_publish, peer_publish):
-        """Report a new subscriber."""
         report("connected", topic=topic_name)
 
     def peer_unsubscribe(self, topic_name, num_peers):
-        """Report a subscriber that left."""
         report("disconnected", topic=topic_name, left=num_peers)
 
 

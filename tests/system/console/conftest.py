@@ -37,13 +37,11 @@ CONFIG = "api: 127.0.0.1:0\napi_tls: off\napi_limits: {requests_per_second: 500,
 
 @pytest.fixture(scope="session")
 def chromium() -> str:
-    """Return the path of the browser."""
     return need_program("chromium", "chromium")
 
 
 @pytest.fixture(scope="module")  # its event loop must not outlive the file
 def playwright() -> Iterator[Playwright]:
-    """Start Playwright for the tests of a file."""
     with sync_playwright() as driver:
         yield driver
 

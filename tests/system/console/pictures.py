@@ -62,7 +62,6 @@ with xmlrpc.client.ServerProxy(sys.argv[1]) as master:
 
 
 def main() -> None:
-    """Start both robots, and take the pictures."""
     minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
     if REPOSITORY.is_relative_to("/opt"):
         raise SystemExit(f"{REPOSITORY}: the demonstration hides /opt; run this from a checkout elsewhere")
@@ -188,7 +187,6 @@ def _one_topic(reader: Reader) -> None:
 
 
 def _narrow(reader: Reader) -> None:
-    """Compose three views side by side."""
     shots = []
     for view in ("now", "graph", "audit"):
         page = reader.go(view)

@@ -69,7 +69,6 @@ class Reader:
         self.page.on("response", self._answered)
 
     def go(self, view: str = "now", *, heading: str | None = None) -> Page:
-        """Open a view by its URL and wait for its heading."""
         self.page.goto(f"{self.url}/console/{view}")
         name = heading or view.partition("?")[0].partition("/")[0].capitalize()
         expect(self.page.get_by_role("heading", level=1, name=name, exact=heading is None)).to_be_visible(
@@ -78,17 +77,14 @@ class Reader:
         return self.page
 
     def editor(self) -> Locator:
-        """Return the text area of the first editor."""
         return self.page.locator("[data-editor] .cm-content").first
 
     def write(self, text: str) -> None:
-        """Replace the editor's text."""
         self.editor().click()
         self.page.keyboard.press("Control+a")
         self.page.keyboard.insert_text(text)
 
     def toast(self, text: str) -> Locator:
-        """Return a notification by its text."""
         return self.page.locator(".toasts").get_by_text(text)
 
     def settle(self) -> None:
@@ -132,7 +128,6 @@ class Reader:
             assert cookies == [], f"the page set cookies: {cookies}"
 
     def foreign(self) -> list[str]:
-        """Return the URLs of requests to other hosts."""
         own = urllib.parse.urlsplit(self.url).netloc
         return [
             url
@@ -156,7 +151,6 @@ class Reader:
 
 
 def texts(locators: Iterable[Any]) -> list[str]:
-    """Return the text of each element."""
     return [str(one.inner_text()) for one in locators]
 
 

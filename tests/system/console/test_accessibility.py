@@ -25,7 +25,6 @@ VIEWS = [
 
 @pytest.fixture(autouse=True)
 def refused(appliance: Appliance, attempt: Callable[..., Any]) -> None:
-    """Make records for the views to show."""
     attempt("registerPublisher", "/intruder", "/guarded", "std_msgs/String", "http://127.0.0.1:1/")
     appliance.recorded("--deny", caller_id="/intruder")
 

@@ -1,5 +1,3 @@
-"""Test the view Audit: find a record and the line that decided it; follow, verify and export the log."""
-
 import json
 import random
 import re
@@ -305,7 +303,6 @@ def drop(number: int, reason: str = "", monitor: str = "limit", **detail: Any) -
 
 
 def denial(number: int, resource: str) -> LogEntry:
-    """Return the record of a denied registration."""
     record = AuditRecord(
         id=f"{number:020x}", time=number * 10**9, event="decision", severity=Severity.NOTICE, decision="deny",
         host="10.0.0.9", caller_id="/x", category="publish", resource=resource, reason="no rule",

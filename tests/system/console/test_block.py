@@ -1,5 +1,3 @@
-"""Block a host in the console: from a denied record or the view Hosts, with the list of blocked hosts."""
-
 import re
 from collections.abc import Callable
 from typing import Any

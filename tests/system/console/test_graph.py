@@ -1,5 +1,3 @@
-"""Test the view Graph: connections, denied attempts with their rules, and a robot of a thousand topics."""
-
 import threading
 from collections.abc import Callable, Iterator
 from socketserver import ThreadingMixIn

@@ -1,5 +1,3 @@
-"""Test guards in the console: margins, the map of a fence, and a button for each verb, by role."""
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,7 +14,6 @@ _ODOMETRY = "{pose: {pose: {position: {x: 1.5}, orientation: {w: 1}}}}"
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """Run an appliance with a folder of specifications of its own."""
     with Appliance(settings=CONFIG, monitors={}) as running:
         yield running
 

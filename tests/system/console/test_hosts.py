@@ -1,5 +1,3 @@
-"""Test the view Hosts: enrol by kit and by token, list and revoke; the appliance has its own network."""
-
 import json
 import tarfile
 from collections.abc import Iterator
@@ -18,7 +16,6 @@ from tests.system.console.reader import Reader
 
 @pytest.fixture
 def appliance(tmp_path: Path) -> Iterator[Appliance]:
-    """Run an appliance on a host of a lab."""
     need_root()
     need_strongswan()
     config = tmp_path / "appliance.yaml"

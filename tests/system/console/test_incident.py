@@ -96,7 +96,6 @@ class Keys:
         self.count = 0
 
     def press(self, *keys: str) -> None:
-        """Press one key after the other."""
         for key in keys:
             self.page.keyboard.press(key)
             self.count += 1

@@ -1,5 +1,3 @@
-"""Test the size of a first visit, and run joined modules in the browser."""
-
 from playwright.sync_api import Browser, expect
 
 from appliance.api.console.console_bundle import join_modules

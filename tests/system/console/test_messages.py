@@ -14,7 +14,6 @@ from tests.system.console.reader import LIMIT, Reader
 
 @pytest.fixture
 def ros(appliance: Appliance, tmp_path: Path) -> Iterator[RosSession]:
-    """Return the nodes of one test."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with RosSession(appliance.master_uri, tmp_path) as session:
         yield session

@@ -1,5 +1,3 @@
-"""Test the view Monitors: switch, read, write with and without errors, replace, remove."""
-
 import threading
 from collections.abc import Callable
 from typing import Any

@@ -1,5 +1,3 @@
-"""Test the view Now: events appear as they happen, and the page reports when it has no data."""
-
 import re
 from collections.abc import Callable
 from typing import Any

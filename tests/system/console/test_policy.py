@@ -1,5 +1,3 @@
-"""Test the view Policy: edit, explain, test, load with commit-confirm, roll back; two engineers at once."""
-
 import http.client
 import re
 import urllib.parse
@@ -46,7 +44,6 @@ Element.prototype.attachShadow = function (options) {
 
 @pytest.fixture(scope="module")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
-    """Run an appliance whose policy has tests."""
     config = tmp_path_factory.mktemp("console") / "appliance.yaml"
     config.write_text(CONFIG)
     running = Appliance(policy=POLICY, options=("--config", str(config)))
@@ -56,7 +53,6 @@ def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
 
 
 def revision(appliance: Appliance) -> int:
-    """Return the policy in force."""
     return int(appliance.rest().get("/v1/policy").json["revision"])
 
 
@@ -121,7 +117,6 @@ def test_the_editor_completes_by_keys(appliance: Appliance, opened: Callable[...
         proposals = page.get_by_role("listbox", name="Completions")
 
         def choose(typed: str, proposed: str) -> None:
-            """Type, and choose the first proposal."""
             page.keyboard.type(typed)
             first = proposals.get_by_role("option").first
             expect(first).to_have_accessible_name(proposed)
@@ -201,7 +196,6 @@ def test_a_right_text_is_loaded_with_its_comment(appliance: Appliance, opened: C
 
 
 def publish(master: str, address: str, topic: str) -> None:
-    """Register a publisher as a node on this address of the machine."""
     node, port = f"/mover_{address[-1]}", urllib.parse.urlsplit(master).port
     call = build_call("registerPublisher", (node, topic, "std_msgs/String", f"http://{address}:1/"))
     with closing(http.client.HTTPConnection("127.0.0.1", port, source_address=(address, 0))) as connection:

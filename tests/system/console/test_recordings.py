@@ -1,5 +1,3 @@
-"""Test recordings in the console: from a record, an investigator fetches the messages and an evidence bundle."""
-
 import copy
 import json
 import re
@@ -23,7 +21,6 @@ recorder: {enabled: true, memory: 16MiB, disk: 512MiB, triggers: []}
 
 @pytest.fixture(scope="module")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
-    """Run an appliance with a flight recorder."""
     config = tmp_path_factory.mktemp("console") / "appliance.yaml"
     config.write_text(CONFIG)
     with Appliance(options=("--config", str(config))) as running:

@@ -1,5 +1,3 @@
-"""Test a site's settings: a notice on the sign-in page, and required signatures."""
-
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Two appliances in the console: the panel, the banner, the switchover, and the page of the standby."""
-
 import errno
 import functools
 import json
@@ -39,11 +37,9 @@ class PairConsoles:
         self.windows = ExitStack()
 
     def url(self, name: str) -> str:
-        """Return the URL of an appliance's REST."""
         return f"https://{ADDRESSES[name]}:{PORT}"
 
     def open(self, name: str, role: str, **look: Any) -> Reader:
-        """Open the console of an appliance, with a token of this role."""
         return self.windows.enter_context(Reader(self.browser, self.url(name), self.tokens[role], **look))
 
 
@@ -113,7 +109,6 @@ def pair(site: StandbySite, remote_browser: Browser, tokens: dict[str, str]) -> 
 
 
 def panel(page: Page) -> Any:
-    """Return the panel with the two appliances."""
     return page.get_by_role("region", name="Two appliances")
 
 

@@ -28,7 +28,6 @@ class Site:
 
 @pytest.fixture(scope="session")
 def images() -> None:
-    """Build the images from this checkout."""
     need_root()
     build_images()
 
@@ -59,7 +58,6 @@ def demo(site: Site, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Compo
 
 @pytest.fixture
 def alone(site: Site, tmp_path: Path) -> Iterator[Compose]:
-    """Run `docker compose up`: the appliance alone, healthy."""
     compose = site.engine.compose(project(tmp_path), "alone")
     try:
         compose("up", "--detach", "--no-build")
@@ -70,7 +68,6 @@ def alone(site: Site, tmp_path: Path) -> Iterator[Compose]:
 
 
 def without(alone: Compose, right: str) -> None:
-    """Start it again with all capabilities except one."""
     text = yaml.safe_load((alone.directory / "compose.yaml").read_text())
     text["services"]["appliance"]["cap_add"].remove(right)
     text["services"]["appliance"]["restart"] = "no"

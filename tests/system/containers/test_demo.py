@@ -1,5 +1,3 @@
-"""Test `docker compose --profile demo up`: real nodes in containers, and the reachable ports of each network."""
-
 import json
 import re
 import socket
@@ -39,13 +37,10 @@ def attacks(demo: Compose) -> dict[str, dict[str, Any]]:
 
 
 def ports_open(where: Namespace, address: str, ports: range) -> tuple[int, ...]:
-    """Return the ports that accept a connection from there."""
     return where.run(lambda: scan(address, ports, seconds=3.0)).open
 
 
 def reaches(where: Namespace, address: str, port: int, family: int = socket.AF_INET) -> str:
-    """Return the result of a connection from there."""
-
     def attempt() -> str:
         with socket.socket(family, socket.SOCK_STREAM) as client:
             client.settimeout(2)

@@ -89,7 +89,6 @@ class Walk:
         return str(said)
 
     def fleet(self, *arguments: str) -> str:
-        """Run a command of the collector."""
         return self.compose.exec("collector", "rosrv-fleet", *arguments, timeout=120).stdout
 
     def wait_healthy(self, service: str) -> None:
@@ -102,7 +101,6 @@ class Walk:
         )
 
     def segments(self) -> set[str]:
-        """Return the names of the stored segments."""
         find = ("find", "/var/lib/rosrv-fleet/segments", "-type", "f")
         return set(self.compose.exec("collector", *find).stdout.split())
 

@@ -1,5 +1,3 @@
-"""Test compose.host.yaml: the nodes run on the machine itself, the appliance beside them in its container."""
-
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path

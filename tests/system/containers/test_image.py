@@ -1,5 +1,3 @@
-"""Test the images: their contents, and the environments in which they refuse to run."""
-
 import io
 import json
 import re

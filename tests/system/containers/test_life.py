@@ -1,5 +1,3 @@
-"""Test the life of the container: start, stop, kill, restart, removal, and the need for each capability."""
-
 import json
 import ssl
 import subprocess
@@ -158,7 +156,6 @@ def _said(*command: str) -> str:
 
 
 def rights(compose: Compose) -> list[str]:
-    """Return the capabilities in compose.yaml."""
     text = yaml.safe_load((compose.directory / "compose.yaml").read_text())
     granted: list[str] = text["services"]["appliance"]["cap_add"]
     return granted

@@ -1,5 +1,3 @@
-"""Test compose.standby.yaml: two appliances in containers; one is killed while the operator drives."""
-
 from collections.abc import Iterator
 from pathlib import Path
 

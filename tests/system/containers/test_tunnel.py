@@ -1,5 +1,3 @@
-"""Test a host behind a tunnel to the appliance in its container: enrolled, heard, revoked."""
-
 import os
 import subprocess
 from pathlib import Path

@@ -19,13 +19,11 @@ def cluster() -> Iterator[PostgresCluster]:
 
 @pytest.fixture
 def database(cluster: PostgresCluster) -> str:
-    """Return the connection string of an empty database."""
     return cluster.create(f"test_{secrets.token_hex(6)}")
 
 
 @pytest.fixture
 def site(database: str, tmp_path: Path) -> Iterator[FleetSite]:
-    """Return a running collector with a database of its own."""
     with running(FleetSite(tmp_path / "site", database)) as found:
         yield found
 

@@ -34,8 +34,6 @@ from tests.support.waiting import NoAnswerError, eventually
 
 @dataclass
 class FleetSite:
-    """A collector's folder and process."""
-
     folder: Path
     database: str
     limits: dict[str, Any] = field(default_factory=dict)
@@ -64,11 +62,9 @@ class FleetSite:
         (self.folder / "fleet.yaml").write_text(yaml.safe_dump(config | changes))
 
     def command(self, *arguments: str) -> list[str]:
-        """Return a command line of `rosrv-fleet`."""
         return [sys.executable, "-m", "rosrv_fleet", *arguments, "--config", str(self.folder / "fleet.yaml")]
 
     def run(self, *arguments: str, status: int = 0) -> subprocess.CompletedProcess[str]:
-        """Run a verb and check its exit status."""
         environment = os.environ | {"PYTHONPATH": str(ROOT / "fleet")}
         done = subprocess.run(
             self.command(*arguments), capture_output=True, text=True, check=False, env=environment
@@ -95,7 +91,6 @@ class FleetSite:
             return False
 
     def stop(self, with_signal: int = signal.SIGTERM) -> None:
-        """End the collector."""
         if self._process is not None:
             self._process.send_signal(with_signal)
             self._process.wait(60)
@@ -103,12 +98,10 @@ class FleetSite:
 
     @property
     def pid(self) -> int:
-        """Return the process id of the running collector."""
         assert self._process is not None
         return self._process.pid
 
     def kill(self) -> None:
-        """Kill the collector."""
         self.stop(signal.SIGKILL)
 
     def get(self, path: str, token: str | None = "", **parameters: Any) -> httpx.Response:
@@ -133,12 +126,10 @@ class FleetSite:
         return dict(found.json())
 
     def search(self, **words: Any) -> list[dict[str, Any]]:
-        """Return the records of a search."""
         records: list[dict[str, Any]] = self.answer("/v1/search", **words)["records"]
         return records
 
     def all(self, **words: Any) -> list[dict[str, Any]]:
-        """Return the records of all pages of a search."""
         found: list[dict[str, Any]] = []
         more: dict[str, str] = {}
         while True:
@@ -149,7 +140,6 @@ class FleetSite:
             more = {"cursor": page["cursor"]}
 
     def stored(self) -> int:
-        """Return the number of stored segments."""
         assert self.data is not None
         return sum(1 for _file in (self.data / "segments").rglob("*.gz"))
 
@@ -164,7 +154,6 @@ class FleetSite:
 
     @property
     def receipt_key(self) -> bytes:
-        """Return the public key of receipts."""
         assert self.data is not None
         return read_public_key(self.data / "receipts.pub")
 
@@ -210,7 +199,6 @@ class FleetRobot:
         self._open()
 
     def is_trusted(self) -> bool:
-        """Whether the collector accepts the certificate."""
         try:
             with self.site.client(self.certificates) as client:
                 return client.get(f"/v1/logs/{'0' * 32}").status_code == 200
@@ -223,7 +211,6 @@ class FleetRobot:
             log.signed(number, self.key.sign(text), self.public)
 
     def record(self, count: int, **changes: Any) -> None:
-        """Record decisions, and seal them with a signed checkpoint."""
         for number in range(count):
             self.log.record(decision(self.log, number, **changes))
             if number % 10 == 9:
@@ -231,18 +218,15 @@ class FleetRobot:
         asyncio.run(asyncio.wait_for(self.log.wait_signed(), 60))
 
     def sealed(self) -> int:
-        """Return the last sequence that a signed checkpoint seals."""
         return signed_checkpoints(self.log_file, 0, 1_000_000)[-1].sequence
 
     def pusher(self) -> SegmentPusher:
-        """Return the appliance's client for this robot."""
         tls = self.certificates
         url = f"https://127.0.0.1:{self.site.port}"
         collector = robot_connection(url, self.site.server.ca, tls.certificate, tls.key)
         return SegmentPusher(self.log_file, self.folder / "state", collector, self.site.receipt_key)
 
     def push(self) -> SegmentPusher:
-        """Push all sealed segments; fail with the first trouble."""
         pusher = self.pusher()
         while pusher.step() == 0:
             pass
@@ -251,7 +235,6 @@ class FleetRobot:
         return pusher
 
     def close(self) -> None:
-        """Close the log."""
         self.log.close()
 
 
@@ -267,7 +250,6 @@ def push_joined(robot: FleetRobot, state: Path) -> None:
 
 @contextmanager
 def running(site: FleetSite) -> Iterator[FleetSite]:
-    """Run a collector in a `with` block."""
     try:
         site.start()
         yield site

@@ -31,11 +31,9 @@ class PostgresCluster:
 
     @property
     def data(self) -> Path:
-        """Return the data directory."""
         return self.folder / "data"
 
     def database(self, name: str) -> str:
-        """Return the connection string of a database."""
         return f"host={self.folder} user=postgres dbname={name}"
 
     def make(self) -> None:
@@ -74,12 +72,10 @@ class PostgresCluster:
 
     @property
     def pid(self) -> int:
-        """Return the process id of the running server."""
         assert self._process is not None
         return self._process.pid
 
     def stop(self) -> None:
-        """Shut the server down."""
         if self._process is not None:
             self._process.send_signal(signal.SIGINT)
             self._process.wait(120)
@@ -103,20 +99,17 @@ class PostgresCluster:
             (self.data / "postmaster.pid").unlink(missing_ok=True)
 
     def create(self, name: str) -> str:
-        """Create a database and return its connection string."""
         with psycopg.connect(self.database("postgres"), autocommit=True) as connection:
             connection.execute(psycopg.sql.SQL("CREATE DATABASE {}").format(psycopg.sql.Identifier(name)))
         return self.database(name)
 
 
 def _is_stopped(pid: int) -> bool:
-    """Whether a process is stopped, or has ended."""
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in ("T", "Z")
 
 
 @contextmanager
 def postgres() -> Iterator[PostgresCluster]:
-    """Run a cluster; everything is removed at the end."""
     # A short path: the name of a Unix socket has at most 107 bytes.
     folder = Path(tempfile.mkdtemp(prefix="rosrv-pg-", dir="/tmp"))
     cluster = PostgresCluster(folder)

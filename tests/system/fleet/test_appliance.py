@@ -1,5 +1,3 @@
-"""A real appliance pushes its log to a real collector."""
-
 import json
 import os
 import shutil
@@ -38,7 +36,6 @@ def pushing(site: FleetSite, folder: Path) -> dict[str, Any]:
 
 
 def collector_state(appliance: Appliance) -> dict[str, Any]:
-    """Return the state of the collector in `rosrv status`."""
     return dict(appliance.status()["audit"]["collector"])
 
 

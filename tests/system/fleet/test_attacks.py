@@ -24,7 +24,6 @@ MakeRobot = Callable[..., FleetRobot]
 
 
 def segment(robot: FleetRobot, number: int) -> tuple[SegmentSummary, bytes]:
-    """Return a segment of a robot's log, uncompressed."""
     lines: list[bytes] = []
     summary = write_segment(robot.log_file, number, lines.append)
     assert summary is not None
@@ -173,7 +172,6 @@ def test_a_client_with_another_history_continues_from_the_common_part(
 
 @pytest.fixture
 def strict(database: str, tmp_path: Path) -> Iterator[FleetSite]:
-    """Return a collector with small limits of size."""
     limits = {"segment_bytes": 200_000, "upload_bytes": 50_000}
     with running(FleetSite(tmp_path / "site", database, limits)) as found:
         yield found
@@ -288,7 +286,6 @@ class _Busy(CollectorConnection):
     """A collector that asks every robot to wait for ten minutes."""
 
     def get(self, path: str, longest: int = 0) -> bytes:
-        """Refuse."""
         raise CollectorError(f"not now: {path} {longest}", 503, 600.0)
 
 

@@ -62,11 +62,9 @@ class Operator:
         self.run("bundle", "publish", str(folder), *here)
 
     def rollout(self, verb: str, *arguments: str, token: Path | None = None, status: int = 0) -> str:
-        """Run a verb of `rosrv-fleet rollout`."""
         return self.remote("rollout", verb, *arguments, token=token, status=status)
 
     def remote(self, *arguments: str, token: Path | None = None, status: int = 0) -> str:
-        """Run a command that asks the running collector."""
         url, ca = f"https://{self._site.address}:{self._site.port}", str(self._site.server.ca)
         access = ("--collector", url, "--ca", ca, "--token-file", str(token or self.token))
         return self.run(*arguments, *access, status=status)

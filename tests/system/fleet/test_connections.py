@@ -52,7 +52,6 @@ def _is_held(connection: ssl.SSLSocket) -> bool:
 
 
 def _is_healthy(site: FleetSite) -> bool:
-    """Whether the collector serves the next connection."""
     try:
         return site.get("/healthz", token=None).status_code == 200
     except httpx.TransportError:

@@ -53,7 +53,6 @@ def opened_page(width: int = 1280, theme: Literal["light", "dark"] = "light") ->
 
 
 def log_in(page: Page, site: FleetSite, token: str) -> None:
-    """Log in, with the keyboard."""
     page.goto(f"https://127.0.0.1:{site.port}/login")
     expect(page.get_by_label("Token")).to_be_focused()
     page.keyboard.type(token)
@@ -125,7 +124,6 @@ class RolloutSite:
 
     @property
     def token(self) -> str:
-        """Return the operator's token."""
         return self.operator.token.read_text().strip()
 
     def start(self) -> None:
@@ -145,19 +143,16 @@ class RolloutSite:
                 assert client.put("/v1/bundles/report", json=report).status_code == 204
 
     def order(self, token: str, number: str, **headers: str) -> httpx.Response:
-        """Send the form that stops the rollout."""
         cookie = {"Cookie": f"__Host-rosrv-fleet={token}"}
         with self.site.client() as client:
             return client.post(f"/rollouts/{PLACE}/stop", data={"number": number}, headers=cookie | headers)
 
     def rollout(self) -> dict[str, Any]:
-        """Return the last rollout."""
         return dict(self.site.get(f"/v1/rollouts/{PLACE}").json()["rollout"])
 
 
 @pytest.fixture
 def rollouts(site: FleetSite, tmp_path: Path, make_robot: MakeRobot) -> RolloutSite:
-    """Return a collector with a running rollout."""
     return RolloutSite(site, tmp_path, make_robot)
 
 
@@ -247,7 +242,6 @@ def test_axe_finds_nothing(rollouts: RolloutSite) -> None:
 
 
 def _violations(page: Page, rollouts: RolloutSite) -> Iterator[tuple[str, list[str]]]:
-    """Yield what is wrong with each page."""
     page.goto(f"https://127.0.0.1:{rollouts.site.port}/login")
     yield "login", _axe(page)
     page.get_by_label("Token").fill("wrong")

@@ -1,5 +1,3 @@
-"""The migrations of the collector's database."""
-
 from pathlib import Path
 
 import psycopg

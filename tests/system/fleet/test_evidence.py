@@ -43,7 +43,6 @@ class Carrier:
 
     @property
     def incoming(self) -> Path:
-        """Return the folder of unfinished uploads."""
         assert self.site.data is not None
         return self.site.data / "evidence" / "incoming"
 
@@ -61,7 +60,6 @@ def acts_of(site: FleetSite) -> list[tuple[str, str, str]]:
 
 @pytest.fixture
 def carrier(site: FleetSite) -> Carrier:
-    """Return an operator of a running collector."""
     return Carrier(site)
 
 

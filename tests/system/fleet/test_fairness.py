@@ -32,7 +32,6 @@ _RECORDS = 10_000  # of an attacker's segment: much processor time
 def _push_again_and_again(
     site: FleetSite, robot: FleetRobot, summary: SegmentSummary, body: bytes, ended: threading.Event
 ) -> int:
-    """Push a segment without a pause; return how often."""
     end = summary.header.end
     path = f"/v1/logs/{end.log}/segments/{end.number}/{summary.name}"
     count = 0
@@ -50,7 +49,6 @@ def _push_again_and_again(
 
 
 def _seen(site: FleetSite, uploads: set[str]) -> set[str]:
-    """Add the names of the uploads that are there now."""
     assert site.data is not None
     uploads.update(path.name for path in (site.data / "incoming").iterdir())
     return uploads
@@ -198,7 +196,6 @@ def test_a_damaged_segment_stops_no_other(site: FleetSite, make_robot: MakeRobot
 
 
 def every_hour(site: FleetSite) -> None:
-    """Do what the collector does every hour."""
     collector = make_collector(load_config(site.folder / "fleet.yaml"))
     collector.database.open()
     collector.pruner.step()

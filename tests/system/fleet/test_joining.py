@@ -42,7 +42,6 @@ def inviting(site: FleetSite) -> FleetSite:
 
 
 def invite(site: FleetSite, name: str, file: Path, *options: str) -> Path:
-    """Write an invitation to a file, as an operator does."""
     file.write_text(site.run("robot", "invite", name, *options).stdout)
     return file
 
@@ -86,7 +85,6 @@ def request_of(robot: FleetRobot, file: Path) -> dict[str, str]:
 
 
 def post(site: FleetSite, request: dict[str, str]) -> httpx.Response:
-    """Send a request to join."""
     with site.client() as client:
         return client.post("/v1/join", json=request)
 

@@ -1,5 +1,3 @@
-"""The two appliances of a robot with a standby are one robot of the collector, also after a takeover."""
-
 import json
 import socket
 from collections.abc import Iterator
@@ -32,18 +30,15 @@ class Fleet(FleetSite):
             return False
 
     def heard(self) -> dict[str, str | None]:
-        """Return when each appliance was heard."""
         rows = map(json.loads, self.run("robot", "list", "--json").stdout.splitlines())
         return {row["appliance"]: row["heard"] for row in rows}
 
     def proven(self) -> list[dict[str, Any]]:
-        """Return the results of `verify`, one for each log."""
         return [json.loads(line) for line in self.run("verify", "--json").stdout.splitlines()]
 
 
 @pytest.fixture
 def pair(tmp_path: Path) -> Iterator[tuple[Lab, StandbySite]]:
-    """Run both appliances, `a` active."""
     need_root()
     need_program("nft", "nftables")
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
@@ -91,7 +86,6 @@ def test_both_join_and_a_takeover_goes_on(
 
 
 def _join(lab: Lab, site: StandbySite, fleet: Fleet) -> None:
-    """Join with both appliances."""
     whole = fleet.server.certificate.read_bytes() + fleet.server.ca.read_bytes()
     fleet.server.certificate.write_bytes(whole)
     for name, words in (("a", ()), ("b", ("--appliance", "b"))):
@@ -103,7 +97,6 @@ def _join(lab: Lab, site: StandbySite, fleet: Fleet) -> None:
 
 
 def _configure(site: StandbySite, operator: Operator) -> None:
-    """Give both appliances the same settings of bundles."""
     for one in site.appliances.values():
         root, config = one.directory / "root.json", one.directory / "appliance.yaml"
         root.write_bytes((operator.repository / "root.json").read_bytes())

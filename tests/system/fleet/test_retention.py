@@ -1,5 +1,3 @@
-"""Retention on the collector, and PostgreSQL's full disk."""
-
 import gzip
 import json
 import os
@@ -239,7 +237,6 @@ def test_the_first_segments_of_a_day_are_indexed_at_the_same_time(database: str)
 
 @pytest.fixture
 def own_cluster() -> Iterator[PostgresCluster]:
-    """Return a PostgreSQL of the test's own."""
     with postgres() as cluster:
         yield cluster
 

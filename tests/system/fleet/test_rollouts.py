@@ -54,7 +54,6 @@ class Robot:
             self.stated = BundleStated(bundle.path, bundle.sha256, health=self.stated.health)
 
     def deny(self, denials: int) -> None:
-        """Set the number of denials in the last minute."""
         self.stated = BundleStated(self.stated.in_force, self.stated.sha256, health=BundleHealth(denials))
 
 
@@ -70,7 +69,6 @@ class Fleet:
         )
 
     def add(self, count: int) -> None:
-        """Add robots."""
         for _ in range(count):
             name = f"r-{len(self.robots)}"
             self.collector.enrol(RobotGroup(SITE, GROUP), name)
@@ -85,7 +83,6 @@ class Fleet:
             self.robots[name] = robot
 
     def poll(self, *names: str) -> None:
-        """Let robots poll once."""
         wanted = [self.robots[name] for name in names] or list(self.robots.values())
         parts = [wanted[start::6] for start in range(6)]
 
@@ -103,12 +100,9 @@ class Fleet:
             thread.join()
 
     def publish(self, *rings: Ring, **files: str) -> BundlePath:
-        """Sign and publish a bundle."""
         return self.site.repository.add(SITE, GROUP, bundle_files(**files), everywhere(None, *rings))
 
     def start(self, path: BundlePath, **gates: Any) -> dict[str, Any]:
-        """Begin a rollout as an operator does."""
-
         def there() -> bool:
             publication = self.collector.service.publication
             return publication is not None and str(path) in publication.bundles
@@ -138,7 +132,6 @@ class Fleet:
 
 
 def _nameless(fleet: Fleet) -> httpx.Client:
-    """Return a client without a certificate."""
     return httpx.Client(verify=ssl.create_default_context(cafile=fleet.site.authority.ca), trust_env=False)
 
 
@@ -148,7 +141,6 @@ def _context(site: RobotSite, certificate: Path, key: Path) -> Any:
 
 @pytest.fixture
 def fleet(tmp_path: Path, database: str) -> Iterator[Fleet]:
-    """Run a site and its collector."""
     site = RobotSite(tmp_path / "site")
     with collector(site.repository.folder, site.authority, database) as running:
         made = Fleet(site, running, tmp_path)

@@ -31,7 +31,6 @@ OTHER_USER = 61055  # a user without other processes
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
-    """Run one appliance for all tests here."""
     need_root()
     need_strongswan()
     need_program("nft", "nftables")
@@ -89,7 +88,6 @@ class Datagrams:
                 self._arrived.put((data[0], data[1][0]))
 
     def close(self) -> None:
-        """Stop listening."""
         self._socket.close()
 
 
@@ -104,14 +102,12 @@ def datagrams(site: TunnelSite, kit: Path) -> Iterator[Datagrams]:
 
 
 def send(joined: JoinedHost, port: int, data: bytes) -> None:
-    """Send one datagram through a tunnel."""
     with joined.outer.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.bind((joined.address, 0))
         sender.sendto(data, (OWN, port))
 
 
 def lab_host(site: TunnelSite) -> Host:
-    """Return the appliance's host."""
     assert isinstance(site.appliance.host, Host)
     return site.appliance.host
 
@@ -358,7 +354,6 @@ def charon_of(site: TunnelSite) -> int:
 
 
 def kilobytes(pid: int) -> int:
-    """Return the memory of a process."""
     found = re.search(r"VmRSS:\s+(\d+)", Path(f"/proc/{pid}/status").read_text())
     assert found is not None
     return int(found[1])

@@ -39,7 +39,6 @@ def test_an_encrypted_ed25519_authority(tmp_path: Path) -> None:
 
 
 def error_of_start(site: TunnelSite) -> str:
-    """Return the error of an appliance that does not start."""
     try:
         site.appliance.start()
     except AssertionError as error:

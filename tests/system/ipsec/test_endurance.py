@@ -32,7 +32,6 @@ connections {
 
 @pytest.fixture
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
-    """Run an appliance."""
     need_root()
     need_strongswan()
     with Lab("rosrv-endure") as lab, TunnelSite(lab, tmp_path_factory.mktemp("endure")) as one:

@@ -57,13 +57,11 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
 
 @pytest.fixture
 def laptop(site: TunnelSite, tmp_path: Path) -> Iterator[ScriptHost]:
-    """Return an unknown machine."""
     with ScriptHost(site.ocu, tmp_path / "laptop") as host:
         yield host
 
 
 def awaited(site: TunnelSite, name: str, out: Path, *options: str, verb: str = "add") -> str:
-    """Return a one-time token; its script is in `out`."""
     done = site.appliance.rosrv(
         "host", verb, name, "--appliance", MIDDLE, "--token", "--output", str(out), "--json", *options
     )
@@ -71,7 +69,6 @@ def awaited(site: TunnelSite, name: str, out: Path, *options: str, verb: str = "
 
 
 def row(site: TunnelSite, name: str) -> dict[str, Any]:
-    """Return a host in `rosrv host list`."""
     return next(one for one in site.hosts() if one["name"] == name)
 
 
@@ -153,7 +150,6 @@ def forged(site: TunnelSite, laptop: ScriptHost) -> None:
 
 
 def dropped(laptop: ScriptHost) -> int:
-    """Return the datagrams that the laptop's firewall has dropped."""
     rules = laptop.run("nft", "list", "table", "inet", "rosrv_protect").stdout
     return int(re.findall(r"udp dport .* counter packets (\d+) bytes \d+ drop", rules)[0])
 
@@ -211,7 +207,6 @@ def leave(site: TunnelSite, laptop: ScriptHost, before: list[str]) -> None:
 
 
 def commands(laptop: ScriptHost) -> list[bytes]:
-    """Return the command lines of the laptop's own processes."""
     found = []
     for pid in laptop.outer.namespace.processes():
         with contextlib.suppress(OSError):  # it has ended by now
@@ -272,7 +267,6 @@ def test_everything_over_rest(site: TunnelSite, laptop: ScriptHost, tmp_path: Pa
 
 
 def join_kit(laptop: ScriptHost, folder: Path, kit: bytes) -> None:
-    """Unpack a kit on the host and run its script."""
     folder.mkdir()
     (folder / "kit.tar.gz").write_bytes(kit)
     laptop.run("tar", "-xzf", str(folder / "kit.tar.gz"), "-C", str(folder))
@@ -347,7 +341,6 @@ def seconds_of(record: dict[str, Any]) -> float:
 
 @contextlib.contextmanager
 def endless(laptop: ScriptHost, commands: str) -> Iterator[None]:
-    """Repeat these shell commands on the laptop, ignoring failures."""
     loop = laptop.popen(["sh", "-c", f"while :; do {commands}; done >/dev/null 2>&1"], start_new_session=True)
     try:
         yield

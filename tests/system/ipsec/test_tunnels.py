@@ -41,7 +41,6 @@ def kit(site: TunnelSite) -> Path:
 
 @pytest.fixture
 def joined(site: TunnelSite, kit: Path) -> Iterator[JoinedHost]:
-    """Return `ocu` with its tunnel up."""
     with site.joined(kit) as host:
         yield host
 

@@ -19,13 +19,11 @@ def lab(request: pytest.FixtureRequest) -> Iterator[Lab]:
 
 @pytest.fixture
 def protected(lab: Lab) -> Host:
-    """Return the host that a firewall protects."""
     return lab.host("protected", "10.77.0.2/24", "fd77::2/64")
 
 
 @pytest.fixture
 def robot(lab: Lab) -> Host:
-    """Return the machine that the nodes run on."""
     return lab.host("robot", "10.77.0.10/24", "fd77::10/64")
 
 

@@ -1,5 +1,3 @@
-"""Test `appliance.network.public_address` on hosts of the lab with the addresses and routes of real machines."""
-
 import pytest
 
 from appliance.network import interfaces

@@ -1,5 +1,3 @@
-"""Test the firewall against the kernel, with both back ends."""
-
 import contextlib
 import itertools
 import os
@@ -83,7 +81,6 @@ def listening(host: Host, address: str = "::", port: int = 0) -> Iterator[int]:
 
 
 def settings(port: int, **others: Any) -> FirewallSettings:
-    """Return settings that protect `port` as the port of rosmaster."""
     return FirewallSettings(
         control_uid=CONTROL,
         rosmaster_uid=ROSMASTER,

@@ -1,5 +1,3 @@
-"""Access to the real rosmaster behind the firewall."""
-
 import os
 import select
 import socket
@@ -35,7 +33,6 @@ def host(lab: Lab) -> Host:
 
 @pytest.fixture
 def master(host: Host, tmp_path: Path) -> "Iterator[subprocess.Popen[str]]":
-    """Run the unmodified program, under its own user."""
     program = need_program("rosmaster", "python3-rosmaster")
     os.chown(tmp_path, ROSMASTER, ROSMASTER)
     for folder in (tmp_path, *list(tmp_path.parents)[:2]):

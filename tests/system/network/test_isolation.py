@@ -1,5 +1,3 @@
-"""Test the isolation `netns`: a namespace of the lab plays the bare host."""
-
 import contextlib
 import json
 import os
@@ -26,13 +24,11 @@ MASTER, FIRST, LAST = 11311, 20000, 20009
 
 @pytest.fixture
 def bare(lab: Lab) -> Host:
-    """Return the bare host that the appliance is started on."""
     return lab.host("bare", "10.77.0.2/24", "fd77::2/64")
 
 
 @pytest.fixture
 def node(lab: Lab) -> Host:
-    """Return a host of the network with nodes on it."""
     return lab.host("node", "10.77.0.30/24", "fd77::30/64")
 
 
@@ -58,7 +54,6 @@ def isolated(bare: Host, tmp_path: Path) -> Iterator[Isolation]:
 
 @contextlib.contextmanager
 def serving(namespace: Namespace, port: int) -> Iterator[socket.socket]:
-    """Listen on all addresses of a namespace."""
     with namespace.entered():
         server = socket.create_server(("::", port), family=socket.AF_INET6, dualstack_ipv6=True)
     server.settimeout(10)

@@ -1,5 +1,3 @@
-"""Test the lab, whose hosts are network namespaces."""
-
 import asyncio
 import os
 import signal

@@ -1,5 +1,3 @@
-"""Access to rosout behind the firewall, and the access of a compromised rosout."""
-
 import contextlib
 import json
 import socket
@@ -50,7 +48,6 @@ print(json.dumps([getattr(master, name)(*given) for name, *given in json.loads(s
 
 @pytest.fixture
 def host(lab: Lab) -> Host:
-    """Return the machine of the appliance."""
     need_program("iptables-legacy", "iptables")
     return lab.host("appliance", "10.77.0.2/24")
 

@@ -1,5 +1,3 @@
-"""Test `rosrv protect` on hosts of a lab, with real listeners and a real scan from outside."""
-
 import contextlib
 import json
 import os
@@ -27,7 +25,6 @@ INSIDE, KEPT, OUTSIDE = 40007, 40022, 39000
 
 @pytest.fixture
 def gateway(lab: Lab) -> Host:
-    """Return the appliance, as another machine."""
     return lab.host("gateway", "10.77.0.2/24", "fd77::2/64")
 
 
@@ -47,14 +44,12 @@ def protect(host: Host, *arguments: str, status: int = 0, **environment: str) ->
 
 
 def close(robot: Host, gateway: Host, *more: str) -> None:
-    """Put the protection in force."""
     addresses = ("--appliance", gateway.address, "--appliance", gateway.address6)
     protect(robot, *addresses, "--ports", FEW, "--apply", *more)
 
 
 @contextlib.contextmanager
 def listening(host: Host, *ports: int) -> Iterator[None]:
-    """Listen on TCP ports of a host, on all its addresses."""
     with contextlib.ExitStack() as stack:
         for port in ports:
             with host.entered():
@@ -75,7 +70,6 @@ def reaches(host: Host, address: str, port: int) -> bool:
 
 
 def rules(host: Host) -> str:
-    """Return all nftables rules of a host, without counters."""
     process = host.popen(["nft", "-s", "list", "ruleset"], stdout=subprocess.PIPE, text=True)
     return str(process.communicate(timeout=30)[0])
 

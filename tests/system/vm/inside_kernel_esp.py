@@ -25,7 +25,6 @@ test_a_local_program_is_no_host = attacks.test_a_local_program_is_not_a_tunnelle
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
-    """Run an appliance that tests its back end first."""
     home = tmp_path_factory.mktemp("site")
     with Lab("rosrv-kernel") as lab, TunnelSite(lab, home, options=("--api", "off")) as one:
         yield one
@@ -34,19 +33,16 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
 
 @pytest.fixture
 def joined(site: TunnelSite, kit: Path) -> Iterator[JoinedHost]:
-    """Return the trusted host, with its tunnel up."""
     with site.joined(kit) as host:
         yield host
 
 
 def middle(site: TunnelSite) -> Host:
-    """Return the appliance's host."""
     assert isinstance(site.appliance.host, Host)
     return site.appliance.host
 
 
 def told(host: Host, *command: str) -> str:
-    """Return the output of a program on a host."""
     process = host.popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     return str(process.communicate(timeout=LIMIT)[0])
 

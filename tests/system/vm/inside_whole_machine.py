@@ -24,7 +24,6 @@ from tests.support.wire import connect
 
 @pytest.fixture
 def lab() -> Iterator[Lab]:
-    """Make an Ethernet."""
     with Lab("rosrv-machine") as lab:
         yield lab
 

@@ -21,7 +21,6 @@ pytestmark = pytest.mark.timeout(2400)  # the first one makes the machine's disk
 
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
-    """Boot the machine once for all tests here."""
     with Machine(tmp_path_factory.mktemp("machine")) as one:
         yield one
         assert one.stop(), f"it was not shut down cleanly\n{one.story()}"

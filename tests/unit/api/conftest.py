@@ -8,5 +8,4 @@ from tests.support.rest_world import idle_application
 
 @pytest.fixture(scope="module")
 def app() -> FastAPI:
-    """Return the REST application of an idle appliance."""
     return idle_application()

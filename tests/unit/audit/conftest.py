@@ -52,19 +52,16 @@ def time() -> Iterator[VirtualClock]:
 
 @pytest.fixture
 def notary(tmp_path: Path) -> Notary:
-    """Return the memory of the test's signer."""
     return Notary(tmp_path / "notary")
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """Return the path of the test's log."""
     return tmp_path / "audit.db"
 
 
 @pytest.fixture
 def key() -> Ed25519PrivateKey:
-    """Return the key of the test's signer."""
     return Ed25519PrivateKey.generate()
 
 

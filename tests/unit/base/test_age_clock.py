@@ -1,5 +1,3 @@
-"""Tests of the clock of ages: it counts elapsed time and ignores a step of the machine's clock for a day."""
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +21,6 @@ class Machine:
     wrong: int = 0
 
     def begin(self) -> None:
-        """Start the process."""
         started = self.true
         self.age = AgeClock(
             self.path, wall=lambda: self.true + self.wrong, monotonic=lambda: self.true - started
@@ -38,14 +35,12 @@ class Machine:
         return self.age()
 
     def off(self, duration: int) -> None:
-        """Switch the machine off and on again."""
         self.true += duration
         self.begin()
 
 
 @pytest.fixture
 def machine(tmp_path: Path) -> Iterator[Machine]:
-    """Return a new machine with a correct clock."""
     machine = Machine(tmp_path / "age")
     machine.begin()
     yield machine

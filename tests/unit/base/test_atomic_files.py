@@ -1,5 +1,3 @@
-"""Tests of `appliance.base.atomic_files`."""
-
 import errno
 import os
 import re

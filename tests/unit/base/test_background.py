@@ -1,5 +1,3 @@
-"""Tests of `appliance.base.background`: work that lasts as long as its process."""
-
 import asyncio
 
 import pytest

@@ -1,5 +1,3 @@
-"""Tests of the clocks: the operating system's, and those that replace it for a block."""
-
 import asyncio
 import contextvars
 import time

@@ -1,5 +1,3 @@
-"""Tests of `appliance.base.deadlines`."""
-
 from appliance.base import clock
 from appliance.base.deadlines import Deadlines
 from tests.support.virtual_clock import VirtualClock

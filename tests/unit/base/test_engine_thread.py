@@ -1,5 +1,3 @@
-"""The thread that calls the turns of an engine."""
-
 import math
 import queue
 import threading
@@ -22,7 +20,6 @@ class Engine:
         self._dues = list(dues)  # seconds from a turn to the next one
 
     def turn(self, now: float) -> float | None:
-        """Note the turn."""
         self.turns.put(now)
         if self.closed:
             return None

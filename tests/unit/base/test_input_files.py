@@ -1,5 +1,3 @@
-"""Tests of files named by a person: regular files of bounded size are read; any other file is a clear error."""
-
 import logging
 import os
 import subprocess
@@ -52,7 +50,6 @@ def folder(place: Path) -> None:
 
 
 def huge(place: Path) -> None:
-    """Make a sparse file of a gigabyte."""
     place.touch()
     os.truncate(place, 1 << 30)
 
@@ -71,7 +68,6 @@ KINDS: dict[str, Callable[[Path], object]] = {
 
 @pytest.fixture
 def logs() -> Iterator[None]:
-    """Restore logging after a verb (`up`) that configured it."""
     root = logging.getLogger()
     handlers, level = [*root.handlers], root.level
     yield

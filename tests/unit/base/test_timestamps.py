@@ -1,5 +1,3 @@
-"""Tests of times on the command line."""
-
 import pytest
 
 from appliance.base.timestamps import TimestampError, parse_timestamp

@@ -94,7 +94,6 @@ def test_the_configuration_explains_valid_keys(tmp_path: Path, monkeypatch: pyte
 
 
 def _dependants(of: FastAPI) -> Iterator[Any]:
-    """Yield the dependencies of every route, recursively."""
     found = [getattr(route.original_route, "dependant", None) for route in iter_route_contexts(of.routes)]
     while found:
         if (dependant := found.pop()) is not None:
@@ -103,8 +102,6 @@ def _dependants(of: FastAPI) -> Iterator[Any]:
 
 
 def _said_of(reads: Any, value: Any) -> set[str]:
-    """Return the validation messages for a request body."""
-
     async def sent() -> dict[str, Any]:
         return {"type": "http.request", "body": json.dumps(value).encode()}
 

@@ -1,5 +1,3 @@
-"""Tests of withdrawing orders before they take effect."""
-
 import asyncio
 
 import pytest

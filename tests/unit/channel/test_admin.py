@@ -1,5 +1,3 @@
-"""Tests of `appliance.channel.admin`: every request that REST can make has a route and a role."""
-
 from appliance.channel.operations import CHANGES, OPERATIONS
 
 

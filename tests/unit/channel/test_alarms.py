@@ -1,5 +1,3 @@
-"""Tests of `appliance.channel.alarms`."""
-
 from typing import Any
 
 import pytest

@@ -1,5 +1,3 @@
-"""Tests of `appliance.channel.channel`."""
-
 import asyncio
 import os
 import socket

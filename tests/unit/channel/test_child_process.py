@@ -1,5 +1,3 @@
-"""Tests of the base class of the supervisor's children; the test holds the ends of supervisor and control."""
-
 import asyncio
 import socket
 from collections.abc import Callable, Coroutine
@@ -62,8 +60,6 @@ class Bench:
 
 
 def run(work: Callable[[Bench], Coroutine[Any, Any, None]]) -> None:
-    """Run the child's loop and a test's steps."""
-
     async def inside() -> None:
         bench = Bench()
         assert await bench.heard.get() == Ready({"x": 1})

@@ -1,5 +1,3 @@
-"""Tests of `appliance.channel.link`: peers and questions."""
-
 import asyncio
 import socket
 from collections.abc import Iterator
@@ -29,7 +27,6 @@ class World:
             self.link.answered(message.number, message)
 
     def life(self) -> Channel:
-        """Connect a new process at the other end."""
         here, there = socket.socketpair()
         self.link.attach(Channel(here, Ping | Pong))
         self.ends.append(Channel(there, Ping | Pong))
@@ -38,7 +35,6 @@ class World:
 
 @pytest.fixture
 def world() -> Iterator[World]:
-    """Return a world that is closed after the test."""
     world = World()
     yield world
     world.link.close()

@@ -1,5 +1,3 @@
-"""Tests of `appliance.channel.rest_meaning`: a request and its order, both ways, for every operation."""
-
 import json
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -19,7 +17,6 @@ TEXT = st.text(st.characters(codec="utf-8"), max_size=9)
 
 
 def values(kind: Any) -> st.SearchStrategy[Any]:
-    """Return values of a field's type."""
     if get_origin(kind) is Annotated:
         return values(get_args(kind)[0])
     if get_origin(kind) is Literal:
@@ -52,7 +49,6 @@ def orders(draw: st.DrawFn, operation: Operation) -> Any:
 
 
 def request_of(call: RestCall, if_match: str) -> ClientRequest:
-    """Return a call as the api receives it."""
     body = b"" if call.body is None else json.dumps(call.body).encode()
     return ClientRequest("10.0.0.1", call.method, call.target, if_match, "application/json", "", body)
 

@@ -1,5 +1,3 @@
-"""Tests of `appliance.channel.status_summary`."""
-
 from typing import Any
 
 import pytest

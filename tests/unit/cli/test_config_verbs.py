@@ -1,5 +1,3 @@
-"""The schema of `rosrv config`; `config.txt` has the rest."""
-
 import json
 from pathlib import Path
 

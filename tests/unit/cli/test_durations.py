@@ -1,5 +1,3 @@
-"""Tests of `appliance.cli.durations`."""
-
 import pytest
 
 from appliance.cli.durations import seconds_of

@@ -1,5 +1,3 @@
-"""Tests of `appliance.cli.lazy` and the table of verbs: imports, help and completion."""
-
 import os
 import subprocess
 import sys

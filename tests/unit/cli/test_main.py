@@ -1,5 +1,3 @@
-"""How `appliance.cli.main` ends with an error; `main.txt` has the rest."""
-
 import pytest
 
 from appliance.cli import main

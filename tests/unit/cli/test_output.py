@@ -1,5 +1,3 @@
-"""Tests of `appliance.cli.output`."""
-
 import json
 import sys
 

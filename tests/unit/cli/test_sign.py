@@ -1,5 +1,3 @@
-"""`rosrv sign`: signatures of the site beside files."""
-
 import json
 from pathlib import Path
 

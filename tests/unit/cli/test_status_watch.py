@@ -1,5 +1,3 @@
-"""Tests of `appliance.cli.status_watch`: on a terminal, in a pipe, and while the appliance is away."""
-
 import codecs
 import contextlib
 import fcntl

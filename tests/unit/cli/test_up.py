@@ -1,5 +1,3 @@
-"""Tests of the output of `rosrv up` when nodes may connect."""
-
 import errno
 import io
 import json

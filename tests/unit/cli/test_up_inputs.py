@@ -1,5 +1,3 @@
-"""Tests of `appliance.cli.up_inputs`: what `rosrv up` reads before it starts anything."""
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""The compiler's process: its answers, its end, and its limits."""
-
 import asyncio
 import contextlib
 import os

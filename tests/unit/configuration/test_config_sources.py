@@ -1,5 +1,3 @@
-"""Tests of `appliance.configuration.config_sources`."""
-
 import re
 from contextlib import suppress
 from dataclasses import asdict
@@ -14,14 +12,12 @@ from appliance.configuration.settings import Settings
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    """Return the path of a configuration file."""
     return tmp_path / "appliance.yaml"
 
 
 def mistakes(
     file: Path | None, environment: dict[str, str] | None = None, flags: dict[str, Any] | None = None
 ) -> list[str]:
-    """Return the mistakes, one line each."""
     with pytest.raises(ConfigError) as caught:
         resolve(file, environment or {}, flags or {})
     return [str(mistake) for mistake in caught.value.mistakes]

@@ -1,5 +1,3 @@
-"""Tests of `appliance.configuration.inventory`."""
-
 import hashlib
 import json
 from collections.abc import Iterator

@@ -1,5 +1,3 @@
-"""Tests of `appliance.configuration.settings`."""
-
 import json
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass

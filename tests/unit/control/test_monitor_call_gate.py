@@ -59,7 +59,6 @@ class Control:
         self.granted += effects
 
     def answer(self) -> MonitorCallAnswered:
-        """Ask for a call of /arm."""
         return asyncio.run(self.gate.answer(MonitorCallWanted(7, "/arm")))
 
 

@@ -1,5 +1,3 @@
-"""Control's start and end."""
-
 import asyncio
 import ipaddress
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Tests of the compiled module's build: at most once for each source, whole or not at all, the same everywhere."""
-
 import re
 import shutil
 import subprocess
@@ -42,11 +40,9 @@ class Checkout:
         self.write(_TEXT.format(1))
 
     def write(self, text: str) -> None:
-        """Replace the source."""
         self.source.write_text(text)
 
     def start(self, **environment: str) -> subprocess.Popen[str]:
-        """Start the program."""
         return subprocess.Popen(
             [sys.executable, str(self.program)],
             env=environment,
@@ -71,7 +67,6 @@ class Checkout:
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Checkout:
-    """Provide a checkout in which nothing is built."""
     return Checkout(tmp_path / "one")
 
 
@@ -85,7 +80,6 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Checkout:
 
 @pytest.fixture
 def built(original: Checkout, checkout: Checkout) -> Checkout:
-    """Provide a copy of a checkout in which the module is built."""
     shutil.copytree(original.folder, checkout.folder, dirs_exist_ok=True)
     return checkout
 

@@ -1,5 +1,3 @@
-"""Tests of a release's signature: standard tools check it and find changes."""
-
 import hashlib
 import json
 import subprocess

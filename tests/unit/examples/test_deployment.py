@@ -1,5 +1,3 @@
-"""Tests of the files that the Ansible role and the cloud-init example install (tests/system checks their syntax)."""
-
 from pathlib import Path
 from typing import Any
 

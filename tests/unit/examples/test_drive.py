@@ -1,5 +1,3 @@
-"""The simulated drive is deterministic, and its recording has every published message."""
-
 from pathlib import Path
 
 import pytest

@@ -1,5 +1,3 @@
-"""Tests of the shipped Grafana dashboard: its metrics exist, and Grafana can draw it."""
-
 import json
 import re
 from collections.abc import Iterator

@@ -14,7 +14,6 @@ FILE = Path(__file__).parents[3] / "examples" / "landshark" / "nodes" / "physics
 
 
 def load() -> ModuleType:
-    """Load the module from its file, as the nodes do: the module is not in a package."""
     spec = importlib.util.spec_from_file_location("landshark_physics", FILE)
     assert spec is not None
     assert spec.loader is not None

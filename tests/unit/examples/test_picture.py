@@ -1,5 +1,3 @@
-"""The picture in the documentation states the facts of the simulated drive."""
-
 import re
 from pathlib import Path
 from xml.etree import ElementTree
@@ -26,10 +24,8 @@ def test_the_picture_states_the_measured_facts() -> None:
 
 
 def words(svg: str) -> list[str]:
-    """Return the texts of a picture, in order."""
     return [one.text or "" for one in ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")]  # noqa: S314  our own text
 
 
 def tracks(svg: str) -> list[list[str]]:
-    """Return the points of each track."""
     return [points.split() for points in re.findall(r'<polyline [^>]*points="([^"]*)"', svg)]

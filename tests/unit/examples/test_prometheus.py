@@ -1,5 +1,3 @@
-"""Tests of the shipped alert rules: their metrics exist, and each has advice."""
-
 import re
 from pathlib import Path
 from typing import Any
@@ -15,7 +13,6 @@ COLLECTORS = set(re.findall(r"`(rosrv_fleet_\w+)`", (FOLDER.parents[1] / "docs/f
 
 
 def rules() -> list[dict[str, Any]]:
-    """Return all alerts."""
     groups = yaml.safe_load((FOLDER / "alerts.yaml").read_text())["groups"]
     return [rule for group in groups for rule in group["rules"]]
 

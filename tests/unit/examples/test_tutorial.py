@@ -1,5 +1,3 @@
-"""The tutorial's specifications work, and its quoted output is real."""
-
 import math
 import re
 import shutil
@@ -27,7 +25,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def said(*arguments: str) -> list[str]:
-    """Return the output of `rosrv monitor`."""
     return CliRunner().invoke(app, ["monitor", *arguments]).output.splitlines()
 
 

@@ -12,11 +12,9 @@ __all__ = ["MakeLog", "Notary", "key", "make_log", "notary"]  # fixtures and the
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """Return the path of the test's log."""
     return tmp_path / "audit.db"
 
 
 @pytest.fixture
 def certificates(tmp_path: Path) -> Certificates:
-    """Return the certificates of a receiver."""
     return make_certificates(tmp_path / "tls")

@@ -1,5 +1,3 @@
-"""The states of features: their fields in the documented status, their alarms and metrics."""
-
 from typing import Any
 
 import msgspec

@@ -12,8 +12,6 @@ from tests.support.unreadable_folders import make_unreadable
 
 
 class Desk:
-    """An operator's folder."""
-
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.secret = folder / "passphrase"
@@ -24,14 +22,12 @@ class Desk:
         (self.robot / "hosts.yaml").write_text("hosts: []\n")
 
     def run(self, *words: str, secret: Path | None = None) -> Result:
-        """Run a command of `rosrv-fleet bundle`."""
         options = ["--repository", str(self.folder / "repository")]
         if words[0] not in ("list", "publish"):
             options += ["--passphrase-file", str(secret or self.secret)]
         return CliRunner().invoke(bundle, [*words, *options])
 
     def good(self, *words: str) -> str:
-        """Run a command that succeeds; return its output."""
         done = self.run(*words)
         assert done.exit_code == 0, done.output
         return done.output
@@ -39,7 +35,6 @@ class Desk:
 
 @pytest.fixture
 def desk(tmp_path: Path) -> Desk:
-    """Return a folder with a repository and one group."""
     made = Desk(tmp_path)
     made.good("init")
     made.good("delegate", "site-a/arms")

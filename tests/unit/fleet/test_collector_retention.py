@@ -1,5 +1,3 @@
-"""Tests of `rosrv_fleet.retention`."""
-
 import gzip
 import os
 from datetime import date

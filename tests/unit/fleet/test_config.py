@@ -1,5 +1,3 @@
-"""Tests of `rosrv_fleet.config`: a wrong file is refused with its key and the reason."""
-
 import errno
 import os
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Tests of the collector's connections: unproven addresses leave room for robots and operators."""
-
 import asyncio
 import json
 from collections.abc import Callable

@@ -1,5 +1,3 @@
-"""Tests of `rosrv_fleet.evidence.store`: a damaged description hides no other bundle."""
-
 from pathlib import Path
 
 import msgspec

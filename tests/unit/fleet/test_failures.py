@@ -1,5 +1,3 @@
-"""Tests of `rosrv_fleet.failures`: the collector's background work continues after an unexpected error."""
-
 import asyncio
 import errno
 import os
@@ -45,8 +43,6 @@ class _Defect:
 
 
 class _WithoutMemory(Workers):
-    """Workers that have no memory for their work."""
-
     def submit(self, *_work: Any, **_named: Any) -> Future[Any]:
         future: Future[Any] = Future()
         future.set_exception(MemoryError())

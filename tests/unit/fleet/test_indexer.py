@@ -1,5 +1,3 @@
-"""Tests of `rosrv_fleet.indexer`: a failure that is not the segment's fault sets no segment aside."""
-
 import errno
 from collections.abc import Callable
 from concurrent.futures import Future

@@ -1,5 +1,3 @@
-"""Tests of `rosrv_fleet.bundles.publication`: when the collector signs a timestamp."""
-
 import datetime
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Tests of `rosrv_fleet.quotas`."""
-
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -77,7 +75,6 @@ def test_a_tiny_segment_has_its_price(clock: _Clock, tmp_path: Path) -> None:
 
 @pytest.fixture
 def machine() -> Iterator[VirtualClock]:
-    """The clock that pauses are measured with."""
     machine = VirtualClock()
     with using(machine):
         yield machine

@@ -1,5 +1,3 @@
-"""Tests of `rosrv_fleet.request_body`."""
-
 import asyncio
 from collections.abc import Callable
 

@@ -1,5 +1,3 @@
-"""Tests of the commands `rosrv-fleet robot` and `token`: groups are pinned, and every act is recorded with its user."""
-
 import errno
 import json
 import os
@@ -44,7 +42,6 @@ from tests.support.virtual_clock import VirtualClock
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    """Return the data folder of a collector."""
     (tmp_path / "fleet.yaml").write_text("data: data\ncertificate: c\nkey: k\n")
     (tmp_path / "data").mkdir()
     return tmp_path / "data"

@@ -1,5 +1,3 @@
-"""The state machine of rollouts keeps its invariants for all robots, reports and times."""
-
 from collections.abc import Mapping
 
 import pytest
@@ -50,7 +48,6 @@ def begun(terms: Terms | None = None, gates: HealthGates = GATES) -> BundleRollo
 
 
 def all_at(now: float, in_force: str = NEW) -> dict[str, RobotSeen]:
-    """Return robots that all report the same, now."""
     return {robot: RobotSeen(now, in_force) for robot in ROBOTS}
 
 

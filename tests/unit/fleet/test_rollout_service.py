@@ -1,5 +1,3 @@
-"""Tests of `rosrv_fleet.rollouts.service`: orders, reports and ticks at the same time. No threads, no database."""
-
 import asyncio
 from collections.abc import Callable, Coroutine
 from pathlib import Path
@@ -39,7 +37,6 @@ class _Memory(RolloutStore):
         self.meddle: Callable[[], None] = lambda: None
 
     def change(self, **fields: Any) -> None:
-        """Change the rollout, as another collector does."""
         self.stored = StoredRollout(1, msgspec.structs.replace(self.stored.rollout, **fields))
 
     def latest(self) -> dict[RobotGroup, StoredRollout]:

@@ -1,5 +1,3 @@
-"""Tests of `rosrv_fleet.search_sql`: the globs of SQLite, and no input in a statement."""
-
 import re
 import sqlite3
 from collections.abc import Iterator

@@ -1,5 +1,3 @@
-"""Tests of `rosrv_fleet.server_certificate`: a certificate is of use to robots, or the error says how to make one."""
-
 from pathlib import Path
 
 import pytest
@@ -11,7 +9,6 @@ from tests.support.certificates import make_certificates
 
 
 def config_in(folder: Path, listen: str = "0.0.0.0:8444") -> FleetConfig:
-    """Return a configuration with the certificate in this folder."""
     return FleetConfig(certificate=folder / "server.pem", key=folder / "server.key", listen=listen)
 
 

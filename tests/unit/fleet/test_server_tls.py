@@ -1,5 +1,3 @@
-"""Tests of `rosrv_fleet.server.ServerTls`."""
-
 import hashlib
 import ssl
 from pathlib import Path

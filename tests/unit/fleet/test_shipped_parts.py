@@ -1,5 +1,3 @@
-"""The collector runs with the parts of the appliance that its wheel and its image contain."""
-
 import re
 import subprocess
 import sys

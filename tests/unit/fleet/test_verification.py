@@ -1,5 +1,3 @@
-"""Tests of `rosrv_fleet.verification`: a proof while segments are removed."""
-
 import asyncio
 import gzip
 import itertools

@@ -1,5 +1,3 @@
-"""Workers of the collector end with it."""
-
 import fcntl
 import os
 import signal

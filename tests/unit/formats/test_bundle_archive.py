@@ -1,5 +1,3 @@
-"""Archives of bundles: one form for each content, and nothing else is accepted."""
-
 import io
 import tarfile
 
@@ -31,7 +29,6 @@ def tar(*members: tuple[tarfile.TarInfo, bytes], form: int = tarfile.USTAR_FORMA
 
 
 def member(name: str, kind: bytes = tarfile.REGTYPE, **fields: object) -> tarfile.TarInfo:
-    """Return a header."""
     made = tarfile.TarInfo(name)
     made.type = kind
     for field, value in fields.items():

@@ -1,5 +1,3 @@
-"""Tests of segments: written from real logs, proven with the key alone, and refused after any change."""
-
 import io
 import json
 from collections.abc import Callable
@@ -32,7 +30,6 @@ _LARGEST = 1 << 20
 
 @pytest.fixture
 def public(key: Ed25519PrivateKey) -> bytes:
-    """Return the raw public key of the log's signer."""
     return key.public_key().public_bytes_raw()
 
 
@@ -47,7 +44,6 @@ def segments(make_log: MakeLog, path: Path) -> list[bytes]:
 
 
 def fill(log: AuditLog, count: int) -> None:
-    """Record decisions, one batch for each five."""
     for number in range(count):
         strange = {"detail": {"text": "naïve\0\x1b", "value": 0.1}, "reason": "a\0b", "caller_id": "/x\u202e"}
         log.record(decision(log, number, **(strange if number % 3 == 0 else {})))

@@ -1,5 +1,3 @@
-"""Tests of `appliance.forwarding.process`: every control gets the report of missed records."""
-
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -23,12 +21,10 @@ class Control:
         self.hears: Callable[[object, tuple[int, ...]], None] = lambda _message, _descriptors: None
 
     def happened(self, event: str, _text: str, **detail: Any) -> None:
-        """Record, as the trail does."""
         if event == "forwarding gap":
             self.gaps.append(detail["count"])
 
     def attach(self, _loop: object, received: Any, *_ends: object) -> None:
-        """Attach, as a channel does."""
         self.hears = received
 
     def close(self) -> None:
@@ -36,7 +32,6 @@ class Control:
 
 
 def missed(count: int) -> messages.ForwardingReported:
-    """Return the report that this number of records was missed."""
     return messages.ForwardingReported(missed=count)
 
 
@@ -48,8 +43,6 @@ def controls() -> list[Control]:
 
 @pytest.fixture
 def reports(controls: list[Control]) -> ProgressReports:
-    """Return reports that go to the current control."""
-
     def send(message: messages.ForwardingReported) -> bool:
         if controls:
             controls[-1].hears(message, ())
@@ -61,7 +54,6 @@ def reports(controls: list[Control]) -> ProgressReports:
 def begin(
     controls: list[Control], reports: ProgressReports, progress: messages.ForwardingReported
 ) -> Control:
-    """Start a new control."""
     control = Control()
     control.forwarded.link.attach(cast(Channel, control))
     controls.append(control)

@@ -1,5 +1,3 @@
-"""Tests of reading `ipsec/hosts.yaml`."""
-
 from pathlib import Path
 
 import pytest

@@ -26,7 +26,6 @@ _NUMBERS = itertools.count(1 << 70)
 
 
 def serials(count: int) -> list[str]:
-    """Return serial numbers as the authority makes them."""
     return [f"{next(_NUMBERS):x}" for _ in range(count)]
 
 
@@ -38,7 +37,6 @@ def store(tmp_path: Path) -> Iterator[StateStore]:
 
 
 def bytes_of_list(revoked: RevokedCertificates, enrolled: set[str], directory: Path) -> int:
-    """Return the length of the list that charon gets."""
     directory.mkdir()
     rows = [(row.serial, row.moment) for row in revoked.listed(enrolled)]
     signed = x509.load_pem_x509_crl(CertificateAuthority(directory).revocations(rows))

@@ -1,5 +1,3 @@
-"""Tests of the authority's key: kinds, passphrases, and error messages."""
-
 import os
 from pathlib import Path
 

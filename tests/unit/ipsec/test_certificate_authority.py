@@ -1,5 +1,3 @@
-"""Tests of the certificate authority: what it makes, what it refuses, how it keeps its key."""
-
 import base64
 import datetime
 import stat
@@ -126,7 +124,6 @@ def test_the_list_of_revoked_certificates_is_signed_and_complete(tmp_path: Path)
 
 
 def number_of(revocations: bytes) -> int:
-    """Return the number of a list."""
     extension = x509.load_pem_x509_crl(revocations).extensions.get_extension_for_class(x509.CRLNumber)
     return extension.value.crl_number
 

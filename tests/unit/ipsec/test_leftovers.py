@@ -1,5 +1,3 @@
-"""appliance/ipsec/leftovers.py: what of the kernel's states and policies is charon's."""
-
 import subprocess
 
 import pytest

@@ -36,7 +36,6 @@ class Desk:
         ).encode()
 
     def sign(self, *, removed: int | None) -> None:
-        """Have the next checkpoint signed."""
         text = self.text(removed=removed)
         self.signed.approve(text)
         self.texts.append(text)

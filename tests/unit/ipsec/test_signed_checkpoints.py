@@ -12,7 +12,6 @@ _NONE = "0" * 64
 
 
 def checkpoint(number: int, previous: str = _NONE, log: str = "a" * 32, digest: str = "b" * 64) -> bytes:
-    """Return the text of a checkpoint."""
     return (
         f"rosrv audit checkpoint 1\nlog {log}\nnumber {number}\nsequence {number * 10}\n"
         f"hash {digest}\ntime 1\nprevious {previous}\n"

@@ -1,5 +1,3 @@
-"""Tests of the signer as a process of its own, spoken to over its lifeline and its link."""
-
 import asyncio
 import contextlib
 import os
@@ -86,7 +84,6 @@ class SignerProcess:
         return self.links[-1]
 
     def end(self) -> int:
-        """Stop it and return its exit status."""
         for link in self.links:
             link.close()
         with contextlib.suppress(ChannelClosedError):
@@ -96,7 +93,6 @@ class SignerProcess:
 
 
 def hear(channel: Channel) -> Any:
-    """Return the next message on a channel."""
     assert select.select([channel], [], [], _LIMIT_SECONDS)[0], "no answer"
     ((message, _descriptors),) = channel.receive()
     return message
@@ -104,7 +100,6 @@ def hear(channel: Channel) -> Any:
 
 @pytest.fixture
 def signer(tmp_path: Path) -> Iterator[SignerProcess]:
-    """A signer in service, with an empty directory of its own."""
     (tmp_path / "signer").mkdir(mode=0o700)
     running = SignerProcess(tmp_path / "signer")
     assert isinstance(hear(running.lifeline), Ready)

@@ -1,5 +1,3 @@
-"""Tests of charon's configuration."""
-
 from pathlib import Path
 
 from appliance.channel.messages import TunnelHost, TunnelsStated

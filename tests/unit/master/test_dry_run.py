@@ -68,7 +68,6 @@ TREES = st.sampled_from([{}, {"x": 1}, {"x": {"y": 1}}, {"x": {"y": {"z": 1}}}])
 
 
 def text_of(written: dict[str, dict[str, str]]) -> str:
-    """Return the text of the policy."""
     return "".join(
         f"[{name}]\n" + "".join(f"{key} = {who}\n" for key, who in lines.items())
         for name, lines in written.items()
@@ -76,7 +75,6 @@ def text_of(written: dict[str, dict[str, str]]) -> str:
 
 
 def held(world: ControlParts) -> set[Row]:
-    """Return the registrations and grants of all nodes."""
     return {
         (str(node.host), node.name, WORDS[each.kind], each.resource)
         for node in world.registry.all()

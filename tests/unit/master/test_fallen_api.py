@@ -43,7 +43,6 @@ class World:
         self.begin(require_proof=False)
 
     def begin(self, *, require_proof: bool) -> None:
-        """Start control again with the saved tokens."""
         self.tokens = TokenOrders(self.store, self, Deadlines(), self.token_changed)  # type: ignore[arg-type]  # as above
         parts: Any = self
         self.link = RestLink(
@@ -54,18 +53,15 @@ class World:
         """Send no notification."""
 
     async def carry_out(self, request: AnyRequest, *, who: str) -> AdminAnswer[Any]:
-        """Record an order."""
         self.done.append((request, who))
         return AdminAnswer(True)
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:
-        """Record an event."""
         self.recorded.append({"event": event, "reason": reason, **fields})
         return "id"
 
     @property
     def refusals(self) -> list[dict[str, Any]]:
-        """Return the records of refused orders."""
         return [one for one in self.recorded if one["event"] == "order refused"]
 
 
@@ -82,7 +78,6 @@ class Api:
     async def ask(
         self, request: AdminRequest[A], shown: str = "", asked: ClientRequest | None = None
     ) -> AdminAnswer[A]:
-        """Send a message and return control's answer."""
         self._answers += 1
         self.channel.send(RequestMade(self._answers, request, shown, asked))
         while True:
@@ -92,7 +87,6 @@ class Api:
             await self._ear.until(len(self._ear.messages) + 1)
 
     async def signed(self, token: str, asked: ClientRequest) -> ClientRequest:
-        """Return the request of an honest holder of a token."""
         answer = await self.ask(admin.ChallengeWanted(), reading_key(token))
         challenge = answer.given().challenge
         stated = statement(
@@ -106,7 +100,6 @@ class Api:
         return msgspec.structs.replace(asked, proof=proof_of(token, challenge, stated))
 
     def close(self) -> None:
-        """Close both ends."""
         self.channel.close()
         self.control.close()
 
@@ -123,7 +116,6 @@ def world(tmp_path: Path) -> Iterator[World]:
 
 @pytest.fixture
 async def token(world: World) -> str:
-    """Return the token of alice, an admin."""
     return (await world.tokens.add(TokenAdd("alice", "admin", 600))).token
 
 

@@ -48,7 +48,6 @@ def quota_class(host: Address) -> QuotaClass:
 
 
 def charged(there: ParameterMirror) -> dict[Address, int]:
-    """Return the charge of each host."""
     return dict(there.charges.pool.holders())
 
 
@@ -59,7 +58,6 @@ class Ledger:
         self.owners: dict[tuple[str, ...], Address] = {(): APPLIANCE}
 
     def set(self, tree: Value, key: str, owner: Address) -> None:
-        """Record that this host set the key to `tree`."""
         parts = tuple(parts_of(key))
         new = next(
             parts[:depth] for depth in range(len(parts) + 1) if self._is_new(tree, parts[:depth], parts)
@@ -70,11 +68,9 @@ class Ledger:
                 self.owners[place] = owner
 
     def drop(self, key: tuple[str, ...]) -> None:
-        """Drop the key and all keys below it."""
         self.owners = {place: owner for place, owner in self.owners.items() if place[: len(key)] != key}
 
     def charges(self, tree: Value) -> dict[Address, int]:
-        """Return the charge of each host."""
         found: Counter[Address] = Counter()
         for place, value in _places(tree).items():
             alone: Value = {} if isinstance(value, dict) else value

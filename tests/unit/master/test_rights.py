@@ -106,14 +106,12 @@ def text_of(granted: frozenset[str], missing: frozenset[str], keyed: bool) -> st
 
 
 def argument_of(parameter: CallParameter[Any]) -> Any:
-    """Return a canonical value for a parameter of a call."""
     if parameter in {CALLER_API, SERVICE_API}:
         return ApiUri(URI, parse_node_uri(URI))
     return KEY_GIVEN if parameter is KEY else THING
 
 
 def gate_says(policy: Policy, call: RosCall[Any], tree: Tree) -> Decision:
-    """Return RVMaster's answer to the call."""
     gate = CallGate(lambda: policy, Registry(), HostLimits())
     name = "" if call.identity is Identity.NOBODY else NAME
     arguments = tuple(argument_of(one) for one in call.method.parameters)
@@ -142,7 +140,6 @@ def deeds(call: RosCall[Any]) -> list[Request]:
 
 
 def case_passes(policy: Policy, request: Request, allowed: bool) -> bool:
-    """Whether a case that expects this answer passes."""
     word = "allow" if allowed else "deny"
     deed = f"{SAID[request.category]} {request.resource}"
     text = f"cases:\n- host: {request.host}\n  node: {NAME}\n  {word}: ['{deed}']\n"

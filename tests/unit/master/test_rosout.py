@@ -21,7 +21,6 @@ class Desk:
         self.rosout = Rosout("/rosrv", self.sent.append, lambda monitor: f"{monitor}.rv", lambda: self.now)
 
     def said(self) -> list[dict[str, object]]:
-        """Return the messages as a subscriber reads them."""
         fields = [read_fields(DEFINITIONS, "rosgraph_msgs/Log", one.data) for one in self.sent]
         return [one for one in fields if one is not None]
 

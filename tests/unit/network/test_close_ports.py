@@ -1,5 +1,3 @@
-"""Tests of the rules file that `rosrv protect` makes, without a kernel."""
-
 import pytest
 
 from appliance.network.close_ports import (

@@ -1,5 +1,3 @@
-"""Tests of the choice between ESP in the kernel and in user space."""
-
 import errno
 import os
 import shutil

@@ -1,5 +1,3 @@
-"""Tests of waiting for a program while it makes progress."""
-
 import logging
 import os
 import signal
@@ -22,7 +20,6 @@ sys.stdout.write(str(len(sys.stdin.read())))
 
 
 def program(text: str) -> "subprocess.Popen[str]":
-    """A Python program with pipes."""
     return subprocess.Popen(
         [sys.executable, "-I", "-S", "-c", text],
         stdin=subprocess.PIPE,

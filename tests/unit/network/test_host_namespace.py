@@ -1,5 +1,3 @@
-"""Tests of the check whether a network namespace is the machine's own."""
-
 from pathlib import Path
 
 from appliance.network.namespaces import bridges, is_contained, lives_on_the_machines_network

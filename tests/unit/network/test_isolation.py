@@ -1,5 +1,3 @@
-"""Tests of the isolation's rules on the host, without a kernel."""
-
 from pathlib import Path
 
 import pytest

@@ -1,5 +1,3 @@
-"""Tests of the port scan on loopback."""
-
 import contextlib
 import errno
 import os

@@ -1,5 +1,3 @@
-"""`address_of` returns objects that equal those of `ipaddress`."""
-
 import ipaddress
 
 import pytest

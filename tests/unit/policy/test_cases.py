@@ -1,5 +1,3 @@
-"""The test cases beside a policy: host, action, allow or deny."""
-
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st

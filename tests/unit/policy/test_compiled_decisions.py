@@ -41,7 +41,6 @@ def key_matches(key: str, name: str) -> bool:
 
 
 def rank(key: str) -> tuple[int, int, int]:
-    """Return the rank of a key; a greater rank is more specific."""
     return ("*" not in key, len(key.partition("*")[0]), "**" not in key)
 
 

@@ -1,5 +1,3 @@
-"""Explaining a decision: the deciding rule, how it matches the host, and the overridden rules."""
-
 import ipaddress
 
 from appliance.policy.decision_reasons import DecisionExplanation, explain, render

@@ -1,5 +1,3 @@
-"""Comparing two policies by recorded requests."""
-
 import ipaddress
 
 from appliance.policy.diff import diff

@@ -1,5 +1,3 @@
-"""docs/policy.md and docs/reference/policy-file.md agree with the program."""
-
 import re
 from pathlib import Path
 

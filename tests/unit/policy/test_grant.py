@@ -1,5 +1,3 @@
-"""The smallest change that grants a denied request, and grants no other host anything."""
-
 import ipaddress
 from dataclasses import replace
 from itertools import product

@@ -1,5 +1,3 @@
-"""Names of hosts mean the same addresses everywhere, and an address has one label."""
-
 from ipaddress import ip_address, ip_network
 
 import pytest

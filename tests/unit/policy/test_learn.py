@@ -1,5 +1,3 @@
-"""Tests of `appliance.policy.learn`."""
-
 import ipaddress
 
 import pytest

@@ -1,5 +1,3 @@
-"""Deciding requests by a compiled policy."""
-
 import ipaddress
 import re
 from dataclasses import replace

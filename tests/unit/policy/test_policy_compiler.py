@@ -1,5 +1,3 @@
-"""Compiling a policy: any text gives a policy, or one error with the position of every mistake."""
-
 import ipaddress
 import time
 

@@ -1,5 +1,3 @@
-"""The lint warns of rights that an operator most likely did not intend."""
-
 import ipaddress
 
 import pytest

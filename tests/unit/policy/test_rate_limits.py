@@ -1,5 +1,3 @@
-"""`[Limits]`: its syntax, its effect on each host, and its errors."""
-
 import ipaddress
 
 import pytest

@@ -1,5 +1,3 @@
-"""No process runs out of file descriptors before a quota is used up."""
-
 import resource
 from collections.abc import Iterator
 from pathlib import Path
@@ -53,7 +51,6 @@ def test_the_configuration_has_the_tables_bounds() -> None:
 
 @pytest.fixture
 def few_descriptors() -> Iterator[None]:
-    """Let the process open a thousand files."""
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (1000, before[1]))
     yield

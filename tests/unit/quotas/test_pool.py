@@ -1,5 +1,3 @@
-"""A pool that is counted by host is compared with a naive count."""
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,5 +1,3 @@
-"""The table of quotas, and the page that is made from it."""
-
 import ast
 from pathlib import Path
 

@@ -61,7 +61,6 @@ class Dialogue:
             getattr(self, "_peer_" + words[0].replace("-", "_"))(who, *words[1:])
 
     def string(self, word: str) -> bytes:
-        """Return the frame of a word."""
         return encode_frame(word.encode())
 
     def _bytes(self, words: tuple[str, ...]) -> bytes:

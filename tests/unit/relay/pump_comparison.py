@@ -104,7 +104,6 @@ class ComparedRelay(Monitored):
         return super().until(condition, seconds)
 
     def publish(self, topic: str) -> None:
-        """Connect the publisher of this topic, as soon as the relay asks for it."""
         self.hears(UpstreamWanted, key="k", topic=topic)
         self.state(UpstreamFound("k", topic, LOOPBACK, self.publisher.getsockname()[1]))
         peer = self.accept(self.publisher)
@@ -114,7 +113,6 @@ class ComparedRelay(Monitored):
         self.publishers[topic] = peer
 
     def subscribe(self, topic: str, name: str) -> None:
-        """Connect a subscriber that is served."""
         self.state(GrantInstalled("k", topic, LOOPBACK, name))
         peer = self.connect(encode_header(WANTED | {"topic": topic, "callerid": name}))
         if topic not in self.publishers:
@@ -127,7 +125,6 @@ class ComparedRelay(Monitored):
         return self.engine.topics["k", topic][0].counters.following - 1 == self.expected[topic]
 
     def take_all(self) -> None:
-        """Let the relay receive all messages that were sent."""
         self.until(lambda: all(map(self.arrived, _TOPICS)))
 
     def answered(self, revision: int) -> None:
@@ -135,7 +132,6 @@ class ComparedRelay(Monitored):
         self.until(lambda: self.taken(SpecificationsTaken, revision))
 
     def collect(self) -> None:
-        """Add up the reports to control."""
         self.told += [message for message, _fds in self.control.receive()]
         kept = []
         for message in self.told:
@@ -201,12 +197,10 @@ class PumpComparison:
                 side.subscribe(topic, name)
 
     def close(self) -> None:
-        """Close both relays."""
         for side in self.both:
             side.close()
 
     def step(self) -> None:
-        """Perform one random step with both relays, and compare."""
         steps = (
             (900, self._batch), (60, self._read), (12, self._leave), (8, self._join), (8, self._both_at_once),
             (8, self._switch), (5, self._load), (5, self._break), (5, self._end), (5, self._large), (10, self._compare),
@@ -395,7 +389,6 @@ class PumpComparison:
 
     @contextlib.contextmanager
     def _watching(self, side: ComparedRelay) -> Any:
-        """Count whether Python received this batch."""
         seen: list[bool] = []
 
         def watch(frame: FrameType, event: str, _argument: Any) -> None:

@@ -1,5 +1,3 @@
-"""The table of control's statements."""
-
 from appliance.channel.messages import (
     ClientGranted,
     ClientRevoked,
@@ -24,7 +22,6 @@ EVERYTHING = (NODE, TOPIC, GRANT, SERVICE, CLIENT)
 
 
 def stated() -> GrantTable:
-    """Return a table with one statement of each kind."""
     table = GrantTable()
     for message in EVERYTHING:
         table.state(message)

@@ -1,5 +1,3 @@
-"""The event loop: descriptors and timers."""
-
 import itertools
 import socket
 import threading
@@ -12,7 +10,6 @@ from appliance.relay.loop import ACCEPTING, QUANTUM, READ, SYSTEM, UNKNOWN, Even
 
 @pytest.fixture
 def loop() -> Iterator[EventLoop]:
-    """Yield a loop, and close it."""
     loop = EventLoop()
     yield loop
     loop.close()
@@ -69,7 +66,6 @@ class Costs:
         self._open: list[socket.socket] = []
 
     def ready(self, payer: str, cost: int, times: float = float("inf")) -> socket.socket:
-        """Watch a socket that is ready this number of times, at this cost each time."""
         ours, theirs = socket.socketpair()
         self._open += (ours, theirs)
         theirs.send(b"x")
@@ -102,7 +98,6 @@ class Costs:
 
 @pytest.fixture
 def costs() -> Iterator[Costs]:
-    """A loop with handlers of known cost."""
     costs = Costs()
     yield costs
     costs.close()

@@ -1,5 +1,3 @@
-"""The pump does what the path in Python does (docs/dev/assurance.md)."""
-
 import gc
 
 import pytest

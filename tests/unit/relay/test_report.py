@@ -1,5 +1,3 @@
-"""Reports to control."""
-
 import socket
 from collections.abc import Iterator
 from dataclasses import replace
@@ -37,11 +35,9 @@ class Control:
         self._channel = Channel(ours, RelayLink)
 
     def heard(self) -> list[Any]:
-        """Return the received messages."""
         return [message for message, _fds in self._channel.receive()]
 
     def close(self) -> None:
-        """Close both ends."""
         self.link.close()
         self._channel.close()
         self.loop.close()
@@ -49,7 +45,6 @@ class Control:
 
 @pytest.fixture
 def control() -> Iterator[Control]:
-    """Return a receiver."""
     control = Control()
     yield control
     control.close()

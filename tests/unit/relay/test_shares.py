@@ -66,7 +66,6 @@ def publish(world: World, number: int, host: str, header: dict[str, str] = HEADE
 
 
 def carries_images(world: World, publisher: Peer, subscriber: Peer) -> None:
-    """Check that ten of the robot's images are relayed."""
     for _ in range(10):
         world.push(publisher, IMAGE)
         world.gets(subscriber, IMAGE)

@@ -16,12 +16,10 @@ TOLD = HEADER | {"message_definition": "string data\n"}
 
 
 def text(word: str) -> bytes:
-    """Return a std_msgs/String."""
     return struct.pack("<I", len(word)) + word.encode()
 
 
 def seen(world: World, word: str) -> MessageSeen:
-    """Return the report of this message."""
     found: MessageSeen = world.until(
         lambda: next(
             (one for one in world.told if isinstance(one, MessageSeen) and one.fields == {"data": word}), None

@@ -104,7 +104,6 @@ class HeldWork:
         self.do: Callable[[], None] | None = do
 
     def discard(self) -> None:
-        """Forget the work."""
         self.do = None
 
 
@@ -114,13 +113,11 @@ class WorldLoop(EventLoop):
     holds = False
 
     def beside(self, work: Callable[[], T], done: Callable[[T], None]) -> WorkBeside:
-        """Do the work at the next turn."""
         self._work = HeldWork(lambda: done(work()))
         self.after(0, self._do)
         return self._work
 
     def release(self) -> None:
-        """Do the work that the test held."""
         self.holds = False
         self.after(0, self._do)
 
@@ -150,7 +147,6 @@ class World:
         self.state(ClientGranted("k", "/mode", LOOPBACK, "/client"))
 
     def connect_control(self) -> None:
-        """Connect a (new) control."""
         ours, theirs = socket.socketpair()
         self.control = Channel(ours, RelayLink)
         self.link = LoopLink(self.loop, Channel(theirs, RelayLink), self.engine.take, lambda _reason: None)
@@ -184,8 +180,6 @@ class World:
             assert time.monotonic() < deadline, f"not within {seconds} s; control was told {self.told[-10:]}"
 
     def hears(self, kind: type[Message], **fields: Any) -> Any:
-        """Return a report of this kind, and remove it from the reports."""
-
         def find() -> Any:
             for message in self.told:
                 if isinstance(message, kind) and all(getattr(message, k) == v for k, v in fields.items()):
@@ -272,14 +266,12 @@ class World:
         return peer
 
     def subscribed(self) -> tuple[Peer, Peer]:
-        """Return a publisher and a subscriber that is served."""
         subscriber = self.connect(encode_header(ASK))
         publisher = self.upstream()
         assert self.gets_header(subscriber) == HEADER
         return publisher, subscriber
 
     def close(self) -> None:
-        """Close everything."""
         self.engine.close()
         self.link.close()
         self.loop.close()

@@ -28,5 +28,4 @@ def genpy_types() -> dict[str, dict[str, Any]]:
 
 @pytest.fixture(scope="session")
 def standard() -> Definitions:
-    """Return ROS's own definitions."""
     return standard_definitions()

@@ -8,7 +8,6 @@ _TABLES = transcripts(Path(__file__).with_name("tables.txt"))
 
 
 def rows(title: str) -> list[tuple[str, ...]]:
-    """Return the rows of a table."""
     return [
         tuple(column.encode("ascii").decode("unicode_escape") for column in line.split(" => "))
         for line in _TABLES[title]

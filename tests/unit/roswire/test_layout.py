@@ -1,5 +1,3 @@
-"""Layouts: every field is found at the position where genpy wrote it."""
-
 import struct
 from itertools import pairwise
 from typing import Any
@@ -36,7 +34,6 @@ def read(layout: MessageLayout, data: bytes, position: int) -> tuple[Values, int
 
 
 def read_leaf(leaf: FixedField, data: bytes, position: int) -> Any:
-    """Read a value of fixed size."""
     if leaf.count is None:
         return primitive(leaf.type, data, position)
     if leaf.layout is not None:

@@ -1,5 +1,3 @@
-"""The text of definitions: text that genmsg reads is read, any other text is refused with file and line."""
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

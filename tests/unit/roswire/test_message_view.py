@@ -1,5 +1,3 @@
-"""Messages as fields and values, shown to people."""
-
 import struct
 
 from roswire.definitions import Definitions

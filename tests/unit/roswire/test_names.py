@@ -1,5 +1,3 @@
-"""Names are resolved as in rosmaster, or refused."""
-
 import json
 import subprocess
 from collections.abc import Callable, Iterator

@@ -1,5 +1,3 @@
-"""The tree of parameters is read with rosmaster's rules."""
-
 import json
 import random
 import subprocess

@@ -1,5 +1,3 @@
-"""ROS's own definitions have the same types as on the robot."""
-
 from typing import Any
 
 import pytest

@@ -31,12 +31,10 @@ NAMES = st.from_regex(r"[a-z_0-9]{1,12}", fullmatch=True)
 
 
 def length(size: int) -> bytes:
-    """Return a length as TCPROS writes it."""
     return struct.pack("<I", size)
 
 
 def header(*fields: bytes) -> bytes:
-    """Return a connection header of these raw fields."""
     body = b"".join(length(len(field)) + field for field in fields)
     return length(len(body)) + body
 

@@ -1,5 +1,3 @@
-"""URIs of nodes and services have one reading, or are refused with advice."""
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

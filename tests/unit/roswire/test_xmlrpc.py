@@ -54,7 +54,6 @@ def call(value: str) -> bytes:
 
 
 def read(value: str, limits: XmlRpcLimits | None = None) -> Value:
-    """Return the result of reading the element `value`."""
     return parse_call(call(value), limits or XmlRpcLimits()).params[0]
 
 

@@ -19,12 +19,10 @@ def anyio_backend(
 
 @pytest.fixture
 async def server() -> AsyncIterator[Server]:
-    """Run a server that echoes bodies."""
     async with serving() as server:
         yield server
 
 
 @pytest.fixture
 async def client(server: Server) -> Client:
-    """Return a connection to it."""
     return await server.connect()

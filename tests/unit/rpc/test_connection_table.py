@@ -1,5 +1,3 @@
-"""Connections by host and class: quotas, and the connections that make room."""
-
 import ipaddress
 import math
 from dataclasses import dataclass, field
@@ -15,7 +13,6 @@ ROBOT, OTHER = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2"
 
 
 def guest(number: int) -> Address:
-    """Return one of many addresses."""
     return ipaddress.ip_address("10.1.0.0") + number
 
 
@@ -30,14 +27,11 @@ class QuotaClasses:
         return self.of.get(host, QuotaClass.UNKNOWN)
 
     def clock(self) -> float:
-        """Return the time of the test."""
         return self.now
 
 
 @dataclass(eq=False)
 class Guest:
-    """A connection of a test."""
-
     connection_table: ConnectionTable[Address]
     host: Address
     deadline: float = 0.0
@@ -48,13 +42,11 @@ class Guest:
         """Ignore the end of its time; no test uses it."""
 
     def abort(self) -> None:
-        """End as a connection does."""
         self.cut = True
         self.connection_table.release(self.host, self.holding)
         self.connection_table.leave(self)
 
     def hold(self, size: int) -> str:
-        """Hold a body of this size."""
         why = self.connection_table.hold(self.host, size)
         if not why:
             self.holding += size

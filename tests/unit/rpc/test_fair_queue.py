@@ -1,5 +1,3 @@
-"""Hosts take turns, and no slot is lost."""
-
 import asyncio
 import ipaddress
 from typing import Any
@@ -18,7 +16,6 @@ WAIT = 20.0
 
 
 def slots(whole: int, host: int) -> Turns[Address]:
-    """Turns of hosts that are all known alike."""
     return Turns(Bounds(whole, host, 0, 0), lambda _host: QuotaClass.REGISTERED)
 
 

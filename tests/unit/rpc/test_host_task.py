@@ -16,7 +16,6 @@ ROBOT, GUEST = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.66
 
 @pytest.fixture
 def time() -> ProcessorTime:
-    """Return processor time with a clock that does not move."""
     return ProcessorTime(lambda host: host, lambda: 0.0)
 
 

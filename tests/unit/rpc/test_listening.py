@@ -1,5 +1,3 @@
-"""The listening sockets of RVMaster, and the addresses of their peers."""
-
 import ipaddress
 import socket
 

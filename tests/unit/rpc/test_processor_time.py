@@ -27,8 +27,6 @@ class Loop:
         self.time = ProcessorTime(lambda host: "unknown" if host in UNKNOWN else host, lambda: self.now)
 
     def work(self, host: Address, seconds: float = PIECE) -> Callable[[], None]:
-        """Return work that takes this long."""
-
         def run() -> None:
             self.order.append(host)
             self.now += seconds
@@ -45,7 +43,6 @@ class Loop:
 
 @pytest.fixture
 def loop() -> Loop:
-    """Return a loop that has done nothing."""
     return Loop()
 
 

@@ -1,5 +1,3 @@
-"""HTTP of RVMaster over loopback: requests that are refused, and their answers."""
-
 from dataclasses import replace
 
 import pytest

@@ -1,5 +1,3 @@
-"""Connections are sorted by source address into two accept queues."""
-
 import contextlib
 import ipaddress
 import socket
@@ -21,7 +19,6 @@ WAIT = 20.0
 
 
 def networks(*texts: str) -> list[Network]:
-    """Parse networks."""
     return [ipaddress.ip_network(text) for text in texts]
 
 
@@ -82,7 +79,6 @@ class Port:
 
 @pytest.fixture
 def port() -> Iterator[Callable[..., Port]]:
-    """Open ports, and close them at the end."""
     with contextlib.ExitStack() as stack:
 
         def opened(host: str, *known: str) -> Port:

@@ -1,5 +1,3 @@
-"""Tests of `appliance.rpc.xmlrpc_client`."""
-
 import asyncio
 import contextlib
 import tracemalloc

@@ -1,5 +1,3 @@
-"""Tests of `appliance.signing.fingerprints`: texts are recognised by a hash that no other texts have."""
-
 import itertools
 
 from appliance.signing.fingerprints import file_name, fingerprint, fingerprint_of_all

@@ -1,5 +1,3 @@
-"""Tests of `appliance.signing.request_signing`, with the vectors of `docs/reference/rest.md`."""
-
 from pathlib import Path
 from typing import Any
 

@@ -1,5 +1,3 @@
-"""Control's end of the link to the compiler, with a compiler that a test plays."""
-
 import asyncio
 import socket
 from collections.abc import Callable

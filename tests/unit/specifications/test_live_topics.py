@@ -1,5 +1,3 @@
-"""The effects of specifications on topics that are published now."""
-
 from collections.abc import Collection
 from typing import Any
 

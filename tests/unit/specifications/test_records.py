@@ -1,5 +1,3 @@
-"""Actions of monitors become records, whatever names their details have."""
-
 from pathlib import Path
 
 import pytest

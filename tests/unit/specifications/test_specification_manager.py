@@ -1,5 +1,3 @@
-"""The specifications in force: revisions, switches, statements to the relay and its answers."""
-
 import asyncio
 import hashlib
 import time

@@ -1,5 +1,3 @@
-"""Tests of `appliance.specifications.timed_switches`."""
-
 import asyncio
 from collections.abc import Mapping
 from pathlib import Path

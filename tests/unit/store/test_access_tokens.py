@@ -1,5 +1,3 @@
-"""Tests of `appliance.store.access_tokens`."""
-
 import pytest
 
 from appliance.base.clock import using

@@ -1,16 +1,12 @@
-"""The latest changes, for a consumer."""
-
 from appliance.store.ahead import Encoded
 from appliance.store.change_feed import ChangeFeed
 
 
 def change(number: int, size: int = 10) -> Encoded:
-    """Return a change of this size."""
     return Encoded(number, bytes(size))
 
 
 def numbers(changes: list[Encoded] | None) -> list[int] | None:
-    """Return the numbers of changes."""
     return None if changes is None else [one.number for one in changes]
 
 

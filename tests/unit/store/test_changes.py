@@ -1,5 +1,3 @@
-"""Typed changes of tables."""
-
 import sqlite3
 from collections.abc import Iterator
 
@@ -19,7 +17,6 @@ ROW = ("a", 1, 1.5, b"x", None)
 
 @pytest.fixture
 def connection() -> Iterator[sqlite3.Connection]:
-    """A database with the tables."""
     connection = sqlite3.connect(":memory:")
     connection.executescript(SCHEMA)
     yield connection

@@ -24,13 +24,10 @@ class ChangedError(Exception):
 
 
 def row(revision: int, who: str = "eve") -> MonitorRevisionRow:
-    """A revision of anything."""
     return MonitorRevisionRow(revision, "{}", float(revision), who, "")
 
 
 class Keeper(Revisions[MonitorRevisionRow]):
-    """Revisions of nothing in particular."""
-
     refusal = RefusedError
     outdated = ChangedError
 
@@ -41,7 +38,6 @@ class Keeper(Revisions[MonitorRevisionRow]):
         raise AssertionError(revision)
 
     def change(self, to: MonitorRevisionRow, within: float | None = None) -> None:
-        """Bring a revision into force."""
         self._put_in_force(to, within)
 
     def started(self, *, restarted: bool) -> bool:
@@ -49,7 +45,6 @@ class Keeper(Revisions[MonitorRevisionRow]):
         return self._find_last(restarted=restarted)
 
     async def wanted(self, revision: int | None) -> MonitorRevisionRow:
-        """Return the revision that a rollback takes."""
         return await self._wanted(revision)
 
     def limit(self) -> list[str]:

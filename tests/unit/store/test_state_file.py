@@ -1,5 +1,3 @@
-"""The tables of control's state file."""
-
 import copy
 import os
 import random
@@ -28,19 +26,16 @@ from tests.support.parameters import mirror, put
 
 
 def incarnation(key: str) -> IncarnationRow:
-    """A row that differs by its key."""
     return IncarnationRow(
         key, "/talker", "10.0.0.1", "http://robot:4711/", "10.0.0.2", 19001, 19002, False, "live", 1.5
     )
 
 
 def reopened(directory: Path) -> StateStore:
-    """Return the store as the next control finds it."""
     return StateStore(directory, failed=pytest.fail, kind=InlineDatabase)
 
 
 def leave_behind(directory: Path, changes: Sequence[Encoded]) -> None:
-    """Write the file that a killed process leaves."""
     ahead = WriteAhead(directory / "state.ahead")
     ahead.append(changes)
     ahead.close()

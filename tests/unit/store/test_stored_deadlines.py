@@ -1,5 +1,3 @@
-"""Tests of `appliance.store.stored_deadlines`."""
-
 from pathlib import Path
 
 import pytest

@@ -1,5 +1,3 @@
-"""One SQLite file with one writer thread."""
-
 import asyncio
 import contextlib
 import errno
@@ -51,19 +49,16 @@ SCHEMA = "CREATE TABLE IF NOT EXISTS thing (name TEXT PRIMARY KEY, size INTEGER)
 
 
 def encoded(number: int, name: str) -> Encoded:
-    """Return the change that puts this row."""
     return Encoded(number, msgspec.msgpack.encode(Put("thing", [(name, number)])))
 
 
 @pytest.fixture
 def failures() -> list[str]:
-    """Return the complaints of the database."""
     return []
 
 
 @pytest.fixture
 def database(tmp_path: Path, failures: list[str]) -> Iterator[Database]:
-    """A new database."""
     database = Database(tmp_path / "state.db", SCHEMA, failed=failures.append, drive=ByHand)
     yield database
     database.close()
@@ -90,7 +85,6 @@ def test_closing_writes_what_is_left(tmp_path: Path) -> None:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have SQLite not wait for locks of other processes."""
     monkeypatch.setattr(sqlite3, "connect", partial(sqlite3.connect, timeout=0))
 
 
@@ -333,7 +327,6 @@ async def test_the_file_of_statements_on_their_way_is_empty_once_all_are_in(
 
 
 def leave_behind(path: Path, *changes: Encoded) -> None:
-    """Write the file that a killed process leaves."""
     ahead = WriteAhead(path)
     for change in changes:
         ahead.append([change])
@@ -560,13 +553,11 @@ class _Gate:
         self._lock.release()
 
     def write(self, descriptor: int, data: bytes) -> int:
-        """Write when another thread wants to close the file."""
         self.writing.set()
         assert self.closing.wait(30)
         return os.write(descriptor, data)
 
     def close(self, descriptor: int) -> None:
-        """Close it, and put another file in its place."""
         os.close(descriptor)
         self.other = os.open("another", os.O_RDWR | os.O_CREAT)  # the lowest number that is free
         self.closing.set()

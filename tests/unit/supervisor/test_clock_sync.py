@@ -1,5 +1,3 @@
-"""Tests of the kernel's report on the machine's clock."""
-
 import ctypes
 from types import SimpleNamespace
 from typing import Any

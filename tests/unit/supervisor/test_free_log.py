@@ -1,5 +1,3 @@
-"""Tests of ending processes that lock the audit log."""
-
 import socket
 from pathlib import Path
 from typing import cast
@@ -15,18 +13,14 @@ from appliance.supervisor.supervisor import Supervisor
 pytestmark = pytest.mark.nightly
 
 READER = Role("reader", "rosrv-syslog", "reader", "reader:main", dispensable=True, group="rosrv-api")
-"""A role of a feature that reads the log."""
 
 
 class _Life:
-    """Stands in for a process."""
-
     def __init__(self, pid: int) -> None:
         self.pid = pid
         self.killed = False
 
     def kill(self) -> None:
-        """Record the signal."""
         self.killed = True
 
 

@@ -1,5 +1,3 @@
-"""Tests of `appliance.supervisor.inherited_listeners`."""
-
 import os
 import socket
 from collections.abc import Iterator
@@ -13,7 +11,6 @@ pytestmark = pytest.mark.nightly
 
 @pytest.fixture
 def kept() -> Iterator[InheritedListeners]:
-    """Return a store for two sockets."""
     sockets = InheritedListeners(limit=2)
     yield sockets
     sockets.close()

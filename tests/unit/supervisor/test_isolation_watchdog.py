@@ -1,5 +1,3 @@
-"""Tests of `appliance.supervisor.isolation_watchdog`, with an enclosure that a test controls."""
-
 import asyncio
 import errno
 import threading
@@ -28,11 +26,9 @@ class Surroundings(NoIsolation):
         self.looked = threading.Event()
 
     def report(self) -> FirewallState:
-        """Return a recognisable report."""
         return FirewallState(backend="nft")
 
     def probe(self) -> str | None:
-        """Return the next finding."""
         self.looked.set()
         finding = self.found.pop(0)
         if isinstance(finding, Exception):
@@ -54,7 +50,6 @@ class Surroundings(NoIsolation):
 
 @pytest.fixture
 def surroundings() -> Surroundings:
-    """Return an enclosure without a finding yet."""
     return Surroundings()
 
 

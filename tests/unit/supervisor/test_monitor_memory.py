@@ -1,5 +1,3 @@
-"""The files with the state of monitors: of this run, of the last run, and after an orderly end."""
-
 import os
 from pathlib import Path
 
@@ -18,7 +16,6 @@ def given(memory: MonitorMemory, index: int) -> list[tuple[StateGiven, bytes]]:
 
 
 def write(memory: MonitorMemory, index: int, more: bytes = b"") -> None:
-    """Write the state of a relay."""
     [*_, (message, descriptor)] = memory.messages_for("relay", index)
     assert message.own
     os.pwrite(descriptor, WRITTEN + more, 0)

@@ -1,5 +1,3 @@
-"""Tests of `appliance.supervisor.port_check`."""
-
 import os
 import socket
 

@@ -1,5 +1,3 @@
-"""Tests of `appliance.supervisor.sandbox.private_view`: another user runs a program in a closed folder."""
-
 import json
 import os
 import subprocess
@@ -74,7 +72,6 @@ def home(tmp_path: Path) -> Path:
 
 
 def seen(home: Path, view: PrivateView | None) -> dict[str, Any]:
-    """Return what a process of another user can do."""
     given = json.dumps(None if view is None else asdict(view))
     command = [sys.executable, "-c", _PROCESS, given, str(home), str(USER)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)

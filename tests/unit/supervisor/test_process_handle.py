@@ -1,5 +1,3 @@
-"""Tests of `appliance.supervisor.process_handle`: distinguish a hanging process from a slow one."""
-
 import errno
 import os
 import signal

@@ -1,5 +1,3 @@
-"""Tests of `appliance.supervisor.process_slot`: the delay before a restart."""
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

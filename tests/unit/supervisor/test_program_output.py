@@ -1,5 +1,3 @@
-"""Output of rosmaster and rosout in the appliance's log."""
-
 import os
 from collections.abc import Callable
 from typing import Any
@@ -15,11 +13,9 @@ class Loop:
     read: Callable[[], None] | None = None
 
     def add_reader(self, _descriptor: int, read: Callable[[], None]) -> None:
-        """Keep it."""
         self.read = read
 
     def remove_reader(self, _descriptor: int) -> None:
-        """Forget it."""
         self.read = None
 
 

@@ -1,5 +1,3 @@
-"""Tests of `appliance.supervisor.relay_entry`."""
-
 import json
 from dataclasses import fields
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Tests of the mark of an unfinished restore."""
-
 from pathlib import Path
 
 import pytest

@@ -1,5 +1,3 @@
-"""Tests of `appliance.supervisor.roles`."""
-
 import pkgutil
 import subprocess
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Messages of the appliance to systemd."""
-
 import asyncio
 import os
 import socket

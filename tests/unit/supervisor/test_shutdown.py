@@ -1,5 +1,3 @@
-"""Tests of `appliance.supervisor.shutdown` with simulated processes."""
-
 import asyncio
 import signal
 from typing import cast
@@ -31,25 +29,20 @@ class Crowd:
         self.slots.append(slot)
 
     def end(self) -> list[tuple[str, str]]:
-        """End all processes, and return the actions."""
         autojump.run(shutdown.end_all(self.slots, self.died))
         return self.done
 
 
 class Process:
-    """A process of the crowd."""
-
     pid = 1
 
     def __init__(self, crowd: Crowd, slot: ProcessSlot, ends_by: str, *, is_program: bool) -> None:
         self.crowd, self.slot, self.ends_by, self.is_program = crowd, slot, ends_by, is_program
 
     def send(self, message: object) -> None:
-        """Record the request to stop."""
         self._suffer(type(message).__name__)
 
     def kill(self, number: signal.Signals = signal.SIGKILL) -> None:
-        """Record a signal."""
         self._suffer(number.name)
 
     def _suffer(self, what: str) -> None:

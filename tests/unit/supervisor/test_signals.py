@@ -55,7 +55,6 @@ thread.join()
 
 
 def by_itself(script: str) -> None:
-    """Run a script in a process with one thread."""
     done = subprocess.run(
         [sys.executable, "-c", _BEGIN + script], capture_output=True, text=True, check=False, timeout=120
     )

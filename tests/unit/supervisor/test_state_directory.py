@@ -1,5 +1,3 @@
-"""Tests of `appliance.supervisor.state_directory`, run as the user of the tests."""
-
 import os
 import socket
 import stat

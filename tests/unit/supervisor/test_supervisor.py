@@ -1,5 +1,3 @@
-"""Tests of races in `appliance.supervisor.supervisor` that real processes seldom hit."""
-
 import asyncio
 import errno
 import signal
@@ -47,7 +45,6 @@ class StandIn:
         self.stalled_seconds = 0.0
 
     def kill(self, number: signal.Signals = signal.SIGKILL) -> None:
-        """Record the call."""
         self.killed = number is signal.SIGKILL
         self.signals.append(number)
 
@@ -55,18 +52,15 @@ class StandIn:
         """Do nothing."""
 
     def send(self, message: object, _descriptors: tuple[int, ...] = ()) -> None:
-        """Record the kind of the call."""
         self.told.append(type(message).__name__)
 
     def note_answer(self) -> None:
-        """Count the call."""
         self.heard_of += 1
 
 
 def made(
     tmp_path: Path, role: Role, ready: Callable[[ControlReady], None] = lambda _said: None
 ) -> Supervisor:
-    """Return a supervisor of one process, not started."""
     admin = socket.create_server(("127.0.0.1", 0))
     facts = Facts(state=tmp_path, config=tmp_path / "config.json", rosmaster_port=1)
     return Supervisor((role,), facts, admin=admin, ready=ready)

@@ -1,5 +1,3 @@
-"""Tests of `appliance.supervisor.users`."""
-
 import os
 import pwd
 

@@ -1,5 +1,3 @@
-"""Tests of the event loop with virtual time."""
-
 import asyncio
 import socket
 import threading

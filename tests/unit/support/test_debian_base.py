@@ -1,5 +1,3 @@
-"""Tests of the package sources that a small Debian tree takes from this machine; system tests cover the tree."""
-
 from tests.support.debian_base import apt_settings, debian_sources, pip_settings
 
 TARGETS = """\

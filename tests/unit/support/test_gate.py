@@ -1,5 +1,3 @@
-"""The gate and what runs at night: no chance in the gate, no test outside both."""
-
 import re
 import socket
 import subprocess

@@ -1,5 +1,3 @@
-"""A test that reads an appliance too early waits, and says what it waited for."""
-
 import re
 import subprocess
 
@@ -19,7 +17,6 @@ READ_ITS_STATUS_TOO = {  # the exit status, or the number of lines, is what they
 
 
 def done(output: str, status: int) -> "subprocess.CompletedProcess[str]":
-    """Return the result of a verb."""
     return subprocess.CompletedProcess(
         ["rosrv", "status", "--json"], status, output, "no appliance is running"
     )

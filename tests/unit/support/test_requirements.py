@@ -1,5 +1,3 @@
-"""Tests of the requirements that a test may place on the machine."""
-
 import re
 from pathlib import Path
 

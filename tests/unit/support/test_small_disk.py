@@ -1,5 +1,3 @@
-"""Tests mount file systems with `small_disk` alone, which no late process keeps from ending."""
-
 from tests.support.sources import ROOT
 
 ELSEWHERE = {

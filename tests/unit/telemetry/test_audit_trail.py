@@ -1,5 +1,3 @@
-"""Tests of the errors that callers receive while nothing can be recorded."""
-
 import asyncio
 from typing import Any
 
@@ -26,7 +24,6 @@ class Log:
         self.budget = Budget(lambda host: QuotaClass.UNKNOWN if host == UNKNOWN else QuotaClass.NAMED)
 
     def record(self, record: Any) -> str:
-        """Accept a record."""
         self.budget.charge(record)
         self.records.append(record)
         return str(record.id)
@@ -37,7 +34,6 @@ class Log:
 
 
 def trail(log: Log, *, deny: bool, details: RecordDetails = lambda *_: {}) -> AuditTrail:
-    """Return a trail as control makes it."""
     return AuditTrail(
         log,  # type: ignore[arg-type]  # stands for the log
         strict=True,

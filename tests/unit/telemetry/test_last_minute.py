@@ -1,5 +1,3 @@
-"""Tests of `appliance.telemetry.metrics`."""
-
 from appliance.telemetry.metrics import LastMinute, Meter
 
 

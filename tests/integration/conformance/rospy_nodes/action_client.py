@@ -14,7 +14,6 @@ from report import init_node, report
 
 
 def main():
-    """Send the goals, report their results, and end."""
     init_node("action_client")
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
     client = actionlib.SimpleActionClient("count", TestAction)

@@ -17,14 +17,10 @@ from std_msgs.msg import String
 
 
 class Orders:
-    """The subscriptions and publications."""
-
     def __init__(self):
         self.subscribers, self.publishers = {}, {}
 
     def subscribe(self, told):
-        """Report every message with its publisher."""
-
         def heard(message):
             report(
                 "received",
@@ -36,7 +32,6 @@ class Orders:
         self.subscribers[told["topic"]] = rospy.Subscriber(told["topic"], String, heard)
 
     def unsubscribe(self, told):
-        """Stop listening."""
         self.subscribers.pop(told["topic"]).unregister()
 
     def abandoned(self, told):
@@ -49,26 +44,21 @@ class Orders:
         raise RuntimeError("still connected")
 
     def advertise(self, told):
-        """Become a publisher."""
         self.publishers[told["topic"]] = rospy.Publisher(
             told["topic"], String, queue_size=100, latch=told.get("latch", False)
         )
 
     def unadvertise(self, told):
-        """Stop publishing."""
         self.publishers.pop(told["topic"]).unregister()
 
     def publish(self, told):
-        """Send one message."""
         self.publishers[told["topic"]].publish(told["text"])
 
     def log(self, told):
-        """Log to rosout."""
         rospy.logwarn(told["text"])
 
 
 def main():
-    """Carry out each line."""
     init_node("orders")
     orders = Orders()
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())

@@ -44,7 +44,6 @@ write /agent/** = site, ask agent
 
 @pytest.fixture
 def appliance(lab: Lab) -> Iterator[Appliance]:
-    """An appliance with the door of an agent on the robot."""
     with Appliance(lab.host("appliance", "10.77.0.2/24"), policy=POLICY) as running:
         running.rosrv("door", "add", "agent-1", "--port", "9091", "--from", "10.77.0.10")
         eventually(lambda: not running.row("door", "list")["trouble"], "the door serves")
@@ -67,7 +66,6 @@ def agent(robot: Host, *frames: dict[str, Any], answer: str) -> dict[str, Any]:
 
 
 def number_in(text: str) -> str:
-    """Return the number of the approval in a refusal."""
     found = re.search(r"held for approval ([0-9]+); ask the operator, then repeat; expires in [0-9]+ s", text)
     assert found, text
     return found[1]

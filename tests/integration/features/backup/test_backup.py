@@ -19,7 +19,6 @@ LOADED = OPEN_POLICY + "[Services]\ndefault = *\n"
 
 @contextlib.contextmanager
 def busy(uri: str) -> Iterator[None]:
-    """Run a node that sets parameters continuously."""
     started, ending = threading.Event(), threading.Event()
 
     def work() -> None:

@@ -28,8 +28,6 @@ def ros(site: Site, tmp_path: Path) -> Iterator[RosSession]:
 def with_client(
     site: Site, work: Callable[[ClientConnection], Awaitable[None]], subprotocols: tuple[str, ...] = ()
 ) -> None:
-    """Run a client of a door on the robot."""
-
     async def run() -> None:
         async with (
             asyncio.timeout(3 * SECONDS),
@@ -45,7 +43,6 @@ def with_client(
 
 
 async def next_frame(client: ClientConnection, op: str) -> Any:
-    """Return the next text frame with this operation."""
     while True:
         frame = json.loads(await asyncio.wait_for(client.recv(), SECONDS))
         if frame["op"] == op:

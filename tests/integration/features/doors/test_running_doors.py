@@ -45,7 +45,6 @@ AGENT = "ws://10.77.0.2:9091"
 
 @pytest.fixture(scope="module")
 def appliance(common_lab: Lab) -> Iterator[Appliance]:
-    """An appliance with the door of an agent on the robot."""
     host = common_lab.host("appliance", "10.77.0.2/24")
     settings = "api_networks: [10.77.0.0/24]\n"
     with Appliance(host, policy=POLICY, settings=settings, options=("--api", "10.77.0.2:8443")) as running:
@@ -54,12 +53,10 @@ def appliance(common_lab: Lab) -> Iterator[Appliance]:
 
 
 def on_robot(robot: Host, work: Callable[[], Any]) -> Any:
-    """Run a client on the robot."""
     return robot.run(work)
 
 
 def frame(client: ClientConnection, **wanted: Any) -> Any:
-    """Return the next frame with these fields."""
     while True:
         found = json.loads(client.recv(SECONDS))
         if all(found.get(name) == value for name, value in wanted.items()):

@@ -41,7 +41,6 @@ def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
 
 
 def cast(answer: Any) -> list[Any]:
-    """Return a master's answer with its type."""
     assert isinstance(answer, list)
     return answer
 

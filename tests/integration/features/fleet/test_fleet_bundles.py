@@ -47,7 +47,6 @@ def site() -> Iterator[tuple[BundleSite, str]]:
 
 @contextmanager
 def robot(site: BundleSite, url: str, **bundles: Any) -> Iterator[Appliance]:
-    """Run an appliance of the group."""
     certificate, key = site.authority.issue(ROBOT)
     for file in (site.folder, key):
         file.chmod(0o755)
@@ -67,7 +66,6 @@ def robot(site: BundleSite, url: str, **bundles: Any) -> Iterator[Appliance]:
 
 
 def bundles_of(appliance: Appliance) -> dict[str, Any]:
-    """Return the state of bundles in `rosrv status`."""
     return dict(appliance.status()["bundles"])
 
 
@@ -113,7 +111,6 @@ def refusal(appliance: Appliance, path: object) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def appliance(site: tuple[BundleSite, str]) -> Iterator[Appliance]:
-    """Run an appliance that has taken a good bundle."""
     served, url = site
     with robot(served, url) as appliance:
         in_force(appliance, served.add(bundle_files(OPEN_POLICY)))
@@ -212,7 +209,6 @@ def test_a_change_on_the_robot_is_reported(site: tuple[BundleSite, str]) -> None
 
 
 def changed(site: BundleSite) -> bool:
-    """Whether the robot has reported a change."""
     return any(site.reports.get()[1]["changed"] for _ in range(site.reports.qsize()))
 
 
@@ -231,7 +227,6 @@ def test_a_lying_collector_is_an_alarm(site: tuple[BundleSite, str]) -> None:
 
 
 def reported(site: BundleSite, path: object) -> bool:
-    """Whether the robot has reported this bundle in force."""
     while not site.reports.empty():
         name, report = site.reports.get()
         assert name == ROBOT

@@ -61,8 +61,6 @@ def appliance(recording: Appliance) -> Iterator[Appliance]:
 
 
 def recordings(appliance: Appliance, count: int = 1) -> list[dict[str, Any]]:
-    """Return the recordings, once there are `count` of them."""
-
     def found() -> list[dict[str, Any]] | None:
         rows = appliance.rows("record", "list")
         return rows if len(rows) >= count else None

@@ -55,7 +55,6 @@ class Browser:
         self.rest = httpx.Client(base_url=str(appliance.ready["api"]), verify=False)  # noqa: S501  of the test
 
     def begin(self) -> str:
-        """Return the URL at the provider."""
         keys = keys_of(self.token)
         reading, verifying = (base64.urlsafe_b64encode(key).decode().rstrip("=") for key in keys)
         body = {"id": self.token.split("_")[1], "reading": reading, "verifying": verifying}

@@ -68,7 +68,6 @@ def site(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Site]:
 
 @contextlib.contextmanager
 def held(site: Site, name: str, epoch: int) -> Iterator[Renewing]:
-    """Let an appliance hold the lease."""
     peer = site.peer(name)
     renewing = Renewing(peer, peer.granted(epoch))
     try:

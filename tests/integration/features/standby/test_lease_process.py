@@ -82,7 +82,6 @@ class Site:
             self.failures.append(error)
 
     def start(self) -> None:
-        """Start the process, with a control that is present."""
         self._thread.start()
         ours, theirs = socket.socketpair()
         self.control = Channel(ours, lease_link.LeaseLink)
@@ -112,7 +111,6 @@ class Site:
         eventually(met, lambda: f"{self.reports[-10:]} {self.failures}")
 
     def read(self) -> None:
-        """Keep the reports to the supervisor."""
         with contextlib.suppress(ChannelClosedError):
             self.reports += [
                 message
@@ -125,7 +123,6 @@ class Site:
         return bool(self.reports) and isinstance(self.reports[-1], messages.LeaseHeld)
 
     def close(self) -> None:
-        """End the process by the end of its lifeline."""
         self.supervisor.close()
         if self._thread.is_alive():
             self._thread.join(30)
@@ -138,7 +135,6 @@ class Site:
 
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[Site]:
-    """Make the hosts; the process is not started."""
     need_root()
     with Lab("rosrv-lease") as lab:
         made = Site(lab, tmp_path)

@@ -1,5 +1,3 @@
-"""The kits as `rosrv standby join` writes them, installed on the robot and on a follower, with `rosrv protect`."""
-
 import contextlib
 import json
 import os
@@ -94,7 +92,6 @@ class RobotSite:
         self.join("kit")
 
     def join(self, kit: str, *more: str) -> None:
-        """Make the kits, and the memberships of both appliances."""
         self.kit = self.kit.with_name(kit)
         arguments = [f"--address={ADDRESSES['a']}", f"--other={ADDRESSES['b']}", f"--witness={ROBOT}"]
         arguments += [f"--fixed={FIXED}", f"--follower=arm={FOLLOWER}", "--ports=11311,20000-20999"]
@@ -115,23 +112,19 @@ class RobotSite:
     def script(
         self, host: ScriptHost, path: str | Path, *, check: bool = True
     ) -> subprocess.CompletedProcess[str]:
-        """Run a script of the kit."""
         return host.run("sh", str(path), check=check, PATH=self._path)
 
     def memberships(self) -> dict[str, Membership]:
-        """Return the memberships of both appliances."""
         own, other = load_membership(path_of(self.state)), load_membership(self.kit / "standby-b.json")
         assert own is not None and other is not None
         return {"a": own, "b": other}
 
     def peer(self, name: str) -> Peer:
-        """Return an appliance with the key of its membership."""
         peer = Peer(self.hosts[name], name, bytes.fromhex(self.memberships()[name].witness_key))
         self._stack.enter_context(peer.socket)
         return peer
 
     def connects(self, host: Host, address: str, port: int) -> bool:
-        """Whether a connection is accepted."""
         try:
             host.run(lambda: socket.create_connection((address, port), timeout=LIMIT / 3)).close()
         except OSError:
@@ -139,13 +132,11 @@ class RobotSite:
         return True
 
     def rules(self, host: ScriptHost) -> str:
-        """Return all firewall rules of a host."""
         return host.run("nft", "list", "ruleset").stdout
 
 
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[RobotSite]:
-    """Yield a site before any kit is installed."""
     need_root()
     need_program("nft", "nftables")
     with Lab("rosrv-kit") as lab, contextlib.ExitStack() as stack:

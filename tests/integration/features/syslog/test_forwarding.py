@@ -17,7 +17,6 @@ from tests.support.waiting import allowed, eventually
 
 @pytest.fixture(scope="module")
 def collector() -> Iterator[StreamCollector]:
-    """Run a receiver for several tests."""
     with StreamCollector() as collector:
         yield collector
 
@@ -38,13 +37,11 @@ def work(appliance: Appliance, count: int) -> None:
 
 
 def all_sequences(appliance: Appliance) -> set[int]:
-    """Return the sequence numbers in the log."""
     lines = appliance.rosrv("audit", "export").stdout.splitlines()
     return {int(json.loads(line)["sequence"]) for line in lines}
 
 
 def forwarding_status(appliance: Appliance) -> dict[str, Any]:
-    """Return the state of forwarding in `rosrv status`."""
     return dict(appliance.status()["audit"]["forwarding"])
 
 

@@ -61,13 +61,11 @@ class WebSocketClient:
         self.socket.receive_eof()
 
     def flush(self) -> None:
-        """Send what the protocol has to send."""
         for data in self.socket.data_to_send():
             if data:
                 self.writer.write(data)
 
     def send(self, frame: "dict[str, Any] | str | bytes") -> None:
-        """Send a frame."""
         if isinstance(frame, bytes):
             self.socket.send_binary(frame)
         else:
@@ -75,7 +73,6 @@ class WebSocketClient:
         self.flush()
 
     async def next(self) -> Any:
-        """Return the next frame of the door."""
         async with asyncio.timeout(100):
             return await self.frames.get()
 
@@ -86,12 +83,10 @@ class WebSocketClient:
         return str(self.socket.close_reason or "")
 
     def stop_reading(self) -> None:
-        """Read nothing more, as a client that hangs."""
         self._reading.cancel()
 
     @property
     def is_open(self) -> bool:
-        """Whether the connection is open."""
         return self.socket.state is State.OPEN
 
 
@@ -112,7 +107,6 @@ class DoorWorld:
         self.lookout: Lookout
 
     async def start(self) -> None:
-        """Start the door."""
         self.node = await self.robot("10.0.0.2", "/door_alice")
         sight = MasterSight(self.node, lambda: (7, 8))
         self.door = DoorNode(self.node, self.types, Rosapi(sight, self.types).answer, most_topics=50)
@@ -121,7 +115,6 @@ class DoorWorld:
         self.network.listen(DOOR[0], partial(connections.serve, self.serve), DOOR[1])
 
     async def robot(self, address: str, name: str) -> RosNode:
-        """Start another node."""
         node = RosNode(
             name, MASTER, self.network.at(address), limits=NodeLimits(), shut_down=lambda _reason: None
         )
@@ -130,7 +123,6 @@ class DoorWorld:
         return node
 
     async def serve(self, reader: asyncio.StreamReader, writer: Any) -> None:
-        """Serve one client."""
         queue: ViewerQueue[Any] = ViewerQueue(message_bytes=1 << 20, reply_bytes=1 << 20)
         self.queues.append(queue)
         session = DoorSession(

@@ -30,7 +30,6 @@ NAME = "/door"
 
 
 def protocol_of(subprotocol: str | None) -> ClientProtocol:
-    """Return the protocol that a client speaks."""
     if subprotocol is None:
         return Rosbridge(NAME, RosbridgeLimits(), ViewerQueue())
     return Foxglove(NAME, FoxgloveLimits(), ViewerQueue())

@@ -33,7 +33,6 @@ class World:
         self.now = BEGAN
 
     def passes(self, seconds: float) -> None:
-        """Let time pass."""
         self.now += int(seconds * SECOND)
 
 
@@ -49,7 +48,6 @@ class Member:
         self.path = state / "control" / "audit.db"
 
     def clock(self) -> int:
-        """Return the time of this machine's clock."""
         return self._world.now + int(self.ahead * SECOND)
 
     def open(self) -> None:
@@ -81,7 +79,6 @@ class Member:
             self._signer.send(messages.SignatureMade(message.number, self.key.sign(message.text), public))
 
     def silence(self) -> None:
-        """Let the signer answer no further request."""
         self._signs = False
 
     def close(self) -> None:
@@ -126,7 +123,6 @@ class Member:
         )
 
     def replicated(self) -> SignedCheckpoint | None:
-        """Return this appliance's checkpoint in its state."""
         text = self.store.settings().get(f"audit checkpoint of {self.name}")
         return None if text is None else msgspec.json.decode(text, type=SignedCheckpoint)
 
@@ -136,7 +132,6 @@ class Member:
             other.store.save_setting(name, value)
 
     async def hand_over(self, epoch: int) -> None:
-        """Hand over in an orderly way."""
         with self.timed():
             await asyncio.wait_for(self.recorder.handed_over(epoch), 60)
 

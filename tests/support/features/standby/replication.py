@@ -35,7 +35,6 @@ Tables = dict[str, list[tuple[Any, ...]]]
 
 
 def tables_of(path: Path) -> Tables:
-    """Return all rows of a state file."""
     with contextlib.closing(sqlite3.connect(path)) as reader:
         return {
             table: reader.execute(f"SELECT * FROM {table} ORDER BY 1").fetchall()  # noqa: S608  names below
@@ -111,7 +110,6 @@ class ActiveSide:
         self._task = asyncio.create_task(ReplicationListener(self.sender, context).run(self._socket))
 
     async def close(self) -> None:
-        """End the link, and close the database."""
         self.sender.close()
         self._task.cancel()
         await asyncio.wait([self._task])
@@ -141,7 +139,6 @@ class StandbySide:
             await asyncio.sleep(0.02)
 
     async def close(self) -> None:
-        """End the link, and close the database."""
         self._task.cancel()
         await asyncio.wait([self._task])
         self.replica.close()
@@ -158,13 +155,11 @@ class CuttingProxy:
         self._server: asyncio.Server | None = None
 
     async def start(self) -> int:
-        """Listen; return the port."""
         self._server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
         port: int = self._server.sockets[0].getsockname()[1]
         return port
 
     async def close(self) -> None:
-        """Listen no longer."""
         assert self._server is not None
         self._server.close()
 
@@ -195,7 +190,6 @@ class CuttingProxy:
 
 @contextlib.asynccontextmanager
 async def replicated(directory: Path, **options: Any) -> AsyncIterator[tuple[ActiveSide, StandbySide]]:
-    """Run an active appliance and its standby."""
     server, client = certificates(directory)
     active = ActiveSide(directory / "active.db", server, **options)
     standby = StandbySide(directory / "standby.db", client, lambda: active.port)

@@ -31,7 +31,6 @@ class Transport(xmlrpc.client.Transport):
     """Connections that do not wait forever."""
 
     def make_connection(self, host: Any) -> http.client.HTTPConnection:
-        """Return a connection with a time limit."""
         connection = super().make_connection(host)
         connection.timeout = _SECONDS
         return connection
@@ -80,7 +79,6 @@ class Registrar:
             self.topics.add(topic)
 
     def differences(self) -> list[str]:
-        """Return what the master does not have as it was answered."""
         tree = self.call("getParam", "/registrar") if self.parameters else {}
         wrong = [
             f"{key} is {tree.get(key.rpartition('/')[2])}, not {value}"
@@ -93,7 +91,6 @@ class Registrar:
 
 
 def report(event: str, **fields: Any) -> None:
-    """Print one event."""
     sys.stdout.write(json.dumps({"event": event, **fields}) + "\n")
     sys.stdout.flush()
 

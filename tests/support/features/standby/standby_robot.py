@@ -19,8 +19,6 @@ CLIENTS: tuple[Client, Client] = ("rospy", "roscpp")
 
 
 class StandbyRobot:
-    """The nodes; a context manager."""
-
     def __init__(self, site: StandbySite, *, rate: float = 10) -> None:
         """Prepare the nodes; `rate` is the number of messages a second of each talker."""
         self.site, self.rate = site, rate

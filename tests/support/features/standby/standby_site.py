@@ -123,7 +123,6 @@ class StandbySite:
         return arm
 
     def start_witness(self) -> None:
-        """Start the witness; at the first start with a lease of which `a` is in sync."""
         if not Path(self.lease.path).exists():
             self.lease.write(LeaseRecord(1, "", ("a",), ""))
         command = ["nice", "-n", "-10", *self.command("serve")]  # as its unit does
@@ -131,7 +130,6 @@ class StandbySite:
         self.witness.wait_for_error("the witness answers at")
 
     def stop_witness(self) -> None:
-        """Kill the witness; its rules stay."""
         assert self.witness is not None
         self.witness.stop(with_signal=signal.SIGKILL)
 
@@ -161,7 +159,6 @@ class StandbySite:
         return self.lease.read().holder
 
     def in_sync(self) -> set[str]:
-        """Return the appliances in sync."""
         return set(self.lease.read().in_sync)
 
     def until_both_in_sync(self) -> None:
@@ -169,12 +166,10 @@ class StandbySite:
         eventually(lambda: self.in_sync() == {"a", "b"}, self.story)
 
     def cut(self, name: str) -> None:
-        """Cut the power of an appliance."""
         interfaces.set_link(self.lab.hosts[name].namespace, INTERFACE, up=False)
         self.signal(name, signal.SIGKILL)
 
     def restore(self, name: str) -> None:
-        """Switch an appliance on again after a cut."""
         one = self.appliances[name]
         if one.process is not None:
             one.process.stop()
@@ -217,7 +212,6 @@ class StandbySite:
         return found
 
     def signal(self, name: str, number: int) -> None:
-        """Send a signal to all processes of an appliance."""
         for pid in self.pids(name):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, number)
@@ -241,7 +235,6 @@ class StandbySite:
         self.lab.switch.run(lambda: subprocess.run(["nft", "-f", "-"], input=text, text=True, check=True))
 
     def story(self) -> str:
-        """Return the output of all."""
         witness_said = "\n".join(self.witness.errors) if self.witness is not None else ""
         return "\n".join([witness_said, *(one.story() for one in self.appliances.values())])
 

@@ -119,19 +119,16 @@ class Site:
         return [sys.executable, "-I", "-S", program, *words, *options]
 
     def run(self, *words: str) -> None:
-        """Run a command on the robot to its end."""
         with Process(self.robot, self.command(*words), env=self.environment, label=words[0]) as process:
             process.wait()
             assert process.popen.returncode == 0, process.errors
 
     def serve(self) -> Process:
-        """Start the witness."""
         self.process = Process(self.robot, self.command("serve"), env=self.environment, label="witness")
         eventually(lambda: "answers at" in self.log(), self.log)
         return self.process
 
     def follow(self) -> Process:
-        """Start the follower."""
         command = self.command("follow", settings=self.follower_settings)
         following = Process(self.follower, command, env=self.environment, label="follower")
         self.following = following
@@ -141,17 +138,14 @@ class Site:
         return following
 
     def log(self) -> str:
-        """Return the witness's log."""
         return "\n".join(self.process.errors) if self.process is not None else ""
 
     def stop(self) -> None:
-        """Stop the witness and the follower."""
         for process in (self.process, self.following):
             if process is not None:
                 process.stop()
 
     def peer(self, name: str) -> Peer:
-        """Return an appliance."""
         peer = Peer(self.hosts[name], name, KEYS[name])
         self.sockets.enter_context(peer.socket)
         return peer
@@ -168,7 +162,6 @@ class Site:
         return made
 
     def accepted(self, server: socket.socket) -> socket.socket:
-        """Return the next connection of a server."""
         return self.sockets.enter_context(server.accept()[0])
 
     def _listening(self, host: Host, port: int) -> socket.socket:

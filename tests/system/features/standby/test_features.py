@@ -38,7 +38,6 @@ TWIST = ("rostopic", "pub", "-r", "20", "/cmd_vel", "geometry_msgs/Twist", "{lin
 
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[StandbySite]:
-    """Yield two appliances in sync, `a` active."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     settings, rest = "api_networks: [10.79.0.0/24]\n", ("--api", "0.0.0.0:8443")
@@ -55,7 +54,6 @@ def site(tmp_path: Path) -> Iterator[StandbySite]:
 
 
 def guards(site: StandbySite, name: str) -> dict[str, Any]:
-    """Return the monitors of the active appliance by name."""
     return {row["name"]: row for row in site.appliances[name].rows("monitor", "list")}
 
 

@@ -1,5 +1,3 @@
-"""Full disks of the active appliance and of the robot, and a standby that the witness does not answer."""
-
 from collections.abc import Iterator
 from pathlib import Path
 

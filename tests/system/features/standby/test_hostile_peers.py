@@ -107,8 +107,6 @@ class Liar:
             self.context.verify_mode = ssl.CERT_NONE
 
     def run(self, talk: Callable[[ReplicationLink[Any]], Any]) -> Any:
-        """Open a link, and talk."""
-
         async def work() -> Any:
             sock = self.host.run(lambda: socket.create_connection((self.active, PORT), 10))
             sock.setblocking(False)
@@ -234,7 +232,6 @@ def record(site: StandbySite, number: int) -> list[bytes]:
 
 
 def port_of(frame: bytes) -> int:
-    """Return the destination port of a UDP frame."""
     start = 14 + 4 * (frame[14] & 15)
     port: int = struct.unpack_from("!H", frame, start + 2)[0]
     return port

@@ -26,7 +26,6 @@ NO_SIGNATURE = "it has no signature of the site"
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
-    """Run both appliances, `a` active with an unsigned policy."""
     need_root()
     need_program("nft", "nftables")
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
@@ -63,7 +62,6 @@ def until_obstacle(site: StandbySite, words: str, *names: str) -> None:
 
 
 def load(site: StandbySite, text: str, signature: str) -> None:
-    """Bring a policy into force on the active appliance."""
     site.appliances[site.holder()].ask(admin.PolicyLoad(text, signature=signature))
 
 

@@ -192,7 +192,6 @@ def learn_of_the_pause(one: Appliance, get: Callable[[str], Answer]) -> None:
 
 
 def stopped(pid: int) -> bool:
-    """Whether a process is stopped by a signal."""
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "T"
 
 
@@ -263,5 +262,4 @@ def test_a_power_cut_of_all_three(site: StandbySite, robot: StandbyRobot, order:
 
 
 def wait(seconds: float) -> None:
-    """Let time pass in which nothing may happen."""
     threading.Event().wait(seconds)

@@ -61,7 +61,6 @@ class TunnelledStandbySite:
         self.kits = 0
 
     def start(self) -> None:
-        """Start everything; `a` becomes active."""
         self.site.start_witness()
         for name in ADDRESSES:
             self.site.start(name)
@@ -77,13 +76,11 @@ class TunnelledStandbySite:
         return path
 
     def serving(self) -> Appliance:
-        """Return the appliance that has the lease, once it serves."""
         one = self.site.appliances[self.site.holder()]
         eventually(lambda: one.rosrv("host", "list", check=False).returncode == 0, self.site.story)
         return one
 
     def join(self, kit: Path, host: Host | None = None, programs: Path | None = None) -> JoinedHost:
-        """Return a host with a kit, not started."""
         folder = self.home / f"joined-{time.monotonic_ns()}"
         return JoinedHost(host or self.ocu, kit, folder, programs=programs)
 
@@ -106,7 +103,6 @@ class TunnelledStandbySite:
 
 @pytest.fixture
 def tunnelled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelledStandbySite]:
-    """Run both appliances."""
     need_root()
     need_strongswan()
     with Lab("rosrv-two") as lab, contextlib.ExitStack() as stack:
@@ -117,13 +113,11 @@ def tunnelled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelledSta
 
 
 def told(host: Host, *command: str) -> str:
-    """Return the output of a program on a host."""
     process = host.popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     return str(process.communicate(timeout=LIMIT)[0])
 
 
 def reaches(joined: JoinedHost) -> bool:
-    """Whether the appliance answers in the tunnel."""
     probe = joined.popen(
         ["ping", "-c", "1", "-W", "1", "-I", joined.address, OWN],
         stdout=subprocess.DEVNULL,
@@ -138,7 +132,6 @@ def is_later(number: int, event: Event) -> bool:
 
 
 def opened_connection(joined: JoinedHost) -> Process:
-    """Open a connection to the master through the tunnel."""
     command = [sys.executable, "-m", "tests.support.held_connection", OWN, joined.address]
     process = Process(joined.outer, command, env=dict(os.environ), label="connection")
     process.wait_for(event="opened")

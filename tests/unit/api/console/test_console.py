@@ -1,5 +1,3 @@
-"""Tests of `appliance.api.console.console`, and of the files it serves."""
-
 import hashlib
 import json
 import re

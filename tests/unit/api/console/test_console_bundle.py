@@ -1,5 +1,3 @@
-"""Tests of `console_bundle`; tests/system/console/test_load_time.py runs joined modules in a browser."""
-
 import pytest
 
 from appliance.api.console.console_bundle import ModuleError, join_late_modules, join_modules, join_styles

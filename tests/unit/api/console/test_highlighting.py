@@ -1,5 +1,3 @@
-"""The console's editors know the words of the languages."""
-
 import re
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Tests of `appliance.api.front.access`."""
-
 import asyncio
 from typing import Any
 

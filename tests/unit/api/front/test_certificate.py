@@ -1,5 +1,3 @@
-"""Tests of `appliance.api.front.certificate`."""
-
 import datetime
 import socket
 import ssl

@@ -1,5 +1,3 @@
-"""Tests of `appliance.api.front.control`."""
-
 import asyncio
 from collections.abc import Callable, Iterator
 from dataclasses import replace

@@ -1,5 +1,3 @@
-"""Tests of `appliance.api.front.etags`: a client does not get an unchanged body again."""
-
 from collections.abc import AsyncIterator
 
 import httpx

@@ -1,5 +1,3 @@
-"""Tests of `appliance.api.front.health`."""
-
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator

@@ -1,5 +1,3 @@
-"""Tests of `appliance.api.front.history`."""
-
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Awaitable, Callable

@@ -1,5 +1,3 @@
-"""Tests of `appliance.api.front.journal`."""
-
 from typing import Any
 
 import msgspec

@@ -1,5 +1,3 @@
-"""Tests of `appliance.api.front.listener` over loopback sockets, with a small application behind it."""
-
 import asyncio
 import contextlib
 import datetime

@@ -1,5 +1,3 @@
-"""Tests of `appliance.api.front.rates`."""
-
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st

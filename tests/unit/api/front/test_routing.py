@@ -16,14 +16,10 @@ from tests.support.asgi import requested
 
 
 class Part(msgspec.Struct, forbid_unknown_fields=True):
-    """Part of a body."""
-
     port: Annotated[int, msgspec.Meta(ge=1, le=65535)]
 
 
 class Wanted(msgspec.Struct, forbid_unknown_fields=True):
-    """A body."""
-
     name: Annotated[str, msgspec.Meta(min_length=2)]
     count: int
     parts: list[Part] = []

@@ -1,5 +1,3 @@
-"""Tests of `appliance.api.front.streams`."""
-
 import asyncio
 from collections.abc import Callable
 from typing import Any

@@ -1,5 +1,3 @@
-"""Tests of `appliance.api.routes.audit`."""
-
 import pytest
 
 from appliance.api.routes.monitor_routes import records_of

@@ -1,5 +1,3 @@
-"""Tests of `appliance.api.routes.audit_summary`."""
-
 import asyncio
 import threading
 from collections.abc import Callable, Coroutine

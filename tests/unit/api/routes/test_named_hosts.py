@@ -1,5 +1,3 @@
-"""A search for a host by its name finds the host's records, and an unknown name is an error."""
-
 import pytest
 
 from appliance.api.routes.named_hosts import has_name, labels_of, with_networks

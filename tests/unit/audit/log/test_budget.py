@@ -28,7 +28,6 @@ class Desk:
         return QuotaClass.REGISTERED if host in self.registered else QuotaClass.NAMED
 
     def spend(self, host: str, size: int = 1 << 21) -> AuditRecord:
-        """Charge one record about a host with this size on disk."""
         record = AuditRecord(id="0", time=0, event="decision", host=host, detail={"key": "k" * (size // 2)})
         self.budget.charge(record)
         return record

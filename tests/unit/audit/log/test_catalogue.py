@@ -1,5 +1,3 @@
-"""Tests of the page of audit events."""
-
 from pathlib import Path
 
 from appliance.audit.log.events import EVENTS

@@ -1,5 +1,3 @@
-"""Tests of storing any value that an unknown host can put into a record."""
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +9,6 @@ from appliance.audit.log.record import AuditRecord, RuleReference, Severity
 
 
 def make(**fields: Any) -> AuditRecord:
-    """Return a record with these fields."""
     return AuditRecord(**{"id": "0" * 20, "time": 1, "event": "decision", **fields})
 
 
@@ -35,8 +32,6 @@ class Ended(msgspec.Struct):
 
 @dataclass
 class Row:
-    """The same as a dataclass."""
-
     publications: int = 1
     connections: int = 2
 

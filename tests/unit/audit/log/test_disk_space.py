@@ -1,5 +1,3 @@
-"""Tests of free space for the log: alarms before the disk is full, and recovery without a restart."""
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Compare the registry of events with the program."""
-
 from appliance.audit.log.events import EVENTS, SEVERITIES
 from distribution.audit_events_page import uses
 

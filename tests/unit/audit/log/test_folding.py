@@ -1,5 +1,3 @@
-"""Tests of folding repeated denials, with a clock that the test moves."""
-
 import itertools
 from collections.abc import Callable
 from typing import Any
@@ -26,7 +24,6 @@ def make_folder(
 
 
 def denial(resource: str = "/a", host: str = "10.0.0.1", **fields: Any) -> AuditRecord:
-    """Return a denial with its own id."""
     plain: dict[str, Any] = {
         "event": "decision", "decision": "deny", "caller_id": "/n", "category": "call", "reason": "no",
     }  # fmt: skip
@@ -34,7 +31,6 @@ def denial(resource: str = "/a", host: str = "10.0.0.1", **fields: Any) -> Audit
 
 
 def offer(folder: RecordFolder, *records: AuditRecord, now: float = 0) -> list[AuditRecord]:
-    """Return the records that the folder writes for these records."""
     return [written for record in records for written in folder.offer(record, now)]
 
 
@@ -72,7 +68,6 @@ class Interrupted(dict[Any, Any]):
         self._others_work = others_work
 
     def get(self, key: Any, default: Any = None) -> Any:
-        """Look, then let the other thread work."""
         found = super().get(key, default)
         self._others_work()
         return found
@@ -316,7 +311,6 @@ def test_named_hosts_keep_a_line_each() -> None:
 
 
 def read(key: str, **fields: Any) -> AuditRecord:
-    """Return an allowed call that reads a parameter."""
     plain: dict[str, Any] = {"decision": "allow", "folds": True, "detail": {"call": "hasParam", "key": key}}
     return denial("hasParam", **(plain | fields))
 

@@ -1,5 +1,3 @@
-"""Tests of the ids of records."""
-
 import itertools
 
 import pytest

@@ -41,7 +41,6 @@ def holding(file: Path, byte: int) -> Iterator[int]:
 
 @pytest.fixture
 def log(tmp_path: Path) -> Iterator[AuditLog]:
-    """Return a log with one record."""
     log = AuditLog(tmp_path / "audit.db", drive=ByHand)
     log.record(decision(log, 1))
     assert settle(log) is None

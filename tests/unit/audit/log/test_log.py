@@ -1,5 +1,3 @@
-"""Tests of the log on real files, also with a full disk and a killed process."""
-
 import asyncio
 import os
 import signal

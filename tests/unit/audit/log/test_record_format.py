@@ -1,5 +1,3 @@
-"""Tests of records as JSON and as text."""
-
 import json
 
 import msgspec

@@ -25,7 +25,6 @@ _DAY = 86_400_000_000_000
 
 
 def first_sequence(path: Path) -> int:
-    """Return the sequence of the oldest record."""
     return next(export(path, Filter(), page=1)).sequence
 
 
@@ -187,7 +186,6 @@ def test_denials_and_alarms_are_removed_last(make_log: MakeLog, path: Path) -> N
 
 
 def denial(number: int, host: str, **fields: Any) -> AuditRecord:
-    """Return a denial with its own id."""
     return AuditRecord(
         id=f"{number:020x}", time=number, event="decision", decision="deny", host=host, **fields
     )

@@ -1,5 +1,3 @@
-"""Tests of the documented format of a record."""
-
 from pathlib import Path
 
 from appliance.audit.log.events import EVENTS

@@ -45,7 +45,6 @@ def log(make_log: MakeLog, path: Path) -> Path:
 
 @pytest.fixture
 def public(key: Ed25519PrivateKey) -> bytes:
-    """Return the reviewer's copy of the key."""
     return key.public_key().public_bytes_raw()
 
 

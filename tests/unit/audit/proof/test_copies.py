@@ -1,5 +1,3 @@
-"""Tests of checkpoints copied to another machine. The attacker is root and also has the signer's key."""
-
 import json
 import sqlite3
 from contextlib import closing
@@ -39,7 +37,6 @@ def log(make_log: MakeLog, path: Path) -> Path:
 
 
 def kinds(result: Verification) -> set[FindingKind]:
-    """Return the kinds of the findings."""
     assert result.ok == (not result.findings)
     return {one.kind for one in result.findings}
 

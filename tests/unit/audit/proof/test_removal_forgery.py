@@ -29,7 +29,6 @@ OLD_LOG = Path(__file__).with_name("log-0.1.0.db.xz")
 
 
 def kinds(result: Verification) -> set[FindingKind]:
-    """Return the kinds of the findings."""
     return {one.kind for one in result.findings}
 
 

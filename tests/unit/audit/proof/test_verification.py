@@ -1,5 +1,3 @@
-"""Tests of finding every way to tamper with a log. The attacker can write the database file."""
-
 import base64
 import hashlib
 import sqlite3
@@ -52,7 +50,6 @@ def log(make_log: MakeLog, path: Path) -> Path:
 
 
 def attack(path: Path, *statements: str) -> None:
-    """Run SQL on the file."""
     with closing(sqlite3.connect(path)) as connection:
         for statement in statements:
             connection.execute(statement)
@@ -61,7 +58,6 @@ def attack(path: Path, *statements: str) -> None:
 
 
 def found(path: Path, **arguments: Any) -> list[tuple[FindingKind, int, int]]:
-    """Return the findings of verification."""
     result = verify(path, **arguments)
     assert result.ok == (not result.findings)
     return [(one.kind, one.first, one.last) for one in result.findings]
@@ -221,7 +217,6 @@ def test_signatures_without_a_key_are_a_finding(log: Path) -> None:
 
 
 def signer_memory(log: Path, directory: Path) -> None:
-    """Write the memory of this log's signer, with all of its checkpoints."""
     with closing(sqlite3.connect(log)) as connection:
         (log_id,) = connection.execute("SELECT id FROM log").fetchone()
         texts = connection.execute("SELECT text FROM checkpoint WHERE signature IS NOT NULL ORDER BY number")
@@ -396,7 +391,6 @@ def test_a_missing_key_is_an_error(tmp_path: Path) -> None:
 
 
 def unsign(path: Path, first: int) -> None:
-    """Remove the signatures from the checkpoint `first` on."""
     attack(path, f"UPDATE checkpoint SET signature = NULL, public_key = NULL WHERE number >= {first}")
 
 

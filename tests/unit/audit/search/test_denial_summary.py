@@ -1,5 +1,3 @@
-"""Tests of `appliance.audit.search.denial_summary`."""
-
 import time
 
 import msgspec
@@ -51,7 +49,6 @@ def folded(scope: str, host: str | None, count: int, **more: object) -> AuditRec
 
 
 def of(*records: AuditRecord, limit: int = 10) -> DenialSummary:
-    """Return the summary of these records, oldest first here."""
     return summarised([LogEntry(place, record) for place, record in enumerate(records)][::-1], limit)
 
 

@@ -1,5 +1,3 @@
-"""Rows of equal records."""
-
 from itertools import count
 from typing import Any
 

@@ -1,5 +1,3 @@
-"""Tests of finding records in a running and in a closed log."""
-
 import itertools
 from pathlib import Path
 from typing import Any

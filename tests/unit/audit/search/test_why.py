@@ -1,5 +1,3 @@
-"""Explanations of records, in lines."""
-
 from appliance.audit.log.record import AuditRecord, RuleReference, Severity
 from appliance.audit.search.why import _ACTIONS, lines_of
 

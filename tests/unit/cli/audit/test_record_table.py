@@ -1,5 +1,3 @@
-"""The output of `rosrv audit` on a terminal."""
-
 import re
 import sys
 

@@ -1,5 +1,3 @@
-"""Tests of `appliance.cli.connection.audit_over_rest`: the log over REST behaves as the log's file does."""
-
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager

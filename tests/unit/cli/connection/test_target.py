@@ -1,5 +1,3 @@
-"""Tests of `appliance.cli.connection.target`: errors of users without permission or without an appliance."""
-
 import socket
 import subprocess
 import sys

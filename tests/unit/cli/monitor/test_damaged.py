@@ -1,5 +1,3 @@
-"""Damaged recordings: any exception of the reader becomes an error that says so."""
-
 import random
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Resetting to the folder's specifications while the appliance is stopped."""
-
 import json
 from pathlib import Path
 

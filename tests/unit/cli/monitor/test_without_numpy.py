@@ -1,5 +1,3 @@
-"""The commands for recordings without numpy and apsw, which the package and the image do not have."""
-
 import json
 import os
 import struct

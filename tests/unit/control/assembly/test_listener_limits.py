@@ -1,5 +1,3 @@
-"""Limits of control's listeners: admission, and idle connections."""
-
 import asyncio
 import dataclasses
 import ipaddress

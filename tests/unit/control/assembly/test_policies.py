@@ -1,5 +1,3 @@
-"""The policy in force after reloads, restarts, and the timeout of an unconfirmed change."""
-
 import asyncio
 import contextlib
 import ipaddress

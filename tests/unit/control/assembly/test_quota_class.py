@@ -1,5 +1,3 @@
-"""The quota class of a host: from the policy in force and its registrations."""
-
 import ipaddress
 from dataclasses import replace
 

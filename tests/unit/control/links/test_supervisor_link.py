@@ -1,5 +1,3 @@
-"""Tests of control's end of its lifeline; the test holds the supervisor's."""
-
 import asyncio
 import socket
 from collections.abc import AsyncIterator

@@ -1,5 +1,3 @@
-"""The admin socket: orders of a client that gives up."""
-
 import asyncio
 import contextlib
 import socket

@@ -1,5 +1,3 @@
-"""Acknowledged and silenced alarms."""
-
 import asyncio
 from pathlib import Path
 from typing import Any
@@ -31,12 +29,10 @@ class Robot:
         self.restart()
 
     def restart(self) -> None:
-        """Read the state again, as after a restart or a takeover."""
         handled = HandledAlarms(StateStore(self.state, failed=pytest.fail, kind=InlineDatabase))
         self.orders = AlarmOrders(handled, self, lambda: handled.marked(example(Status, **self.fields)))  # type: ignore[arg-type]  # it records
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:
-        """Note a record."""
         self.events.append(f"{event} by {fields['who']}: {reason}")
         return ""
 
@@ -46,11 +42,9 @@ class Robot:
         return alarms[0] if alarms else None
 
     def silence(self, seconds: float | None) -> None:
-        """Silence the alarm, or end that."""
         asyncio.run(self.orders.silence(AlarmSilence("rosmaster", seconds), "ann"))
 
     def acknowledge(self) -> None:
-        """Acknowledge the alarm."""
         asyncio.run(self.orders.acknowledge(AlarmAcknowledge("rosmaster", "spare part"), "ann"))
 
 

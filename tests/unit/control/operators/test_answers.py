@@ -1,5 +1,3 @@
-"""Messages between processes are typed, and each request has one method that answers it."""
-
 import inspect
 import typing
 from collections import Counter

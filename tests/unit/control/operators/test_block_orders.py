@@ -103,7 +103,6 @@ class Control(ControlParts):
         return await self.orders.block(HostBlock(address, seconds, **more), "ann")
 
     async def unblock(self, address: str) -> int:
-        """Lift a block; return how many registrations returned."""
         return (await self.orders.unblock(HostUnblock(address), "ann")).restored
 
     async def blocked(self) -> list[str]:

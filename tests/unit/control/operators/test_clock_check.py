@@ -1,5 +1,3 @@
-"""Tests of control's records about the machine's clock: one for each event, without blocking."""
-
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,8 +13,6 @@ from tests.support.virtual_clock import VirtualClock
 
 
 class Trail:
-    """Collects records."""
-
     def __init__(self) -> None:
         self.events: list[str] = []
 

@@ -1,5 +1,3 @@
-"""Each request whose change is stored is tried on a full disk, at night."""
-
 from appliance.channel import admin
 from appliance.control.operators.administration import KEPT
 from tests.integration.test_full_disk import ORDERS, UNSTORED

@@ -1,5 +1,3 @@
-"""The use of finite resources, as `rosrv limits` shows it."""
-
 import asyncio
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,5 +1,3 @@
-"""Tests of control's measurements: bounded, whatever names clients choose."""
-
 import ipaddress
 from typing import Any, cast
 

@@ -1,5 +1,3 @@
-"""Alarms about disabled parts that were forgotten."""
-
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace

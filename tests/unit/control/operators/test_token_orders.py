@@ -1,5 +1,3 @@
-"""`TokenOrders`: the first token reaches its owner, whichever process dies first."""
-
 import asyncio
 import os
 import signal

@@ -1,5 +1,3 @@
-"""Tests of `appliance.control.rest.rest_proof`."""
-
 import pytest
 
 from appliance.control.rest.rest_proof import SECONDS, ChallengeRefusedError, Challenges

@@ -1,5 +1,3 @@
-"""Tests of `appliance.control.rest.rest`; administration, tokens and audit trail are test doubles."""
-
 import asyncio
 import socket
 from collections.abc import Iterator

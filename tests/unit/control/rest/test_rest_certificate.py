@@ -1,5 +1,3 @@
-"""Tests of `appliance.control.rest.rest_certificate`."""
-
 from pathlib import Path
 from typing import Any, cast
 

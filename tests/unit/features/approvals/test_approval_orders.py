@@ -1,5 +1,3 @@
-"""Held calls and approvals: random histories, the orders of operators, and the end of each."""
-
 import hashlib
 import random
 import re
@@ -97,13 +95,11 @@ class Site:
         return [one["event"].removeprefix("approval ") for one in self.records]
 
     async def pass_time(self, seconds: float) -> None:
-        """Let time pass, in steps of the watch."""
         for _ in range(round(seconds / CHECK_SECONDS)):
             self.time.advance(CHECK_SECONDS)
             await self.orders.check()
 
     async def call(self, body: bytes = b"", host: Address = AGENT, service: str = "/home") -> str:
-        """Make a request to a service; return its refusal."""
         digest = hashlib.sha256(body).hexdigest()
         wanted = ApprovalWanted(1, service, str(host), "/it", "std_srvs/SetBool", digest, body)
         return (await self.orders.approve_call(wanted)).refused

@@ -83,7 +83,6 @@ class Site:
             assert len({host for host in self.applied if host is not None}) <= 1, self.applied
 
     def handed_over(self) -> list[str]:
-        """Return `from -> to` of each hand-over."""
         return [
             f"{one['earlier']} -> {one['holder']}"
             for one in self.records
@@ -94,7 +93,6 @@ class Site:
         return (await self.orders.status(DriveStatus())).groups[0]
 
     async def pass_time(self, seconds: float, moving: Iterable[str] = ()) -> None:
-        """Let time pass, in which these hosts publish."""
         for _ in range(round(seconds / CHECK_SECONDS)):
             self.time.advance(CHECK_SECONDS)
             self.moved |= {address_of(host): clock.now() for host in moving}
@@ -103,7 +101,6 @@ class Site:
 
 @pytest.fixture
 def site() -> Iterator[Site]:
-    """A site in virtual time, also at night."""
     with clock.using(time := VirtualClock()):
         yield Site(random.Random(1), time)  # noqa: S311  a repeatable history
 

@@ -1,5 +1,3 @@
-"""Tests of validating an archive: every check runs before the first file is written."""
-
 import gzip
 import io
 import random

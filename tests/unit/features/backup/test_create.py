@@ -1,5 +1,3 @@
-"""Tests of backups: their contents, their refusals, and a signer's memory that matches the log."""
-
 import os
 import shutil
 import sqlite3

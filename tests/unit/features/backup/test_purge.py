@@ -1,5 +1,3 @@
-"""Tests of removing a state directory: all of it, nothing else, and not while an appliance uses it."""
-
 import os
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Tests of restoring a backup: target, owner, and an interrupted restore."""
-
 import os
 import stat
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""The counts of connections in the last minute."""
-
 from types import SimpleNamespace
 from typing import Any, cast
 

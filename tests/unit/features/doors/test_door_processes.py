@@ -1,5 +1,3 @@
-"""Control's side of the processes of doors."""
-
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -71,7 +69,6 @@ class Bench:
         self.made.append(port)
 
     def hears(self, message: messages.Message) -> None:
-        """Receive a message of the process."""
         self.link.heard(message)
 
 

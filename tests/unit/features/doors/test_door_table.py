@@ -1,5 +1,3 @@
-"""Doors and tickets in the state: names, addresses, secrets and ends."""
-
 from pathlib import Path
 
 import pytest
@@ -18,7 +16,6 @@ WALL = 1_790_000_000.0
 
 
 def opened(home: Path) -> StateStore:
-    """Return the state in a folder."""
     return StateStore(home, failed=pytest.fail, kind=InlineDatabase)
 
 

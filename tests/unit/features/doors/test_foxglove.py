@@ -21,7 +21,6 @@ OWN = Definitions.from_files({"own/Load.msg": "geometry_msgs/Point32 at\nfloat32
 
 
 async def next_op(client: WebSocketClient, op: str) -> Any:
-    """Return the next text frame with this operation."""
     while True:
         frame = await client.next()
         if isinstance(frame, dict) and frame["op"] == op:

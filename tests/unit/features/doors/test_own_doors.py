@@ -1,5 +1,3 @@
-"""The door of a signed-in person: who gets which, and how long a visit lasts."""
-
 from types import SimpleNamespace
 from typing import Any, cast
 

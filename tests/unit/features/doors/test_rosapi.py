@@ -24,8 +24,6 @@ ACTION = {f"/move_base/{part}": ["/move_base"] for part in ("cancel", "feedback"
 
 
 class StatedSight:
-    """A sight that a test states."""
-
     def __init__(self) -> None:
         self.parameters: dict[str, Value] = {"/rosdistro": "noetic", "/gains": {"p": 1.5, "on": True}}
 

@@ -46,7 +46,6 @@ class Client:
         return self.rosbridge.receive(json.dumps(frame) if isinstance(frame, dict) else frame)
 
     def refusal(self, frame: Frame | dict[str, Any]) -> dict[str, Any]:
-        """Return the status that refuses a frame."""
         assert self.sends(frame) == []
         (status,) = self.gets()
         assert status["op"] == "status" and status["level"] == "error"

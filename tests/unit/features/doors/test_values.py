@@ -35,7 +35,6 @@ def rosbags() -> Typestore:
 
 
 def codec(text: str, limits: ValueLimits = LIMITS) -> MessageCodec:
-    """Return the codec of a message type with this text."""
     return MessageCodec(standard().extended(Definitions.from_files({"t/T.msg": text})), "t/T", limits)
 
 

@@ -76,8 +76,6 @@ class Topic(msgspec.Struct):
 
 
 class Recording(msgspec.Struct):
-    """A recording, as the recorder answers."""
-
     id: str
     began: int
     ended: int
@@ -102,14 +100,12 @@ class Control:
         self.recordings: dict[str, Recording] = {}
 
     def load_policy(self, revision: int, text: str, **changes: Any) -> None:
-        """Bring a policy into force."""
         self.policies[revision] = text
         self.trail.revision = revision
         detail = {"sha256": fingerprint(text), "who": "disk", **changes}
         self.trail.happened("policy loaded", "it is in force", severity=Severity.NOTICE, more=detail)
 
     def load_specifications(self, revision: int, files: dict[str, str]) -> None:
-        """Bring specifications into force."""
         self.specifications[revision] = files
         detail = {"revision_of_specifications": revision, "sha256": fingerprint_of_all(files)}
         self.trail.happened("specifications loaded", "they are in force", category="monitor", more=detail)
@@ -139,7 +135,6 @@ class Control:
         return RecordingSelection(recording.id, folder)
 
     def ask(self, request: AdminRequest[Any]) -> AdminAnswer[Any]:
-        """Answer as control does."""
         try:
             body = self._answer(request)
         except NotSealedError as error:

@@ -50,7 +50,6 @@ def members_of(bundle: Path) -> Members:
 
 
 def written(members: Members, place: Path) -> Path:
-    """Write a bundle with these members."""
     with zipfile.ZipFile(place, "w") as archive:
         for name, data in members.items():
             archive.writestr(name, data)
@@ -59,13 +58,11 @@ def written(members: Members, place: Path) -> Path:
 
 @pytest.fixture
 def bundle(control: Control, tmp_path: Path) -> Path:
-    """Return a bundle of the appliance's working time."""
     return control.exported(tmp_path / "bundle.zip")
 
 
 @pytest.fixture
 def pem(key: Ed25519PrivateKey, tmp_path: Path) -> Path:
-    """Return the reviewer's copy of the key."""
     place = tmp_path / "kept.pub"
     place.write_bytes(key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
     return place
@@ -80,7 +77,6 @@ class Reviewer:
         self.said = ""
 
     def status(self, bundle: Path, *options: object) -> int:
-        """Return the exit status."""
         self._capsys.readouterr()
         status = bundle_verifier.main([str(bundle), "--key", str(self._key), *map(str, options)])
         self.said = self._capsys.readouterr().out
@@ -89,7 +85,6 @@ class Reviewer:
 
 @pytest.fixture
 def reviewer(capsys: pytest.CaptureFixture[str], pem: Path) -> Reviewer:
-    """Return a reviewer with the key."""
     return Reviewer(capsys, pem)
 
 
@@ -444,7 +439,6 @@ def resealed(members: Members) -> Members:
 
 
 def lines(members: Members, change: Callable[[list[dict[str, Any]]], None]) -> Members:
-    """Return a bundle whose lines the forger replaced."""
     records = [json.loads(line) for line in members["records.ndjson"].splitlines()]
     change(records)
     text = "".join(json.dumps(record, separators=(",", ":")) + "\n" for record in records)

@@ -27,7 +27,6 @@ def workers() -> Iterator[Workers]:
 
 
 def checked(workers: Workers, bundle: Path, key: Ed25519PrivateKey, seconds: float = 30.0) -> EvidenceContent:
-    """Return what a worker finds in a bundle of the robot with this key."""
     folder, raw = bundle.parent, key.public_key().public_bytes_raw().hex()
     evidence = EvidenceConfig(check_seconds=seconds)
     config = FleetConfig(certificate=folder, key=folder, data=folder / "data", evidence=evidence)

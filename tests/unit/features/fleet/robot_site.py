@@ -21,7 +21,6 @@ class RobotSite(BundleSite):
     def robot(
         self, url: str, folder: Path, robot: str = ROBOT, clock: Callable[[], float] = time.time
     ) -> VerifiedBundles:
-        """Return a robot's client of bundles."""
         connection = self.connection(url, robot)
         return VerifiedBundles(
             folder, self.first_root, connection, site=SITE, group=GROUP, robot=robot, clock=clock

@@ -1,5 +1,3 @@
-"""Tests of the health by which a bundle is judged: no host but the robot itself can spoil it, or hide an illness."""
-
 import ipaddress
 
 import pytest

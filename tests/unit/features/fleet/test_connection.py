@@ -44,12 +44,10 @@ def drips_the_handshake(visitor: Visitor) -> None:
 
 
 def closes(visitor: Visitor) -> None:
-    """Close the connection."""
     visitor.stream.close()
 
 
 def drips_the_head(visitor: Visitor) -> None:
-    """Send a byte of a header now and then."""
     visitor.stream.sendall(b"HTTP/1.1 200 OK\r\nX: ")
     visitor.repeat(b"x", 0.02)
 
@@ -60,19 +58,16 @@ def sends_interim_answers(visitor: Visitor) -> None:
 
 
 def sends_an_endless_head(visitor: Visitor) -> None:
-    """Send a header without an end."""
     visitor.stream.sendall(b"HTTP/1.1 200 OK\r\nX: ")
     visitor.repeat(b"x" * 65_536, 0)
 
 
 def drips_the_body(visitor: Visitor) -> None:
-    """Send a byte of the body now and then."""
     visitor.stream.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 500\r\n\r\n")
     visitor.repeat(b"x", 0.02)
 
 
 def sends_an_endless_body(visitor: Visitor) -> None:
-    """Send a body without an end."""
     visitor.stream.sendall(b"HTTP/1.1 200 OK\r\n\r\n")
     visitor.repeat(bytes(1 << 16), 0)
 
@@ -84,17 +79,14 @@ def closes_midway(visitor: Visitor) -> None:
 
 
 def redirects(visitor: Visitor) -> None:
-    """Send the client to another server."""
     visitor.give(b"", "307 Temporary Redirect", "Location: https://127.0.0.1:1/")
 
 
 def compresses(visitor: Visitor) -> None:
-    """Answer with a compressed body."""
     visitor.give(b"\x1f\x8b\x08", "200 OK", "Content-Encoding: gzip")
 
 
 def is_not_http(visitor: Visitor) -> None:
-    """Answer in another protocol."""
     visitor.stream.sendall(b"SSH-2.0-OpenSSH_9.2\r\n")
 
 
@@ -126,7 +118,6 @@ IN_ANSWER = {
 
 @pytest.fixture
 def site(tmp_path: Path) -> RobotSite:
-    """Return a fleet's repository and certificates."""
     return RobotSite(tmp_path / "site")
 
 
@@ -137,7 +128,6 @@ def authority(site: RobotSite) -> FleetAuthority:
 
 @pytest.fixture
 def pusher(authority: FleetAuthority, make_log: MakeLog, path: Path, tmp_path: Path) -> Iterator[Client]:
-    """Return the client that pushes segments; its log has one sealed segment."""
     log = make_log(checkpoint_every=10)
     for number in range(10):
         log.record(decision(log, number))
@@ -175,7 +165,6 @@ def poller(site: RobotSite, tmp_path: Path) -> Client:
 
 @pytest.fixture
 def joiner(authority: FleetAuthority, tmp_path: Path) -> Client:
-    """Return the command that joins with an invitation."""
     authority.server_context.verify_mode = ssl.CERT_OPTIONAL  # a robot that joins has no certificate yet
     state, file = tmp_path / "joining", tmp_path / "arm1.json"
     (state / "control").mkdir(parents=True)
@@ -197,14 +186,12 @@ def joiner(authority: FleetAuthority, tmp_path: Path) -> Client:
 
 @pytest.fixture(params=["pusher", "poller", "joiner"])
 def client(request: pytest.FixtureRequest) -> Client:
-    """Return each client."""
     found: Client = request.getfixturevalue(request.param)
     return found
 
 
 @contextmanager
 def connected(authority: FleetAuthority, answer: Lie) -> Iterator[CollectorConnection]:
-    """Return a robot's connection to a collector that answers so."""
     with lying_collector(authority.server_context, answer) as url:
         made = robot_connection(url, authority.ca, *authority.issue(ROBOT))
         yield made

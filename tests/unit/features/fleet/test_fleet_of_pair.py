@@ -1,5 +1,3 @@
-"""Tests of `appliance.features.fleet.fleet_of_pair`: a pair of which one appliance is not in the fleet is noticed."""
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast

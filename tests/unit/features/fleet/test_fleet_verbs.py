@@ -1,5 +1,3 @@
-"""Tests of `rosrv fleet`."""
-
 import json
 from pathlib import Path
 from typing import Any
@@ -30,8 +28,6 @@ def test_a_join_needs_no_checkpoint(
     invitation.write_text(json.dumps(_INVITATION))
 
     class Collector:
-        """A collector that accepts."""
-
         def __init__(self, *_: Any) -> None:
             pass
 

@@ -40,16 +40,13 @@ class Collector(CollectorConnection):
         self.refusal: CollectorError | None = None
 
     def honest_head(self, upto: int) -> dict[str, Any]:
-        """Return the newest pushed checkpoint."""
         number = max([one for one in self.pushed if one <= upto], default=0)
         return {"number": number, "hashes": [self.hash_of(number)] if number else []}
 
     def hash_of(self, number: int) -> str:
-        """Return the hash of the log's checkpoint."""
         return checkpoint_hash(signed_checkpoints(self.log, number - 1, 1)[0].text())
 
     def get(self, path: str, longest: int = 0) -> bytes:
-        """Answer with a head."""
         self.asked += 1
         if self.refusal:
             raise self.refusal
@@ -59,7 +56,6 @@ class Collector(CollectorConnection):
         return json.dumps({"robot": "arm1", "log": ""} | self.head(int(asked["upto"]))).encode()
 
     def put(self, path: str, content: Iterator[bytes], size: int, headers: Any = ()) -> bytes:
-        """Take a segment and answer with a receipt."""
         assert sum(map(len, content)) == size
         _v1, _logs, log, _segments, number, name = path.split("/")
         end = signed_checkpoints(self.log, int(number) - 1, 1)[0].sequence

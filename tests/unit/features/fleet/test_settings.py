@@ -13,12 +13,10 @@ from appliance.features.fleet.settings import Fleet
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    """Return the path of a configuration file."""
     return tmp_path / "appliance.yaml"
 
 
 def mistakes(file: Path | None, flags: dict[str, Any]) -> list[str]:
-    """Return the mistakes, one line each."""
     with pytest.raises(ConfigError) as caught:
         resolve(file, {}, flags)
     return [str(mistake) for mistake in caught.value.mistakes]

@@ -20,7 +20,6 @@ YEAR = 365 * 86_400.0
 
 
 def at(years: float) -> VirtualClock:
-    """Return a clock that is wrong by some years."""
     return VirtualClock(wall=wall() + years * YEAR)
 
 

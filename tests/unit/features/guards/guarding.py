@@ -30,19 +30,16 @@ def twist(*legs: float) -> bytes:
 
 
 def legs_of(data: bytes) -> tuple[float, ...]:
-    """Return the velocities of a command."""
     read = fields(TWIST, data)
     return (read.linear.x, read.linear.y, read.linear.z, read.angular.x, read.angular.y, read.angular.z)
 
 
 def same(one: Iterable[float], other: Iterable[float]) -> bool:
-    """Whether numbers are equal; NaN equals NaN."""
     return all(a == b or (math.isnan(a) and math.isnan(b)) for a, b in zip(one, other, strict=True))
 
 
 @functools.cache
 def _part(text: str) -> bytes:
-    """Return what a relay loads."""
     [part] = parts_of(certified(compiled_from({"guard.rv": text}, DEFINITIONS)).data, [(("guard",), ())])
     return part
 
@@ -62,7 +59,6 @@ class Guarded:
         self.advance(0)
 
     def advance(self, at: int) -> None:
-        """Let time pass."""
         for one in self.monitors.advance(BEGIN + at * MS):
             self._sent(one, (one.time - BEGIN) // MS)
 

@@ -24,18 +24,15 @@ TRACES = range(examples(1000))
 
 
 def seconds(at: int) -> float:
-    """Return a time as the language has it."""
     whole, rest = divmod(BEGIN + at * MS, 10**9)
     return whole + rest * 1e-9
 
 
 def moves(data: bytes) -> bool:
-    """Whether a command is a motion."""
     return any(leg != 0 for leg in legs_of(data))
 
 
 def deadman(commands: list[tuple[int, bytes, str]], end: int, silent: float) -> list[tuple[int, bytes]]:
-    """Return what the base gets, by a naive account."""
     got: list[tuple[int, bytes]] = []
     movers: dict[str, float] = {}
     stopped, pause = False, 0
@@ -87,7 +84,6 @@ def test_a_deadman_stops_within_its_time_and_a_tick(gap: int) -> None:
 
 
 def axis(wanted: float, last: float, most: float, growth: float) -> float:
-    """Return a limited velocity, by a naive account."""
     if math.isnan(wanted):
         return 0.0
     start = abs(last) if wanted * last > 0 else 0.0
@@ -146,7 +142,6 @@ def test_a_rate_drops_motions_and_never_a_stop() -> None:
 
 
 def odometry(x: float, y: float, yaw: float) -> bytes:
-    """Return a position; its quaternion is not normalised."""
     return message(
         "nav_msgs/Odometry",
         pose__pose__position__x=x,

@@ -1,5 +1,3 @@
-"""Presets are valid texts for each of their types, and their parameters are checked before a text is made."""
-
 import re
 from itertools import product
 from pathlib import Path
@@ -27,7 +25,6 @@ INTERPRETED = {"joints", "answer"}
 
 
 def compiled(text: str) -> Compiled:
-    """Return a compiled text, which has no warning."""
     found = compiled_from({"guard.rv": text}, DEFINITIONS)
     assert not found.warnings
     return found

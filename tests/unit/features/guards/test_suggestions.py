@@ -16,7 +16,6 @@ ROBOTS: dict[str, Any] = yaml.safe_load(Path(__file__).with_name("robots.yaml").
 
 
 def graph_of(robot: str) -> list[TopicFacts]:
-    """Return the topics of a robot."""
     rows = []
     for name, line in ROBOTS[robot]["topics"].items():
         kind, rate, *ends = line.split()
@@ -28,7 +27,6 @@ def graph_of(robot: str) -> list[TopicFacts]:
 
 
 def text(proposal: Proposal, graph: list[TopicFacts]) -> str:
-    """Return the text that the proposed command makes."""
     values = {**proposal.measured, **proposal.values}
     return text_of(planned(PRESETS[proposal.preset], proposal.name, proposal.topics, graph, values, {}))
 

@@ -1,5 +1,3 @@
-"""`rosrv guard` loads, changes and removes guards by the operations of monitors."""
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -32,7 +30,6 @@ class Robot:
         ]  # fmt: skip
 
     def ask_or_exit(self, request: Any) -> Any:
-        """Answer as control does."""
         match request:
             case admin.GraphWanted():
                 flows = {one.name: [SimpleNamespace(node=node, messages_per_second=one.rate) for node in one.publishers]

@@ -17,19 +17,16 @@ GO = twist(0.5)
 
 
 def runs(guard: Guarded, at: int) -> bool:
-    """Whether a command passes."""
     return guard.drive(GO, at)[0] == 0.5
 
 
 def stops(guard: Guarded) -> list[int]:
-    """Return the times of stops, and forget them."""
     found = [at for at, data in guard.got if legs_of(data)[0] == 0]
     guard.got.clear()
     return found
 
 
 def button(on: bool) -> bytes:
-    """Return the state of a button."""
     return message("std_msgs/Bool", data=on)
 
 
@@ -79,7 +76,6 @@ def test_an_emergency_stop_is_sent_at_once_and_repeated() -> None:
 
 
 def scan(ranges: list[float]) -> bytes:
-    """Return a scan."""
     return message("sensor_msgs/LaserScan", ranges=ranges)
 
 
@@ -181,7 +177,6 @@ def test_other_sensors_are_watched_likewise(kind: str) -> None:
 
 
 def speed(v: float) -> bytes:
-    """Return odometry with a velocity."""
     return message("nav_msgs/Odometry", twist__twist__linear__x=v)
 
 

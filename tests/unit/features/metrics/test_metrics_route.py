@@ -1,5 +1,3 @@
-"""Tests of `appliance.telemetry.metric_table` and `appliance.features.metrics.metrics_route`."""
-
 import os
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""`rosrv policy` for every shipped policy and every action; `policy.txt` has the rest."""
-
 import json
 from pathlib import Path
 

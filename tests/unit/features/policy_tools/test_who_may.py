@@ -1,5 +1,3 @@
-"""Tests of the list of hosts that may do something, against the decision on each host."""
-
 import ipaddress
 from collections.abc import Iterator
 

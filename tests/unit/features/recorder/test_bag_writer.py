@@ -19,12 +19,10 @@ SECOND = 1_000_000_000
 
 
 def body(text: bytes) -> bytes:
-    """Return a std_msgs/String."""
     return len(text).to_bytes(4, "little") + text
 
 
 def read(path: Path) -> list[tuple[str, int, bytes]]:
-    """Return the messages that `rosbags` reads, ordered by time."""
     with Reader(path) as reader:
         return [(connection.topic, time, bytes(data)) for connection, time, data in reader.messages()]
 

@@ -1,5 +1,3 @@
-"""The row of the recorder."""
-
 import pkgutil
 
 from appliance.configuration.sections import Sections

@@ -1,5 +1,3 @@
-"""When the disk fills, the recorder reports it and continues, and each named recording is complete."""
-
 import hashlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -65,7 +63,6 @@ def test_each_step_on_a_full_disk(disk: Path, tmp_path: Path, what: str) -> None
 
 
 def fill(disk: Path, what: str) -> None:
-    """Fill the disk to the last byte and file."""
     number = 0
     try:
         while True:

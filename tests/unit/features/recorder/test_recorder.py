@@ -50,12 +50,10 @@ class Scene:
         self.recorder = self.make_recorder()
 
     def begin_anew(self) -> None:
-        """Start the recorder again."""
         self.recorder.close()
         self.recorder = self.make_recorder()
 
     def make_recorder(self) -> Recorder:
-        """Start a recorder on the present state."""
         store = RecordingStore(self.folder, disk=self.disk, seconds=None, clock=lambda: 0)
         return Recorder(
             self.rules,
@@ -68,7 +66,6 @@ class Scene:
         )
 
     def say(self, body: bytes = TEXT) -> None:
-        """Write a message of a publisher."""
         assert self.stream is not None
         self.said += 1
         self.stream.write(memoryview(frame(body)), 1, self.said)
@@ -86,11 +83,9 @@ class Scene:
         return self.recorder.step(said)
 
     def closed(self, answers: list[messages.Message]) -> list[Recording]:
-        """Return the recordings that control received."""
         return [one.recording for one in answers if isinstance(one, recorder_link.RecordingClosed)]
 
     def bag(self, recording: Recording) -> list[tuple[str, int, bytes]]:
-        """Return the messages in the bag of a recording."""
         path = self.folder / recording.id / "recording.bag"
         assert hashlib.sha256(path.read_bytes()).hexdigest() == recording.sha256
         assert path.stat().st_size == recording.size
@@ -100,7 +95,6 @@ class Scene:
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Iterator[Scene]:
-    """Start with a first message."""
     scene = Scene(tmp_path)
     scene.say()
     yield scene
@@ -243,7 +237,6 @@ def test_a_flood_of_triggers_does_not_fill_the_disk(tmp_path: Path) -> None:
 
 
 def planned(scene: Scene, recording_id: str, charged_to: str) -> str:
-    """Write a record for which control planned a recording."""
     return scene.happen(detail={"recording": recording_id, "charged_to": charged_to})
 
 

@@ -19,13 +19,11 @@ EVER = 0, 1 << 63
 
 
 def given(descriptor: int, *, never: tuple[str, ...] = (), now: Callable[[], int] = wall_ns) -> RecorderRing:
-    """Return the recorder of a relay."""
     return RecorderRing(RingTerms(0, 1, 60, ["/chat*"], list(never)), os.dup(descriptor), now)
 
 
 @pytest.fixture
 def memory() -> Iterator[int]:
-    """Return the memory of a ring."""
     descriptor = os.memfd_create("ring")
     os.ftruncate(descriptor, SMALLEST)
     yield descriptor
@@ -33,7 +31,6 @@ def memory() -> Iterator[int]:
 
 
 def kept(descriptor: int) -> list[tuple[str, bytes]]:
-    """Return the topics and messages of a ring."""
     reader = RingReader(memoryview(mmap.mmap(descriptor, 0, prot=mmap.PROT_READ)))
     return [
         (found.header["topic"], bytes(message))

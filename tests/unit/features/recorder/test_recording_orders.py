@@ -1,5 +1,3 @@
-"""Orders of operators to the flight recorder; the test plays the recorder."""
-
 import asyncio
 import socket
 from collections.abc import Callable
@@ -45,8 +43,6 @@ class Trail:
 
 
 class Scene:
-    """Control's end and the recorder's."""
-
     def __init__(self, **rules: Any) -> None:
         self.trail = Trail()
         self.orders = RecordingOrders(

@@ -1,5 +1,3 @@
-"""The plan gives each event its recording and its host, or the reason for having no recording."""
-
 from collections.abc import Callable
 from itertools import count
 from typing import Any

@@ -1,5 +1,3 @@
-"""The bodies of orders about recordings."""
-
 import json
 
 import pytest

@@ -1,5 +1,3 @@
-"""A recording that is removed during its download."""
-
 import shutil
 from pathlib import Path
 from types import SimpleNamespace

@@ -37,7 +37,6 @@ def recording(
 
 
 def put(store: RecordingStore, kept: Recording) -> Recording:
-    """Save it, as the recorder does."""
     part = store.part(kept.id)
     part.mkdir()
     (part / ABOUT).write_bytes(msgspec.json.encode(kept))
@@ -46,7 +45,6 @@ def put(store: RecordingStore, kept: Recording) -> Recording:
 
 
 def cleared(store: RecordingStore, now: int = 0, *, room: bool = False) -> list[tuple[Recording, str]]:
-    """Remove recordings as the recorder does, and return them."""
     gone = []
     for kept, why in store.outdated(now):
         store.remove(kept, "", why)

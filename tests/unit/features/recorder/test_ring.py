@@ -35,7 +35,6 @@ HEADER = {
 
 
 def frame(body: bytes) -> bytes:
-    """Return a message as it is on the wire."""
     return struct.pack("<I", len(body)) + body
 
 
@@ -46,7 +45,6 @@ class Clock:
         self.now = now
 
     def __call__(self, judged: int = 0) -> int:
-        """Return the time now."""
         return judged or self.now
 
 
@@ -56,14 +54,12 @@ def ring(memory: memoryview, clock: Clock | None = None) -> RingWriter:
 
 
 def opened(writer: RingWriter, topic: str = "/a", host: str = "10.0.0.1", **header: str) -> RingStream:
-    """Open a stream, and check that there was room for it."""
     stream = writer.open(topic, host, HEADER | header)
     assert stream is not None
     return stream
 
 
 def texts(found: list[StreamFrames], topic: str = "/a") -> list[bytes]:
-    """Return the messages of a topic, in order."""
     return [
         bytes(body)
         for one in found
@@ -75,7 +71,6 @@ def texts(found: list[StreamFrames], topic: str = "/a") -> list[bytes]:
 
 @pytest.fixture
 def memory() -> memoryview:
-    """Return memory for the smallest ring."""
     return memoryview(mmap.mmap(-1, SMALLEST))
 
 

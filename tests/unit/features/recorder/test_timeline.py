@@ -27,7 +27,6 @@ RECORDS = {name: value for name, value in HEADER.items() if name != "host"} | {
 
 
 def record(number: int, **fields: Any) -> bytes:
-    """Return an audit record as the recorder writes it."""
     own = {"id": f"{number:020x}", "event": "decision", "severity": "info", "reason": "so", "detail": {}}
     return body(json.dumps(own | fields).encode())
 

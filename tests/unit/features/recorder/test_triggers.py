@@ -1,5 +1,3 @@
-"""Audit records that trigger recordings."""
-
 from typing import get_args, get_type_hints
 
 import pytest

@@ -1,5 +1,3 @@
-"""Tests of how `rosrv selftest` finds its own call in the audit log, with a clock that the test moves."""
-
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any, cast
@@ -33,7 +31,6 @@ class Log:
         return 5
 
     def search(self, *_arguments: object, newest_first: bool) -> Any:
-        """Return the next answer; the last one is repeated."""
         assert newest_first
         self.searches += 1
         self.machine.advance(0.001)  # a search takes time
@@ -45,7 +42,6 @@ class Log:
 
 @pytest.fixture
 def log(monkeypatch: pytest.MonkeyPatch) -> Iterator[Log]:
-    """Return a log; waiting takes no time."""
     log = Log()
     monkeypatch.setattr(selftest_running, "time", SimpleNamespace(sleep=log.machine.advance))
     monkeypatch.setattr(selftest_running, "secrets", SimpleNamespace(token_hex=lambda _bytes: "00c0ffee"))

@@ -116,7 +116,6 @@ class ScriptedProvider:
         return ProviderAnswer(200, json.dumps({"id_token": signed}).encode())
 
     async def begin(self, address: str = "10.0.0.9", *, again: bool = False) -> str:
-        """Begin a sign-on, and return its state."""
         url, state = await self.sign_ons.begin(KEYS, address, again=again)
         assert url.startswith(self.metadata["authorization_endpoint"])
         self.asked = {name: values[0] for name, values in parse_qs(urlsplit(url).query).items()}

@@ -1,5 +1,3 @@
-"""Hostile ID tokens: each is refused, with its reason."""
-
 import hmac
 from collections.abc import Callable
 from typing import Any

@@ -74,7 +74,6 @@ MUTANTS = {
 
 
 def product_of(mutant: Mutant, folder: Path) -> Product:
-    """Return the product with this change."""
     source = Path(str(mutant.module.__file__)).read_text(encoding="utf-8")
     if source.count(mutant.old) != 1:
         raise ValueError(f"{mutant.old!r} is {source.count(mutant.old)} times in {mutant.module.__file__}")
@@ -89,7 +88,6 @@ def product_of(mutant: Mutant, folder: Path) -> Product:
 
 
 def first_seed(product: Product, faults: tuple[str, ...], histories: int) -> int | None:
-    """Return the first seed whose history breaks a promise."""
     for seed in range(histories):
         try:
             History(seed, product, faults=faults).run()

@@ -108,12 +108,10 @@ class Host:
 
     @property
     def now(self) -> float:
-        """The time of its own clock."""
         return self.offset + self.history.now * self.speed
 
     @property
     def running(self) -> bool:
-        """Whether it runs at present."""
         return self.up and self.history.now >= self.paused_until
 
     def start(self) -> None:
@@ -201,16 +199,13 @@ class SimulatedAppliance(Host):
         self.pending: list[tuple[int, float]] = []  # length of the log with the entry, time
 
     def crashed(self) -> None:
-        """An ended process is passive."""
         self.note_activity()
 
     @property
     def active(self) -> bool:
-        """Whether it runs and is active."""
         return self.running and self.lease.is_active(self.now)
 
     def tick(self) -> None:
-        """Tick the lease, and send the log."""
         if self.lease.is_active(self.now):
             self._send_log()
         else:
@@ -221,7 +216,6 @@ class SimulatedAppliance(Host):
         self._answer()
 
     def write(self) -> None:
-        """Take a write of a client."""
         if self.active and len(self.pending) < _INBOX:
             self._own_log()
             self.log = (*self.log, self.history.next_write())
@@ -236,7 +230,6 @@ class SimulatedAppliance(Host):
                 self._send(self.lease.switch_over(self.now))
 
     def received(self, sender: str, message: Any) -> None:
-        """Take a datagram of the witness, or a message of the other appliance."""
         if sender == "witness":
             answer = self.channel.read(message)
             if answer is not None:
@@ -330,7 +323,6 @@ class SimulatedRobot(Host):
         self.gate = product.WitnessGate(self.keeper, SETTINGS.appliances, nonce)
 
     def crash(self) -> None:
-        """End the witness alone; systemd starts it again."""
         super().crash()
         self.history.at(self.history.random.uniform(0.05, 1), self.start_if_booted)
 
@@ -340,13 +332,11 @@ class SimulatedRobot(Host):
             self.start()
 
     def power_off(self) -> None:
-        """Lose the rules and all that is not on the disk."""
         super().crash()
         self.network_up = False
         self.rules = ""
 
     def received(self, sender: str, message: Any) -> None:
-        """Answer a datagram, and record the event."""
         epoch_before = self.disk.epoch
         try:
             answer = self.gate.answer(message, SETTINGS.appliances[sender].address)
@@ -454,7 +444,6 @@ class History:
         }
 
     def trace(self, event: str) -> None:
-        """Pass an event on."""
         if self.on_event is not None:
             self.on_event(event)
 
@@ -469,17 +458,14 @@ class History:
             raise Violation(f"seed {self.seed}, {self.now:.3f} s: {text}")
 
     def next_write(self) -> str:
-        """Return a new entry of the log."""
         self._writes += 1
         return str(self._writes)
 
     def acknowledged(self, appliance: SimulatedAppliance, entry: str) -> None:
-        """Remember a write that was answered."""
         self.answered.add(entry)
         self.trace(f"acknowledged {appliance.name} {entry}")
 
     def became_active(self, appliance: SimulatedAppliance, epoch: int) -> None:
-        """Check an appliance that becomes active."""
         self.trace(f"active {appliance.name} {epoch}")
         self._require_answered(appliance)
         self.require(epoch >= self.greatest, f"{appliance.name} is active with the old epoch {epoch}")

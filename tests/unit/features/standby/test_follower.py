@@ -50,7 +50,6 @@ class Robot:
         self.start_follower(epoch)
 
     def start_witness(self, record: LeaseRecord | None, boot: str = "one") -> None:
-        """Start the witness, or start it again."""
         self.witness = Witness(
             record=record,
             save=lambda _record: None,
@@ -61,7 +60,6 @@ class Robot:
         self.gate = WitnessGate(self.witness, APPLIANCES, f"nonce {id(self.witness)}", FOLLOWERS)
 
     def start_follower(self, epoch: int = 0, session: str = "first") -> None:
-        """Start the follower, or start it again."""
         self.follower = WitnessFollower(
             name="arm",
             key=KEY,
@@ -84,7 +82,6 @@ class Robot:
         self.follower_admits.append(name)
 
     def claim(self, name: str) -> None:
-        """Let the lease expire; grant it to an appliance."""
         self.now += EXPIRY
         assert self.witness.handle(name, "claim", 0, "") == ""
 
@@ -339,7 +336,6 @@ class RandomHistory:
         self.start_follower()
 
     def start_witness(self) -> None:
-        """Start the witness again, sometimes after a reboot of the robot."""
         self.boot += self.random.random() < 0.3
         self.witness = Witness(
             record=self.record,
@@ -351,7 +347,6 @@ class RandomHistory:
         self.gate = WitnessGate(self.witness, APPLIANCES, f"{self.random.random()}", FOLLOWERS)
 
     def start_follower(self) -> None:
-        """Start the follower again."""
         self.follower = WitnessFollower(
             name="arm",
             key=KEY,
@@ -411,7 +406,6 @@ def test_robot_and_follower_never_admit_different_appliances(seed: int) -> None:
 
 
 def written(folder: Path, **changes: object) -> Path:
-    """Return a settings file of a follower."""
     path = folder / "witness.json"
     body: dict[str, object] = {
         "listen": "10.0.0.1:7411",

@@ -66,7 +66,6 @@ class Pairs:
 
     @property
     def present(self) -> Pair:
-        """Return an appliance in the present epoch."""
         return self.members["a"]._replace(epoch=self.epoch)
 
     def copies(self, *contents: bytes | None, followed: bool = True) -> StateCopies:
@@ -86,15 +85,12 @@ class Relays:
         self.at = 5
 
     def has_state(self) -> bool:
-        """Act as `Rollout`."""
         return self.state
 
     async def leave(self, _seconds: float) -> list[bytes]:
-        """Act as `Rollout`."""
         return [content or b"" for content in self.contents]
 
     async def copies(self, _seconds: float, *, full: bool) -> list[StateLeft]:
-        """Act as `Rollout`."""
         if self.hangs:
             raise TimeoutError
         if None in self.contents and full:

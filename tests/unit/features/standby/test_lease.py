@@ -1,5 +1,3 @@
-"""The lease as an appliance sees it: when it is active, and what it sends."""
-
 import pytest
 
 from appliance.features.standby.lease import (
@@ -30,28 +28,22 @@ def answer_of(**changes: object) -> WitnessAnswer:
 
 
 class Lease:
-    """The lease of `a`, with a clock."""
-
     def __init__(self, epoch: int = 1) -> None:
         self.now = 50.0
         self.lease = ApplianceLease("a", "b", "session", epoch, self.now)
 
     def later(self, seconds: float) -> "Lease":
-        """Move the clock."""
         self.now += seconds
         return self
 
     def tick(self, *, waiting_since: float | None = None, caught_up: bool = False) -> Outgoing:
-        """Return what is due."""
         return self.lease.tick(self.now, waiting_since=waiting_since, caught_up=caught_up)
 
     def operations(self, *, waiting_since: float | None = None, caught_up: bool = False) -> list[str]:
-        """Return the operations that are due at the witness."""
         due = self.tick(waiting_since=waiting_since, caught_up=caught_up)
         return [one.operation for one in due if isinstance(one, WitnessRequest)]
 
     def request(self, operation: str) -> WitnessRequest:
-        """Return the request that is due."""
         (found,) = [
             one for one in self.tick() if isinstance(one, WitnessRequest) and one.operation == operation
         ]
@@ -62,12 +54,10 @@ class Lease:
         return self.lease.answered(request, answer_of(**answer))
 
     def active(self) -> bool:
-        """Whether it is active now."""
         return self.lease.is_active(self.now)
 
 
 def active_lease() -> Lease:
-    """Return a lease that has just been granted."""
     lease = Lease().later(EXPIRY)
     lease.answered(lease.request("claim"))
     assert lease.active()
@@ -75,7 +65,6 @@ def active_lease() -> Lease:
 
 
 def asked_by(lease: Lease) -> PromiseRequest:
-    """Return the request for a promise that is due."""
     return next(one for one in lease.tick() if isinstance(one, PromiseRequest))
 
 

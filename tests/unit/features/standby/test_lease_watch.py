@@ -40,14 +40,11 @@ class Role:
         return self.serving
 
     async def until_stopped(self) -> float:
-        """Return the time when it stopped to serve."""
         await self.stopped.wait()
         return clock.since_boot()
 
 
 def run(work: Callable[[Role], Awaitable[None]]) -> None:
-    """Run a test in a loop."""
-
     async def inside() -> None:
         await work(Role())
 

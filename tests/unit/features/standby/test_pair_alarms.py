@@ -1,5 +1,3 @@
-"""Alarms of two appliances, from the status."""
-
 from typing import Any
 
 import pytest

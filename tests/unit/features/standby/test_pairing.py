@@ -1,5 +1,3 @@
-"""The start of an appliance that is one of two, from the membership in its state directory."""
-
 import json
 from contextlib import closing
 from pathlib import Path

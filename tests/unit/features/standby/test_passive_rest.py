@@ -1,5 +1,3 @@
-"""Tests of `appliance.features.standby.passive_rest`: the api of a standby knows the replicated tokens."""
-
 import asyncio
 import socket
 import sqlite3

@@ -18,7 +18,6 @@ ALL: tuple[PeerMessage, ...] = (
 
 
 def ends() -> tuple[PeerChannel, PeerChannel]:
-    """Return the channels of both appliances."""
     return PeerChannel("a", "b", KEY), PeerChannel("b", "a", KEY)
 
 

@@ -109,7 +109,6 @@ class Pair:
         self.control.begin()
 
     def step(self, name: str) -> None:  # noqa: PLR0912  a branch for each thing that can happen
-        """Let one thing happen."""
         sender: Any = self.control.sender
         match name:
             case "change":
@@ -167,19 +166,16 @@ class Pair:
         self.answered = max(self.answered, number)
 
     async def turn(self) -> None:
-        """Let the tasks run, then check the promise."""
         for _ in range(3):
             await asyncio.sleep(0)
         if "b" in self.in_sync():
             assert self.answered <= self.standby, f"change {self.answered} is answered, b has {self.standby}"
 
     def in_sync(self) -> set[str]:
-        """Return the appliances in sync."""
         assert self.witness.record is not None
         return set(self.witness.record.in_sync)
 
     def close(self) -> None:
-        """Close the sockets."""
         for task in self.waiting:
             task.cancel()
         self.supervisor.close()
@@ -190,7 +186,6 @@ class Pair:
 
 
 async def run(pair: Pair, steps: list[str]) -> None:
-    """Become active, then take these steps."""
     pair.machine.advance(EXPIRY)
     pair.start_control(taken_over=True)
     for step in ["settle"] * 8 + steps:

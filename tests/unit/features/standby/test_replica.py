@@ -35,7 +35,6 @@ BEGIN = SnapshotBegin(3, "h", 7)
 
 
 def thing(name: str) -> Put:
-    """Return a change of one row."""
     return Put("thing", [(name, 1, None)])
 
 
@@ -54,14 +53,12 @@ def begun(tmp_path: Path) -> Replica:
 
 @pytest.fixture
 def replica(tmp_path: Path) -> Iterator[Replica]:
-    """A replica, as `begun` returns it."""
     replica = begun(tmp_path)
     yield replica
     replica.close()
 
 
 def names(tmp_path: Path) -> list[str]:
-    """Return the rows of the file."""
     return [row[0] for row in tables_of(tmp_path / "state.db")["thing"]]
 
 

@@ -17,7 +17,6 @@ pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 @pytest.fixture
 def replica(tmp_path: Path) -> Iterator[Replica]:
-    """Yield an empty replica."""
     made = Replica(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
     yield made
     made.close()

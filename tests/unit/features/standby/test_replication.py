@@ -1,5 +1,3 @@
-"""Replication of the state between two databases, over TLS."""
-
 import asyncio
 import contextlib
 import random
@@ -168,7 +166,6 @@ async def test_a_standby_that_was_away_shortly_gets_only_the_changes(tmp_path: P
 
 @contextlib.asynccontextmanager
 async def connected(directory: Path, active: ActiveSide) -> AsyncIterator[ReplicationLink[FromActive]]:
-    """Connect as the standby does, to lie."""
     _server, client = certificates(directory)
     reader, writer = await asyncio.open_connection("127.0.0.1", active.port, ssl=client)
     link: ReplicationLink[FromActive] = ReplicationLink(reader, writer, FromActive)
@@ -405,7 +402,6 @@ Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
 async def pair_of_streams() -> tuple[Streams, Streams]:
-    """Return the two ends of a connection."""
     here, there = socket.socketpair()
     return await asyncio.open_connection(sock=here), await asyncio.open_connection(sock=there)
 

@@ -1,5 +1,3 @@
-"""Replication between two processes that are killed at random times."""
-
 import random
 import subprocess
 import sys
@@ -33,7 +31,6 @@ class Side:
         )
 
     def kill(self) -> str:
-        """Kill the process; return the rest of its output."""
         self.process.kill()
         assert self.process.stdin is not None
         self.process.stdin.close()
@@ -44,7 +41,6 @@ class Side:
         return rest
 
     def start_again(self) -> None:
-        """Start the process again."""
         self.process = self._start()
 
     def lines(self) -> Iterator[str]:
@@ -54,7 +50,6 @@ class Side:
 
 
 def marks_in(path: Path) -> set[int]:
-    """Return the marks in a state file."""
     return {number for (number,) in tables_of(path)["mark"]}
 
 

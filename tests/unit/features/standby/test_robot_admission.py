@@ -1,5 +1,3 @@
-"""The times in which a refused connection does not mean that a node of the robot has ended."""
-
 from appliance.base import clock
 from appliance.features.standby.replication import RobotAdmission
 from tests.support.virtual_clock import VirtualClock

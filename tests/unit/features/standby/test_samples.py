@@ -1,5 +1,3 @@
-"""Tests of `appliance.features.standby.samples`."""
-
 import msgspec
 
 from appliance.features.standby.samples import samples_of

@@ -26,7 +26,6 @@ class Control:
         self.checked = SimpleNamespace(states={"gun": SimpleNamespace(holds=False)})
 
     def report(self) -> ServiceReport:
-        """Return its reports."""
         base: Any = SimpleNamespace(
             audit=self.audit,
             settings=SimpleNamespace(audit=self.policy, state=self.state),

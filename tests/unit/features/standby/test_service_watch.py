@@ -1,5 +1,3 @@
-"""Tests of `appliance.features.standby.service_watch`: when an active appliance does not serve."""
-
 import pytest
 
 from appliance.features.standby.service_watch import (

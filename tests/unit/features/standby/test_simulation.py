@@ -1,5 +1,3 @@
-"""The simulation finds no broken promise in the product, and finds each mutant of its rules."""
-
 from pathlib import Path
 
 import pytest

@@ -1,5 +1,3 @@
-"""Tests of `appliance.features.standby.standby_orders`: who answers what on the active appliance and on the standby."""
-
 from typing import Any, cast
 
 import pytest

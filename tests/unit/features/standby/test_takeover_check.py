@@ -1,5 +1,3 @@
-"""Obstacles to a takeover are found before it, and their ends noticed."""
-
 import asyncio
 import contextlib
 import json

@@ -1,5 +1,3 @@
-"""Tests of recording takeovers and of replicating checkpoints of the audit log, with real logs, keys and states."""
-
 import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path

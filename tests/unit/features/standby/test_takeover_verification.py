@@ -47,16 +47,13 @@ class Pair(NamedTuple):
     key_b: Ed25519PrivateKey
 
     def forge_a(self, change: str) -> None:
-        """Change a's log as root there."""
         write_anew(self.a, self.key_a, self.a.parent / "signer", change)
 
     def forge_b(self, change: str) -> None:
-        """Change b's log as root there."""
         write_anew(self.b, self.key_b, self.b.parent / "signer", change)
 
 
 def build(folder: Path, story: Story) -> Pair:
-    """Return the logs of two appliances after a story."""
     a, b = play(folder, story)
     return Pair(a.path, b.path, a.key, b.key)
 
@@ -69,14 +66,12 @@ def honest(tmp_path_factory: pytest.TempPathFactory) -> Pair:
 
 @pytest.fixture
 def pair(honest: Pair, tmp_path: Path) -> Pair:
-    """Return a copy of the honest pair."""
     for name, path in (("a", honest.a), ("b", honest.b)):
         shutil.copytree(path.parent.parent, tmp_path / name)
     return honest._replace(a=tmp_path / "a/control/audit.db", b=tmp_path / "b/control/audit.db")
 
 
 def verified(a: Path, b: Path) -> PairVerification:
-    """Verify two logs and the takeovers between them."""
     pair = verify_takeovers(VerifiedLog(a, verify(a)), VerifiedLog(b, verify(b)))
     assert pair.ok == (not pair.findings and all(log.ok for log in pair.logs))
     return pair
@@ -94,13 +89,11 @@ def found(pair: Pair) -> list[tuple[Kind, int]]:
 
 
 def read(path: Path, query: str) -> list[Any]:
-    """Return rows of a log."""
     with closing(sqlite3.connect(path)) as connection:
         return connection.execute(query).fetchall()
 
 
 def execute(path: Path, *statements: str) -> None:
-    """Run SQL on a log's file."""
     with closing(sqlite3.connect(path)) as connection:
         for statement in statements:
             connection.execute(statement)
@@ -116,7 +109,6 @@ def setting(field: str, value: str, epoch: int, event: str = "took over") -> str
 
 
 def removing(epoch: int) -> str:
-    """Return SQL that removes the takeover of an epoch."""
     return f"DELETE FROM record WHERE event = 'took over' AND CAST(detail AS TEXT) LIKE '%\"epoch\":{epoch}%'"
 
 

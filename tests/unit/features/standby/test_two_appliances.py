@@ -1,5 +1,3 @@
-"""Tests of hosts' certificates on one of two appliances: the authority's key may be on the other one."""
-
 import asyncio
 from collections.abc import Iterator
 from pathlib import Path
@@ -30,14 +28,12 @@ PIN = "sha256//" + 43 * "A" + "="
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[StateStore]:
-    """Return the state that both appliances have, one after the other."""
     opened = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     yield opened
     opened.close()
 
 
 def near(tmp_path: Path, name: str) -> NearAuthority:
-    """Return the signer's own authority on an appliance."""
     (tmp_path / name).mkdir(exist_ok=True)
     return NearAuthority(tmp_path / name)
 

@@ -64,11 +64,9 @@ class Robot:
         self.admits.append(name)
 
     def asks(self, name: str, operation: str, epoch: int = 1) -> str:
-        """Return the reason of the refusal, or nothing."""
         return self.witness.handle(name, operation, epoch, "b" if name == "a" else "a")
 
     def expired(self) -> "Robot":
-        """Let the lease expire."""
         self.now += EXPIRY
         return self
 
@@ -181,7 +179,6 @@ def request(name: str = "a", key: bytes | None = None, **body: object) -> bytes:
 
 
 def answered(robot: Robot, datagram: bytes, address: str = "10.0.0.2") -> dict[str, object] | None:
-    """Return the authenticated answer."""
     answer = robot.gate.answer(datagram, address)
     return None if answer is None else unseal(ANSWER, KEYS["a"], answer)
 
@@ -369,7 +366,6 @@ def test_a_save_that_fails_keeps_the_lease() -> None:
 
 @pytest.fixture
 def settings(tmp_path: Path) -> Path:
-    """Return a valid settings file."""
     path = tmp_path / "witness.json"
     path.write_text(
         json.dumps(

@@ -1,5 +1,3 @@
-"""Tests of `appliance.features.syslog`: its settings, its process and its part of control."""
-
 import pytest
 from pydantic import ValidationError
 

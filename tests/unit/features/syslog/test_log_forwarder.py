@@ -1,5 +1,3 @@
-"""Tests of forwarding a real log: at least once, in order, and continued after a restart."""
-
 import json
 import shutil
 from collections.abc import Sequence
@@ -54,22 +52,18 @@ class Kept:
 
     @property
     def messages(self) -> list[Message]:
-        """Return the parsed messages."""
         return [parse(one) for one in self.lines]
 
     def sequences(self) -> list[int]:
-        """Return the sequences of the records."""
         return [int(one.fields["sequence"]) for one in self.messages if SYSLOG_ELEMENT not in one.elements]
 
 
 @pytest.fixture
 def kept() -> Kept:
-    """Return a receiver."""
     return Kept()
 
 
 def forwarder(path: Path, kept: Kept, chosen: Chosen = "all") -> LogForwarder:
-    """Return a forwarder as the process makes it."""
     formatter = Formatter(facility=13, longest=8192, host_name="robot")
     return LogForwarder(path, path.with_name("position.json"), kept, formatter, chosen=chosen)
 
@@ -89,7 +83,6 @@ def record(log: AuditLog, count: int, **fields: object) -> None:
 
 
 def everything(path: Path) -> list[int]:
-    """Return all sequences of the log."""
     found: list[int] = []
     cursor: str | None = "0"
     while cursor is not None:
@@ -278,7 +271,6 @@ def test_an_unreadable_position_stops_it(make_log: MakeLog, path: Path, kept: Ke
 
 
 def put_back(path: Path, copy: Path) -> None:
-    """Restore the log from its copy."""
     for file in path.parent.glob("audit.db*"):
         file.unlink()
     shutil.copy(copy, path)

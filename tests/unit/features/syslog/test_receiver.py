@@ -1,5 +1,3 @@
-"""Tests of sending to a receiver, over real sockets on loopback."""
-
 import socket
 import ssl
 import threading
@@ -17,12 +15,10 @@ HOST = "127.0.0.1"
 
 
 def message(number: int) -> bytes:
-    """Return a small message with a number."""
     return f'<110>1 - robot rosrv - decision [rosrv@32473 sequence="{number}"]'.encode()
 
 
 def server_context(certificates: Certificates, *, clients: bool = False) -> ssl.SSLContext:
-    """Return the receiver's TLS context."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificates.certificate, certificates.key)
     if clients:

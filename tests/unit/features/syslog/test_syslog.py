@@ -23,7 +23,6 @@ def entry(**fields: Any) -> LogEntry:
 
 
 def formatter(longest: int = 8192) -> Formatter:
-    """Return a formatter as the appliance makes it."""
     return Formatter(facility=13, longest=longest, host_name="robot-1")
 
 

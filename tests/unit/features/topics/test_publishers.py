@@ -1,5 +1,3 @@
-"""Tests of the past publishers of a topic: gaps in a log without its first records, or after a loss."""
-
 from typing import Any
 
 from msgspec import structs

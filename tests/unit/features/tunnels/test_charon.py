@@ -1,5 +1,3 @@
-"""Tests of the conversation with charon: unexpected answers become one kind of error."""
-
 import base64
 import socket
 import struct
@@ -28,7 +26,6 @@ class Standing(NamedTuple):
     state: str = "ESTABLISHED"
 
     def listed(self) -> bytes:
-        """Return charon's entry of the tunnel in its list."""
         name, child = b"list-sa", {"state": "INSTALLED", "uniqueid": str(self.child)}
         children = {f"ros-{self.child}": child} if self.child else {}
         row = {"state": self.state, "uniqueid": str(self.ike), "child-sas": children}
@@ -72,13 +69,11 @@ class StandIn:
         return [body[by].decode() for name, body in asked if name == "terminate" and by in body]
 
     def close(self) -> None:
-        """Stop it after its clients."""
         self._thread.join()
         self._listener.close()
 
 
 def pem_of(count: int) -> bytes:
-    """Return text of this size instead of a list."""
     text = base64.encodebytes(b"x" * count)
     return b"-----BEGIN X509 CRL-----\n" + text + b"-----END X509 CRL-----\n"
 
@@ -90,7 +85,6 @@ def stated(count: int) -> TunnelsStated:
 
 @pytest.fixture
 def charon(tmp_path: Path) -> Iterator[tuple[StandIn, ViciClient]]:
-    """Return a charon and the conversation with it."""
     stand_in = StandIn(tmp_path / "vici.sock")
     vici = ViciClient(tmp_path / "vici.sock")
     yield stand_in, vici

@@ -1,5 +1,3 @@
-"""Tests of how enrolment by one-time tokens handles wrong tokens."""
-
 import pytest
 
 from appliance.api.front.problems import ProblemError

@@ -1,5 +1,3 @@
-"""Tests of enrolment in control: names, addresses, what happens first when a host is revoked."""
-
 import asyncio
 import ipaddress
 import itertools
@@ -88,7 +86,6 @@ class Bench:
         kind: type[StoredAuthority] = StoredAuthority,
         table: Callable[[HostTables, RevokedCertificates], Appliances] = Appliances,
     ) -> None:
-        """`kind` is the authority, and `table` the appliances that it certifies."""
         self.answer = TunnelsEnclosed("kernel")
         self.asked: list[Message] = []
         self.order: list[str] = []
@@ -129,43 +126,35 @@ class Bench:
         )
 
     def close(self) -> None:
-        """End the threads."""
         self.store.close()
         self.log.close()
 
     def add(
         self, name: str, address: str | None = None, *, key: bytes | None = None
     ) -> Coroutine[Any, Any, KitParts]:
-        """Enrol a host with this key, or one of its own."""
         request = signing_request(key or make_key(), name).decode()
         return self.hosts.add(HostAdd(name, request, 90, address), "tester")
 
     def renew(self, name: str) -> Coroutine[Any, Any, KitParts]:
-        """An operator renews a host's certificate."""
         return self.hosts.renew(HostRenew(name, request_of(name), 90), "tester")
 
     def revoke(self, name: str) -> Coroutine[Any, Any, Revoked]:
-        """Revoke a host."""
         return self.hosts.revoke(HostRevoke(name), "tester")
 
     def reload(self) -> Coroutine[Any, Any, Reloaded]:
-        """Read the declared hosts."""
         return self.hosts.reload(HostsReload(), "tester")
 
     def token(
         self, name: str, *, seconds: float = 60, new: bool = True
     ) -> Coroutine[Any, Any, EnrolmentToken]:
-        """Return a one-time token."""
         return self.hosts.token(HostToken(name, "10.0.0.1", token_seconds=seconds, new=new), "tester")
 
     def enrol(self, token: str, name: str) -> Coroutine[Any, Any, KitParts]:
-        """A host enrols itself with a token."""
         return self.hosts.itself.enrol(HostEnrol(token, request_of(name), "10.9.9.9"))
 
     def renew_itself(
         self, name: str, request: str, former: bytes, peer: str = "10.113.11.2"
     ) -> Coroutine[Any, Any, NewCertificate]:
-        """A host renews its certificate in its tunnel, with its former key."""
         return self.hosts.itself.renew(HostRenewItself(name, request, sign(former, request), peer))
 
     def renewed(self, name: str) -> Coroutine[Any, Any, Any]:
@@ -173,7 +162,6 @@ class Bench:
         return self.hosts.itself.renewed(HostRenewed(name, "10.113.11.2"))
 
     def recorded(self, event: str) -> list[str]:
-        """Return the reasons of all records of an event."""
         return [fields["reason"] for name, fields in self.trail.heard if name == event]
 
     def _said(self, message: Message) -> None:
@@ -203,13 +191,11 @@ def sign(key: bytes, request: str) -> bytes:
 
 
 def request_of(name: str) -> str:
-    """Return a signing request for a new key."""
     return signing_request(make_key(), name).decode()
 
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:
-    """Hosts of one life of control."""
     bench = Bench(tmp_path)
     yield bench
     bench.close()
@@ -217,7 +203,6 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 
 @pytest.fixture(autouse=True)
 def nobody_waits_for_charon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait for no answer of charon, which does not run here."""
     monkeypatch.setattr("appliance.hosts.tunnel_state._TAKEN_SECONDS", 0.0)
 
 

@@ -1,5 +1,3 @@
-"""Tests of a host's kit: what is in it, and for whose eyes."""
-
 import io
 import re
 import subprocess
@@ -38,7 +36,6 @@ KIT = Kit(
 
 
 def unpack(kit: Kit) -> dict[str, tuple[str, int]]:
-    """Text and mode of every file of a kit."""
     with tarfile.open(fileobj=io.BytesIO(archive(kit))) as tar:
         found = {}
         for member in tar:

@@ -1,5 +1,3 @@
-"""The address at which hosts reach the appliance."""
-
 from typing import Any
 
 import pytest

@@ -1,5 +1,3 @@
-"""Tests of requests about hosts in tunnels: how REST sends them."""
-
 from appliance.channel import admin
 from appliance.channel.admin import operation_of
 from appliance.channel.messages.api import ClientRequest

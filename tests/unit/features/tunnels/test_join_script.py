@@ -46,7 +46,6 @@ class Machine:
         (root / "x509/rosrv.pem").write_bytes(made)
 
     def keeps_what_is_in_place(self) -> bool:
-        """Whether join.sh keeps the files that are in place."""
         text = filled("join.sh", defaultdict(str, name="laptop"))
         begin, end = text.index("end() {"), text.index("\n}\n", text.index("renewed() {")) + 3
         script = text[begin:end].replace("/etc/swanctl", str(self._etc)) + "renewed\n"

@@ -1,5 +1,3 @@
-"""Tests of the scripts of a kit as they are shipped: any /bin/sh runs them, and no Python."""
-
 import os
 import re
 import subprocess

@@ -1,5 +1,3 @@
-"""Tests of the process that speaks to charon, with a stand-in for the conversation."""
-
 import asyncio
 import queue
 import socket
@@ -41,7 +39,6 @@ class Conversation:
         self.told = threading.Event()
 
     def provision(self, _stated: TunnelsStated) -> None:
-        """Wait a little for a query of the tunnels."""
         self._busy.set()
         self.interrupted.wait(0.3)
         self._busy.clear()
@@ -104,11 +101,9 @@ class Opening(Conversation):
         self._listed = False
 
     def listen(self) -> Iterator[tuple[str, bool, str]]:
-        """Yield the opening."""
         yield self._opened.get(timeout=_LIMIT_SECONDS)
 
     def seen(self) -> list[TunnelSeen]:
-        """Return the tunnels as they were at the beginning."""
         listed, self._listed = self._listed, True
         if not listed:
             self._opened.put((self.tunnel.name, True, self.tunnel.remote))

@@ -1,5 +1,3 @@
-"""Tests of reading refused hosts from charon's log."""
-
 from appliance.features.tunnels.refusals import Refusal, RefusalParser
 
 REVOKED = """\
@@ -14,7 +12,6 @@ REVOKED = """\
 
 
 def refusals(text: str) -> list[Refusal]:
-    """Return the refusals in a log."""
     reader = RefusalParser()
     return [found for line in text.splitlines() if (found := reader.read(line)) is not None]
 

@@ -1,5 +1,3 @@
-"""Tests of the kit's `renew.sh`: a host checks the answers of an appliance whose REST server is compromised."""
-
 import json
 import os
 import subprocess
@@ -60,11 +58,9 @@ class Host:
         self._script = folder / "renew.sh"
 
     def answer(self, name: str, body: bytes) -> None:
-        """Set the appliance's answer."""
         (self.answers / name).write_bytes(body)
 
     def renew(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """Run the script to its end."""
         environment = {
             "PATH": f"{self._programs}:{os.environ['PATH']}",
             "SWANCTL_DIR": str(self.swanctl),
@@ -77,13 +73,11 @@ class Host:
 
     @property
     def list_of_revoked(self) -> Path:
-        """Return the path where charon finds the list."""
         return self.swanctl / "x509crl" / "rosrv.crl"
 
 
 @pytest.fixture
 def host(tmp_path: Path) -> Host:
-    """A host whose certificate is new."""
     return Host(tmp_path)
 
 

@@ -1,5 +1,3 @@
-"""Tests of where REST is reached: by machines that want to enrol, and by hosts in their tunnels."""
-
 from typing import Any
 
 import pytest

@@ -1,5 +1,3 @@
-"""`rosrv host authority rotate`."""
-
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace

@@ -112,7 +112,6 @@ def test_only_a_probe_of_the_present_holder_decides_a_contest() -> None:
 
 
 def register(gate: CallGate, number: int, topic: str, name: str) -> Decision:
-    """Return the decision on a publisher of the host with this number."""
     host, uri = f"10.1.0.{number}", f"http://10.1.0.{number}:4000{name}"
     caller = Caller(Peer(ipaddress.ip_address(host), host, "10.0.0.1"), name, 0)
     given = (topic, "std_msgs/String", ApiUri(uri, parse_node_uri(uri)))
@@ -122,7 +121,6 @@ def register(gate: CallGate, number: int, topic: str, name: str) -> Decision:
 
 
 def joined(registry: Registry, number: int, name: str) -> Incarnation:
-    """Add a node of the host with this number."""
     host, uri = f"10.1.0.{number}", f"http://10.1.0.{number}:4000{name}"
     node = Incarnation(uri, name, ipaddress.ip_address(host), parse_node_uri(uri), uri, "", 1, 2)
     registry.add(node)

@@ -35,7 +35,6 @@ class Site:
         self.calls = LookupCalls(**parts, port=11311, stop=lambda _reason: None, unseen=unseen)
 
     def node(self, name: str, port: int) -> Incarnation:
-        """Add a live node that has no registrations yet."""
         uri = f"http://10.0.0.5:{port}/"
         one = Incarnation(f"{name}{port}", name, HOST, parse_node_uri(uri), uri, "10.0.0.1", port, port + 100)
         self.registry.add(one)
@@ -45,7 +44,6 @@ class Site:
         self.granted.append(incarnation)
 
     async def types(self, subgraph: str = "") -> object:
-        """Return the answer of `getPublishedTopics`."""
         return (await self.calls.get_published_topics(CALLER, subgraph))[2]
 
 

@@ -26,7 +26,6 @@ class Counted(dict[Any, Any]):
     looks = 0
 
     def values(self) -> Any:
-        """Yield the connections, and count each one."""
         for connection in super().values():
             self.looks += 1
             yield connection

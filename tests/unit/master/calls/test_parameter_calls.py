@@ -126,11 +126,9 @@ class OrderedServer:
         self.told.append((key, None))
 
     async def call(self, method: str, *params: Any) -> Any:
-        """Carry out one call."""
         return (await self.call_in_order([(method, params)]))[0]
 
     async def call_in_order(self, calls: Any) -> list[Any]:
-        """Carry out several calls as one request."""
         if any(value == "unwritable" for _method, params in calls for value in params[2:]):
             raise EncodingError("cannot be written")
         self.requests.append([f"{method} {params[1]}" for method, params in calls])
@@ -150,7 +148,6 @@ class OrderedServer:
 
 
 def ordered(server: OrderedServer, *calls: tuple[Any, ...]) -> list[Any]:
-    """Carry out the calls in order."""
     peer = Peer(ipaddress.ip_address("10.0.0.1"), "10.0.0.1", "10.0.0.2")
     caller = Caller(peer, "/me", 0)
     writes = [ParameterWrite(caller, key, value[0] if value else None) for _method, key, *value in calls]

@@ -1,5 +1,3 @@
-"""The pipeline of a request, with stand-ins for the ROS master and the audit log."""
-
 import asyncio
 import copy
 import ipaddress
@@ -104,11 +102,9 @@ class Site:
         return False
 
     async def call(self, method: str, *params: Any) -> Any:
-        """Answer one call as the ROS master."""
         return (await self.call_in_order([(method, params)]))[0]
 
     async def call_in_order(self, calls: Any) -> list[Any]:
-        """Answer several calls as one, as the ROS master."""
         self.arrived += [f"{method} {params[1]}" for method, params in calls]
         await self.go.wait()
         if self.dies_at in [params[1] for _method, params in calls]:
@@ -133,7 +129,6 @@ class Site:
         return [-1, "not there", 0] if node is None else [1, "there", copy.deepcopy(node)]
 
     async def ask(self, host: str, method: str, *params: Value) -> Any:
-        """Return the answer to one call of a host."""
         peer = Peer(ipaddress.ip_address(host), host, "10.0.0.1")
         return parse_response(await self.serve(HttpRequest(peer, "/", build_call(method, params), 0)))
 
@@ -145,7 +140,6 @@ def site() -> Site:
 
 
 def part(method: str, *params: Value) -> Value:
-    """Return a part of a multicall."""
     return {"methodName": method, "params": ["/me", *params]}
 
 
@@ -164,7 +158,6 @@ RUNS = [[f"/arm/{run}_{place}" for place in range(64)] for run in range(3)]
 
 
 def told(answers: list[Any]) -> list[int]:
-    """Return the code of each part's answer."""
     return [one[0][0] for one in answers]
 
 

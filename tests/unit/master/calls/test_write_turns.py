@@ -1,5 +1,3 @@
-"""Writes of a key wait for writes of its ancestors and descendants, registering calls for calls of their name."""
-
 import asyncio
 from collections.abc import Sequence
 

@@ -1,5 +1,3 @@
-"""The address of the appliance in answers to a peer."""
-
 import ipaddress
 
 import pytest
@@ -10,7 +8,6 @@ from tests.support import autojump
 
 
 def peer(host: str, local: str) -> Peer:
-    """Return a caller that reached the appliance at `local`."""
     return Peer(ipaddress.ip_address(host), host, local)
 
 

@@ -1,5 +1,3 @@
-"""The queues of calls to nodes: their limits, and the fate of an undelivered call."""
-
 import asyncio
 import ipaddress
 from typing import Any, cast

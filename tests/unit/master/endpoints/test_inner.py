@@ -22,7 +22,6 @@ CALLS: list[tuple[str, tuple[Value, ...]]] = [
 
 
 async def call(face: MasterSideApi, path: str, method: str, params: tuple[Value, ...]) -> Any:
-    """Call the endpoint as the ROS master does."""
     request = HttpRequest(Peer(MASTER, "127.0.0.1", "127.0.0.1"), path, build_call(method, params), 0)
     return parse_response(await face.handle(request))
 

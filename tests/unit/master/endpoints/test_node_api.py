@@ -1,5 +1,3 @@
-"""A process that reuses the port of a killed node is not mistaken for that node."""
-
 import asyncio
 from typing import Any, cast
 

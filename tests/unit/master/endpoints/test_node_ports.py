@@ -1,5 +1,3 @@
-"""The ports of incarnations survive a restart, and are reused as late as possible."""
-
 import errno
 import ipaddress
 import os

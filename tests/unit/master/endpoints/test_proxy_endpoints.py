@@ -1,5 +1,3 @@
-"""The proxy endpoints of incarnations."""
-
 import ipaddress
 from typing import Any, cast
 
@@ -15,7 +13,6 @@ class Told:
         self.calls: list[tuple[str, Any]] = []
 
     def close(self, *given: Any) -> None:
-        """Stand in for a server, and for `NodePorts`."""
         self.calls.append(("close", given))
 
 

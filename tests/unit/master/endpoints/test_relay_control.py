@@ -76,7 +76,6 @@ class Link:
         """Act as `Channel`."""
 
     def heard(self) -> list[messages.Message]:
-        """Return the messages since the last call."""
         told, self.told = [message for message, _descriptors in self.told], []
         return told
 
@@ -162,22 +161,18 @@ class World:
         return ""
 
     def grant_topic(self, topic: str, host: Address, caller_id: str) -> None:
-        """Grant the node's topic."""
         self.enactor.carry_out(self.graph.topic_granted(self.node, topic, host, caller_id))
 
     def limits_changed(self, before: Policy, now: Policy) -> None:
-        """Bring another policy into force."""
         self.enactor.carry_out(self.graph.limits_changed(before, now))
 
     def put(self, **topics: int) -> None:
-        """Assign these topics to these relays."""
         resources = {(TOPIC, f"/{name}"): relay for name, relay in topics.items()}
         self.allocation.adopt(AllocationPlan({}, {**resources, (SERVICE, "/serve"): 0}))
 
 
 @pytest.fixture
 async def world() -> World:
-    """Return control with two relays."""
     return World()
 
 

@@ -19,7 +19,6 @@ class Kept:
         self.records: list[dict[str, Any]] = []
 
     def happened(self, event: str, reason: str, **fields: Any) -> None:
-        """Keep a record, as `AuditTrail` does."""
         self.records.append({"event": event, "reason": reason, **fields})
 
 

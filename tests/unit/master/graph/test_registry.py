@@ -28,7 +28,6 @@ STEP = st.tuples(
 
 
 def incarnation(number: int) -> Incarnation:
-    """Return one of two incarnations of a name."""
     api = f"http://h:{40000 + number}/"
     return Incarnation(
         new_key(), f"/n{number % 3}", HOSTS[number % 2], parse_node_uri(api), api, "10.0.0.9", 1, 2
@@ -67,7 +66,6 @@ def test_invariants(steps: list[tuple[str, int, Kind, str]]) -> None:
 
 
 def check(registry: Registry, known: list[Incarnation]) -> None:
-    """Compare each query of the registry with a scan of all incarnations."""
     there = [one for one in known if registry.by_key(one.key) is one]
     assert registry.all() == there
     holding = [one for one in there if one.life is Life.LIVE and one.registrations]

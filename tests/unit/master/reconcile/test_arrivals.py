@@ -1,5 +1,3 @@
-"""Arrivals of incarnations: several at once, also when there is not room for all."""
-
 import asyncio
 from typing import Any, cast
 
@@ -45,7 +43,6 @@ class NoFaces:
 
 
 async def world_with(faces: NoFaces | SlowFaces) -> ControlParts:
-    """Return control with room for `_NODES` nodes."""
     world = await ControlParts.begun()
     arrivals = Arrivals(
         world.registry,

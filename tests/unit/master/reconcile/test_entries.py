@@ -14,7 +14,6 @@ TYPE = "std_msgs/String"
 
 
 def uri(number: int = 1) -> str:
-    """Return the URI of a node."""
     return f"http://10.0.0.5:{4000 + number}/"
 
 
@@ -32,7 +31,6 @@ class Requests:
         world.rosmaster.calls = cast(Any, self)
 
     async def call(self, method: str, *params: Any) -> Any:
-        """Answer one request."""
         self.methods.append(method)
         self.at_once += 1
         self.most = max(self.most, self.at_once)

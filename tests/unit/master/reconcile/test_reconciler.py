@@ -48,7 +48,6 @@ class _Requests:
         world.rosmaster.calls = cast(Any, self)
 
     async def call(self, method: str, *params: Any) -> Any:
-        """Answer one request."""
         self.number += 1
         return await self._hidden.call(method, *params)
 

@@ -1,5 +1,3 @@
-"""Subscribers that do not reconnect to a new relay receive their lists again."""
-
 import ipaddress
 from typing import Any, cast
 
@@ -36,7 +34,6 @@ class Told:
 
 
 def node(registry: Registry, name: str, kind: Kind) -> Incarnation:
-    """Return a live subscriber or publisher of /chatter."""
     uri = "http://10.0.0.5:4000/"
     node = Incarnation(f"key of {name}", name, HOST, parse_node_uri(uri), uri, "10.0.0.1", 19001, 19002)
     registry.add(node)

@@ -1,5 +1,3 @@
-"""Tests of the list of rules, without a kernel."""
-
 from dataclasses import fields, replace
 from typing import Any
 
@@ -300,7 +298,6 @@ CONDITIONS: dict[str, tuple[PacketRule, Any]] = {
     "local_source": (OUT, True), "forwarded": (LEAVING, True), "distant": (OUT, True), "new_connection": (OUT, True),
     "unknown": (OUT, True), "answered": (OUT, True), "translated": (OUT, True), "to": (NAT, "10.0.0.2"),
 }  # fmt: skip
-"""A value of each condition, and a rule that may have it."""
 
 
 def test_replication_and_lease_are_for_the_other_appliance() -> None:

@@ -1,5 +1,3 @@
-"""Tests of the iptables back end, without a kernel."""
-
 import sys
 
 import pytest

@@ -1,5 +1,3 @@
-"""Tests of the nft back end, without a kernel."""
-
 import errno
 import json
 import subprocess

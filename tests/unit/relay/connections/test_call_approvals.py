@@ -1,5 +1,3 @@
-"""Requests to services that need an approval, without sockets."""
-
 from typing import Any, cast
 
 import pytest

@@ -1,5 +1,3 @@
-"""Requests and replies of one service connection."""
-
 import struct
 
 import pytest

@@ -1,5 +1,3 @@
-"""The service calls of monitors; the test plays control, and a service."""
-
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -26,7 +24,6 @@ REACT = """react() { std_srvs::SetBoolRequest r;
 
 
 def wanted(monitor: str = "react") -> Published:
-    """Return a call that a monitor wants."""
     return Published(monitor, "/arm", "std_srvs/SetBool", b"\x01", 0, True)
 
 
@@ -51,12 +48,10 @@ class Calls:
 
     @property
     def faults(self) -> int:
-        """Return the number of faults of the monitor."""
         monitors = self.quiet.interceptor.monitors
         return monitors.monitor("react").faults if monitors is not None else 0
 
     def run(self) -> None:
-        """Call the timers that are not cancelled, in the order of their times."""
         due, self.loop.due[:] = sorted(self.loop.due, key=lambda one: one[0]), []
         for _, timer in due:
             if timer.callback is not None:

@@ -1,5 +1,3 @@
-"""Subscribers that need a connection to the publisher under their own name."""
-
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -24,7 +22,6 @@ ACCEPTED = {"type": "a/FibonacciActionGoal", "md5sum": "*"}
 
 @pytest.fixture
 def loop() -> Iterator[EventLoop]:
-    """The relay's loop."""
     loop = EventLoop()
     yield loop
     loop.close()
@@ -32,7 +29,6 @@ def loop() -> Iterator[EventLoop]:
 
 @pytest.fixture
 def publisher() -> Iterator[socket.socket]:
-    """Return the publisher's listening socket."""
     with socket.create_server(("127.0.0.1", 0)) as sock:
         sock.settimeout(0.01)
         yield sock
@@ -44,7 +40,6 @@ def _nothing(*_what: object) -> None:
 
 @pytest.fixture
 def presences(loop: EventLoop) -> Iterator[NamedSubscribers]:
-    """Return the named subscribers of one topic."""
     limits = RelayLimits()
     reporter = Reporter(limits)
     memory = RelayMemory.of(limits, lambda _host: QuotaClass.REGISTERED)
@@ -85,7 +80,6 @@ def accept(loop: EventLoop, publisher: socket.socket) -> tuple[socket.socket, di
 
 
 def ended(sock: socket.socket) -> bool:
-    """Whether the relay closed the connection."""
     try:
         return sock.recv(4096) == b""
     except TimeoutError:

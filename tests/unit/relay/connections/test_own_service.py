@@ -1,5 +1,3 @@
-"""The service that the appliance itself offers; the test plays control."""
-
 from collections.abc import Iterator
 
 import pytest
@@ -37,19 +35,16 @@ class Scene(World):
             self.state(ClientGranted("own", CALL["service"], host, "/client"))
 
     def client(self, host: str = LOOPBACK, **fields: str) -> Peer:
-        """Return a client that has read the service's header."""
         peer = self.connect(encode_header(CALL | fields), host=host)
         assert self.gets_header(peer) == HEADER | {"callerid": "/rosrv"}
         return peer
 
     def called(self) -> list[OwnServiceCalled]:
-        """Return the calls that control received."""
         return [message for message in self.told if isinstance(message, OwnServiceCalled)]
 
 
 @pytest.fixture
 def scene(request: pytest.FixtureRequest) -> Iterator[Scene]:
-    """Yield a relay."""
     scene = Scene(getattr(request, "param", LIMITS))
     yield scene
     scene.close()

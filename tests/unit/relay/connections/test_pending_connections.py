@@ -1,5 +1,3 @@
-"""Peers that wait at the relay, and the order in which they are closed to make room."""
-
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import RELAY_HEADERS
 from appliance.relay.connections.pending_connections import PendingConnections
@@ -20,20 +18,16 @@ class World:
         return QuotaClass.REGISTERED if host in self.granted else QuotaClass.UNKNOWN
 
     def guest(self, host: str) -> "Peer":
-        """Add a peer that just connected."""
         peer = Peer(self.room)
         self.room.enter(peer, host)
         return peer
 
 
 class Peer:
-    """A peer that waits."""
-
     def __init__(self, room: PendingConnections) -> None:
         self.room, self.ended = room, False
 
     def make_room(self) -> None:
-        """Close the connection to make room."""
         self.ended = True
         self.room.leave(self)
 

@@ -1,5 +1,3 @@
-"""One relayed topic: the story of its publisher and its subscribers."""
-
 import struct
 from collections.abc import Callable, Collection, Mapping
 
@@ -20,7 +18,6 @@ HEADER = {"callerid": "/liar", "type": "std_msgs/String", "md5sum": "m", "latchi
 
 
 def batch(*texts: bytes) -> Batch:
-    """Return frames with these bodies."""
     frames = [struct.pack("<I", len(text)) + text for text in texts]
     data = b"".join(frames)
     return Batch(memoryview(data), len(frames), len(data) - len(frames[-1]))
@@ -34,27 +31,21 @@ class RecordedUpstream(Upstream):
         self.announced: tuple[list[str], str] = ([], "")
 
     def connect(self) -> None:
-        """Note the request to connect."""
         self.asked.append("want")
 
     def release(self) -> None:
-        """Note the request to release the connection."""
         self.asked.append("spare")
 
     def pause(self, seconds: float) -> None:
-        """Record that reading pauses."""
         self.asked.append(f"pause {seconds:.2f}")
 
     def resume(self) -> None:
-        """Record that reading resumes."""
         self.asked.append("resume")
 
     def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
-        """Record the served subscribers."""
         self.announced = (sorted(names()), type_name)
 
     def request_latched(self) -> None:
-        """Record the request to send the latched message again."""
         self.asked.append("give again")
 
 
@@ -74,32 +65,26 @@ class RecordedMember:
         self._fits = fits
 
     def greet(self, header: Mapping[str, str]) -> bool:
-        """Record the header."""
         self.header = header
         return self._fits
 
     def deliver(self, batch: Batch) -> int:
-        """Record the frames."""
         self.received += bytes(batch.view)
         return 0
 
     def accepted(self, batch: Batch, sent: int) -> int:
-        """Record the frames that the pump has sent in part."""
         self.received += bytes(batch.view[sent:])
         return 0
 
     @property
     def exhausted(self) -> bool:
-        """Return False: there is always memory."""
         return False
 
     @property
     def full(self) -> bool:
-        """Whether the test made it slow."""
         return self.behind_since is not None
 
     def trim(self) -> int:
-        """Pretend to drop three messages."""
         self.trimmed += 1
         return 3
 
@@ -107,7 +92,6 @@ class RecordedMember:
         """Do nothing: this subscriber never stalls."""
 
     def cut(self, reason: str) -> None:
-        """Record the reason."""
         self.was_cut = reason
 
 
@@ -150,7 +134,6 @@ class Story:
         self.topic.received(frames, self.now - late)
 
     def join(self, caller_id: str = "/listener") -> RecordedMember:
-        """Add a subscriber."""
         member = RecordedMember(caller_id=caller_id)
         self.topic.join(member)
         return member
@@ -505,7 +488,6 @@ class LeavingMember(RecordedMember):
     topic: RelayedTopic
 
     def cut(self, reason: str) -> None:
-        """Close its connection."""
         super().cut(reason)
         self.topic.leave(self)
 

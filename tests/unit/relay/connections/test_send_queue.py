@@ -1,5 +1,3 @@
-"""The queue of one slow subscriber is compared with a naive queue."""
-
 import struct
 from dataclasses import replace
 
@@ -16,7 +14,6 @@ LIMITS = replace(RelayLimits(), queue_messages=5, queue_bytes=100)
 
 
 def frame(size: int, fill: int = 0) -> bytes:
-    """Return a frame with a body of this size."""
     return struct.pack("<I", size) + bytes([fill % 256]) * size
 
 
@@ -28,7 +25,6 @@ class NaiveOutbox:
         self.frames: list[bytes] = []
 
     def append(self, frames: list[bytes], sent: int) -> None:
-        """Queue frames, the first of which is partly sent."""
         self.frames += frames
         self.advance(sent)
 
@@ -42,7 +38,6 @@ class NaiveOutbox:
             self.started, sent = first[taken:], sent - taken
 
     def trim(self) -> int:
-        """Drop the oldest frames beyond the limits."""
         dropped = 0
         while len(self.frames) > LIMITS.queue_messages or sum(map(len, self.frames)) > LIMITS.queue_bytes:
             self.frames.pop(0)

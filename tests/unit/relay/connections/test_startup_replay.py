@@ -8,7 +8,6 @@ from tests.support.relay_memory import share
 
 
 def frames(messages: int, size: int = 8) -> Batch:
-    """Return a batch of this number of frames, each of this size."""
     return Batch(memoryview(bytes(size)), messages, 0)
 
 

@@ -1,5 +1,3 @@
-"""The end of the connection to a publisher without subscribers."""
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import cast
@@ -15,8 +13,6 @@ from appliance.relay.relay_limits import RelayLimits
 
 @dataclass
 class Timer:
-    """A timer of the loop."""
-
     seconds: float
     callback: Callable[[], None]
 
@@ -37,21 +33,17 @@ class Relay:
 
     @property
     def loop(self) -> "Relay":
-        """Return the loop."""
         return self
 
     @property
     def reporter(self) -> "Relay":
-        """Return the reporter."""
         return self
 
     def after(self, seconds: float, callback: Callable[[], None]) -> Timer:
-        """Set a timer."""
         self.timers.append(Timer(seconds, callback))
         return self.timers[-1]
 
     def send(self, message: Message) -> None:
-        """Send control a message."""
         self.sent.append(message)
 
 

@@ -39,13 +39,11 @@ BEGINNING = GUARD.replace("guard()", "begin guard()")
 
 
 def string(text: str) -> bytes:
-    """Return the frame of a std_msgs/String."""
     data = text.encode()
     return encode_frame(struct.pack("<I", len(data)) + data)
 
 
 def data_of(peer: Peer) -> bytes:
-    """Return everything that was sent to the peer."""
     peer.read()
     return bytes(peer.data)
 
@@ -147,7 +145,6 @@ class MonitoredDialogue(Dialogue):
         self._answer: Any = None
 
     def string(self, word: str) -> bytes:
-        """Return the frame of a std_msgs/String."""
         return string(word)
 
     def _load(self, *words: str) -> None:

@@ -23,32 +23,26 @@ class Timers:
         return False
 
     def beside(self, work: Callable[[], Any], done: Callable[[Any], None]) -> "Timers":
-        """Leave the work to `finish`."""
         self._work.append(lambda: done(work()))
         return self
 
     def finish(self) -> None:
-        """Do the work that was left."""
         while self._work:
             self._work.pop(0)()
 
     def after(self, seconds: float, callback: Callable[[], None]) -> LoopTimer:
-        """Note a timer."""
         timer = LoopTimer(callback)
         self.due.append((seconds, timer))
         return timer
 
 
 class Reports:
-    """The messages to control."""
-
     attached = True
 
     def __init__(self) -> None:
         self.sent: list[Message] = []
 
     def send(self, message: Message) -> None:
-        """Note a message."""
         self.sent.append(message)
 
 
@@ -90,7 +84,6 @@ class QuietMonitors:
         return answer
 
     def process(self, topic: str, data: bytes, time: int = 1) -> Outcome:
-        """Return the outcome of a message, which is reported."""
         assert self.interceptor.monitors is not None
         outcome = self.interceptor.monitors.process(topic, data, time)
         self.interceptor.observer.report(outcome, NOWHERE)

@@ -49,11 +49,9 @@ class Heard(Reporter):
 
     @property
     def attached(self) -> bool:
-        """Report that a control is attached."""
         return True
 
     def send(self, told: Message) -> None:
-        """Keep the message."""
         self.messages.append(told)
 
 
@@ -74,7 +72,6 @@ class Monitored:
         self.heard = Heard()
         self.time = began
         self.published: list[tuple[str, bytes]] = []
-        """Return the messages that monitors published."""
         self._loop = EventLoop()
         self.interceptor = Interceptor(
             self._loop,
@@ -91,7 +88,6 @@ class Monitored:
         self.interceptor.loaded(stated(1, [], {}, {}, restarted=restarted), self.set)
 
     def close(self) -> None:
-        """Close the monitors and their loop."""
         self.interceptor.close()
         self._loop.close()
 
@@ -140,7 +136,6 @@ class Monitored:
             yield from getattr(one, "events", None) or getattr(one, "rows", None) or [one]
 
     def rows(self) -> list[MonitorRow]:
-        """Return the counters."""
         return self.interceptor.observer.rows(self.set, self.interceptor.now())
 
     def state(self) -> list[object]:
@@ -186,7 +181,6 @@ def agree(texts: dict[str, str], known: Definitions, all_traffic: Iterable[Traff
 
 
 def random_case(seed: int) -> tuple[dict[str, str], list[Traffic]]:
-    """Return valid specifications and their traffic."""
     texts = Specifications(seed).texts()
     messages = Messages(seed)
     return {f"{number}.rv": text for number, text in enumerate(texts)}, [
@@ -219,7 +213,6 @@ def test_hard_cases_are_the_same_together(name: str, on_fault: str) -> None:
 
 
 def _shipped_traffic(seed: int) -> list[Traffic]:
-    """Return messages on the topics of the shipped specifications."""
     random = Random(seed)  # noqa: S311  draws examples, not keys
     kinds = {
         "/landshark/battery": lambda: message("sensor_msgs/BatteryState", percentage=random.random(), voltage=12.0),

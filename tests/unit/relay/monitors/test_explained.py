@@ -49,18 +49,14 @@ class Row(NamedTuple):
     by: str
     """The caller id; empty of what time alone has done."""
     at: str
-    """The text that begins where it is written."""
     because: list[tuple[str, str]]
     """The events that explain a verdict, or the verdict in whose handler it happened, and who sent each."""
     where: dict[str, dict[str, object]]
-    """Conditions by the text that they begin with."""
     values: Mapping[str, object] = MappingProxyType({})
     restarted: bool = False
 
 
 class Trail(idle_class(AuditTrail)):  # type: ignore[misc]  # it is made
-    """Keeps records."""
-
     def __init__(self) -> None:
         self.records: list[AuditRecord] = []
         self.meter = Meter()
@@ -69,7 +65,6 @@ class Trail(idle_class(AuditTrail)):  # type: ignore[misc]  # it is made
         self, event: str, reason: str, *, severity: Severity, host: str | None, caller_id: str | None, category: str,
         resource: str, more: dict[str, Any], **detail: Any,
     ) -> str:  # fmt: skip
-        """Act as `AuditTrail`."""
         self.records.append(
             AuditRecord(
                 id="1", time=1, event=event, severity=severity, host=host, caller_id=caller_id, category=category,
@@ -82,7 +77,6 @@ class Trail(idle_class(AuditTrail)):  # type: ignore[misc]  # it is made
 def events_of(
     row: Row, given: Iterable[Given], *, together: bool, shadows: Collection[str] = ()
 ) -> list[MonitorEvent]:
-    """Return the reports to control after these messages."""
     monitored = Monitored(
         {"x.rv": row.text},
         definitions(),

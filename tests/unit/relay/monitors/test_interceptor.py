@@ -1,5 +1,3 @@
-"""Monitors as transcripts of the whole relay: specifications and messages in, messages and reports out."""
-
 import gc
 import struct
 import time
@@ -61,7 +59,6 @@ def test_dialogue(world: Monitored, title: str) -> None:
 
 @pytest.fixture
 def world() -> Iterator[Monitored]:
-    """Yield a relay with one node."""
     world = Monitored()
     yield world
     world.close()
@@ -297,7 +294,6 @@ def test_a_verdict_is_reported_with_its_property_logic_and_category(world: Monit
 
 
 def _called(world: Monitored, persistent: bool = True) -> tuple[Peer, Peer]:
-    """Return a client and its connection at the service."""
     fields = {"callerid": "/client", "service": "/mode", "md5sum": "*"}
     client = world.connect(encode_header(fields | ({"persistent": "1"} if persistent else {})))
     service = world.accept(world.service)

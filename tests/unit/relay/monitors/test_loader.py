@@ -1,5 +1,3 @@
-"""Loading of compiled specifications in a process of its own."""
-
 import subprocess
 import sys
 

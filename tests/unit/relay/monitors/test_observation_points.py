@@ -1,11 +1,7 @@
-"""The numbers of senders."""
-
 from appliance.relay.monitors.observation_points import ObservationPoint, Senders
 
 
 class Pipeline:
-    """A holder of a point."""
-
     def __init__(self, point: ObservationPoint) -> None:
         self.point = point
 

@@ -31,7 +31,6 @@ class Told:
         self.monitored = Monitored(files, definitions(), together=together, on_fault=on_fault)
 
     def send(self, *commands: tuple[float, float, float]) -> None:
-        """Send commands (forward, sideways, turn) in one batch."""
         bodies = [message(COMMAND, linear__x=x, linear__y=y, angular__z=z) for x, y, z in commands]
         frames = b"".join(struct.pack("<I", len(body)) + body for body in bodies)
         self.monitored.through(Traffic("/cmd", frames, len(bodies)))
@@ -45,7 +44,6 @@ class Told:
         return found
 
     def counts(self) -> dict[str, tuple[int, int]]:
-        """Return drops and changes by monitor."""
         return {row.name: (row.drops, row.changes) for row in self.monitored.rows()}
 
 

@@ -1,5 +1,3 @@
-"""The relay sends what the monitors behind a publishing monitor let through, and reports what they did."""
-
 from collections.abc import Iterator
 
 import pytest

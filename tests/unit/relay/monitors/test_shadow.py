@@ -33,7 +33,6 @@ class Trying(Monitored):
         return taken.began
 
     def row(self, name: str) -> MonitorRow:
-        """Return the last reported counters of a monitor."""
         self.engine.interceptor.observations.tell_counters()
         self.link.catch_up()
 
@@ -45,13 +44,11 @@ class Trying(Monitored):
         return found
 
     def kinds(self) -> set[str]:
-        """Return the reported actions of monitors."""
         return {event.kind for one in self.told if isinstance(one, MonitorsReported) for event in one.events}
 
 
 @pytest.fixture
 def world() -> Iterator[Trying]:
-    """Yield a relay with one node."""
     world = Trying()
     yield world
     world.close()

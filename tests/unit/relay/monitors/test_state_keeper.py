@@ -1,5 +1,3 @@
-"""The state of monitors outlives the relay: after a kill at any batch, the next process continues it."""
-
 from dataclasses import replace
 from random import Random
 
@@ -34,7 +32,6 @@ STOP = """{modifier} stop() {{
 
 
 def begun(monitors: MonitorSet, memory: bytearray, given: StateGiven = GIVEN) -> StateKeeper:
-    """Start a process with this memory, as `Interceptor` does."""
     keeper = StateKeeper(given, memory)
     left = keeper.recovered()
     if left is None:
@@ -46,7 +43,6 @@ def begun(monitors: MonitorSet, memory: bytearray, given: StateGiven = GIVEN) ->
 
 
 def again(monitors: MonitorSet) -> MonitorSet:
-    """Start another process with the same specifications."""
     return on_module(monitors.compiled, monitors.on_fault)
 
 
@@ -88,7 +84,6 @@ def test_random_specifications_go_on_where_a_killed_process_was(seed: int, step_
 
 
 def stop(modifier: str = "", more: str = "") -> MonitorSet:
-    """Return an emergency stop that latches."""
     text = STOP.format(modifier=modifier, more=more)
     return on_module(compiled_from({"stop.rv": text}, standard_definitions()))
 
@@ -101,7 +96,6 @@ def press(monitors: MonitorSet, keeper: StateKeeper) -> None:
 
 
 def drives(monitors: MonitorSet) -> str:
-    """Return the outcome of a command to drive."""
     return monitors.judge("/drive", b"\x01", 2).result
 
 
@@ -300,7 +294,6 @@ def test_the_other_appliance_goes_on_with_a_copy(modifier: str) -> None:
 
 
 def other_stop() -> MonitorSet:
-    """Return a stop of another name."""
     text = STOP.format(modifier="", more="").replace("stop()", "late_stop()")
     return on_module(compiled_from({"stop.rv": text}, standard_definitions()))
 

@@ -32,7 +32,6 @@ class Relay:
             self.monitors.load(HALT, **stated)
 
     def send(self, topic: str, type_name: str, **fields: object) -> str:
-        """Return what became of a message."""
         with clock.using(self.machine):
             time = self.monitors.interceptor.now()
             result = self.monitors.process(topic, message(type_name, **fields), time).result
@@ -40,11 +39,9 @@ class Relay:
         return result
 
     def drive(self) -> str:
-        """Return what became of a command to drive."""
         return self.send("/cmd_vel", "geometry_msgs/Twist")
 
     def left(self) -> tuple[bytes]:
-        """Return the state for the other appliance."""
         with clock.using(self.machine):
             return (self.keeper.content(),)
 

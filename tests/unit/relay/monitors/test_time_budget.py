@@ -1,5 +1,3 @@
-"""The processor time for messages after one message used up its budget."""
-
 from itertools import pairwise
 
 from appliance.relay.monitors.time_budget import TimeBudget

@@ -25,12 +25,10 @@ LIMIT = 16 << 20
 
 
 def frame(size: int, fill: int = 7) -> bytes:
-    """Return a frame with a body of this size."""
     return struct.pack("<I", size) + bytes([fill % 256]) * size
 
 
 def receiver(limit: int = LIMIT, memory: int = 1 << 30) -> tuple[FrameReceiver, HostMemory]:
-    """Return a receiver with its own scratch area."""
     budget = share(memory)
     return FrameReceiver(Scratch(), limit, budget), budget
 

@@ -1,5 +1,3 @@
-"""A channel served by the relay's event loop."""
-
 import os
 import socket
 import struct
@@ -18,8 +16,6 @@ pytestmark = pytest.mark.nightly
 
 
 class Ends:
-    """A link and its other end."""
-
     def __init__(self) -> None:
         ours, theirs = socket.socketpair()
         self.used = 0
@@ -41,7 +37,6 @@ class Ends:
         return False
 
     def close(self) -> None:
-        """Close both ends."""
         self.link.close()
         self.other.close()
         self.loop.close()

@@ -1,5 +1,3 @@
-"""The pump: steps of one armed connection, over real sockets."""
-
 import errno
 import select
 import socket
@@ -58,12 +56,10 @@ class Pumped:
         self.arm()
 
     def arm(self, torn: bytes = b"") -> None:
-        """Arm the connection."""
         ours = [pair[0].fileno() for pair in self.pairs[1:]]
         self.connection.arm(self.ours.fileno(), self.topic, ours, None, torn)
 
     def wait(self, longest: float = 0.0) -> list[tuple[int, int]]:
-        """Wait once."""
         return self.pump.wait(longest, _ROOM, True)
 
     def left(self) -> Left | None:
@@ -88,7 +84,6 @@ class Pumped:
 
 @pytest.fixture
 def pumped() -> Iterator[Pumped]:
-    """A connection with one subscriber."""
     pumped = Pumped()
     yield pumped
     pumped.close()

@@ -1,5 +1,3 @@
-"""Limits on messages, for any times and any pieces."""
-
 import struct
 
 import pytest
@@ -19,7 +17,6 @@ from tests.support.relay_memory import share
 
 
 def frames(*sizes: int) -> Batch:
-    """Return frames of these sizes, their lengths included."""
     return Batch(
         memoryview(b"".join(struct.pack("<I", size - 4) + bytes(size - 4) for size in sizes)),
         len(sizes),
@@ -125,7 +122,6 @@ def flood(share: RateAllowance, until: float) -> list[tuple[float, RateAllowance
 
 
 def passed(events: list[tuple[float, RateAllowance, Batch]]) -> dict[RateAllowance, int]:
-    """Return how many messages of each holder pass."""
     counts = {holder: 0 for _, holder, _ in events}
     for now, holder, batch in sorted(events, key=lambda event: event[0]):
         counts[holder] += sent(holder, (now, batch))

@@ -15,7 +15,6 @@ pytestmark = pytest.mark.nightly
 
 
 def write_pair(*, below: list[str]) -> None:
-    """Write the logs of two appliances with four takeovers."""
     assert not below
     for member, folder in zip(play(Path("pair"), four_takeovers), ("state", "other"), strict=True):
         shutil.copytree(member.state, folder, dirs_exist_ok=True)
