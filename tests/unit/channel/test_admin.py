@@ -2,7 +2,7 @@ from appliance.channel.operations import CHANGES, OPERATIONS
 
 
 def test_changes_are_for_operators_and_admins() -> None:
-    """Each change requires one of these roles, makes messages that only investigators may fetch, or opens one's own door.
+    """Each change needs one of these roles, makes messages for investigators, or opens the caller's own door.
 
     Some requests for these roles change nothing: the lists of tokens and sessions, a kit, a query, a check.
     """
