@@ -53,6 +53,7 @@ LOCAL = {
     "appliance/cli/": "a process of the operator",
     "appliance/features/policy_tools/": "a process of the operator",
     "appliance/features/selftest/": "a process of the operator",
+    "appliance/features/topics/": "a process of the operator",
     "appliance/features/guards/": "a process of the operator",
     "rosmop/certify/": "a process of the compiler, whose processor time is limited (`DRY_RUNS`)",
     "rosmop/check/": "a process of the compiler, whose processor time is limited (`DRY_RUNS`)",

@@ -34,6 +34,11 @@ def _alarms(state: ApprovalCounts) -> Iterator[Trouble]:
         yield Trouble("warning", "approval-unanswered", text)
 
 
+def _line(state: ApprovalCounts) -> tuple[str, str]:
+    calls = "call waits" if state.waiting == 1 else "calls wait"
+    return "approvals", f"{state.waiting} {calls}, {state.leases} {'lease' if state.leases == 1 else 'leases'}"
+
+
 APPROVALS_VIEW = FeatureView(
     "approvals",
     (
@@ -42,6 +47,7 @@ APPROVALS_VIEW = FeatureView(
             ApprovalCounts,
             "calls that wait for an operator's approval, and approvals",
             alarms=_alarms,
+            line=_line,
             metrics=_METRICS,
             samples=lambda state: {
                 "rosrv_approvals_waiting": [((), state.waiting)],
