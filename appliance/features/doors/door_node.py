@@ -8,7 +8,7 @@ and every call of a service is decided by the master and the relay, as for any h
 
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 from weakref import WeakValueDictionary
 
@@ -50,6 +50,7 @@ _REPLAY_SECONDS = 1.0  # not longer: an old command must not reach a robot
 _LEARN_SECONDS = 1.0
 _ASK_SECONDS, _ASK_AGAIN_SECONDS = 1.0, 10.0
 _MOST_PARAMETERS = 1000  # of one request
+_MOST_CALL_BYTES = 32 << 20  # of the arguments of all calls that wait for answers
 _ANSWER_SECONDS = 60.0  # for a client that answers a call of its service
 
 BuiltIn = Callable[[CallOfService], "Awaitable[Raw] | None"]
@@ -124,6 +125,7 @@ class DoorNode:
         self._publications: dict[str, _Publication] = {}
         self._heard: dict[str, set[_Subscriber]] = {}
         self._offers: dict[str, _Offer] = {}
+        self._call_bytes = 0  # of the arguments of calls that wait for answers
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         self._tasks = OwnedTasks()
 
@@ -146,7 +148,7 @@ class DoorNode:
             case UnsubscribeTopic(topic):
                 self._unsubscribe(topic, client)
             case CallOfService():
-                self._tasks.start(self._call(request, client))
+                self._begin_call(request, client)
             case OfferService():
                 await self._offer(request, client)
             case WithdrawService(service):
@@ -297,12 +299,26 @@ class DoorNode:
 
     # --- services ---
 
-    async def _call(self, request: CallOfService, client: DoorClient) -> None:
+    def _begin_call(self, request: CallOfService, client: DoorClient) -> None:
+        values = (
+            request.values.copy() if isinstance(request.values, Raw) else request.values
+        )  # not the whole frame
+        size = memoryview(values).nbytes
+        if self._call_bytes + size > _MOST_CALL_BYTES:
+            raise LimitExceededError(
+                f"{self._call_bytes} bytes of calls of this door wait for answers; repeat the call later"
+            )
+        self._call_bytes += size
+        self._tasks.start(self._call(replace(request, values=values), client, size))
+
+    async def _call(self, request: CallOfService, client: DoorClient, size: int) -> None:
         try:
             own = self._built_in(request)
             client.answered(request.call, await (self._call_node(request) if own is None else own))
         except RosError as error:
             client.failed(request, str(error))
+        finally:
+            self._call_bytes -= size
 
     async def _call_node(self, request: CallOfService) -> Raw | bytes:
         header = await self.node.probe_service(request.service)

@@ -69,6 +69,7 @@ class RosbridgeLimits:
     topics: int = 1000  # subscriptions and advertisements, by topic
     ids: int = 100  # of one topic
     services: int = 100
+    will_bytes: int = 4096
     calls: int = 100  # without an answer, in each direction
     fragment_bytes: int = 8 << 20  # of all frames that are not complete
     call_seconds: float = 60.0
@@ -137,9 +138,14 @@ class Rosbridge:
             return []
 
     def _advertise(self, operation: AdvertiseOp) -> list[DoorRequest]:
-        topic = self._resolved(operation.topic)
+        topic, size = self._resolved(operation.topic), len(bytes(operation.will))
+        if size > self._limits.will_bytes:
+            raise OperationError(f"the will has {size} bytes; at most {self._limits.will_bytes}")
         self._add_advertisement(topic, operation.id)
-        queue, will = operation.queue_size or 1, operation.will if bytes(operation.will) else None
+        queue, will = (
+            operation.queue_size or 1,
+            operation.will.copy() if size else None,
+        )  # not the whole frame
         return [AdvertiseTopic(topic, operation.type, operation.latch, queue, operation.id, will)]
 
     def _add_advertisement(self, topic: str, client: ClientId) -> None:

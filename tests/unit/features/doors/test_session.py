@@ -97,6 +97,36 @@ async def test_a_will_is_published_within_seconds_after_the_network_is_cut() -> 
         assert heard == [string("stop")]
 
 
+async def test_what_a_door_keeps_of_its_clients_is_bounded() -> None:
+    """Wills, and arguments of calls; of each the bytes, and not its whole frame."""
+    async with door_world() as world:
+        robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
+        slow = ServiceType.defined(standard_definitions(), "roscpp/SetLoggerLevel")
+
+        async def answer(_body: bytes) -> bytes:
+            await asyncio.sleep(3600)
+            return b""
+
+        await robot.offer("/slow", slow, answer)
+        large, will = "x" * (4 << 20), {"op": "advertise", "topic": "/cmd", "type": "std_msgs/String"}
+        client.send(will | {"will": {"data": "x" * 5000}})
+        assert "at most 4096" in (await client.next())["msg"]
+        tracemalloc.start()
+        for number in range(6):
+            client.send(will | {"topic": f"/cmd{number}", "will": {"data": "stop"}, "more": large})
+            client.send({"op": "call_service", "service": "/slow", "more": large, "args": {"logger": "x"}})
+            await asyncio.sleep(0.5)
+        taken, _peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert taken < 3 * len(large)
+        for _number in range(10):
+            client.send({"op": "call_service", "service": "/slow", "args": {"logger": large}})
+            await asyncio.sleep(0.1)
+        refusal = await client.next()
+        assert "of calls of this door wait for answers" in refusal["values"]["message"]
+        assert client.frames.qsize() == 2
+
+
 async def test_a_client_that_does_not_read_pictures_is_heard_at_once() -> None:
     """Its stop does not wait until the network has taken the pictures."""
     async with door_world() as world:
