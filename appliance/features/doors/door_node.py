@@ -50,7 +50,6 @@ _REPLAY_SECONDS = 1.0  # not longer: an old command must not reach a robot
 _LEARN_SECONDS = 1.0
 _ASK_SECONDS, _ASK_AGAIN_SECONDS = 1.0, 10.0
 _MOST_PARAMETERS = 1000  # of one request
-_MOST_CALL_BYTES = 32 << 20  # of the arguments of all calls that wait for answers
 _ANSWER_SECONDS = 60.0  # for a client that answers a call of its service
 
 BuiltIn = Callable[[CallOfService], "Awaitable[Raw] | None"]
@@ -114,18 +113,28 @@ class _Offer:
 class DoorNode:
     """Carries out the requests of all connections of one door.
 
-    The connections use at most `most_topics` publications, and as many subscriptions.
+    The connections use at most `most_topics` publications, and as many subscriptions. The arguments of their calls that
+    wait for answers have at most `call_bytes`.
     """
 
-    def __init__(self, node: RosNode, types: KnownTypes, built_in: BuiltIn, *, most_topics: int) -> None:
+    def __init__(
+        self,
+        node: RosNode,
+        types: KnownTypes,
+        built_in: BuiltIn,
+        *,
+        most_topics: int,
+        call_bytes: int = 32 << 20,
+    ) -> None:
         self.node = node
         self._most_topics = most_topics
+        self._most_call_bytes = call_bytes
         self._types = types
         self._built_in = built_in
         self._publications: dict[str, _Publication] = {}
         self._heard: dict[str, set[_Subscriber]] = {}
         self._offers: dict[str, _Offer] = {}
-        self._call_bytes = 0  # of the arguments of calls that wait for answers
+        self._call_bytes = 0
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         self._tasks = OwnedTasks()
 
@@ -304,7 +313,7 @@ class DoorNode:
             request.values.copy() if isinstance(request.values, Raw) else request.values
         )  # not the whole frame
         size = memoryview(values).nbytes
-        if self._call_bytes + size > _MOST_CALL_BYTES:
+        if self._call_bytes + size > self._most_call_bytes:
             raise LimitExceededError(
                 f"{self._call_bytes} bytes of calls of this door wait for answers; repeat the call later"
             )

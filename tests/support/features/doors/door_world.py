@@ -109,7 +109,8 @@ class DoorWorld:
     async def start(self) -> None:
         self.node = await self.robot("10.0.0.2", "/door_alice")
         sight = MasterSight(self.node, lambda: (7, 8))
-        self.door = DoorNode(self.node, self.types, Rosapi(sight, self.types).answer, most_topics=50)
+        built_in = Rosapi(sight, self.types).answer
+        self.door = DoorNode(self.node, self.types, built_in, most_topics=50, call_bytes=1 << 20)
         self.lookout = Lookout(sight, self.types, self.door.learn)
         connections = DoorConnections(self.limits)
         self.network.listen(DOOR[0], partial(connections.serve, self.serve), DOOR[1])
