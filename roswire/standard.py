@@ -4,6 +4,8 @@ The store lacks services, the messages of actions, and the message of `/tf`. Thi
 messages among these. The definitions of mavros_msgs are in `mavros`.
 """
 
+from itertools import islice
+
 from rosbags.typesys import Stores, get_typestore
 
 from roswire.definitions import Definitions
@@ -73,6 +75,20 @@ _ACTIONS = {
 }
 """Goal, result and feedback of each action. The messages that `actionlib` sends are made from these."""
 
+_CONSTANTS_BEFORE = {
+    "actionlib_msgs/GoalStatus": {"text": 10},
+    "sensor_msgs/NavSatFix": {"position_covariance_type": 4},
+    "sensor_msgs/NavSatStatus": {"status": 4, "service": 4},
+    "sensor_msgs/Range": {"radiation_type": 2},
+    "shape_msgs/SolidPrimitive": {"type": 4},
+    "visualization_msgs/InteractiveMarkerControl": {"orientation_mode": 3, "interaction_mode": 10},
+    "visualization_msgs/MenuEntry": {"command_type": 3},
+}
+"""The number of constants directly before a field, in types whose file does not begin with all constants.
+
+The type store does not keep these places. Viewers compare a definition with their own, and report another order.
+"""
+
 _NOT_ROS_1 = "builtin_interfaces"  # has `time` and `duration` as ROS 2 messages
 
 
@@ -83,8 +99,19 @@ def standard_definitions() -> Definitions:
     for name in store.fielddefs:
         package, _, type_name = name.split("/")
         if package != _NOT_ROS_1:
-            files[f"{package}/{type_name}.msg"] = store.gendefhash(name, {})[0]
+            before = _CONSTANTS_BEFORE.get(f"{package}/{type_name}")
+            text = store.gendefhash(name, {})[0]
+            files[f"{package}/{type_name}.msg"] = text if before is None else _in_places(text, before)
     return Definitions.from_files(files)
+
+
+def _in_places(text: str, before: dict[str, int]) -> str:
+    """Return a definition with its constants in their places; constants without a place come last."""
+    constants = iter([line for line in text.splitlines() if "=" in line])
+    lines = []
+    for line in [line for line in text.splitlines() if line and "=" not in line]:
+        lines += [*islice(constants, before.get(line.split()[-1], 0)), line]
+    return "\n".join([*lines, *constants, ""])
 
 
 def _messages_of_actions() -> dict[str, str]:

@@ -24,6 +24,17 @@ def test_every_type_is_whole(standard: Definitions) -> None:
         assert len(standard.service_md5sum(name)) == 32
 
 
+def test_constants_keep_their_places(standard: Definitions) -> None:
+    """Lichtblick reports a change of a definition whose constants are in another order than in ROS's file."""
+    name = "sensor_msgs/NavSatStatus"
+    lines = [line.rpartition(" ")[2].partition("=")[0] for line in standard.message(name).text.splitlines()]
+    assert lines[4:] == [
+        "status", "SERVICE_GPS", "SERVICE_GLONASS", "SERVICE_COMPASS", "SERVICE_GALILEO", "service"
+    ]  # fmt: skip
+    assert standard.md5sum(name) == "331cdbddfa4bc96ffc3b9ad98900a54c"
+    assert standard.message("shape_msgs/SolidPrimitive").text.endswith("uint8 CONE_RADIUS=1\n")
+
+
 def test_types_beside_the_type_store(standard: Definitions) -> None:
     assert standard.md5sum("tf2_msgs/TFMessage") == "94810edda583a504dfda3829e70d7eec"
     assert standard.md5sum("tf/tfMessage") == "94810edda583a504dfda3829e70d7eec"
