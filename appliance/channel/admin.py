@@ -29,9 +29,7 @@ from appliance.channel import alarms
 from appliance.channel import rest_bodies as bodies
 from appliance.channel.answers import (
     graph_answers,
-    host_answers,
     inventory_answers,
-    limit_answers,
     measures,
     monitor_answers,
     policy_answers,
@@ -97,11 +95,6 @@ class StatusWanted(AdminRequest[status.Status], frozen=True, tag="status"):
 @rest("viewer", "GET", "/v1/inventory", name="inventory", tag="status")
 class InventoryWanted(AdminRequest[inventory_answers.Inventory], frozen=True, tag="inventory"):
     """The running software: version, build, parts with their licences, and the kernel's features in use."""
-
-
-@rest("viewer", "GET", "/v1/limits", name="limits", tag="status")
-class LimitsWanted(AdminRequest[limit_answers.LimitList], frozen=True, tag="limits"):
-    """The finite resources that hosts can exhaust: used of allowed, and the host that uses most of each."""
 
 
 @rest("viewer", "GET", "/v1/alarms", name="alarms", tag="status")
@@ -449,39 +442,6 @@ class TokenRevoke(AdminRequest[token_answers.Token], frozen=True, tag="token rev
     """End a token now: from then on it is answered with 401, and open streams of its holder end. For admins."""
 
     name: Annotated[str, parameter(min_length=1, max_length=80, examples=["shift"])]
-
-
-@rest(
-    "operator", "POST", "/v1/blocks", name="block_host", body=bodies.NewBlock, tag="hosts",
-    problems={422: "The address cannot be blocked, or only with `force`."},
-)  # fmt: skip
-class HostBlock(AdminRequest[host_answers.HostBlocked], frozen=True, tag="host block"):
-    """Block a host: deny its requests and end its registrations and connections, for `for_seconds`, or until `DELETE`.
-
-    The block of a host that is already blocked is replaced.
-    """
-
-    address: str
-    for_seconds: float | None = None
-    note: str = ""
-    force: bool = False
-
-
-@rest(
-    "operator", "DELETE", "/v1/blocks/{address}", name="unblock_host", tag="hosts",
-    problems={404: "This host is not blocked."},
-)  # fmt: skip
-class HostUnblock(AdminRequest[host_answers.HostUnblocked], frozen=True, tag="host unblock"):
-    """Lift the block of a host: the policy decides its requests again, and its withdrawn registrations return."""
-
-    address: Annotated[
-        str, parameter("address or name of the host", min_length=1, max_length=64, examples=["10.0.0.7"])
-    ]
-
-
-@rest("viewer", "GET", "/v1/blocks", name="host_blocks", tag="hosts")
-class HostBlocks(AdminRequest[host_answers.BlockedHosts], frozen=True, tag="host blocks"):
-    """The hosts that operators block, the earliest block first."""
 
 
 @rest("viewer", "GET", "/v1/challenge", name="challenge", tag="status")

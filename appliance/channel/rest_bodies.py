@@ -9,7 +9,6 @@ from appliance.channel.answers.field_docs import doc
 WHOLE = r"(?!\n)"  # follows `$`, because Python's `$` also matches before a final newline
 LONGEST_REVISION = 10**15
 LONGEST_SILENCE_SECONDS = 7 * 86_400.0
-LONGEST_BLOCK_SECONDS = 365 * 86_400
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=1 << 20)]
 Signature = Annotated[
     str,
@@ -118,20 +117,6 @@ class SwitchMany(Switch, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The same for several monitors at once: all of them, or none when there is an unknown name."""
 
     names: Annotated[list[MonitorName], msgspec.Meta(min_length=1, max_length=1000)]
-
-
-class NewBlock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A host to block."""
-
-    address: Annotated[
-        str, doc("an IPv4 or IPv6 address, or the name of an enrolled host", min_length=1, max_length=64)
-    ]
-    for_seconds: Annotated[
-        Annotated[float, msgspec.Meta(ge=1, le=LONGEST_BLOCK_SECONDS)] | None,
-        doc("the block ends after this time; null: it ends by an order only"),
-    ] = None
-    note: Annotated[str, doc("reason for the block, shown to operators", max_length=200)] = ""
-    force: Annotated[bool, doc("block the robot's own host also")] = False
 
 
 class OneAlarm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -20,7 +20,6 @@ _CONFIRM = "Keep a change loaded with --confirm-within. Exit status 1 if there i
 VERBS: Verbs = {
     "up": Verb("up:up"),
     "status": Verb("status_verb:status"),
-    "limits": Verb("limits_verb:limits"),
     "alarm": Group(
         "List the present alarms, and record who takes care of them.",
         {
@@ -90,14 +89,6 @@ VERBS: Verbs = {
     "config": Group(
         "Check or show the configuration.",
         {"check": Verb("config_verbs:check"), "show": Verb("config_verbs:show")},
-    ),
-    "host": Group(
-        "Block hosts; enrol, list and revoke hosts that connect through IPsec tunnels.",
-        {
-            "block": Verb("host.block_verbs:block"),
-            "blocks": Verb("host.block_verbs:list_blocks"),
-            "unblock": Verb("host.block_verbs:unblock"),
-        },
     ),
     "certificate": Verb("certificate_verb:certificate"),
     "token": Group(

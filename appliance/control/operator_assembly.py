@@ -9,10 +9,8 @@ from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.foundation import Current, Foundation
 from appliance.control.operators.administration import Administration
 from appliance.control.operators.alarm_orders import AlarmOrders, HandledAlarms
-from appliance.control.operators.block_orders import BlockOrders
 from appliance.control.operators.clock_check import ClockCheck
-from appliance.control.operators.limit_use import LimitQueries
-from appliance.control.operators.overview import graph_of, hosts_connected
+from appliance.control.operators.overview import graph_of
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.switched_off import SwitchedOffWatch
@@ -30,7 +28,6 @@ class Operators:
     ends_of_tokens: StoredDeadlines
     clock: ClockCheck
     switched_off: SwitchedOffWatch
-    blocks: BlockOrders
     administration: Administration
     rest: RestLink
 
@@ -48,20 +45,6 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         parts.monitors, base.policies, base.store, trail, settings.forgotten_after
     )
     core = parts.core
-    blocks = BlockOrders(
-        base.blocks,
-        base.policies,
-        base.store,
-        trail,
-        live=core.revocation.live,
-        connected=partial(hosts_connected, parts),
-        enrolled=lambda: {
-            **{row.name: row.address for row in base.table.enrolled()},
-            **{name: str(address) for name, address in base.features.addresses().items()},
-        },
-        remotes=lambda: {name: seen.remote for name, seen in base.tunnels.seen.items()},
-        carried_out=ends.relay.carried_out,
-    )
     base.features.operate(
         appliance=base.role.name,
         store=base.store,
@@ -86,7 +69,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         queued_deliveries=lambda: ends.enactor.delivery.waiting,
         live=core.revocation.live,
         switched_off=switched_off.rows,
-        blocks=blocks.status,
+        blocks=base.blocks.state,
         handled=handled.marked,
         name=base.settings.name,
     )
@@ -98,9 +81,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
             policies=base.policies,
             monitors=parts.monitors,
             tokens=tokens,
-            blocks=blocks,
             alarms=AlarmOrders(handled, trail, looks.present),
-            limits=LimitQueries(parts, settings, base.listener_limits, base.features.limits),
         ),
         durable=partial(_durable, base),
         require_room=base.store.database.require_room,
@@ -121,7 +102,6 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         ends_of_tokens=ends_of_tokens,
         clock=clock,
         switched_off=switched_off,
-        blocks=blocks,
         administration=administration,
         rest=rest(),
     )

@@ -151,7 +151,6 @@ class _Control:
             "the check of the clock": operators.clock.watch,
             "the ends of tokens": operators.ends_of_tokens.watch,
             "the check of protection that is off": operators.switched_off.watch,
-            "the blocks of hosts": operators.blocks.watch,
             "the storage of parameters": self._save_parameters,
             "the publications of monitors": partial(parts.publisher.run, parts.reconciler.ready),
             **base.features.work(),

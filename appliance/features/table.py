@@ -11,12 +11,14 @@ from appliance.configuration.sections import Sections
 from appliance.features.approvals.feature import APPROVALS
 from appliance.features.authority.feature import AUTHORITY
 from appliance.features.backup.feature import BACKUP
+from appliance.features.blocks.feature import BLOCKS
 from appliance.features.demo.feature import DEMO
 from appliance.features.doors.feature import DOORS
 from appliance.features.evidence.feature import EVIDENCE
 from appliance.features.feature import Feature
 from appliance.features.fleet.feature import FLEET
 from appliance.features.guards.feature import GUARDS
+from appliance.features.limits.feature import LIMITS
 from appliance.features.live.feature import LIVE
 from appliance.features.metrics.feature import METRICS
 from appliance.features.policy_tools.feature import POLICY_TOOLS
@@ -33,6 +35,8 @@ if TYPE_CHECKING:
     from appliance.supervisor.service_gate import Pairing
 
 FEATURES: tuple[Feature, ...] = (
+    BLOCKS,
+    LIMITS,
     TOPICS,
     TUNNELS,
     SYSLOG,

@@ -43,7 +43,7 @@ ORDERS: tuple[admin.AdminRequest[Any], ...] = (
     admin.AlarmSilence("none"),
     admin.TokenAdd("late", "viewer", 3600.0),
     admin.TokenRotate("guest"),
-    admin.HostUnblock("192.0.2.66"),
+    *of_feature("host unblock", address="192.0.2.66"),
     *of_feature("host token", name="laptop", endpoint="192.0.2.1"),
     *of_feature("host add", name="laptop", request=REQUEST),
     *of_feature("host enrol", token="rosrv-enrol_none", request=REQUEST, peer="192.0.2.2"),  # noqa: S106  no token
@@ -64,7 +64,7 @@ UNSTORED = {
 }  # fmt: skip
 LOOKS: tuple[admin.AdminRequest[Any], ...] = (
     admin.PolicyRevisions(), admin.MonitorRevisions(), admin.MonitorsWanted(True), admin.TokenList(),
-    admin.HostBlocks(), *of_feature("host list"),
+    *of_feature("host blocks"), *of_feature("host list"),
 )  # fmt: skip
 
 

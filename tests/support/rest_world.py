@@ -33,8 +33,6 @@ from appliance.configuration.settings import ApiLimits, Settings
 from appliance.control.assembly.policies import Policies
 from appliance.control.operators.administration import Administration
 from appliance.control.operators.alarm_orders import AlarmOrders
-from appliance.control.operators.block_orders import BlockOrders
-from appliance.control.operators.limit_use import LimitQueries
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.request_methods import request_methods
@@ -145,8 +143,6 @@ class RestWorld:
             policies=idle(Policies),
             monitors=idle(SpecificationManager),
             tokens=idle(TokenOrders),
-            blocks=idle(BlockOrders),
-            limits=idle(LimitQueries),
             alarms=idle(AlarmOrders),
         )
         administration = Administration(

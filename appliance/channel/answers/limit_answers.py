@@ -1,4 +1,4 @@
-"""The answer about the limits of finite resources: how much of each is used."""
+"""The use of a finite resource."""
 
 from typing import Annotated
 
@@ -19,9 +19,3 @@ class LimitUse(msgspec.Struct, frozen=True):
     )
     host_used: Annotated[int, doc("by that host")] = 0
     host_allowed: Annotated[int, doc("the limit of one host")] = 0
-
-
-class LimitList(msgspec.Struct, frozen=True):
-    """The finite resources that hosts can exhaust, with their present use."""
-
-    limits: Annotated[list[LimitUse], doc("one row for each resource")]

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 
 from appliance.base import clock
+from appliance.channel.answers.status import BlocksState
 from appliance.policy.model import Address, address_of
 from appliance.store.host_tables import HostBlockRow
 from appliance.store.state_file import StateStore
@@ -40,6 +41,11 @@ class BlockTable:
     def read_clock(self) -> None:
         """Read the age clock, which may write a file. Only one thread at a time may call this."""
         self._now, self._wall, self._seen = self._age(), clock.wall(), clock.since_boot_ns()
+
+    def state(self) -> BlocksState:
+        """Return the number of blocks and the earliest end."""
+        ends = [self.until(row) for row in self._rows.values()]
+        return BlocksState(len(ends), min((end for end in ends if end is not None), default=None))
 
     def age_now(self) -> int:
         """Return the age clock's time, from the last reading and the time since."""

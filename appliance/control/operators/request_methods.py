@@ -5,8 +5,6 @@ from typing import Any
 from appliance.channel import admin
 from appliance.control.assembly.policies import Policies
 from appliance.control.operators.alarm_orders import AlarmOrders
-from appliance.control.operators.block_orders import BlockOrders
-from appliance.control.operators.limit_use import LimitQueries
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.token_orders import TokenOrders
@@ -19,8 +17,6 @@ def request_methods(
     policies: Policies,
     monitors: SpecificationManager,
     tokens: TokenOrders,
-    blocks: BlockOrders,
-    limits: LimitQueries,
     alarms: AlarmOrders,
 ) -> tuple[RequestMethod[Any], ...]:
     """Return the methods of these parts: one for each request of the core."""
@@ -30,7 +26,6 @@ def request_methods(
         RequestMethod(admin.AlarmsWanted, alarms.listed, order=False),
         RequestMethod(admin.AlarmAcknowledge, alarms.acknowledge, who=True),
         RequestMethod(admin.AlarmSilence, alarms.silence, who=True),
-        RequestMethod(admin.LimitsWanted, limits.use, order=False),
         RequestMethod(admin.GraphWanted, queries.graph, order=False),
         RequestMethod(admin.MonitorsWanted, queries.monitors, order=False),
         RequestMethod(admin.TopicLook, queries.topic_look, who=True, order=False),
@@ -56,9 +51,6 @@ def request_methods(
         RequestMethod(admin.MonitorShadow, monitors.shadow, who=True),
         RequestMethod(admin.MonitorGive, monitors.give, who=True),
         RequestMethod(admin.MonitorResume, monitors.resume, who=True),
-        RequestMethod(admin.HostBlock, blocks.block, who=True, full_disk=True),
-        RequestMethod(admin.HostUnblock, blocks.unblock, who=True),
-        RequestMethod(admin.HostBlocks, blocks.listed, order=False),
         RequestMethod(admin.TokenList, tokens.listed),
         RequestMethod(admin.TokenAdd, tokens.add, who=True),
         RequestMethod(admin.TokenRotate, tokens.rotate, who=True),

@@ -7,7 +7,6 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-from appliance.channel.admin import HostBlocks
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.command import ROSRV
 from tests.support.processes import LIMIT
@@ -67,10 +66,9 @@ def test_backed_up_while_running_and_restored_elsewhere(tmp_path: Path) -> None:
             assert master.getParam("/robot", "/arm")[2] == {"joints": [1.5, -2.0], "name": "left"}
             assert master.getParam("/robot", "/counter")[2] > 0
         assert new.status()["policy"]["revision"] == 2
-        [block] = new.ask(HostBlocks()).blocks
-        assert (block.address, block.note) == ("10.9.9.9", "odd")
-        assert block.until is not None
-        assert 0 < block.until - block.since <= 3600.5
+        block = json.loads(new.rosrv("host", "blocks", "--json").stdout)
+        assert (block["address"], block["note"]) == ("10.9.9.9", "odd")
+        assert 0 < block["until"] - block["since"] <= 3600.5
         assert new.rest(token).get("/v1/status").status == 200
         eventually(
             lambda: (

@@ -6,7 +6,6 @@ from functools import partial
 
 import pytest
 
-from appliance.channel import admin
 from tests.support.features.standby.standby_site import OCU, StandbySite
 from tests.support.waiting import allowed, eventually
 
@@ -15,9 +14,8 @@ HOUR = 3600.0
 
 def blocked_for(site: StandbySite, name: str) -> float:
     """Return the seconds that the block has left at an appliance."""
-    [block] = site.appliances[name].ask(admin.HostBlocks()).blocks
-    assert block.until is not None
-    return block.until - time.time()
+    block = json.loads(site.appliances[name].rosrv("host", "blocks", "--json").stdout)
+    return float(block["until"]) - time.time()
 
 
 @pytest.mark.parametrize("ahead", [HOUR, -HOUR])
@@ -26,7 +24,7 @@ def test_a_block_keeps_its_length_over_switchovers(site: StandbySite, ahead: flo
     age = site.appliances[passive].state / "control" / "age"
     now = time.time_ns()
     age.write_text(json.dumps({"lived": 0, "credited": now + int(ahead * 1e9), "believed": now}))
-    site.appliances[active].ask(admin.HostBlock(OCU, HOUR))
+    site.appliances[active].rosrv("host", "block", OCU, "--for", "1h")
     began = time.monotonic()
     for leaves, follows in ((active, passive), (passive, active)):
         time.sleep(6.0)  # noqa: TID251  a reading of the clocks is replicated every five seconds
@@ -35,4 +33,4 @@ def test_a_block_keeps_its_length_over_switchovers(site: StandbySite, ahead: flo
         left = eventually(partial(blocked_for, site, follows), site.story)
         assert left == pytest.approx(HOUR - (time.monotonic() - began), abs=allowed(5.0))
         site.until_both_in_sync()
-    site.appliances[active].ask(admin.HostUnblock(OCU))
+    site.appliances[active].rosrv("host", "unblock", OCU)

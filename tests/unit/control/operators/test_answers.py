@@ -13,8 +13,6 @@ from appliance.channel.operations import AnyRequest, RestRequest
 from appliance.control.assembly.policies import Policies
 from appliance.control.operators.administration import Administration
 from appliance.control.operators.alarm_orders import AlarmOrders
-from appliance.control.operators.block_orders import BlockOrders
-from appliance.control.operators.limit_use import LimitQueries
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.token_orders import TokenOrders
@@ -26,8 +24,6 @@ CLASSES: dict[str, Any] = {
     "policies": Policies,
     "monitors": SpecificationManager,
     "tokens": TokenOrders,
-    "blocks": BlockOrders,
-    "limits": LimitQueries,
     "alarms": AlarmOrders,
 }
 METHODS = idle_parts().methods() + request_methods(**CLASSES)

@@ -14,13 +14,21 @@ from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from msgspec.structs import asdict, replace
 
 from appliance.base.withdrawal import take_effect
-from appliance.channel import admin
-from appliance.channel.answers import host_answers as answers
-from appliance.channel.answers.status import BlocksState
-from appliance.channel.rest_bodies import LONGEST_BLOCK_SECONDS
+from appliance.control.assembly.assembly import Parts
+from appliance.control.assembly.foundation import Foundation
 from appliance.control.assembly.host_blocks import BlockTable
 from appliance.control.assembly.policies import Policies
 from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.control.operators.overview import hosts_connected
+from appliance.control.operators.request_method import RequestMethod
+from appliance.features.blocks import block_requests as requests
+from appliance.features.blocks.block_requests import (
+    LONGEST_BLOCK_SECONDS,
+    HostBlock,
+    HostBlocks,
+    HostUnblock,
+)
+from appliance.features.feature import FeaturePart
 from appliance.hosts.host_table import HostRefusedError
 from appliance.policy.host_names import HostNames, UnknownHostNameError
 from appliance.policy.live_rights import LiveRight
@@ -43,6 +51,32 @@ _REGISTERED = {
     "registerService": "services",
     "subscribeParam": "parameters",
 }
+
+
+async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
+    """Return the part of control."""
+    orders = BlockOrders(
+        base.blocks,
+        base.policies,
+        base.store,
+        base.trail,
+        live=parts.core.revocation.live,
+        connected=lambda: hosts_connected(parts),
+        enrolled=lambda: {
+            **{row.name: row.address for row in base.table.enrolled()},
+            **{name: str(address) for name, address in base.features.addresses().items()},
+        },
+        remotes=lambda: {name: seen.remote for name, seen in base.tunnels.seen.items()},
+        carried_out=parts.endpoints.relay.carried_out,
+    )
+    return FeaturePart(
+        methods=(
+            RequestMethod(HostBlock, orders.block, who=True, full_disk=True),
+            RequestMethod(HostUnblock, orders.unblock, who=True),
+            RequestMethod(HostBlocks, orders.listed, order=False),
+        ),
+        work={"the blocks of hosts": orders.watch},
+    )
 
 
 class BlockOrders:
@@ -78,16 +112,11 @@ class BlockOrders:
         self._clock_reads = asyncio.Lock()
         self._changed = asyncio.Event()
 
-    async def listed(self, _request: admin.HostBlocks) -> answers.BlockedHosts:
+    async def listed(self, _request: HostBlocks) -> requests.BlockedHosts:
         await self._read_clock()
-        return answers.BlockedHosts([self._row(row) for row in self._blocks.rows().values()])
+        return requests.BlockedHosts([self._row(row) for row in self._blocks.rows().values()])
 
-    def status(self) -> BlocksState:
-        """Return the number of blocks and the earliest end."""
-        ends = [self._blocks.until(row) for row in self._blocks.rows().values()]
-        return BlocksState(len(ends), min((end for end in ends if end is not None), default=None))
-
-    async def block(self, request: admin.HostBlock, who: str) -> answers.HostBlocked:
+    async def block(self, request: HostBlock, who: str) -> requests.HostBlocked:
         """Block a host. Raises `SenselessError`, `HostRefusedError` and `StoreError`."""
         address = self._address(request.address)
         _require_sensible(request)
@@ -129,9 +158,9 @@ class BlockOrders:
         await self._carried_out()
         knows = self._policies.current.knows
         others = sorted(other for other in self._same_machine(row.address) if knows(address_of(other)))
-        return answers.HostBlocked(**asdict(shown), ended=ended, replaced=replaced, other_addresses=others)
+        return requests.HostBlocked(**asdict(shown), ended=ended, replaced=replaced, other_addresses=others)
 
-    async def unblock(self, request: admin.HostUnblock, who: str) -> answers.HostUnblocked:
+    async def unblock(self, request: HostUnblock, who: str) -> requests.HostUnblocked:
         """Lift the block of a host. Raises `SenselessError`, `UnknownThingError` and `StoreError`."""
         address = self._address(request.address)
         await self._read_clock()
@@ -151,7 +180,7 @@ class BlockOrders:
         )
         await self._store.settled()
         await self._carried_out()
-        return answers.HostUnblocked(**asdict(shown), restored=restored)
+        return requests.HostUnblocked(**asdict(shown), restored=restored)
 
     async def watch(self) -> None:
         """End blocks when their time is over; runs until cancelled."""
@@ -213,7 +242,7 @@ class BlockOrders:
             raise SenselessError(f"{text[:80]!r} is not one host: block one address at a time ({some})")
         return plain_address(str(networks[0].network_address))
 
-    def _require_not_the_robot(self, address: Address, held: answers.BlockEnded) -> None:
+    def _require_not_the_robot(self, address: Address, held: requests.BlockEnded) -> None:
         own, whole = _registrations_of(held), self._registrations()
         if any(address in network for network in self._policies.current.robot):
             why = "is the robot's own host"
@@ -233,19 +262,19 @@ class BlockOrders:
 
     # --- what a host has ---
 
-    def _held_by(self, address: Address) -> answers.BlockEnded:
+    def _held_by(self, address: Address) -> requests.BlockEnded:
         count = Counter(_REGISTERED.get(one.call, "") for one in self._live() if one.host == address)
         connections = sum(str(address) in hosts for hosts in self._connected())
-        return answers.BlockEnded(
+        return requests.BlockEnded(
             **{name: count[name] for name in _REGISTERED.values()}, connections=connections
         )
 
     def _registrations(self) -> int:
         return sum(one.call in _REGISTERED for one in self._live())
 
-    def _row(self, row: HostBlockRow) -> answers.BlockedHost:
+    def _row(self, row: HostBlockRow) -> requests.BlockedHost:
         names = (name for name, address in self._enrolled().items() if address == row.address)
-        return answers.BlockedHost(
+        return requests.BlockedHost(
             row.address, next(names, ""), row.since, self._blocks.until(row), row.who, row.note
         )
 
@@ -260,7 +289,7 @@ def _require_possible(address: Address) -> None:
         )
 
 
-def _require_sensible(request: admin.HostBlock) -> None:
+def _require_sensible(request: HostBlock) -> None:
     seconds = request.for_seconds
     if seconds is not None and not 1 <= seconds <= LONGEST_BLOCK_SECONDS:
         raise SenselessError(
@@ -282,15 +311,15 @@ def _is_own(address: Address) -> bool:
     return True
 
 
-def _difference(before: answers.BlockEnded, after: answers.BlockEnded) -> answers.BlockEnded:
+def _difference(before: requests.BlockEnded, after: requests.BlockEnded) -> requests.BlockEnded:
     left = asdict(after)
-    return answers.BlockEnded(**{name: count - left[name] for name, count in asdict(before).items()})
+    return requests.BlockEnded(**{name: count - left[name] for name, count in asdict(before).items()})
 
 
-def in_words(held: answers.BlockEnded) -> str:
+def in_words(held: requests.BlockEnded) -> str:
     """Return numbers of registrations and connections as text."""
     return f"{_registrations_of(held)} registrations and {held.connections} connections"
 
 
-def _registrations_of(held: answers.BlockEnded) -> int:
+def _registrations_of(held: requests.BlockEnded) -> int:
     return held.publications + held.subscriptions + held.services + held.parameters

@@ -3,10 +3,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from appliance.channel.admin import LimitsWanted
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.configuration.config_sources import read
-from appliance.control.operators.limit_use import LimitQueries
+from appliance.features.limits.limit_requests import LimitsWanted
+from appliance.features.limits.limit_use import LimitQueries
 from appliance.quotas.pool import Bounds, Pool, QuotaClass
 
 

@@ -6,13 +6,22 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from appliance.channel import admin
-from appliance.channel.answers.limit_answers import LimitList, LimitUse
+from appliance.channel.answers.limit_answers import LimitUse
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.assembly import Parts
+from appliance.control.assembly.foundation import Foundation
 from appliance.control.assembly.listener_limits import ListenerLimits
+from appliance.control.operators.request_method import RequestMethod
+from appliance.features.feature import FeaturePart
+from appliance.features.limits.limit_requests import LimitList, LimitsWanted
 from appliance.quotas.pool import Pool
 from appliance.quotas.table import NAMES, RELAY_FRAMES, RELAY_LATCHED, RELAY_QUEUES, QuotaRow
+
+
+async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
+    """Return the part of control."""
+    queries = LimitQueries(parts, base.settings, base.listener_limits, base.features.limits)
+    return FeaturePart(methods=(RequestMethod(LimitsWanted, queries.use, order=False),))
 
 
 @dataclass(frozen=True)
@@ -24,7 +33,7 @@ class LimitQueries:
     listeners: ListenerLimits
     features: Callable[[], Iterable[LimitUse]]
 
-    async def use(self, _request: admin.LimitsWanted) -> LimitList:
+    async def use(self, _request: LimitsWanted) -> LimitList:
         """Return the resources that hosts can exhaust, with their present use."""
         return LimitList([*self._registry(), *self._pools(), *self._relays(), *self._stored()])
 

@@ -12,13 +12,19 @@ import pytest
 
 from appliance.base.clock import using
 from appliance.base.withdrawal import WithdrawnError, awaited
-from appliance.channel.admin import HostBlock, HostBlocks, HostUnblock, PolicyReload
-from appliance.channel.answers.host_answers import BlockEnded, HostBlocked
+from appliance.channel.admin import PolicyReload
 from appliance.control.assembly import host_blocks
 from appliance.control.assembly.policies import Policies
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.control.operators import block_orders
-from appliance.control.operators.block_orders import BlockOrders
+from appliance.features.blocks import block_orders
+from appliance.features.blocks.block_orders import BlockOrders
+from appliance.features.blocks.block_requests import (
+    BlockEnded,
+    HostBlock,
+    HostBlocked,
+    HostBlocks,
+    HostUnblock,
+)
 from appliance.hosts.host_table import HostRefusedError
 from appliance.master.graph.registry import Kind
 from appliance.master.graph.revocation import revoked

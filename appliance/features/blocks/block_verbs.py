@@ -5,13 +5,18 @@ from typing import Annotated
 
 import typer
 
-from appliance.channel.admin import HostBlock, HostBlocks, HostUnblock
-from appliance.channel.answers.host_answers import BlockedHost, BlockEnded
-from appliance.channel.rest_bodies import LONGEST_BLOCK_SECONDS
 from appliance.cli import output
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import moment, say_json, say_row
+from appliance.features.blocks.block_requests import (
+    LONGEST_BLOCK_SECONDS,
+    BlockedHost,
+    BlockEnded,
+    HostBlock,
+    HostBlocks,
+    HostUnblock,
+)
 from rosmop.tool.terminal import counted, say
 
 _usage_error = functools.partial(output.usage_error, verb="rosrv host")

@@ -1,1 +1,0 @@
-"""`rosrv host`: manage the hosts with a tunnel."""

@@ -1,0 +1,1 @@
+"""Blocks: hosts that operators block during an incident."""

@@ -1,0 +1,1 @@
+"""Limits: how much of each finite resource is used."""
