@@ -28,7 +28,7 @@ from appliance.rpc.xmlrpc_client import CallFailedError
 from roswire.uris import service_uri
 
 NAME = "/master"
-_GATHER_SECONDS = 0.02  # the ROS master serves gathered changes in half the processor time
+_GATHER_SECONDS = 0.1  # gathered changes cost half the processor time
 
 _log = structlog.get_logger()
 
