@@ -18,6 +18,7 @@ from roswire.standard import standard_definitions
 
 BESIDE = "msg"
 """The folder of message definitions beside a specification."""
+_RECORDINGS = (b"#ROSBAG ", b"\x89MCAP")
 
 
 def load(
@@ -45,6 +46,8 @@ def read_specifications(program: CommandContext, files: Sequence[Path]) -> dict[
             raw = program.read(file)
         except OSError as error:
             raise program.usage_error(f"cannot read {file}: {error.strerror}") from error
+        if raw.startswith(_RECORDINGS):
+            raise program.usage_error(f"{file} is a recording, not a specification; give it with --bag {file}")
         name = os.fsencode(file).decode("utf-8", "backslashreplace")
         texts[name] = raw.decode("utf-8-sig", "surrogateescape")
     return texts
