@@ -150,7 +150,7 @@ def list_hosts(
         say("no hosts; enrol one: rosrv host add NAME")
     for machine in body.machines:
         nodes = f"{machine.nodes} nodes in clear text"
-        say_row([f"{machine.address:<37} {nodes:<13}", _ports_words(machine.ports)])
+        say_row([f"{running.host_in_words(machine.address):<37} {nodes:<13}", _ports_words(machine.ports)])
     for trouble in body.troubles:
         say(f"! {trouble}")
 
