@@ -25,7 +25,7 @@ FILES: list[tuple[str, Callable[[Path], object], str]] = [
     ("check given", lambda path: path.symlink_to("/dev/zero"), DEVICE),
     ("check given", Path.mkdir, "not a regular file: it is a folder"),
     ("check given", huge, f"longer than {MAX_FILE} bytes"),
-    ("run m.rv given", lambda path: path.write_bytes(b"#ROSBAG V2.0\n"), "with --bag given"),
+    ("run m.rv given", lambda path: path.write_bytes(b"#ROSBAG V2.0\n"), "use --bag given"),
     ("check given", lambda path: path.write_bytes(b"\x89MCAP0\r\n"), "given is a recording"),
     ("run m.rv --bag given", os.mkfifo, PIPE),
     ("run m.rv --bag given", lambda path: path.symlink_to("/dev/zero"), DEVICE),
