@@ -91,7 +91,6 @@ class InCaller:
         """Leave new work to a later turn."""
 
     def hurry(self) -> None:
-        """Call the turns that are due."""
         time = now()
         self.due = self._turn(time)
         while self.due is not None and self.due <= time:

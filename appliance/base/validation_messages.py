@@ -65,7 +65,6 @@ _YAML = {
     "end of stream": "close the quote",
     "cannot start any token|undefined alias": "put the string in quotes",
 }
-"""Advice for messages of the YAML parser."""
 
 
 def not_yaml(problem: object) -> str:

@@ -63,7 +63,6 @@ class Channel:
         self._writing = False
 
     def fileno(self) -> int:
-        """Return the descriptor to wait on."""
         return self._socket.fileno()
 
     @property

@@ -108,7 +108,6 @@ class Operation:
     request: Any = None
 
     def __call__(self, request: type[R]) -> type[R]:
-        """Add the row for a request."""
         words, tag = self.words or request.__doc__ or "", self.tag or "".join(self.path.split("/")[2:3])
         of = self.of if self.method != "GET" else None
         seconds = self.seconds or (of.seconds if of is not None else ANSWER_SECONDS)
@@ -118,7 +117,6 @@ class Operation:
 
     @property
     def is_change(self) -> bool:
-        """Whether this route changes something."""
         return bool(self.path) and self.method != "GET"
 
     def fields(self) -> Mapping[str, msgspec.structs.FieldInfo]:

@@ -41,7 +41,6 @@ _SERVICE_LINK = re.compile(r"ROSRV_(SERVICE_(HOST|PORT.*+)|PORT|PORT_\d++_.*+|NA
 
 
 def _paths_of(section: type) -> Iterator[tuple[str, ...]]:
-    """Yield the keys of a section, and of the sections in it, that are paths."""
     for name, annotation in typing.get_type_hints(section).items():
         if Path in (annotation, *typing.get_args(annotation)):
             yield (name,)

@@ -46,7 +46,6 @@ class MonitorCallGate:
     host: str
 
     async def answer(self, wanted: MonitorCallWanted) -> MonitorCallAnswered:
-        """Decide, record and grant a call."""
         refused = await self._refused(wanted.service)
         provider = next(iter(self.registry.registered(Kind.SERVICE, wanted.service)), None)
         if not refused and provider is None:

@@ -89,7 +89,6 @@ class FeatureParts:
         return next((part.longest[role] for part in self._parts if role in part.longest), LONGEST)
 
     def methods(self) -> "tuple[RequestMethod[Any], ...]":
-        """Return the methods that answer the features' requests."""
         return tuple(method for part in self._parts for method in part.methods)
 
     def state(self) -> dict[str, Any]:
@@ -125,7 +124,6 @@ class FeatureParts:
         return {group: host for part in self._parts for group, host in part.holders().items()}
 
     def approved(self) -> "frozenset[Approval]":
-        """Return the approvals that last."""
         return frozenset(approval for part in self._parts for approval in part.approved())
 
     def hold_call(self, request: "Request") -> str:
@@ -147,7 +145,6 @@ class FeatureParts:
         return next((part.sessions for part in self._parts if part.sessions is not None), None)
 
     def hosts(self) -> TunnelHosts:
-        """Return the hosts in tunnels."""
         return next((part.hosts for part in self._parts if part.hosts is not None), self._no_hosts)
 
     def work(self) -> dict[str, Callable[[], Awaitable[None]]]:

@@ -56,7 +56,6 @@ class PairView:
         raise _NO_PAIRS
 
     def samples(self, state: Any) -> Mapping[str, Samples]:
-        """Return the samples of each metric of a pair."""
         del state
         return {}
 

@@ -54,5 +54,4 @@ def states_of(status: Any) -> Iterator[tuple[StateView[Any], Any]]:
 
 @functools.cache
 def pair_view() -> PairView:
-    """Return the views of two appliances."""
     return next((pkgutil.resolve_name(view.pair)() for view in VIEWS if view.pair), PairView())

@@ -6,7 +6,6 @@ METADATA, TARGETS, SELECTION = "v1/bundles/metadata", "v1/bundles/targets", "v1/
 EVENTS = "v1/bundles/events"
 """The path of the collector's event stream."""
 REPORT = "v1/bundles/report"
-"""The path of the collector for reports."""
 
 
 class RobotReport(msgspec.Struct, frozen=True):

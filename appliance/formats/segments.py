@@ -227,7 +227,6 @@ class SegmentReader:
         return self._done.add(line)
 
     def __iter__(self) -> Iterator[StoredColumns]:
-        """Yield the stored columns of each record."""
         end = self.header.end
         sequence, digest = self.header.start
         while line := self._read():

@@ -179,7 +179,6 @@ class HostTable:
     # --- changes ---
 
     def keep(self, name: str, address: str, made: CertificateMade) -> HostRow:
-        """Make this the only certificate of a host."""
         before, now = self.rows.get(name), clock.wall()
         if before is not None and before.revoked is None:
             self._revoke_certificates(before)
@@ -213,7 +212,6 @@ class HostTable:
         return taken
 
     def revoke(self, name: str) -> HostRow:
-        """Revoke all certificates of a host."""
         row = self.enrolled_row(name)
         self._revoke_certificates(row)
         self.changed()

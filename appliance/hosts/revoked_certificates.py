@@ -30,7 +30,6 @@ class RevokedCertificates:
         self.forget_ended()
 
     def add(self, name: str, serial: str, expires: float) -> None:
-        """Add a revoked certificate, once."""
         row = RevokedCertificateRow(serial, name, clock.wall(), expires)
         if serial not in self._rows:
             self._rows[serial] = row

@@ -27,7 +27,6 @@ class StoredAuthority:
         return ""
 
     async def certificate(self) -> bytes:
-        """Return the authority's certificate, in PEM."""
         own = (await self._signer.stated()).certificate
         kept = self._row
         if kept is not None and self._keeps(kept, own):

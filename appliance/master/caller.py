@@ -35,7 +35,6 @@ class Caller(NamedTuple):
     target: Incarnation | None = None
 
     def as_named(self, caller_id: str) -> "Caller":
-        """Return the same caller with the name that is claimed in this call."""
         return Caller(self.peer, caller_id, self.arrived, self.own, self.target)
 
     @property

@@ -15,7 +15,6 @@ from roswire.log_message import DEBUG, ERROR, FATAL, INFO, TYPE, WARN, log_messa
 
 TOPIC = "/rosout"
 PUBLICATIONS = {TOPIC: TYPE}
-"""The published topic, and its type."""
 _A_SECOND = 50
 _LEVELS = {"DEBUG": DEBUG, "INFO": INFO, "WARN": WARN, "ERROR": ERROR, "FATAL": FATAL}
 _ALARMING = frozenset({"violation", "fail", "timeout"})  # categories of verdicts with level WARN

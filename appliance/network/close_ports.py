@@ -52,7 +52,6 @@ def parse_services(texts: Sequence[str]) -> tuple[OpenService, ...]:
 
 
 def parse_ports(text: str) -> PortRange:
-    """Parse a range of ports such as `32768-60999`, or a single port."""
     first, _, last = text.partition("-")
     if not (first.isdecimal() and (last or first).isdecimal()):
         raise ValueError(f"{text!r} is not a range of ports such as 32768-60999")
@@ -134,7 +133,6 @@ def apply(text: str) -> None:
 
 
 def remove() -> None:
-    """Remove the protection, if there is one."""
     _nft(["-f", "-"], f"table inet {TABLE}\ndelete table inet {TABLE}\n")
 
 

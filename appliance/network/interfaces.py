@@ -98,7 +98,6 @@ def add_address(namespace: Namespace, name: str, address: str) -> None:
 
 
 def delete_address(namespace: Namespace, name: str, address: str) -> None:
-    """Remove an address from the interface `name`, if the interface has it."""
     interface = ipaddress.ip_interface(address)
 
     def delete(route: Any) -> None:

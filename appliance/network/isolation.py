@@ -92,7 +92,6 @@ class LinkAddresses:
 
     @property
     def length(self) -> int:
-        """Return the prefix length, in bits."""
         return ipaddress.ip_network(self.network).prefixlen
 
 

@@ -19,7 +19,6 @@ def listening_ports() -> set[int]:
 
 
 def listening_inodes(port: int) -> set[str]:
-    """Return the inodes of the sockets that listen on a TCP port."""
     return {row.inode for row in _listeners() if row.port == port}
 
 

@@ -95,7 +95,6 @@ COMMANDS = frozenset(name for name, call in CALLS.items() if not call.elsewhere)
 NAMED_ONLY = frozenset(name for name, call in CALLS.items() if call.named_only)
 DECIDED_ELSEWHERE = {name: call.elsewhere for name, call in CALLS.items() if call.elsewhere}
 ALIASES = {call.wire: name for name, call in CALLS.items() if call.wire}
-"""The names of calls in the policy, by their longer names on the wire."""
 
 
 def policy_call(name: str) -> PolicyCall:

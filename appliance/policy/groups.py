@@ -162,7 +162,6 @@ class HostGroups:
         return None
 
     def _find_cycles(self) -> None:
-        """Report one error for each cycle of groups that contain each other."""
         done: set[str] = {ROBOT}
         for start in self.groups:
             path: list[str] = []

@@ -63,7 +63,6 @@ def _range(entry: Entry, findings: Findings) -> range | None:
 
 
 def read_monitor(section: SectionText | None, findings: Findings) -> MonitorSection:
-    """Return the names to relay."""
     names: dict[str, set[str]] = {"topic": set(), "service": set()}
     for entry in _entries(section, tuple(names), findings):
         for word in entry.values:

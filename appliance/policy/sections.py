@@ -40,7 +40,6 @@ DECIDERS = (
 BY_CATEGORY = {category: decider for decider in DECIDERS for category in decider.categories}
 
 PARAMETERS = frozenset({Category.READ, Category.WRITE})
-"""The categories of access to parameters."""
 
 ASK = "ask"
 """The word in a value after which the hosts need an operator's approval."""

@@ -138,7 +138,6 @@ class Pool(Generic[Holder]):
         self._set(host, quota_class, mine, mine - amount)
 
     def held(self, host: Holder) -> int:
-        """Return the holdings of `host`."""
         return self._held.get(host, _NOTHING)[1]
 
     def held_by(self, quota_class: QuotaClass) -> int:
@@ -147,7 +146,6 @@ class Pool(Generic[Holder]):
 
     @property
     def total(self) -> int:
-        """Return the holdings of all hosts."""
         return sum(self._by_class)
 
     def holders(self) -> Iterator[tuple[Holder, int]]:

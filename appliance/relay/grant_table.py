@@ -60,7 +60,6 @@ class ServiceEndpoint:
     host: str
     port: int
     node: str
-    """The name of the node that offers it."""
 
 
 class GrantTable:
@@ -96,7 +95,6 @@ class GrantTable:
         return withdrawals
 
     def state(self, message: Statement) -> None:
-        """Add or replace a fact."""
         fact = _fact(message)
         self._take_out(fact)
         self._facts[fact] = message

@@ -52,12 +52,10 @@ class Reporter:
         self._limited: dict[_Limited, list[int]] = {}
 
     def attach(self, link: LoopLink | None) -> None:
-        """Report to this control from now on."""
         self._link = link
 
     @property
     def attached(self) -> bool:
-        """Whether there is a control to report to."""
         return self._link is not None
 
     def repeat_connections(self) -> None:

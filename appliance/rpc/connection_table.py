@@ -30,7 +30,6 @@ class Stage(StrEnum):
     """The stage of a connection."""
 
     IDLE = "idle"
-    """All requests are answered."""
 
     UNFINISHED = "unfinished"
     """The connection waits for the rest of a request, for its turn, or for the peer to read an answer."""

@@ -85,7 +85,6 @@ class Front(asyncio.BaseProtocol, ABC):
 
     @property
     def is_open(self) -> bool:
-        """Whether the connection has a transport."""
         return self._socket is None
 
     def open(self, transport: asyncio.Transport) -> bool:
@@ -149,11 +148,9 @@ class Front(asyncio.BaseProtocol, ABC):
             self._reject_head()
 
     def on_headers_complete(self) -> None:
-        """End the head."""
         self.head_done = True
 
     def on_message_complete(self) -> None:
-        """End the request."""
         self.in_request = False
 
     def _reject_head(self) -> None:
@@ -170,7 +167,6 @@ class Front(asyncio.BaseProtocol, ABC):
         self.connection_table.leave(self)
 
     def expire(self) -> None:
-        """Handle a passed deadline."""
         self.abort()
 
     def abort(self) -> None:

@@ -57,7 +57,6 @@ class Line(Generic[Key, Item]):
         return used if used > start else start
 
     def charge(self, key: Key, seconds: float) -> None:
-        """Add to the use of a key."""
         kept, start = self._used, self.start
         used = kept.get(key, start)
         kept[key] = (used if used > start else start) + seconds
@@ -67,7 +66,6 @@ class Line(Generic[Key, Item]):
             self._used = {one: used for one, used in largest if used > start}
 
     def forget(self) -> None:
-        """Forget the use of all keys."""
         self._used.clear()
 
     def put(self, key: Key, item: Item) -> None:

@@ -35,7 +35,6 @@ class FileGroup:
 
     @property
     def specifications(self) -> int:
-        """Return the number of monitors."""
         return sum(self.files.values())
 
 

@@ -13,7 +13,6 @@ from appliance.channel.messages import GivenDeclared, GivenValue
 from appliance.specifications.specification_files import CheckedSpecifications, SpecificationsRefusedError
 
 Given = Mapping[str, Mapping[str, GivenValue]]
-"""Values by monitor and name."""
 
 NO_VALUES: Given = MappingProxyType({})
 

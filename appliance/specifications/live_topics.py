@@ -26,7 +26,6 @@ class LiveType(NamedTuple):
 
 
 Published = Mapping[str, Mapping[str, LiveType]]
-"""For each topic, its publishers with the type that each publishes."""
 
 _ANY = "*"
 

@@ -62,7 +62,6 @@ class Revision:
     sources: Sources = field(default_factory=Sources)
     checked: CheckedSpecifications = field(default_factory=CheckedSpecifications)
     shadows: frozenset[str] = frozenset()
-    """The monitors in shadow mode."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,6 @@ from appliance.specifications.rollout import SHADOW, Switch
 from appliance.specifications.specification_files import CheckedSpecifications, SpecificationsRefusedError
 
 SWITCHES = "monitor switches"
-"""The setting with the switches of operators."""
 
 
 class Switches:
@@ -39,7 +38,6 @@ class Switches:
         return self.states.get(name) == SHADOW
 
     def shadowed(self) -> list[str]:
-        """Return the monitors in shadow mode."""
         return [name for name, state in self.states.items() if state == SHADOW]
 
     def switched_off(self) -> dict[str, Switch]:

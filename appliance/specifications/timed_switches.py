@@ -43,7 +43,6 @@ class _Return(msgspec.Struct, frozen=True):
 
 
 def returns_moved(store: StateStore, seconds: float) -> None:
-    """Move the ends of all stored time limits."""
     kept = msgspec.json.decode(store.settings().get(_SETTING, "{}"), type=dict[str, _Return])
     moved = {name: msgspec.structs.replace(one, until=one.until + seconds) for name, one in kept.items()}
     store.save_setting(_SETTING, msgspec.json.encode(moved).decode())

@@ -50,7 +50,6 @@ class DoorTables:
         self._database = database
 
     def save(self, row: DoorRow) -> None:
-        """Store a door, or its removal."""
         self._database.put("door", *row)
 
     def doors(self) -> list[DoorRow]:

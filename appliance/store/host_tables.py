@@ -226,7 +226,6 @@ class HostTables:
         return AuthorityRow(*rows[0]) if rows else None
 
     def save_appliance(self, row: ApplianceRow) -> None:
-        """Store one of two appliances."""
         self._database.put("appliance", *row)
 
     def forget_appliance(self, key: str) -> None:

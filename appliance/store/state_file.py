@@ -56,7 +56,6 @@ CREATE TABLE IF NOT EXISTS setting (name TEXT PRIMARY KEY, value TEXT NOT NULL) 
 
 
 REVISION_TABLES = frozenset({"policy_revision", "policy_signature", "monitor_revision"})
-"""The tables of the policy and the specifications."""
 
 LARGEST_CHANGE = 64 << 10  # bytes of one parameter whose change is stored at once
 _MOST_NOTED = 10_000  # keys with changes, before the tree replaces them
@@ -159,7 +158,6 @@ class StateStore:
                 self.database.put("relay_port", row.key, relay, port)
 
     def forget_incarnation(self, key: str) -> None:
-        """Drop an incarnation and its registrations."""
         with self.database.together():
             for table in ("incarnation", "relay_port", "registration", "permission"):
                 self.database.delete(table, key=key)
@@ -193,7 +191,6 @@ class StateStore:
         self.database.delete("permission", **row._asdict())
 
     def permissions(self) -> list[PermissionRow]:
-        """Return all stored grants."""
         return [PermissionRow(*row) for row in self.database.query("SELECT * FROM permission")]
 
     # --- parameters ---
@@ -255,7 +252,6 @@ class StateStore:
         return [(key, None if data is None else msgspec.msgpack.decode(data)) for _number, key, data in rows]
 
     def parameter_owned(self, key: str, host: str) -> None:
-        """Store that this host owns the parameters at and below this key."""
         self.database.put("parameter_owner", key, host)
 
     def parameters_disowned(self, key: str) -> None:
@@ -292,7 +288,6 @@ class StateStore:
         return [RevisionRow(*row) for row in rows]
 
     def save_monitor_revision(self, row: MonitorRevisionRow) -> None:
-        """Store specifications that come into force."""
         self.database.put("monitor_revision", *row)
 
     def monitor_revisions(self, limit: int = -1) -> list[MonitorRevisionRow]:
@@ -307,7 +302,6 @@ class StateStore:
         self.database.put("monitor_state", relay, epoch, content)
 
     def clear_monitor_states(self) -> None:
-        """Remove the states that relays left."""
         self.database.delete("monitor_state", ("relay", ">", -1))
 
     def monitor_states(self, epoch: int) -> list[bytes]:
@@ -333,7 +327,6 @@ class StateStore:
         return [TokenRow._make((*row, kept.get(row[0]))) for row in rows]
 
     def save_token_use(self, token: str, used: float) -> None:
-        """Store when a token was last used."""
         self.database.put("token_use", token, used)
 
     def token_uses(self) -> dict[str, float]:
@@ -356,5 +349,4 @@ class StateStore:
         self.database.put("setting", name, value)
 
     def settings(self) -> dict[str, str]:
-        """Return all named values."""
         return dict(self.database.query("SELECT name, value FROM setting"))

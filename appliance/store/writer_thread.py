@@ -320,7 +320,6 @@ class Database:
         return None if closed else math.inf
 
     def _commit(self, queued: list[_Queued]) -> bool:
-        """Commit changes, and return whether the database has them."""
         last = queued[-1].number
         try:
             self._execute([self.tables.statement(item.change) for item in queued], last)

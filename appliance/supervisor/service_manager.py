@@ -42,7 +42,6 @@ class ServiceManager:
         self._say(f"READY=1\nSTATUS={status}")
 
     def stopping(self) -> None:
-        """Report the orderly end."""
         self._say("STOPPING=1\nSTATUS=stopping its processes, then removing its firewall")
 
     @asynccontextmanager

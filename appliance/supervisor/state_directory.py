@@ -115,7 +115,6 @@ class StateDirectory:
                 self._folder(role.part, account.uid, account_of(role.readable_by).gid, 0o2710)
 
     def write_config(self, text: str) -> None:
-        """Write the configuration for the children."""
         write_whole(self.config, text.encode(), 0o644)
 
     def write_files(self, files: Iterable[tuple[str, str, bytes]]) -> None:

@@ -489,7 +489,6 @@ class Supervisor:
         self._answers = self._spawn(answer_for_control(partial(self.kept.copy_of, ADMIN), reason))
 
     def _leave_answers(self) -> None:
-        """Leave the answers to control again."""
         if self._answers is not None:
             self._answers.cancel()
             self._answers = None

@@ -49,12 +49,10 @@ class Histogram:
     sum: float = 0.0
 
     def observe(self, seconds: float) -> None:
-        """Count one duration."""
         self.counts[bisect.bisect_left(BOUNDS, seconds)] += 1
         self.sum += seconds
 
     def values(self) -> tuple[list[int], float]:
-        """Return the counts and the sum."""
         return self.counts, self.sum
 
 

@@ -88,7 +88,6 @@ class ControlLink:
         return self._link.channel is not None and self.known
 
     def attach(self, channel: Channel) -> None:
-        """Use the channel to a new control."""
         self.known = False
         self._link.attach(channel)
         self._tell_pin()
@@ -180,7 +179,6 @@ class ControlLink:
             self._link.send(TokenUsed(token))
 
     def tell(self, call: RestCalled) -> None:
-        """Send a call to control to be recorded."""
         self._kept.append(call)
         if len(self._kept) > _MOST_KEPT:
             self._dropped += self._kept.popleft().count

@@ -24,7 +24,6 @@ class ConditionalGet:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request."""
         if scope["type"] == "http" and scope["method"] == "GET":
             send = _Answer(Headers(scope=scope).get("if-none-match", ""), send)
         await self._app(scope, receive, send)

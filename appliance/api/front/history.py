@@ -73,7 +73,6 @@ class SampleHistory:
 
     @contextlib.contextmanager
     def following(self) -> Iterator[None]:
-        """Sample more often during the block."""
         self._followers += 1
         self._sooner.set()
         try:

@@ -37,7 +37,6 @@ class Journal:
         duration_us: int,
         dry: bool = False,
     ) -> None:
-        """Report one answer."""
         # A client may send invalid text (JSON's \ud800), which cannot be encoded for control.
         path, reason = _text(path), _text(reason)
         self.calls[method if method in _METHODS else "other", str(status)] += 1
@@ -55,7 +54,6 @@ class Journal:
             self._repeated[rest] = self._repeated.get(rest, 0) + 1
 
     def flush(self) -> None:
-        """Report the counted repetitions."""
         repeated, self._repeated = self._repeated, {}
         for kind, count in repeated.items():
             if count:

@@ -204,7 +204,6 @@ class Listener:
         return self._websockets is not None and target.startswith(PREFIX)
 
     def pass_on(self, passage: WebSocketPassage, head: bytes) -> None:
-        """Pass a WebSocket on."""
         if self._websockets is not None:
             self._begin(self._websockets.pass_on(passage, head))
 

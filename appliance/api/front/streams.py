@@ -118,7 +118,6 @@ class StreamResponse(Response):
         self.background = response.background
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send the response, then release its place."""
         try:
             await self._response(scope, receive, send)
         finally:

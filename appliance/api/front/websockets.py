@@ -43,7 +43,6 @@ class WebSocketPassage(asyncio.Protocol):
         return str(self.client.get_extra_info("peername")[0])
 
     def from_client(self, data: bytes) -> None:
-        """Take bytes of the client."""
         if self._door is None:
             self.client.pause_reading()  # until the door takes the connection
             self._held.append(data)

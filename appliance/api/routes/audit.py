@@ -372,7 +372,6 @@ def _begun(entries: Iterator[_T]) -> Iterator[_T]:
 
 
 def _joined(lines: Iterator[str]) -> Iterator[str]:
-    """Join lines into larger pieces."""
     while piece := "".join(f"{line}\n" for line in itertools.islice(lines, _STREAM_PAGE)):
         yield piece
 

@@ -75,7 +75,6 @@ def _of_connection(record: AuditRecord) -> DecidedRequest:
 
 
 def _of_call(record: AuditRecord, call: str) -> DecidedRequest:
-    """Return the request that the policy decided for the call in a record."""
     category, detail = policy_call(call).category, {**record.detail, "call": call}
     resource = record.resource
     if category is Category.COMMAND:

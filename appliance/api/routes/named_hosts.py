@@ -28,7 +28,6 @@ class HostLabels(msgspec.Struct, frozen=True):
 
 
 def names_of(known: PolicyInForce) -> HostNames:
-    """Return the names of hosts that the policy in force knows."""
     enrolled = {name: address_of(address) for name, address in known.hosts.items()}
     return HostNames.of(known.text, enrolled, map(ipaddress.ip_network, known.robot))
 

@@ -79,7 +79,6 @@ class Budget:
             self._changes.append((record.host, -weight(record)))
 
     def summarised(self, record: AuditRecord) -> None:
-        """Charge a summary of counted records."""
         if record.host is not None and not record.unknown:
             self._changes.append((record.host, weight(record)))
 

@@ -81,7 +81,6 @@ class Housekeeping:
         return self._failing or self.remover.unremoved
 
     def opened(self, writer: ChainWriter) -> None:
-        """Start with an open database."""
         self.writer = writer
         self.unsealed = writer.sequence - writer.checkpoint_sequence
         self._signatures.ask(writer)
@@ -169,7 +168,6 @@ class Housekeeping:
             self._signatures.sealed(checkpoint.number, text)
 
     def ask_signatures(self) -> None:
-        """Request all missing signatures."""
         self._asked_at = self._now()
         if self.writer is not None:
             self._signatures.ask(self.writer)

@@ -33,11 +33,9 @@ class SignerMemory(msgspec.Struct, frozen=True):
 
     @property
     def last(self) -> int:
-        """Return the number of the last signed checkpoint."""
         return self.first + len(self.hashes) // _HASH - 1
 
     def hash(self, number: int) -> str | None:
-        """Return the hash of the checkpoint with this number, or None."""
         at = (number - self.first) * _HASH
         return self.hashes[at : at + _HASH].hex() if self.first <= number <= self.last else None
 

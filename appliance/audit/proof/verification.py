@@ -60,7 +60,6 @@ class _Removal(msgspec.Struct, frozen=True):
     signature: str = ""
 
     def is_signed(self, log: str, key: bytes) -> bool:
-        """Whether the signer with this key signed exactly this removal."""
         checkpoint, sequence = self.last_checkpoint, self.last_sequence
         gone = Removal(log, checkpoint, sequence, self.last_hash, self.last_checkpoint_hash, self.limit)
         try:

@@ -147,7 +147,6 @@ def _event_of(record: AuditRecord) -> object:
 
 
 def _hosts_of(record: AuditRecord) -> Iterator[tuple[str, int]]:
-    """Yield the hosts of a record with their numbers of denials."""
     number = times(record)
     named = record.detail.get("hosts")
     if record.host or not isinstance(named, dict):
@@ -195,7 +194,6 @@ def _callers(record: AuditRecord, number: int) -> Iterable[tuple[str, int]]:
 
 
 def _tallied(names: Any) -> list[tuple[str, int]]:
-    """Return the names that a summary of repetitions counts one by one."""
     if not isinstance(names, dict):
         return []
     return [(name, count) for name, count in names.items() if type(count) is int]

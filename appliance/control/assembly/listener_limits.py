@@ -139,7 +139,6 @@ class ListenerLimits:
         return build_fault(1, with_record(told, record))
 
     def troubled(self, peer: Peer, reason: str) -> None:
-        """Record that a peer exceeded a limit."""
         self._trail.happened("limit exceeded", reason, decision="deny", host=peer.text)
 
     def malformed(self, peer: Peer, reason: str) -> None:

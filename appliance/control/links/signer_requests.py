@@ -33,7 +33,6 @@ class ReceiptFloor:
             self._received = sequence
 
     def through(self) -> int:
-        """Return the sequence of that record."""
         disk = os.statvfs(self._folder)
         return self._received if disk.f_bavail * disk.f_frsize >= self._reserve else _ANY
 

@@ -106,7 +106,6 @@ class ControlLifeline:
         return Channel(socket.socket(fileno=descriptor), ApiLink, limit=16 << 20, longest=8 << 20)
 
     def say(self, message: messages.Message) -> None:
-        """Send the supervisor a message."""
         self._send(message, ())
 
     def log_held(self) -> Callable[[list[int]], None]:
@@ -124,7 +123,6 @@ class ControlLifeline:
         self._send(messages.SocketKept(name), (sock.fileno(),))
 
     def drop(self, name: str) -> None:
-        """Have the supervisor drop a kept socket."""
         self.say(messages.SocketDropped(name))
 
     async def route_to(self, host: str) -> str | None:

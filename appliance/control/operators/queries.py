@@ -154,7 +154,6 @@ class Queries:
         )
 
     async def metrics(self, _request: admin.MetricsWanted) -> Measures:
-        """Return the status and all counters."""
         return measures_of(
             self.parts, self.trail.meter, self.present(), self.hosts.rows(), self.queued_deliveries()
         )

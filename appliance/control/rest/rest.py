@@ -209,7 +209,6 @@ class RestLink:
         )
 
     def state_tokens(self) -> None:
-        """Send the api the usable tokens."""
         self._send(TokensStated(self._tokens.usable()))
 
     def _send_answer(self, number: int, answer: AdminAnswer[Any]) -> None:

@@ -251,7 +251,6 @@ class ApprovalOrders:
     # --- inside ---
 
     def state(self) -> ApprovalCounts:
-        """Return the counts for the status."""
         self._unanswered = [at for at in self._unanswered if clock.now() - at < UNANSWERED_SECONDS]
         entries = self._table.entries()
         waiting = [entry for entry in entries if entry.state is ApprovalState.WAITS]

@@ -130,7 +130,6 @@ class ApprovalTable:
         return self._put(replace(entry, state=ApprovalState.REFUSED, who=who))
 
     def end(self, entry: ApprovalEntry) -> None:
-        """Remove an entry."""
         if self._entries.pop(entry.number, None) is not None:
             self._by_call.pop(entry.call, None)
             self._of_host[entry.call.host] -= 1

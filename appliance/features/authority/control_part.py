@@ -36,7 +36,6 @@ async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
 
 
 def request_methods(orders: DriveOrders) -> tuple[RequestMethod[Any], ...]:
-    """Return the method that answers each request."""
     return (
         RequestMethod(requests.DriveStatus, orders.status),
         RequestMethod(requests.DriveTake, orders.take, who=True, full_disk=True),

@@ -68,7 +68,6 @@ class DoorConnections:
         return ""
 
     async def close(self) -> None:
-        """End all connections."""
         await self._tasks.close()
 
 

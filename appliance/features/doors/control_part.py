@@ -165,7 +165,6 @@ class DoorOrders:
     # --- the caller's own door ---
 
     async def own(self, _request: door_requests.OwnDoorWanted, who: str) -> door_requests.OwnDoor:
-        """Return the door of the caller."""
         name, row, reason = self._own.of(who)
         return door_requests.OwnDoor(name=name, door=None if row is None else self._shown(row), reason=reason)
 
@@ -242,7 +241,6 @@ class DoorOrders:
                     self._processes.retry()
 
     def state(self) -> dict[str, Any]:
-        """Return the state of all doors for the status."""
         rows = self._table.live()
         return {"doors": DoorsState([self._processes.health(row) for row in rows]) if rows else None}
 

@@ -139,7 +139,6 @@ class DoorNode:
         self._tasks = OwnedTasks()
 
     async def close(self) -> None:
-        """End all that is still waiting, and the node."""
         await self._tasks.close()
         await self.node.close()
 
@@ -450,6 +449,5 @@ def _named(values: Raw, names: list[str]) -> bytes:
 
 
 def present_time() -> Now:
-    """Return the system time."""
     seconds, nanoseconds = divmod(clock.wall_ns(), 1_000_000_000)
     return seconds, nanoseconds

@@ -53,7 +53,6 @@ class _Slot:
     full_since: float | None = None
 
     def clear(self) -> None:
-        """Forget what the process reported."""
         self.counts, self.clients = door_link.DoorCounted(), []
         self.started, self.full_since = False, None
 
@@ -102,7 +101,6 @@ class DoorProcesses:
         return slot.counts, trouble or ("" if slot.started else "its process is starting")
 
     def clients(self, row: DoorRow) -> list[door_link.ClientShown]:
-        """Return the connections of a door."""
         return self._slots[row.slot or 0].clients
 
     def health(self, row: DoorRow) -> DoorHealth:
@@ -128,14 +126,12 @@ class DoorProcesses:
         )
 
     def start(self) -> None:
-        """Have the processes of all doors run."""
         for row in self._table.live():
             slot = self._slots[row.slot or 0]
             if not self._table.problem and slot.link.channel is None:
                 self._base.lifeline.say(messages.ProcessWanted(ROLE, row.slot or 0))
 
     def end(self, row: DoorRow) -> None:
-        """End the process of a door that was removed."""
         slot = self._slots[row.slot or 0]
         slot.clear()
         slot.trouble, slot.restarts = "", 0
@@ -143,7 +139,6 @@ class DoorProcesses:
         self._send(slot, door_link.DoorEnded())
 
     def end_ticket(self, row: DoorRow, ticket: str) -> None:
-        """End the connections of a ticket."""
         self._send(self._slots[row.slot or 0], door_link.TicketEnded(ticket))
 
     def pass_on(self, row: DoorRow, descriptor: int, peer: str, ticket: str) -> bool:

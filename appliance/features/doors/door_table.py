@@ -56,7 +56,6 @@ class DoorTable:
         return [row for row in self._rows.values() if row.removed is None]
 
     def ports(self) -> list[int]:
-        """Return the ports of agents."""
         return [row.port for row in self.live() if row.port is not None]
 
     def addresses(self) -> Mapping[str, Address]:
@@ -72,7 +71,6 @@ class DoorTable:
         return row
 
     def in_slot(self, slot: int) -> DoorRow | None:
-        """Return the door of a process."""
         return next((row for row in self.live() if row.slot == slot), None)
 
     def planned(self, name: str, port: int | None, source: str) -> DoorRow:
@@ -123,7 +121,6 @@ class DoorTable:
         raise SenselessError(f"no address of {self._network} is free: set a larger doors.network")
 
     def save(self, row: DoorRow) -> None:
-        """Store a door."""
         self._rows.pop(row.name, None)
         self._rows[row.name] = row
         self._store.doors.save(row)
@@ -136,7 +133,6 @@ class DoorTable:
 
 
 def is_door_name(text: str) -> bool:
-    """Whether a door can have this name."""
     return _NAME.fullmatch(text) is not None
 
 

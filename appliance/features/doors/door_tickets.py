@@ -61,7 +61,6 @@ class DoorTickets:
         return row is None or self._ends.passed(row.id, row.expires)
 
     def forget(self, door: str) -> None:
-        """Forget all tickets of a door."""
         for row in self.valid(door):
             self._forget(row.id)
 
@@ -77,7 +76,6 @@ def new_ticket(door: str, seconds: float, who: str) -> tuple[TicketRow, str]:
 
 
 def shown(text: str, rows: Mapping[str, TicketRow]) -> TicketRow | None:
-    """Return the ticket with this text, or None."""
     parts = _FORM.fullmatch(text)
     row = rows.get(parts[1]) if parts is not None else None
     return (

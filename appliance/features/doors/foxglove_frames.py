@@ -101,7 +101,6 @@ FOXGLOVE_OPERATION: msgspec.json.Decoder[_Operations] = msgspec.json.Decoder(_Op
 
 
 def channel_fields(number: int, seen: SeenTopic) -> dict[str, Any]:
-    """Return the announcement of a channel."""
     return {
         "id": number,
         "topic": seen.topic,
@@ -113,7 +112,6 @@ def channel_fields(number: int, seen: SeenTopic) -> dict[str, Any]:
 
 
 def service_fields(number: int, seen: SeenService) -> dict[str, Any]:
-    """Return the announcement of a service."""
     return {
         "id": number,
         "name": seen.service,

@@ -45,7 +45,6 @@ class GivenNetwork:
             del self._waiting[number]
 
     def given(self, number: int, descriptor: int) -> None:
-        """Take the socket of a request."""
         future = self._waiting.get(number)
         if future is None or future.done():
             os.close(descriptor)
@@ -55,7 +54,6 @@ class GivenNetwork:
         future.set_result(made)
 
     def refused(self, number: int, reason: str) -> None:
-        """Take the refusal of a request."""
         future = self._waiting.get(number)
         if future is not None and not future.done():
             future.set_exception(ConnectionRefusedError(reason))

@@ -41,7 +41,6 @@ class DoorMessage:
 
     @cached_property
     def cbor_values(self) -> dict[str, Any]:
-        """The message as values for CBOR; raises the same."""
         return self.codec_of(self.header).cbor_values(self.body)
 
 
@@ -56,7 +55,6 @@ class KnownTypes:
         self._latest: dict[str, str] = {}  # the md5sum of each type that a header defined
 
     def define(self, given: Definitions) -> None:
-        """Replace the operator's definitions."""
         earlier, self._defined = self._defined, self._standard.extended(given)
         names = {*earlier.message_types, *self._defined.message_types}
         for name, md5sum in [key for key in self._codecs if key[0] in names]:

@@ -65,19 +65,15 @@ class MasterSight:
         )
 
     async def service_header(self, service: str) -> Mapping[str, str]:
-        """Return the connection header of a service."""
         return await self._node.probe_service(service)
 
     async def service_uri(self, service: str) -> str:
-        """Return the URI of a service."""
         return str(await self._node.master("lookupService", service))
 
     async def parameter(self, call: str, *arguments: Value) -> Value:
-        """Make a call of the parameter API."""
         return await self._node.master(call, *arguments)
 
     def time(self) -> Now:
-        """Return the present time."""
         return self._now()
 
 
@@ -144,7 +140,6 @@ class Rosapi:
         }
 
     def answer(self, request: CallOfService) -> Awaitable[Raw] | None:
-        """Answer a call of rosapi; return None for a call of another service."""
         if request.service.endswith("/get_ros_version"):
             return _fail("get_ros_version is a service of ROS 2; this robot has ROS 1")
         if not request.service.startswith(_PREFIX):

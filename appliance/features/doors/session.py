@@ -336,7 +336,6 @@ class DoorSession:
         await self._writer.drain()
 
     def disconnect(self, reason: str) -> None:
-        """End the connection with a reason."""
         self._disconnect(CloseCode.POLICY_VIOLATION, reason)
 
     def _disconnect(self, code: CloseCode, reason: str) -> None:
@@ -350,20 +349,16 @@ class DoorSession:
     # --- the door's side: a `DoorClient` ---
 
     def heard(self, message: DoorMessage) -> None:
-        """Queue a message for the client."""
         self._protocol.message(message, asyncio.get_running_loop().time())
         self._wake.set()
 
     def answered(self, call: int, values: Raw | bytes) -> None:
-        """Queue the answer to a call."""
         self._tell(lambda: self._protocol.answered(call, values))
 
     def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
-        """Queue the values of parameters."""
         self._tell(lambda: self._protocol.parameters(values, reply_to))
 
     def failed(self, request: DoorRequest, reason: str) -> None:
-        """Queue the refusal of a call."""
         self.refusals += 1
         self._tell(lambda: self._protocol.failed(request, reason))
 
@@ -374,7 +369,6 @@ class DoorSession:
         return call
 
     def give_up(self, call: str) -> None:
-        """Forget a call for the client."""
         self._protocol.give_up(call)
 
     def _tell(self, tell: Callable[[], None]) -> None:

@@ -38,5 +38,4 @@ class MessageCodec:
 
 
 def cbor(values: Any) -> bytes:
-    """Encode values as CBOR."""
     return cbor2.dumps(values)

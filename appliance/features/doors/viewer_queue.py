@@ -76,7 +76,6 @@ class ViewerQueue(Generic[Key]):
         self._trim(topic)
 
     def remove(self, key: Key) -> None:
-        """Forget a topic and its messages."""
         topic = self._topics.pop(key, None)
         self._turns.pop(key, None)
         if topic is not None:

@@ -59,7 +59,6 @@ class Page:
         self._left_out = 0
 
     def add(self, lines: bytes) -> None:
-        """Add records of the bundle."""
         for line in lines.splitlines():
             self._add(json.loads(line))
 
@@ -113,7 +112,6 @@ class Page:
 
 
 def _recorded(recording: RecordingSummary | None) -> Iterator[str]:
-    """Yield the triggers of the recording and its topics."""
     if recording is None:
         return
     yield f'<h2>Messages</h2>\n<p>Recording {recording.id}, <a href="recording/recording.bag">a bag</a>\n'

@@ -120,7 +120,6 @@ class CollectorConnection:
         return connection is not None and connection.is_available() and not connection.has_expired()
 
     def close(self) -> None:
-        """Close the connection, if there is one."""
         if self._connection is not None:
             self._connection.close()
             self._connection = None

@@ -91,7 +91,6 @@ class SegmentPusher:
         return 0.0 if more else _IDLE_SECONDS
 
     def close(self) -> None:
-        """Close the connection."""
         self.collector.close()
 
     def _begin(self) -> PushPosition:

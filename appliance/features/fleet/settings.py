@@ -151,7 +151,6 @@ class Fleet(FeatureSection):
         return "retention_waits" if self.retention_waits else ""
 
     def receivers(self) -> dict[str, tuple[str | None, str | None]]:
-        """Return the collector."""
         return {"collector": (self.collector, self.collector and self.destination[0])}
 
     @classmethod

@@ -18,7 +18,6 @@ def facts_of(graph: Graph) -> list[TopicFacts]:
 
 
 def preset_row(preset: Preset) -> PresetRow:
-    """Describe a preset."""
     return PresetRow(
         preset.name,
         preset.version,

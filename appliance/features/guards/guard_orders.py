@@ -61,7 +61,6 @@ def _same(one: str, other: str) -> bool:
 
 
 def _suggestions_of(graph: Graph) -> list[Suggestion]:
-    """Return guards that fit a graph."""
     return [
         Suggestion(one.preset, one.name, PRESETS[one.preset].what, dict(one.topics), dict(one.measured),
                    dict(one.values), one.command)
@@ -78,7 +77,6 @@ class GuardOrders:
         self._acted_at: dict[str, float] = {}
 
     def methods(self) -> tuple[RequestMethod[Any], ...]:
-        """Return the method that answers each request."""
         return (
             RequestMethod(guard_requests.GuardsWanted, self.guards, order=False),
             RequestMethod(guard_requests.GuardSuggestionsWanted, self.suggestions, order=False),
@@ -88,7 +86,6 @@ class GuardOrders:
         )
 
     async def watch(self) -> None:
-        """Note when each guard last acted."""
         while True:
             self.look()
             await asyncio.sleep(_LOOK_SECONDS)
@@ -105,7 +102,6 @@ class GuardOrders:
         self._acts = {name: acts for name, acts in self._acts.items() if name in guards}
 
     async def guards(self, _request: guard_requests.GuardsWanted) -> GuardList:
-        """Return all presets and guards."""
         rows = [self._row(name, preset) for name, preset in self._guards().items()]
         return GuardList(
             self._monitors.revision, self._monitors.tag, [preset_row(one) for one in PRESETS.values()], rows

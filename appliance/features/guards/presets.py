@@ -116,12 +116,10 @@ class Preset:
 
     @functools.cached_property
     def text(self) -> str:
-        """The reviewed text."""
         return (FOLDER / f"{self.name}.rv").read_text(encoding="utf-8")
 
     @property
     def version(self) -> int:
-        """The version in the first line."""
         found = _FIRST_LINE.match(self.text)
         assert found is not None, self.name  # noqa: S101  a test reads every preset
         return int(found["version"])
@@ -320,14 +318,12 @@ def _with_value(text: str, parameter: Parameter, value: str) -> str:
 
 
 def _given(text: str, kind: str, name: str, value: str) -> str:
-    """Return the text with another value of a given constant or topic."""
     return _VALUE.sub(
         lambda found: found[1] + value if (found[2], found[3]) == (kind, name) else found[0], text
     )
 
 
 def _with_table(text: str, name: str, cells: Sequence[str]) -> str:
-    """Return the text with other cells of a table."""
     return _TABLE.sub(lambda found: found[1] + ", ".join(cells) if found[2] == name else found[0], text)
 
 

@@ -37,7 +37,6 @@ class Proposal:
 
     @property
     def command(self) -> str:
-        """The command line to paste."""
         words = [f"rosrv guard new {self.preset} {self.topics['command']}"]
         words += [f"--by {topic}" if name == "by" else f"--topic {name}={topic}"
                   for name, topic in self.topics.items() if name != "command"]  # fmt: skip

@@ -49,7 +49,6 @@ def impact_of(
 
 
 def cases_beside(file: Path) -> Path:
-    """Return the file of the test cases of a policy."""
     return file.with_name(file.name + ".tests.yaml")
 
 

@@ -38,7 +38,6 @@ class MessagePosition(NamedTuple):
 
     @classmethod
     def parsed(cls, text: str) -> Self | None:
-        """Parse the text (`str`) of a position; None if it is malformed."""
         return cls(*map(int, text.split("-"))) if _PLACE.fullmatch(text) else None
 
     def __str__(self) -> str:

@@ -79,7 +79,6 @@ class BagWriter:
             self._file.close()
 
     def close(self) -> None:
-        """Write the index and close."""
         with self._file:
             end = self._file.tell()
             infos = self._chunk_infos(end)

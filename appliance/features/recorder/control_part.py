@@ -28,7 +28,6 @@ def make(core: FeatureContext) -> FeaturePart:
 
 
 def request_methods(orders: RecordingOrders) -> tuple[RequestMethod[Any], ...]:
-    """Return the method that answers each request."""
     return (
         RequestMethod(recording_requests.RecordingsWanted, orders.recordings),
         RequestMethod(recording_requests.RecordingWanted, orders.recording),

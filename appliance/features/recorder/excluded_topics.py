@@ -46,5 +46,4 @@ def left_out_because(
 
 
 def fits(globs: Iterable[str], name: str) -> bool:
-    """Whether one of the globs matches a name."""
     return any(fnmatchcase(name, glob) for glob in globs)

@@ -397,7 +397,6 @@ class Recorder:
 
 
 def _prolong(progress: Progress, trigger: Trigger, after: float | None) -> None:
-    """Add a trigger to a recording in progress, and extend the recording."""
     hold = progress.hold if after is None else int(after * _SECOND)
     progress.ends = max(progress.ends, min(trigger.time + hold, progress.latest))
     if trigger.charged_to in KEPT and progress.charged_to not in KEPT:

@@ -183,7 +183,6 @@ class RecordingPlan:
         )
 
     def closed(self, recording: Recording) -> None:
-        """Note the end of a recording."""
         own = recording_owner(recording.charged_to)
         self._close(own, recording.id)
         self._ended[own] = max(recording.ended, self._ended.pop(own, 0))

@@ -53,7 +53,6 @@ _Reading = Callable[[Recording, Path], _T]
 
 
 def routes(services: Services) -> Routes:
-    """Return the routes."""
     router = Routes(prefix="/v1/recordings", tags=["recordings"])
     _add_bag(router, services)
     _add_reading(router, services)

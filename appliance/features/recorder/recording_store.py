@@ -152,7 +152,6 @@ class RecordingStore:
             del self._temporary[0]
 
     def find(self, recording_id: str) -> Recording | None:
-        """Return the recording with this id; None if there is none."""
         return next((found for found in self.recordings if found.id == recording_id), None)
 
     def knows(self, recording_id: str) -> bool:

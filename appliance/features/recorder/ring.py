@@ -308,7 +308,6 @@ class RingWriter:
         return block
 
     def close_chain(self, stream: int, chain: _Chain) -> None:
-        """End a stream."""
         chain.writer = None
         if not chain.data:
             self._forget(stream, chain)

@@ -31,7 +31,6 @@ MOST_MESSAGES = 1 << 53
 """An upper bound for the number of messages in a stream."""
 
 _Blocks = dict[int, tuple[int, BlockRow]]
-"""The blocks of a chain by their number, each with its row."""
 
 
 class ReadPosition(NamedTuple):

@@ -55,7 +55,6 @@ class RecorderRings:
                 yield MemoryGiven(msgspec.to_builtins(given), USED_BY), writable
 
     def close(self) -> None:
-        """Close all descriptors."""
         for _given, writable, readable in self._rings:
             os.close(writable)
             os.close(readable)

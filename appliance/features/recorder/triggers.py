@@ -32,7 +32,6 @@ def kinds_of(event: str, decision: str | None, severity: Severity) -> list[Trigg
 
 
 def trigger_of(record: AuditRecord, wanted: Collection[TriggerKind]) -> Trigger | None:
-    """Return the record as a trigger of a wanted kind; None if it is not one."""
     for what in kinds_of(record.event, record.decision, record.severity):
         if what in wanted:
             reason = without_binding(record.reason, record.detail)

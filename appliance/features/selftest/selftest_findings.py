@@ -18,7 +18,6 @@ class SelftestFinding:
 
 
 def ok(check: str, text: str) -> SelftestFinding:
-    """Return a passed check."""
     return SelftestFinding(check, "ok", text)
 
 

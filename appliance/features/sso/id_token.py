@@ -71,7 +71,6 @@ def verify(token: str, keys: Sequence[dict[str, Any]], expected: Expected, now: 
 
 
 def _check_rest(claims: dict[str, Any], expected: Expected, now: float) -> None:
-    """Check what the library leaves to its caller."""
     audience = claims["aud"]
     if (isinstance(audience, list) and len(audience) > 1 and "azp" not in claims) or (
         claims.get("azp", expected.client_id) != expected.client_id

@@ -76,7 +76,6 @@ class SsoOrders:
         return _shown(session)
 
     async def listed(self, _request: requests.SessionsWanted) -> requests.SignedOnList:
-        """Return all sessions."""
         return requests.SignedOnList([_shown(one) for one in self.sessions.sessions()])
 
     async def sign_out(self, request: requests.SignOut, who: str) -> requests.SignedOn:

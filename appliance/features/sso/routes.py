@@ -76,7 +76,6 @@ class _Limits:
 
 
 def routes(services: Services) -> Routes:
-    """Return the routes."""
     router = Routes(prefix="/v1/sso", tags=["tokens"])
     limits = _Limits(services.settings.api_limits.failures_per_minute)
 

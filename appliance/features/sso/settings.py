@@ -196,7 +196,6 @@ class Sso(FeatureSection):
 
     @property
     def redirect_uri(self) -> str:
-        """The only redirect URI."""
         return f"{self.url}/console"
 
     @property
@@ -205,7 +204,6 @@ class Sso(FeatureSection):
         return tuple(filter(None, (self.ca, self.client_secret_file)))
 
     def receivers(self) -> dict[str, tuple[str | None, str | None]]:
-        """Return the provider or the proxy."""
         if self.issuer is None:
             return {}
         return {"proxy" if self.proxy else "address": (self.proxy or self.address, self.destination[0])}

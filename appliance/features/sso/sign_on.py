@@ -108,7 +108,6 @@ class SignOns:
         )
 
     async def _token(self, endpoints: ProviderEndpoints, code: str, verifier: str) -> str:
-        """Exchange the code for the ID token."""
         url, client = endpoints.token_endpoint, self._wanted.client_id
         form = {
             "grant_type": "authorization_code",

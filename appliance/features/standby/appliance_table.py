@@ -73,7 +73,6 @@ class ApplianceTable(Appliances):
         self.is_served(self._pin)
 
     def certified(self, key: str, made: CertificateMade) -> None:
-        """Store the certificate for this appliance's own key."""
         self._own = key
         self._save(_row(key, self._endpoint, self._pin, made))
 

@@ -166,7 +166,6 @@ class CopyAge:
             await asyncio.sleep(_LOOK_SECONDS)
 
     def look(self, note: str) -> None:
-        """Take the present note."""
         if note != self._note:
             self._note, self._changed = note, clock.now()
 

@@ -232,7 +232,6 @@ class ApplianceLease:
         return due
 
     def answered(self, request: WitnessRequest, answer: WitnessAnswer) -> Outgoing:
-        """Take an answer of the witness to a request of this process."""
         self.refusal, self._trouble = answer.reason, answer.trouble
         self._witnessed_at = max(self._witnessed_at, request.sent)
         if self.epoch and answer.epoch - self.epoch > FARTHEST:
@@ -269,7 +268,6 @@ class ApplianceLease:
         return ()
 
     def received(self, now: float, message: PeerMessage) -> Outgoing:
-        """Take a message of the other appliance."""
         match message:
             case PromiseRequest():
                 if self.is_active(now):

@@ -33,7 +33,6 @@ class LeaseClient:
         self._handing_over: asyncio.Future[str] | None = None
 
     def attach(self, channel: Channel) -> None:
-        """Use a new link."""
         self._link.attach(channel)
         if self._present:
             self.send(lease_link.ControlPresent())

@@ -43,7 +43,6 @@ class LeaseWatch(ServiceGate):
         self._timer: asyncio.TimerHandle | None = None
 
     def heard(self, message: Any) -> None:
-        """Take a report of the lease."""
         match message:
             case messages.LeaseHeld(until, epoch):
                 self.held(until, epoch)

@@ -31,7 +31,6 @@ class LinkCertificate(NamedTuple):
 
 
 def make_link_certificate() -> LinkCertificate:
-    """Make a key and its certificate for one side of the link."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "ROSRV standby link")])
     certificate = (

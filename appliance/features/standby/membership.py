@@ -81,7 +81,6 @@ class Membership(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 
 def path_of(state: Path) -> Path:
-    """Return the path of the membership in a state directory."""
     return state / FOLDER / FILE
 
 

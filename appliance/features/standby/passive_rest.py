@@ -45,7 +45,6 @@ class ReplicatedTokens:
 
     @property
     def known(self) -> bool:
-        """Whether the tokens could be read."""
         return self._rows is not None
 
     def read(self) -> bool:

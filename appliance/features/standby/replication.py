@@ -180,8 +180,6 @@ class Replication:
         self.report()
 
     def on_introduction(self, introduced: Callable[[Introduction], Coroutine[Any, Any, None]]) -> None:
-        """Call this for each introduction of the standby."""
-
         def start(introduction: Introduction) -> None:
             task = asyncio.get_running_loop().create_task(introduced(introduction))
             self._tasks.add(task)
@@ -241,7 +239,6 @@ class Replication:
         await self._lease.until_active()
 
     def state(self) -> StandbyState:
-        """Return the state of both appliances."""
         lag, lease, now = self.sender.lag(), self._lease.state, asyncio.get_running_loop().time()
         waiting, trouble = lag.waiting_since, self._trouble_since
         witnessed = lease.other_witnessed if lease is not None else None

@@ -128,7 +128,6 @@ class ReplicationSender:
                 del self._waiting[waiter]
 
     def on_introduction(self, introduced: Callable[[Introduction], None]) -> None:
-        """Call this for each introduction of the standby."""
         self._introduced = introduced
 
     async def refuse_switchover(self, reason: str) -> None:

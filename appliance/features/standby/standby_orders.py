@@ -82,7 +82,6 @@ class StandbyOrders:
         self._trail = trail
 
     async def state(self, _request: standby_requests.StandbyWanted) -> StandbyState:
-        """Return the state of both appliances."""
         return _state_of(self._source)
 
     async def promote(self, _request: standby_requests.StandbyPromote, who: str) -> StandbyState:

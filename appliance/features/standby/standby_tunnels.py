@@ -24,7 +24,6 @@ class StandbyTunnels:
         self.pin = ""
 
     def attach(self, channel: Channel) -> None:
-        """Use a new link."""
         self._needed = None
         self._link.attach(channel)
 

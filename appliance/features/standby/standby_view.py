@@ -31,7 +31,6 @@ class StandbyScreen:
     troubles: list[str]
 
     def __rich_console__(self, _console: Console, _options: ConsoleOptions) -> RenderResult:
-        """Yield its parts."""
         for trouble in self.troubles:
             yield Text(f"! {trouble}", style=_RED)
         state = self.state

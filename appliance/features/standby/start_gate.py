@@ -45,5 +45,4 @@ class StandbyGate(StartGate):
         return None if pair is None else PairedRole(pair, settings)
 
     async def begin(self, base: Foundation, parts: Parts) -> FeaturePart:
-        """Return the part of the standby in control."""
         return await begin(base, parts)

@@ -326,7 +326,6 @@ class DiskCheck:
             select.select([], [], [], _DISK_SECONDS)
 
     def check(self) -> None:
-        """Write the file."""
         self._began = self._clock()
         try:
             write_synced(self._lease.path + ".check", b" " * _COPY)
@@ -573,7 +572,6 @@ class WitnessFollower:
         self.tick()
 
     def request(self) -> bytes:
-        """Return the next request to the witness."""
         self._number += 1
         self._pending[self._number] = self._clock()
         if len(self._pending) > _MOST_PENDING:
@@ -1051,7 +1049,6 @@ class BoundedLog:
         self._lines = 0
 
     def add(self, text: str) -> None:
-        """Print a line, or count it."""
         now = self._clock()
         if now - self._since > _LINES_SECONDS:
             if self._lines > _LINES:

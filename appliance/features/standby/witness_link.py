@@ -88,11 +88,9 @@ class WitnessLink(asyncio.DatagramProtocol):
         self._transport: asyncio.DatagramTransport | None = None
 
     def connection_made(self, transport: Any) -> None:
-        """Keep the socket."""
         self._transport = transport
 
     def datagram_received(self, data: bytes, addr: object) -> None:  # noqa: ARG002  asyncio passes it
-        """Pass an authentic answer on."""
         answer = self._channel.read(data)
         if answer is not None:
             self._answered(*answer)

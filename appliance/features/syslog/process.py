@@ -37,7 +37,6 @@ def make_forwarder(settings: Settings, kept: Path) -> LogForwarder:
 
 
 def receiver_of(wanted: Syslog) -> Receiver:
-    """Return the configured receiver."""
     protocol, host, port = wanted.destination
     if protocol == "udp":
         return DatagramReceiver(host, port)

@@ -49,7 +49,6 @@ class DatagramReceiver:
         self._socket: socket.socket | None = None
 
     def send(self, messages: Sequence[bytes]) -> None:
-        """Send each message as a datagram."""
         if self._socket is None:
             family = socket.AF_INET6 if ":" in self._place[0] else socket.AF_INET
             self._socket = socket.socket(family, socket.SOCK_DGRAM)
@@ -59,7 +58,6 @@ class DatagramReceiver:
             self._socket.send(message)
 
     def close(self) -> None:
-        """Close the connection, if there is one."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -103,7 +101,6 @@ class StreamReceiver:
         return connection
 
     def close(self) -> None:
-        """Close the connection, if there is one."""
         if self._socket is not None:
             with suppress(OSError):
                 self._socket.close()

@@ -55,5 +55,4 @@ class Syslog(FeatureSection):
         return tuple(filter(None, (self.ca, self.certificate, self.key)))
 
     def receivers(self) -> dict[str, tuple[str | None, str | None]]:
-        """Return the receiver of the log."""
         return {"to": (self.to, self.to and self.destination[1])}

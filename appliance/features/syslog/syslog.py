@@ -46,7 +46,6 @@ class Formatter:
         self._host = _name(host_name or socket.gethostname(), _LONGEST_HOST_NAME)
 
     def record(self, entry: LogEntry) -> bytes:
-        """Format a record of the log."""
         record = entry.record
         head = self._head(record.severity, record.time, record.event)
         named = {name: _value(value, self._room) for name, value in fields_of(entry).items() if value}

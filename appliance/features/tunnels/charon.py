@@ -43,7 +43,6 @@ class ViciClient:
         self.proposals = proposals_of(self._key_exchanges())
 
     def close(self) -> None:
-        """Close the connection."""
         self._session.transport.close()
 
     def load_key(self, key: bytes) -> None:
@@ -104,7 +103,6 @@ class ViciClient:
             return [(name, row) for reply in self._session.list_sas() for name, row in reply.items()]
 
     def version(self) -> str:
-        """Return charon's version."""
         with self._said("its version"):
             return str(self._session.version()["version"].decode())
 

@@ -77,7 +77,6 @@ class EnrolmentTokens:
             self._tables.save_awaited(row)
 
     def forget(self, name: str) -> None:
-        """Remove the token of a name, if it has one."""
         if self._rows.pop(name, None) is not None:
             self._tables.forget_awaited(name)
 

@@ -339,7 +339,6 @@ class ServedCall(NamedTuple):
 
 
 Table = Mapping[str, ServedCall]
-"""The calls that a listener serves, by name."""
 
 
 def served(calls: Iterable[RosCall[S]], part: S) -> dict[str, ServedCall]:

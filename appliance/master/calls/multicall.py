@@ -40,7 +40,6 @@ class Multicall:
     offload: int
 
     async def answer(self, visit: ServedRequest, params: tuple[Value, ...]) -> Value:
-        """Return the answers to the parts of one multicall."""
         if len(params) != 1 or not isinstance(params[0], list):
             why = "system.multicall takes one list of calls"
             self._refused(visit, why)

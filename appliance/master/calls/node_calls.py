@@ -106,7 +106,6 @@ class NodeCalls:
         return [1, "shutdown", 0]
 
     async def get_name(self, caller: Caller) -> Answer:
-        """`getName(caller_id)`."""
         return [1, "", _target(caller).name]
 
     async def get_uri(self, caller: Caller) -> Answer:

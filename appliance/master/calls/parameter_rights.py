@@ -51,7 +51,6 @@ class ParameterRights:
         return decide_right(self.policy(), right_to_find(request))
 
     def recorded(self, caller: Caller, call: str, key: str, decision: Decision) -> str:
-        """Record a decision on a parameter, and return the text for the caller."""
         record = self.trail.decided(caller.asker, call, Category.READ.value, key, decision)
         return denial_text(decision, record, self.policy().tell)
 

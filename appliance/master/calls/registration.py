@@ -116,7 +116,6 @@ class RegistrationCalls:
     def _unregistered(
         self, caller: Caller, node: Incarnation | None, kind: Kind, resource: str, other: str
     ) -> Answer:
-        """Remove a registration of a node. The answer is `other` if the node does not have the registration."""
         name = caller.caller_id
         if self.registry.holder(name) is None:
             answer: Answer = [1, f"[{name}] is not a registered node", 0]

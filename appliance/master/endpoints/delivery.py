@@ -45,7 +45,6 @@ class _DeliveredList:
     free: float = 0.0
 
     def follow(self, publishers: frozenset[object]) -> None:
-        """Note the delivery of the next list."""
         now = clock.now()
         if now >= self.free:
             self.removed = frozenset()
@@ -177,7 +176,6 @@ class Delivery:
         return call
 
     def close(self) -> None:
-        """Stop delivering."""
         for worker in self._workers.values():
             worker.cancel()
 

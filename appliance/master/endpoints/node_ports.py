@@ -153,7 +153,6 @@ class NodePorts:
         return True
 
     def close(self, incarnation: Incarnation) -> None:
-        """Close the ports of an incarnation. Closed ports are reused last."""
         for port in incarnation.ports:
             owner = self._owners.pop(port, None)
             if owner is not None:

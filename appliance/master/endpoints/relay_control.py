@@ -116,7 +116,6 @@ class RelayControl:
     _stop: int = 0
 
     def __post_init__(self) -> None:
-        """Create an entry for each relay."""
         self._posts = tuple(
             RelayOutbox(index, partial(self._received, index), partial(self._lost, index))
             for index in range(self.allocation.relays)
@@ -247,7 +246,6 @@ class RelayControl:
             post.send(messages.ClientGranted(row.key, row.resource, row.host, row.caller_id, named, asks))
 
     def revoke_grant(self, row: PermissionRow) -> None:
-        """Have the relay revoke a grant and cut its connection."""
         _revoke(self._post(row.kind, row.resource), row)
 
     def place(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> None:

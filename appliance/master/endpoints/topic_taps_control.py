@@ -47,7 +47,6 @@ class TapRequests:
         return seen
 
     def seen(self, message: messages.MessageSeen) -> None:
-        """Add a message from a relay to its tap."""
         count, seen, enough = self._open.get(message.number, (0, [], None))
         if len(seen) < count:
             seen.append(message)

@@ -57,7 +57,6 @@ class Traffic:
         self.delay = row.delay_seconds / sum(row.delays) if row.delays else 0.0
 
     def include(self, other: "Traffic") -> None:
-        """Add the counts of another object."""
         self.messages += other.messages
         self.bytes += other.bytes
         self.dropped += other.dropped
@@ -98,7 +97,6 @@ class RelayTraffic:
         """
 
     def used(self) -> set[PermissionRow]:
-        """Return the grants with a connection."""
         return {
             PermissionRow(
                 connection.key, connection.kind, connection.resource, connection.host, connection.caller_id
@@ -161,7 +159,6 @@ class RelayTraffic:
             )
 
     def opened(self, relay: int, message: messages.ConnectionOpened) -> None:
-        """Record that a peer is connected."""
         number = message.number * self._relays + relay
         self.connections[relay, message.number] = msgspec.structs.replace(message, number=number)
         name = self._name(message.key)

@@ -61,7 +61,6 @@ class RosGraph:
     may_read_value: Callable[[Incarnation, str, Value], bool]
 
     def registered(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> Effects:
-        """Add a registration to a node."""
         effects = self._take_name(incarnation)
         if incarnation.life is Life.SHADOW:  # the node was lost while its call was under way
             effects += self.returned(incarnation)
@@ -194,7 +193,6 @@ class RosGraph:
         return [*effects, _record("node returned", f"{incarnation.name} answers again", incarnation)]
 
     def forgotten(self, incarnation: Incarnation) -> Effects:
-        """Forget an incarnation permanently."""
         registrations = list(incarnation.registrations.values())
         effects = _at_master(incarnation, registrations)
         effects += [*self.registry.forget(incarnation), *self._tell_withdrawn(registrations)]

@@ -144,7 +144,6 @@ class Incarnation:
         return sorted(self.registrations.values(), key=lambda registration: registration.order)
 
     def resources(self, kind: Kind) -> list[str]:
-        """Return the resources of all registrations of this kind."""
         return [
             registration.resource for registration in self.registrations.values() if registration.kind is kind
         ]
@@ -355,7 +354,6 @@ class Registry:
                 self._index(incarnation, registration)
 
     def register(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> list[Durable]:
-        """Add a registration to an incarnation."""
         kept: list[Durable] = []
         self.version += 1
         if incarnation.life is Life.SHADOW:  # the node was lost while its call was under way

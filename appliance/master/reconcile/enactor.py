@@ -157,7 +157,6 @@ _SHELVED = "revoked "  # the prefix of the stored kind of a withdrawn registrati
 
 
 def write(effect: Durable, store: StateStore) -> None:
-    """Store one change of the registry."""
     match effect:
         case SaveNode(node):
             store.save_incarnation(

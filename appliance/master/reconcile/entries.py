@@ -80,7 +80,6 @@ class MasterRegistrations:
         return list(self._registry.in_order())
 
     def call_to_make(self, node: Incarnation, registration: NodeRegistration) -> Wanted:
-        """Return the call that makes a registration of a node at the ROS master."""
         inner, resource = self._inner_uri(node), registration.resource
         told = {
             Kind.PUBLICATION: (resource, registration.detail, inner),

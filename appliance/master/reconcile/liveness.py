@@ -81,7 +81,6 @@ class Watchlist:
         self._filled = asyncio.Event()
 
     def look_at(self, node: Incarnation) -> None:
-        """Add a node to check."""
         self._nodes[node.key] = node
         self._filled.set()
 

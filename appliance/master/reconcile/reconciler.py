@@ -51,7 +51,6 @@ class Reconciler:
     ready: asyncio.Event = field(default_factory=asyncio.Event, init=False)
 
     def wake(self) -> None:
-        """Run a round now."""
         self.rosmaster.doubtful.set()
 
     async def run(self) -> None:

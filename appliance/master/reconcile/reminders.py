@@ -68,12 +68,10 @@ class Reminders:
             self._absences[subscriber.key, topic] = absence
 
     def begin(self) -> None:
-        """Start the checks from the beginning."""
         self.close()
         self.round = asyncio.get_running_loop().create_task(self._remind())
 
     def close(self) -> None:
-        """Stop checking."""
         if self.round is not None:
             self.round.cancel()
 

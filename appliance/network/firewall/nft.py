@@ -53,7 +53,6 @@ class NftBackend:
         self._namespace = namespace
 
     def install(self, rules: tuple[PacketRule, ...]) -> None:
-        """Replace the table in one transaction."""
         self._nft(["-f", "-"], json.dumps({"nftables": [*_delete_table(), _table("add"), *render(rules)]}))
 
     def remove(self) -> None:

@@ -64,7 +64,6 @@ def to_client(fields: Mapping[str, str], node: str) -> dict[str, str]:
 
 
 def to_subscriber(fields: Mapping[str, str], node: str, topic: str) -> dict[str, str]:
-    """Return the header that a subscriber gets from this node."""
     return {"callerid": node, "topic": topic, **_known(fields, _OF_PUBLISHER)}
 
 

@@ -22,7 +22,6 @@ class LatchedMessage:
         self._refused_size: int | None = None
         self.batch: Batch | None = None
         self.is_latching = False
-        """Whether the publisher latches."""
         self.withheld = False
         """Whether monitors have held back a message of this publisher."""
 

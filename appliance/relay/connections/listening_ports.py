@@ -60,7 +60,6 @@ class ListeningPorts:
             self._loop.discard(before)
 
     def close(self, key: str) -> None:
-        """Stop listening for the incarnation."""
         sock = self._listening.pop(key, None)
         if sock is not None:
             self._loop.discard(sock)

@@ -41,7 +41,6 @@ class ActionServers:
         return [f"{action}/goal", f"{action}/cancel"]
 
     def remove(self, key: str, topic: str) -> None:
-        """Forget a publication."""
         action, _, last = topic.rpartition("/")
         if last == "status" and action in self._names:
             self._names[action].pop(key, None)
@@ -49,7 +48,6 @@ class ActionServers:
                 del self._names[action]
 
     def of(self, topic: str) -> Collection[str]:
-        """Return the servers of the action that a topic belongs to."""
         return self._names.get(topic.rpartition("/")[0], {}).values()
 
 

@@ -66,7 +66,6 @@ class OwnService:
         self._send(asked)
 
     def forget(self, service: str, host: str, server: "OwnServer") -> None:
-        """Drop a client that has disconnected."""
         last = self._calls.get((service, host))
         if last is not None and server in last.waiting:
             last.waiting.remove(server)
@@ -155,6 +154,5 @@ class OwnServer:
         self._timer = self._loop.after(0, lambda: self._received(reply))
 
     def close(self) -> None:
-        """Forget the client."""
         self._timer.cancel()
         self._own.forget(self._called[0], self._called[1], self)

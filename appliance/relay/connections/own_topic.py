@@ -46,5 +46,4 @@ class OwnTopicPublisher(Upstream):
             self._topic.published(Batch(memoryview(encode_frame(data)), 1, 0, owned=True))
 
     def close(self) -> None:
-        """Stop publishing."""
         self._current = None

@@ -16,10 +16,8 @@ class TopicSubscriber(Protocol):
     """A subscriber, as its topic uses it."""
 
     host: str
-    """The address it comes from."""
 
     caller_id: str
-    """The caller id that it claims."""
 
     missed: bool
     """Whether it did not get the last message, because of its rate limit or because the topic is withheld from it."""
@@ -93,7 +91,6 @@ class ServedSubscribers:
         return self._row
 
     def add(self, member: TopicSubscriber) -> None:
-        """Serve a subscriber from the next batch on."""
         self._members[member] = self._row = None
 
     def remove(self, member: TopicSubscriber) -> None:

@@ -42,7 +42,6 @@ class ServiceTraffic:
         self.changed = False
 
     def count(self, size: int) -> None:
-        """Count a request or reply."""
         self.messages += 1
         self.bytes += size
         self.changed = True
@@ -249,7 +248,6 @@ class ServiceClient:
         return True
 
     def _approved(self, refused: str) -> None:
-        """Pass the held request on, or refuse it."""
         if self._live:
             self._exchange.settle(refused)
             self._advance()

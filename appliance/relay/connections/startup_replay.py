@@ -65,6 +65,5 @@ class StartupReplay:
         return [] if again else self._batches
 
     def forget(self) -> None:
-        """Drop all messages."""
         self._share.add(-self._bytes)
         self._batches, self._bytes = [], 0

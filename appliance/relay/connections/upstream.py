@@ -165,7 +165,6 @@ class PublisherConnection(Upstream):
             self._reader.pause(seconds)
 
     def resume(self) -> None:
-        """Go on reading."""
         if self._reader is not None:
             self._reader.resume()
 

@@ -81,7 +81,6 @@ class UpstreamReader:
             self._pause = self._loop.after(seconds, self._topic.relieve)
 
     def resume(self) -> None:
-        """Go on reading."""
         if self._pause is None:
             return
         self._pause.cancel()
@@ -260,5 +259,4 @@ def header_refusal(context: RelayContext, host: str, size: int) -> str:
 
 
 def violation_of(error: PeerError) -> Violation:
-    """Return the kind of violation that an error of a peer is."""
     return "limit exceeded" if isinstance(error, LimitExceededError) else "malformed"

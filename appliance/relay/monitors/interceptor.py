@@ -331,7 +331,6 @@ class Interceptor:
             self.invalidate_prepared()
 
     def keep_all(self) -> None:
-        """Keep the state of all monitors."""
         if self._keeper is not None and not self._keeper.keep_all():
             self.invalidate_prepared()
 
@@ -415,7 +414,6 @@ class Interceptor:
         }
 
     def close(self) -> None:
-        """Stop loading, and all timers."""
         self._loader.close()
         self.shadow.close()
         if self._timer is not None:

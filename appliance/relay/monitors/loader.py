@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
 
 Result = Union["MonitorSet", list[str]]
-"""The monitors, or the errors of the specifications."""
 
 
 class Loader:
@@ -36,7 +35,6 @@ class Loader:
         self._loading: WorkBeside | None = None
 
     def later(self, message: SpecificationsStated) -> None:
-        """Load the specifications of a message while the loop continues."""
         self._waiting.append(message)
         if self._loading is None:
             self._begin()

@@ -29,7 +29,6 @@ SHOWN = 1024
 """The most bytes reported of a message, before and after a change."""
 
 LONGEST_TEXT = 4096
-"""The most characters reported of a text."""
 
 _DISTINCT = 100
 _KEPT = 10_000
@@ -228,7 +227,6 @@ class Observations:
         self.tell_counters()  # so that a reported drop is also counted
 
     def tell_counters(self) -> None:
-        """Send the counters that have changed."""
         if not self._reporter.attached:
             return
         rows = list(self._rows())

@@ -223,7 +223,6 @@ class Observer:
         body: memoryview,
         observed: ObservedMessage | None = None,
     ) -> None:
-        """Report a drop."""
         self._counter(outcome.dropped_by).drops += 1
         self._observations.note(
             f"{self._prefix}drop",

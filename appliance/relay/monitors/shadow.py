@@ -118,7 +118,6 @@ class ShadowMonitors:
         self.schedule()
 
     def close(self) -> None:
-        """Stop the timer."""
         if self._timer is not None:
             self._timer.cancel()
 

@@ -164,7 +164,6 @@ class StateKeeper:
         return self.content()
 
     def take(self, monitors: "MonitorSet") -> None:
-        """Keep the state of these monitors from now on."""
         self._entries = [_Entry(group, parts=group.parts()) for group in monitors.kept_groups()]
         self._by_channel = {channel: entry for entry in self._entries for channel in entry.group.channels}
         self._lay_out()

@@ -102,7 +102,6 @@ class Batch:
         return min(most, boundary_at(self.view, ceil(size) - 1)[0] + 1)
 
     def head(self, count: int) -> "Batch":
-        """Return the first frames."""
         end = last = 0
         if self.stride:
             end, last = count * self.stride, (count - 1) * self.stride
@@ -123,7 +122,6 @@ class Batch:
         return tail
 
     def find_last(self) -> int:
-        """Return where the last frame begins."""
         if self.last is None:
             self.last = last_frame(self.view)
         return self.last

@@ -25,7 +25,6 @@ from appliance.relay.transport.frames import Batch
 from appliance.relay.transport.memory import HostMemory
 
 Part = Literal["publisher", "subscriber", "topic"]
-"""The scope of a limit."""
 
 BURST = 0.5
 """Seconds' worth of messages that may come at once."""
@@ -186,7 +185,6 @@ class RateAllowance:
         return self._flow.room(self._name, batch, most, now)
 
     def take(self, batch: Batch) -> None:
-        """Charge a batch that has passed."""
         self._flow.take(self._name, batch)
 
 
@@ -241,7 +239,6 @@ class PublicationRateLimit:
         self._together: RateAllowance | None = None
         self._waiting: Batch | None = None
         self.limits = False
-        """Whether there are any limits."""
 
     def set(self, own: RateAllowance | None, together: RateAllowance | None) -> None:
         """Set the limit of the publication's host, and the limit of its topic."""
@@ -276,7 +273,6 @@ class PublicationRateLimit:
         return waiting
 
     def forget(self) -> None:
-        """Forget the waiting message."""
         if self._waiting is not None:
             self._share.add(-len(self._waiting.view))
             self._waiting = None

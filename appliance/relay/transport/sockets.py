@@ -93,7 +93,6 @@ class BufferedSocket:
         return len(self._outgoing)
 
     def send(self, data: bytes) -> None:
-        """Send the data now, or when the socket accepts it."""
         if not self._live:
             return
         if not self._outgoing and self._opened is None:
