@@ -53,7 +53,6 @@ class ThisProcess:
         self._waiting.append((number, job))
 
     def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:
-        """Execute the next job."""
         number, job = self._waiting.popleft()
         return [(number, self._work(job))]
 

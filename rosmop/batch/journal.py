@@ -75,7 +75,6 @@ class ResumeJournal:
         return result if checksum == _digest(job + result) else None
 
     def add(self, job: bytes, result: bytes) -> None:
-        """Write a result to the disk."""
         line = b"%b %b %b\n" % (_digest(job), _digest(job + result), base64.b64encode(result))
         try:
             self._places[_digest(job)] = os.lseek(self._file.fileno(), 0, os.SEEK_END), len(line) - 1

@@ -42,7 +42,6 @@ class ProcessPool:
             return
 
     def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:
-        """Wait for a result, or for the death of a process."""
         results: list[tuple[int, bytes | WorkerDeath]] = []
         for pipe in wait(list(self._running)):
             assert isinstance(pipe, Connection)  # noqa: S101  for mypy: no others are waited for
@@ -59,7 +58,6 @@ class ProcessPool:
         return results
 
     def close(self) -> None:
-        """Kill all processes."""
         for process, pipe in [
             *self._idle, *((process, pipe) for pipe, (process, _number) in self._running.items())
         ]:  # fmt: skip

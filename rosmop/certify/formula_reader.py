@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from decimal import Decimal
 
 Node = tuple[object, ...]
-"""An operator, and its operands."""
 
 DEEPEST = 120
 

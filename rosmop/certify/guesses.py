@@ -77,5 +77,4 @@ def _either(test: Node, yes: Node, no: Node) -> Node:
 
 
 def _within(node: Node) -> list[Node]:
-    """Return a formula and its parts."""
     return [node, *(inner for part in node[1:] if isinstance(part, tuple) for inner in _within(part))]

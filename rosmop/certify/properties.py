@@ -15,7 +15,6 @@ DEFECT = "this is a defect of the monitor compiler, and nothing is loaded; repor
 
 
 def certificate_of(compiled: CompiledProperty) -> Certificate:
-    """Compare a compiled property with its formula."""
     tables = None
     if isinstance(compiled, FiniteProperty | TimedStateMachine):
         automaton = compiled.automaton

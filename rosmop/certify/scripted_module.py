@@ -174,7 +174,6 @@ def _chosen(section: bytes) -> Iterator[bytes]:
 
 
 def _bodies(section: bytes) -> Iterator[bytes]:
-    """Yield the functions, each with its size."""
     count, at = _read_leb(section, 0)
     for _ in range(count):
         size, begin = _read_leb(section, at)

@@ -89,7 +89,6 @@ class ExpressionDerivatives:
         return self._number("sequence", (first, rest), matches=self._matching[first] and self._matching[rest])
 
     def _several(self, kind: str, operands: Iterable[int]) -> int:
-        """Return a union or an intersection."""
         neutral, decisive = (self._none, self._any) if kind == "union" else (self._any, self._none)
         flat: set[int] = set()
         for operand in operands:

@@ -280,7 +280,6 @@ def _piece(scope: FunctionScope, stream: OutputStream, part: tree.Expression) ->
 def construct(
     scope: FunctionScope, position: Position, kind: value_types.Type, arguments: Sequence[tree.Expression]
 ) -> Value:
-    """Compile `type(arguments)`."""
     if not arguments:
         return Value(nodes.Zero(kind), position)
     values = [

@@ -34,7 +34,6 @@ def compile_event(
     specification: tree.Specification,
     event: tree.EventDefinition,
 ) -> EventCode:
-    """Write the function of an event."""
     function = shared.symbols.fresh("e")
     if isinstance(event.trigger, tree.TimerTrigger):
         return replace(_timer(shared, names, event, function), creates=creates(specification, event))

@@ -25,7 +25,6 @@ _TAKEN = frozenset({"MESSAGE", "PUBLISH", "DROP", "init"})
 def declare_variables(
     shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
 ) -> None:
-    """Give the shared variables of a specification their names and types."""
     for declaration in specification.declarations:
         for declarator in declaration.declarators:
             try:
@@ -201,7 +200,6 @@ def declare_functions(
 
 
 def _calls(names: SpecificationNames) -> dict[str, set[str]]:
-    """Return the functions that each function of the specification calls."""
     known = names.functions
     return {name: {*_called(function.node.body)} & known.keys() for name, function in known.items()}
 
@@ -278,7 +276,6 @@ def compile_library(shared: CompilationContext, names: SpecificationNames) -> No
 
 
 def compile_function(shared: CompilationContext, names: SpecificationNames, function: HelperFunction) -> None:
-    """Write a helper function, or a function of the library."""
     scope = FunctionScope(shared, names, "function")
     scope.notes = scope.notes and not names.is_library
     scope.drop_refused = "a function has no message; return a `bool` and drop in the action"

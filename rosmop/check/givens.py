@@ -27,7 +27,6 @@ Topics = Mapping[str, Mapping[str, str]]
 def declare_givens(
     shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
 ) -> None:
-    """Add the constants that are given to a specification to its names."""
     for node in specification.givens:
         if not isinstance(node, tree.GivenValue):
             continue

@@ -79,7 +79,6 @@ class MemberCall:
 
 
 Method = Callable[[MemberCall], Value]
-"""A member function, which compiles a call to a value."""
 
 
 def length(call: MemberCall) -> Value:
@@ -89,6 +88,5 @@ def length(call: MemberCall) -> Value:
 
 
 def empty(call: MemberCall) -> Value:
-    """Compile `empty()`."""
     call.count(0)
     return call.value(value_types.BOOL, "l_empty")

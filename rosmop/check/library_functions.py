@@ -154,7 +154,6 @@ FREE = ELEMENTARY | {"turned"}
 
 @cache
 def functions() -> dict[str, tree.FunctionDefinition]:
-    """Return the functions of the library by name."""
     [library] = parse(TEXT, "library.rv").specifications
     return {function.name: function for function in library.functions}
 

@@ -17,7 +17,6 @@ from rosmop.types.messages import PRIMITIVES, UnknownNameError, nearest, shown
 
 
 def field(scope: FunctionScope, base: Value, name: str, position: Position, site: int) -> Value:
-    """Compile `base.name`."""
     if isinstance(base.type, value_types.RecordType):
         try:
             slot = scope.messages.slot(base.type.name, name)
@@ -66,7 +65,6 @@ def call(invocation: MemberCall) -> Value:
 
 
 def methods_of(kind: value_types.Type) -> Mapping[str, Method]:
-    """Return the member functions of a type."""
     if isinstance(kind, value_types.StringType):
         return string_members.TEXT_METHODS
     if isinstance(kind, value_types.VectorType):

@@ -215,7 +215,6 @@ class _Rewriting:
         return within
 
     def _parsed(self, members: str) -> tree.Specification:
-        """Parse members of a specification, with the position of the formula."""
         position = self._node.formula_position
         try:
             [specification] = parse(f"s() {{ {members} }}", position.file).specifications

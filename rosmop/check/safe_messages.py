@@ -22,7 +22,6 @@ _SENT_WITH = frozenset({"seq", "stamp"})
 def declare_safes(
     shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
 ) -> None:
-    """Add the safe messages of a specification to its names."""
     for node in specification.safes:
         try:
             safe = _compiled(shared, names, specification, node)

@@ -65,16 +65,13 @@ class SpecificationNames:
     misdeclared: set[str] = field(default_factory=set)
     """Names of variables and functions with rejected declarations; using them is not reported again."""
     events: list[str] = field(default_factory=list)
-    """The events with a message."""
     uses: set[str] = field(default_factory=set)
     """The other specifications whose variables are used."""
     comparisons: dict[tree.BinaryExpression, Comparison] = field(default_factory=dict)
-    """The comparisons that are noted."""
     lent: list[ConstantReference] = field(default_factory=list)
     givens: dict[str, Given] = field(default_factory=dict)
     """The constants that operators may set."""
     safes: dict[str, nodes.SafeMessage] = field(default_factory=dict)
-    """The safe messages, by topic."""
     instances: dict[tuple[object, ...], HelperFunction] = field(default_factory=dict)
     """The functions of the library that are called (`library_functions.py`), by name and types."""
     is_library: bool = False
@@ -126,7 +123,6 @@ class CompilationContext:
         self.types: dict[str, Type] = {}
         """The types of the variables, by their names in the form."""
         self.owners: dict[str, list[SpecificationNames]] = {}
-        """For each name, the specifications that declare a variable of this name."""
         self.unsliced: set[str] = set()
         """The variables that slices share, by their names in the form."""
         self.findings: list[Diagnostic] = []
@@ -148,7 +144,6 @@ class CompilationContext:
     def foreign(
         self, own: SpecificationNames, name: str, position: Position
     ) -> tuple[Variable | None, str | None]:
-        """Return a variable of another specification, and that specification's name."""
         owners = [other for other in self.owners.get(name, ()) if other is not own]
         if len(owners) > 1:
             both = " and ".join(other.name for other in owners[:2])
@@ -176,7 +171,6 @@ class FunctionScope:
         self.values = shared.values
         self.messages = shared.messages
         self.value_of = partial(shared.value_of, self)
-        """Compiles an expression to a value."""
         self.context = names.context
         self.lines = StatementList()
         self.result: Type = value_types.VOID
@@ -308,7 +302,6 @@ class FunctionScope:
         self.lines.found.append(statement)
 
     def evaluate(self, value: nodes.Expression) -> None:
-        """Append an expression for its effect."""
         self.add(nodes.Evaluate(self.lines.site, value))
 
     @contextmanager

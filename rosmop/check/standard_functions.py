@@ -34,7 +34,6 @@ class Arguments:
         self.site = site
 
     def count(self, least: int, most: int | None = None) -> None:
-        """Reject any other number of arguments."""
         most = least if most is None else most
         if not least <= len(self.values) <= most:
             wanted = str(least) if most == least else f"{least} to {most}"

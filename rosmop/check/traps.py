@@ -33,7 +33,6 @@ def traps(specification: tree.Specification) -> Iterator[Diagnostic]:
 
 
 def _called_again(event: tree.EventDefinition) -> Iterator[Diagnostic]:
-    """Warn of an event of a service that calls this service."""
     match event.trigger:
         case tree.MessageTrigger(part="request" | "response", topic=service):
             for node in tree.walk(event.action):

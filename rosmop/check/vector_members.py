@@ -13,7 +13,6 @@ from rosmop.types import value_types
 
 
 def element_value(base: Value, index: Value, position: Position, site: int) -> Value:
-    """Compile `base[index]` of a vector."""
     assert isinstance(base.type, value_types.VectorType)  # the caller checks this
     kind = base.type
     if not value_types.is_number(index.type):

@@ -25,7 +25,6 @@ MOST_KEPT = 1024
 """The maximum number of bytes of a string that a variable of the module keeps."""
 
 MOST_KEPT_ARRAY = 16 << 10
-"""The same of an array of numbers."""
 
 BEYOND = 0xFFFFFFFF
 """Replaces the length of a string or array that is longer."""

@@ -139,9 +139,7 @@ class WasmModule(CompiledModule):
     """A module whose `code` is WebAssembly, with data for its proof and certificate."""
 
     budgets: Mapping[str, int]
-    """Addresses of budgets, by context."""
     strings: Mapping[bytes, int]
-    """Addresses of constant strings."""
     references: Sequence[range]
     """Addresses of memory for the values of references that functions return."""
     handlers: Mapping[str, Sequence[int]]
@@ -366,7 +364,6 @@ class TopicCodegen:
         return any(isinstance(node, nodes.ReadValue) for node in nodes.walk(body))
 
     def feed(self, name: str) -> TopicCode:
-        """Return the data about this code."""
         return TopicCode(
             name,
             any(map(self._drops, range(len(self._events)))),
@@ -685,7 +682,6 @@ class TopicCodegen:
         )  # fmt: skip
 
     def _done(self) -> bytes:
-        """Store the effects of the message."""
         code = b"".join(
             self._count(number, self._is(_FIRST + number, HAPPENED)) for number in range(len(self._events))
         )

@@ -208,7 +208,6 @@ class MessageAccess(ArithmeticCodegen):
             self._assigned |= before
 
     def _address_of(self, node: nodes.Call) -> bytes:
-        """Push the address of an element."""
         values, index = node.arguments
         _, size = self._layout.element(values.type)
         first, place, count = self._elements(values)

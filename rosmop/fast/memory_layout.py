@@ -81,13 +81,11 @@ class MemoryLayout:
         self.constants: dict[bytes, int] = {}
         """Addresses of constant bytes."""
         self.strings: set[bytes] = set()
-        """The constants that are strings."""
         self.references: list[range] = []
         """Addresses of memory for the values of references that functions return."""
         self.lines: list[OutputLine] = []
         self._used = FIRST
         self.said = self.take(LINES)
-        """The address of lines of output."""
 
     def variable(self, name: str, kind: Type) -> int:
         cells = self.shared[name]
@@ -137,7 +135,6 @@ class MemoryLayout:
         return kind
 
     def take(self, size: int) -> int:
-        """Allocate memory and return its address."""
         at = self._used
         self._used += -(-size // 8) * 8
         return at

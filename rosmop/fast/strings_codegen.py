@@ -124,7 +124,6 @@ class StringCodegen(MessageAccess):
         return code, self._get(place), self._get(count, I64)
 
     def _assigned_text(self, node: nodes.Assign) -> bytes:
-        """Assign a string, or an array of numbers, to a variable."""
         first, place, count = self._elements(node.value)
         cells = self._layout.shared.get(node.name)
         if cells is None:

@@ -90,7 +90,6 @@ def text(name: str) -> bytes:
 
 
 def section(number: int, content: bytes) -> bytes:
-    """Encode a section of a module."""
     return bytes((number,)) + unsigned(len(content)) + content
 
 
@@ -149,7 +148,6 @@ def load(machine: int, address: int) -> bytes:
 
 
 def store(machine: int, address: int, value: bytes) -> bytes:
-    """Store a number at a fixed address."""
     return constant(I32, 0) + value + _STORES[machine](address)
 
 

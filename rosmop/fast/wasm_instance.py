@@ -350,7 +350,6 @@ def _check(error: int | None) -> None:
 
 
 def _trapped(trap: ctypes.c_void_p) -> WasmTrap:
-    """Return the message of a trap, and free it."""
     c, code = load(), ctypes.c_uint8()
     c.wasmtime_trap_code(trap, ctypes.byref(code))
     c.wasm_trap_delete(trap)

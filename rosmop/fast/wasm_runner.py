@@ -207,7 +207,6 @@ class ModuleState:
         return self._contexts[context].monitor
 
     def leave(self) -> None:
-        """Move the state back to Python."""
         if self._inside:
             self.show()
             self._inside, self.left = False, True
@@ -532,7 +531,6 @@ class WasmLane:
         return walked
 
     def _put_out(self, output: list[tuple[int, LogLine]]) -> None:
-        """Append the lines of output, each with the offset of its frame."""
         at, end = self._said, _LENGTH.unpack_from(self._memory, SURE)[0]
         while at < end:
             number, frame = HEAD.unpack_from(self._memory, at)
@@ -558,7 +556,6 @@ class WasmLane:
             return self._stopped(*call)
 
     def _undo(self) -> None:
-        """Undo the effects of the message that is left."""
         memory = self._memory
         for address, kept in self._feed.undo:
             memory[address : address + 8] = memory[kept : kept + 8]

@@ -173,7 +173,6 @@ class SpecificationCode:
     properties: tuple[PropertyCode, ...]
     variables: Mapping[str, str]
     uses: frozenset[str]
-    """Other specifications whose variables this one uses."""
     comparisons: tuple[Comparison, ...] = ()
     """Comparisons whose margins are noted, in the order of the text."""
     slicing: Slicing | None = None
@@ -201,7 +200,6 @@ class Compiled:
     messages: MessageTypes
     publications: tuple[Publication, ...]
     calls: tuple[Publication, ...] = ()
-    """The services that specifications call."""
 
     def alone(self, names: Collection[str]) -> "Compiled":
         """Return `part` without the data of other specifications, so that the result does not depend on them."""

@@ -48,7 +48,6 @@ class Symbols:
         self._owner = specification
 
     def fresh(self, prefix: str) -> str:
-        """Return a unique name."""
         self._names[self._owner] += 1
         return f"{prefix}{self._names[self._owner]} {self._owner}"
 

@@ -92,9 +92,7 @@ class LearntFacts:
     contents: Mapping[str, TopicContent]
     orders: TopicOrders
     seconds: float
-    """The length of the recordings."""
     windows: int
-    """The number of windows that they are divided into."""
     trimmed: Counter[str] = field(default_factory=Counter)
     """By topic: the number of conditions that `candidates` left out because there were more than `MOST`."""
 
@@ -106,7 +104,6 @@ class LearntFacts:
         return {topic: names[path] for topic, path in paths.items()}
 
     def candidates(self) -> Iterator[Candidate]:
-        """Yield all candidates, topic by topic."""
         bounds = sum(3 * len(self.fields[topic]) for topic in self.contents) + len(self.orders.pairs)
         mean = max(self.seconds / self.windows, 1e-3)
         proposer = _Proposer(self, QUIET_HOURS * 3600 / mean * max(bounds, 1))

@@ -199,7 +199,6 @@ class _Watch(CompiledProperty):
         self.timed = machine.timed
 
     def start(self, time_ns: int) -> Run:
-        """Return a run of the watched machine."""
         states = read_state_machine(self.source, timed=self._machine.timed).states
         return _Run(self, self._machine.start(time_ns), next(iter(states)))
 
@@ -237,7 +236,6 @@ class _Run:
         return False
 
     def step(self, event: int, time_ns: int) -> Categories:
-        """Take an event, and count it."""
         categories = self._run.step(event, time_ns)
         self._watch.taken[self._state, self._watch.events[event]] += 1
         self._state = categories[0]

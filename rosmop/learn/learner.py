@@ -55,7 +55,6 @@ class LearningResult:
     names: dict[tuple[str, str, str, int | None], str]
     """The specification of each candidate, by its key."""
     types: Mapping[str, str]
-    """The message types of the topics."""
     trained: tuple[LearnedSpan, ...]
     held_out: tuple[LearnedSpan, ...]
     skipped: tuple[str, ...]

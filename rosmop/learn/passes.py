@@ -51,7 +51,6 @@ class ContentStep(LearningStep, frozen=True):
 
     rhythms: dict[str, tuple[float, float]]
     ordered: list[str]
-    """The topics that are compared with each other."""
 
 
 class AlarmStep(LearningStep, frozen=True):

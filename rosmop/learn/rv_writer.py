@@ -36,7 +36,6 @@ def _new_name(text: str, taken: set[str]) -> str:
 
 
 def on(support: CandidateSupport) -> str:
-    """Return the evidence in words."""
     return f"{support.messages} messages, {support.seconds:g} s, {support.recordings} recording" + "s" * (
         support.recordings != 1
     )

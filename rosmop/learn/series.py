@@ -40,7 +40,6 @@ class HighestValues(msgspec.Struct):
             self.of[window] = value
 
     def merged(self, other: "HighestValues") -> "HighestValues":
-        """Return the highest numbers of both."""
         return HighestValues(merged_rows(self.of, other.of, max))
 
     @property
@@ -68,7 +67,6 @@ class ValueSeries(msgspec.Struct):
         self.last = {}
 
     def merged(self, other: "ValueSeries") -> "ValueSeries":
-        """Return the values of both, which have ended."""
         result = ValueSeries(
             merged_rows(self.windows, other.windows, int.__add__), many=self.many or other.many
         )
@@ -107,7 +105,6 @@ class Series(msgspec.Struct):
     infinite: bool = False
     highs: HighestValues = msgspec.field(default_factory=HighestValues)
     lows: HighestValues = msgspec.field(default_factory=HighestValues)
-    """The negated values."""
     values: ValueSeries = msgspec.field(default_factory=ValueSeries)
     rates: HighestValues = msgspec.field(default_factory=HighestValues)
     stays: HighestValues = msgspec.field(default_factory=HighestValues)

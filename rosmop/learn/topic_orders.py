@@ -104,7 +104,6 @@ class TopicOrderReader:
             pair.add_first(time)
 
     def ended(self) -> dict[tuple[str, str], TopicPair]:
-        """End the recording, and return its pairs."""
         for pair in self.pairs.values():
             pair.end()
         return self.pairs

@@ -23,7 +23,6 @@ class TopicRhythm(msgspec.Struct):
 
     count: int = 0
     recordings: set[int] = set()
-    """The numbers of the recordings with a message."""
     gaps: HighestValues = msgspec.field(default_factory=HighestValues)
     some: dict[int, list[int]] = {}
     """By the first window of each part of a recording: its first gaps in nanoseconds, for the median."""

@@ -71,7 +71,6 @@ class FormulaCell:
         self.kind, self.missing, self.operands, self.tells, self.users, self.value = saved
 
     def stand_for(self, kind: str, operands: tuple["Value", ...]) -> None:
-        """Compute the value from these operands."""
         self.touch()
         self.kind, self.operands = kind, operands
         self.missing = sum(_use(operand, self) for operand in operands)
@@ -184,11 +183,9 @@ class _Operator(ABC):
         return None
 
     def saved(self) -> tuple[Any, ...]:
-        """Return the values that change."""
         return (self.rows,)
 
     def restore(self, saved: tuple[Any, ...]) -> None:
-        """Restore these values."""
         (self.rows,) = saved
 
 
@@ -222,7 +219,6 @@ def _wanted(row: _Row) -> bool:
 
 
 _Mark = tuple[int, int]
-"""The time and the number of an event."""
 _Marks = tuple[list[_Mark], ...]
 
 
@@ -230,7 +226,6 @@ class _Rows(_Operator):
     """An operator that keeps the values of its operands."""
 
     def keep(self, now: int) -> _Row:
-        """Return the row of the current event."""
         if not self.rows or self.rows[-1].left is not None:
             self.rows.append(_Row(self.run.place, now, None, None, None))
         row = self.rows[-1]
@@ -654,7 +649,6 @@ class BoundedRun:
         return self._tell()
 
     def expire(self) -> Categories:
-        """Let the deadline pass."""
         deadline = self.deadline
         if deadline is None:
             raise ValueError("this run has no deadline")
@@ -686,7 +680,6 @@ class BoundedRun:
         return self._at_once, self.place, self._now, self._told, self._about
 
     def restore(self, saved: tuple[Any, ...]) -> None:
-        """Restore these values."""
         self._at_once, self.place, self._now, self._told, self._about = saved
 
     def value(self, number: int) -> Value:

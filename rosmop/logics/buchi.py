@@ -125,7 +125,6 @@ class Automata:
         return known
 
     def _fulfilled(self, letter: int, target: Obligations, untils: Obligations) -> Obligations:
-        """Return the untils that a transition fulfils."""
         self._spend(1)
         found = untils & ~target
         for until in _members(untils & target):

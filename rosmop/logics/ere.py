@@ -67,7 +67,6 @@ class ExpressionTable:
         return self._intern("symbol", (letter,), nullable=False)
 
     def complement(self, inner: int) -> int:
-        """Return the expression for all other traces."""
         expression = self._all[inner]
         if expression.kind == "not":
             return expression.parts[0]

@@ -76,7 +76,6 @@ def read_formula(source: Source, syntax: Syntax) -> Formula:
 
 
 def nodes(formula: Formula) -> Iterator[Formula]:
-    """Yield a formula and all its subformulas."""
     yield formula
     for operand in formula.operands:
         yield from nodes(operand)

@@ -213,7 +213,6 @@ class FiniteRun(UntimedRun):
         return self.state
 
     def take_back(self, mark: int) -> None:
-        """Restore the marked state."""
         self.state = mark
 
     def saved(self) -> tuple[Any, ...]:
@@ -299,7 +298,6 @@ class ClockedRun:
         return tables.verdicts[self.state]
 
     def expire(self) -> Categories:
-        """Let the deadline pass."""
         wait = self._tables.waits[self.state]
         if wait is None:
             raise ValueError("this run has no deadline")

@@ -123,7 +123,6 @@ class TokenReader:
         return token
 
     def accept(self, kind: str) -> bool:
-        """Read the next token if it is of this kind."""
         if self.token.kind == kind:
             self._next += 1
             return True

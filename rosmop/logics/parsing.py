@@ -56,7 +56,6 @@ class EarleyShape:
 
 
 Step = tuple[EarleyShape, tuple[int, ...]]
-"""A shape, and the references that are its continuations."""
 
 
 class EarleySet:

@@ -42,7 +42,6 @@ MAX_TABLE_WORK = 2_000_000
 MAX_FOLDED = 50_000
 """The maximum number of operands visited to fold a program; larger programs are not folded."""
 FOREVER = 10**30
-"""Later than any time."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +167,6 @@ class FoldedProgram:
 
 
 def compute(operations: Sequence[Operation], values: list[Any], event: int, now: int) -> None:
-    """Carry out the operations of an event."""
     for operator, place, left, right, window in operations:
         if operator == "or":
             values[place] = values[left] or values[right]
@@ -404,11 +402,9 @@ class SinceWindow:
         return twin
 
     def saved(self) -> tuple[Any, ...]:
-        """Return the bounds and the intervals."""
         return self._high, self._intervals, self._low
 
     def restore(self, saved: tuple[Any, ...]) -> None:
-        """Restore the bounds and the intervals."""
         self._high, self._intervals, self._low = saved
 
     def __len__(self) -> int:
@@ -446,11 +442,9 @@ class PastRun(UntimedRun):
         self.values = mark
 
     def saved(self) -> tuple[Any, ...]:
-        """Return the time and the values."""
         return self.now, self.values
 
     def restore(self, saved: tuple[Any, ...]) -> None:
-        """Restore the time and the values."""
         self.now, self.values = saved
 
 

@@ -52,7 +52,6 @@ UNDECIDED: Categories = ()
 Mode = Literal["waiting", "quiet", "stirred", "over", "violated"]
 MODES: tuple[Mode, ...] = ("waiting", "quiet", "stirred", "over", "violated")
 _DUE: dict[str, Mode] = {"some": "quiet", "causes": "stirred"}
-"""The mode in which the pattern waits for an event."""
 _DONE: dict[str, Mode] = {"some": "stirred", "causes": "quiet"}
 """The mode after the awaited event."""
 ENFORCED: Categories = ("enforced",)

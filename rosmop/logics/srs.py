@@ -77,11 +77,9 @@ class RewritingRun(UntimedRun):
         return self.verdict
 
     def saved(self) -> tuple[Any, ...]:
-        """Return the string and the verdict."""
         return self.string, self.verdict
 
     def restore(self, saved: tuple[Any, ...]) -> None:
-        """Restore the string and the verdict."""
         self.string, self.verdict = saved
 
     def _rewritten(self, string: list[int]) -> tuple[list[int], Categories]:

@@ -111,12 +111,10 @@ class Reader:
         return value - (value >> bits - 1 << bits)
 
     def take(self, size: int) -> bytes:
-        """Read this many bytes."""
         self.at += size
         return self._data[self.at - size : self.at]
 
     def types(self) -> tuple[str, ...]:
-        """Read a list of types."""
         return tuple(TYPES[self.byte()] for _ in range(self.unsigned()))
 
     def block(self) -> tuple[tuple[WasmInstruction, ...], int]:

@@ -265,7 +265,6 @@ def _holds(conditions: Sequence[Term], guess: Any) -> bool:
 
 
 def _example(model: Any) -> str:
-    """Format a message and a state."""
     return ", ".join(
         f"{declaration} = {model[declaration]}" for declaration in model.decls() if declaration.arity() == 0
     )
@@ -287,7 +286,6 @@ def _bit(bits: Term, which: int) -> Term:
 
 
 def _variable(name: str, kind: Type) -> Term:
-    """Return a variable of the set, with any value of its type."""
     if isinstance(kind, value_types.BoolType):
         return z3.Bool(name)
     if isinstance(kind, value_types.FloatingType):

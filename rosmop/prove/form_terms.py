@@ -363,7 +363,6 @@ class FormTerms:
         return self._decoded(number_at(message, place, self._size(kind)), kind)
 
     def _decoded(self, bits: Term, kind: Type) -> Term:
-        """Decode a number."""
         if isinstance(kind, value_types.TimeType | value_types.DurationType):
             extend = z3.ZeroExt if kind == value_types.TIME else z3.SignExt
             seconds, rest = (extend(32, z3.Extract(more + 31, more, bits)) for more in (0, 32))
@@ -378,7 +377,6 @@ class FormTerms:
         return bits if not missing else (z3.SignExt if kind.signed else z3.ZeroExt)(missing, bits)
 
     def _size(self, kind: Type) -> int:
-        """Return the size of each value of a type in a message."""
         code = struct_code(kind)
         if code is not None:
             return struct_size(code)
@@ -787,7 +785,6 @@ class FormTerms:
 
 
 def _compared(operator: str, left: Term, right: Term, kind: Type) -> Term:
-    """Compare numbers, booleans or times."""
     if isinstance(kind, value_types.BoolType) and operator not in ("==", "!="):
         left, right = map(as_bits, (left, right))
     if isinstance(kind, value_types.FloatingType):

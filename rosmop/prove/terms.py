@@ -20,7 +20,6 @@ NEAREST = z3.RNE()
 AT = z3.BitVec("at", 32)
 """Address of the message in the memory."""
 FRAME = z3.BitVec("position", 32)
-"""Address of its frame."""
 
 
 class NotProvedError(Exception):
@@ -49,7 +48,6 @@ def floating(value: float, bits: int) -> Term:
 
 
 def both(*conditions: Term) -> Term:
-    """Return the conjunction, simplified."""
     rest = [condition for condition in conditions if not z3.is_true(condition)]
     if any(z3.is_false(condition) for condition in rest):
         return z3.BoolVal(False)
@@ -57,7 +55,6 @@ def both(*conditions: Term) -> Term:
 
 
 def either(*conditions: Term) -> Term:
-    """Return the disjunction, simplified."""
     rest = [condition for condition in conditions if not z3.is_false(condition)]
     if any(z3.is_true(condition) for condition in rest):
         return z3.BoolVal(True)

@@ -69,7 +69,6 @@ class OutputBag:
         self._write((*sent, *_sender(connection)), time_ns, data, published=False)
 
     def publish(self, outcome: Outcome) -> None:
-        """Write the messages that monitors published."""
         for message in (one for one in outcome.sent() if not one.is_call):
             package, _, kind = message.type.partition("/")
             text, digest = self._definitions.full_text(message.type), self._definitions.md5sum(message.type)

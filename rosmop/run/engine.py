@@ -324,7 +324,6 @@ class MonitorSet:
 
     @property
     def definitions(self) -> Definitions:
-        """Return the definitions that the set was compiled with."""
         return self.compiled.messages.definitions
 
     def wants(self, topic: str) -> bool:

@@ -72,7 +72,6 @@ class MonitorExecution:
         self._copies = False
         """Whether steps in a slice may be undone."""
         self._passed: int | None = None
-        """The deadline that is passing in a slice."""
 
     def begin(self, monitors: Sequence[MonitorInstance], time_ns: int) -> Outcome:
         """Start monitors in stages (constants, first values, `init`), because a monitor may read another monitor's

@@ -299,11 +299,9 @@ class ClockedSteps(Steps):
         _COUNT.pack_into(self.room, 0, 0)
 
     def mark(self) -> tuple[int, bytes]:
-        """Return a copy of everything."""
         return self._started, bytes(self.room)
 
     def take_back(self, mark: tuple[int, bytes]) -> None:
-        """Restore the copy."""
         self._started, self.room[:] = mark
 
     def step(self, run: Run, event: int, time_ns: int, sender: MessageSender) -> Categories:

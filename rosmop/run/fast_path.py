@@ -87,7 +87,6 @@ class NativeCall(NamedTuple):
     packed: Callable[[BatchOptions], bytes]
     failure: Callable[[int, int], Exception]
     keeps: object
-    """Keeps what the addresses refer to."""
 
 
 class NextDue(Protocol):

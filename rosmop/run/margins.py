@@ -9,7 +9,6 @@ from rosmop.run.outcomes import Margin
 
 
 def begin_margins(monitors: Sequence[MonitorInstance], variables: dict[str, Any]) -> None:
-    """Begin to note the margins of monitors that were compiled with them."""
     for monitor in monitors:
         for comparison in monitor.code.comparisons:
             for left, right in (comparison.when_true, comparison.when_false):

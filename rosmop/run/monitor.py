@@ -95,7 +95,6 @@ class RunningProperty:
 
     @property
     def drawable(self) -> bool:
-        """Whether it has a finite automaton."""
         from rosmop.logics.picture import dot_of  # noqa: PLC0415  only tools draw
 
         return dot_of([self.code.property]) is not None
@@ -178,12 +177,10 @@ class MonitorInstance:
     slices: Slices | None = None
     """The slices of a parametric specification. `properties` has the runs of the slice used last."""
     slice: Slice | None = None
-    """The slice used last."""
     group: MonitorGroup | None = None
     """The monitors whose state changes together with its own."""
     trail: deque[Bound] = field(default_factory=partial(deque, maxlen=TRAIL))
     safes: dict[str, SafeSender] = field(default_factory=dict)
-    """The senders of its safe messages, by topic."""
     starting: set[str] = field(default_factory=set)
     """The topics with a safe message on which no message has come since the monitor started again."""
     """The last events of all slices of a parametric specification."""

@@ -231,7 +231,6 @@ class Margin(NamedTuple):
 
     @property
     def distance(self) -> float:
-        """Return the difference of the sides."""
         return abs(self.left - self.right)
 
     @property

@@ -59,7 +59,6 @@ class Quota(Generic[Thing]):
         return ((holder, thing) for holder, things in self._of.items() for thing in things)
 
     def clear(self) -> None:
-        """Release everything."""
         self._of.clear()
         self.total = 0
 

@@ -52,7 +52,6 @@ from rosmop.runtime.action_context import FOLDED_NS
 from rosmop.types import value_types
 
 LIMIT = 100_000
-"""The default limit for the slices of one specification."""
 
 GROWING_LIMIT = 1_000
 """The limit if a run needs more than the state of an automaton (`cfg`, `srs`, `ptcaret`, `mtl` about the future)."""
@@ -159,7 +158,6 @@ class Slices:
         self._now = 0
         self._known = {domain: _Known() for domain in _joined(_domain(event) for event in code.events)}
         self.quota: Quota[Binding] = Quota(self.limit)
-        """Bindings of all slices, by the hosts that are charged for them."""
         self._ended: Quota[tuple[int, Key]] = Quota(self.limit)
         self._forgotten = 0
         self._told: int | None = None
@@ -430,7 +428,6 @@ class Slices:
 
     @property
     def deadline(self) -> int | None:
-        """Return the first deadline of all slices; None if there is none."""
         while self._deadlines:
             time, _, slice_ = self._deadlines[0]
             if time == slice_.due and not slice_.gone:
@@ -466,7 +463,6 @@ class Slices:
         heapify(self._deadlines)
 
     def restart(self, time_ns: int) -> None:
-        """Restart the properties with time bounds in each slice."""
         self._deadlines.clear()
         for known in self._known.values():
             for slice_ in known.slices.values():
@@ -497,7 +493,6 @@ class Slices:
 
     @property
     def first(self) -> Slice:
-        """Return the initial state of slices."""
         return self._first
 
     def state(self, binding: Binding) -> Slice | None:
@@ -566,7 +561,6 @@ class Slices:
         return take_back
 
     def _undo_end(self, slice_: Slice) -> None:
-        """Revive a slice that has ended or was forgotten."""
         if not slice_.gone:
             return
         binding = (slice_.domain, slice_.key)
@@ -607,7 +601,6 @@ class Slices:
         self._put(slice_.domain, slice_.key, slice_)
 
     def _leave(self, slice_: Slice) -> None:
-        """Remove a slice from the live slices."""
         slice_.gone = True
         self.quota.give_back(slice_.holder, (slice_.domain, slice_.key))
 

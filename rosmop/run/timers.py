@@ -145,7 +145,6 @@ class Agenda:
         return outcome
 
     def _leave_out(self, time_ns: int) -> Outcome:
-        """Skip the ticks up to this time."""
         outcome = Outcome(time=time_ns)
         for monitor in self._monitors:
             for timer in monitor.timers:

@@ -117,7 +117,6 @@ class Turn:
 
     @property
     def too_late(self) -> str:
-        """Return the text of the fault."""
         return (
             f"more than {self.seconds * self.part * 1000:g} ms of processor time for one message: it has too many"
             f" elements or characters for its monitors (relay.budget is {self.seconds * 1000:g} ms; for a second after"
@@ -221,7 +220,6 @@ class Context:
             self._measure(size - replaced, site)
 
     def log(self, level: str, text: bytes, site: int) -> None:
-        """Add a line of output."""
         self.spend(OUTPUT_COST + len(text) // BYTES_PER_INSTRUCTION, site)
         self.turn.log.append(line_of(level, text, self.monitor))
 

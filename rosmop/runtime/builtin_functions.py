@@ -120,7 +120,5 @@ def _parameters(function: Function) -> tuple[str, ...]:
 CHARGING = frozenset(
     name for name, function in FUNCTIONS.items() if _parameters(function)[:1] == ("context",)
 )
-"""Functions that take the context."""
 
 FAULTING = frozenset(name for name, function in FUNCTIONS.items() if _parameters(function)[-1:] == ("site",))
-"""Functions that take the site."""

@@ -45,7 +45,6 @@ def truncate(value: float, least: int, most: int) -> int:
 
 
 def wrap(value: int, bits: int, signed: bool) -> int:
-    """Wrap an integer to this number of bits."""
     value &= (1 << bits) - 1
     return value - (1 << bits) if signed and value >> (bits - 1) else value
 

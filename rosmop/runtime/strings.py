@@ -29,7 +29,6 @@ def join(context: Context, left: bytes, right: bytes, site: int) -> bytes:
 
 
 def extend(context: Context, text: bytes, added: bytes, site: int) -> bytes:
-    """Return `text` after `text += added`."""
     size = len(text) + len(added)
     if size > _LONG:
         context.allocate(size, site, len(text))
@@ -60,7 +59,6 @@ def member(text: bytes, index: int, site: int) -> int:
 
 
 def with_character(context: Context, text: bytes, index: int, value: int, site: int) -> bytes:
-    """Return `text` after `text[index] = value`."""
     if not 0 <= index < len(text):
         raise FaultError(site, f"index {index} is past the end of a string of {len(text)} characters")
     if len(text) > _LONG:
@@ -91,7 +89,6 @@ def find_last(context: Context, text: bytes, wanted: bytes, start: int, site: in
 
 
 def find_any(context: Context, text: bytes, wanted: bytes, start: int, site: int) -> int:
-    """Return `text.find_first_of(wanted, start)`."""
     context.spend(len(text), site)
     for first in range(start, len(text), PART):
         context.turn.check()
@@ -114,13 +111,11 @@ def compare(left: bytes, right: bytes) -> int:
 
 
 def resize(context: Context, text: bytes, size: int, value: int, site: int) -> bytes:
-    """Return `text` after `text.resize(size, value)`."""
     context.allocate(size, site, len(text))
     return text[:size].ljust(size, bytes((value & 0xFF,)))
 
 
 def erase(context: Context, text: bytes, start: int, count: int, site: int) -> bytes:
-    """Return `text` after `text.erase(start, count)`."""
     if start > len(text):
         raise FaultError(site, f"erase from {start}, past the end of a string of {len(text)} characters")
     context.allocate(len(text), site, len(text))
@@ -128,7 +123,6 @@ def erase(context: Context, text: bytes, start: int, count: int, site: int) -> b
 
 
 def insert(context: Context, text: bytes, start: int, added: bytes, site: int) -> bytes:
-    """Return `text` after `text.insert(start, added)`."""
     if start > len(text):
         raise FaultError(site, f"insert at {start}, past the end of a string of {len(text)} characters")
     context.allocate(len(text) + len(added), site, len(text))
@@ -136,7 +130,6 @@ def insert(context: Context, text: bytes, start: int, added: bytes, site: int) -
 
 
 def replace(context: Context, text: bytes, start: int, count: int, added: bytes, site: int) -> bytes:  # noqa: PLR0917  the arguments are C++'s
-    """Return `text` after `text.replace(start, count, added)`."""
     if start > len(text):
         raise FaultError(site, f"replace at {start}, past the end of a string of {len(text)} characters")
     context.allocate(len(text) + len(added), site, len(text))

@@ -33,7 +33,6 @@ def nanoseconds(seconds: float, site: int) -> int:
 
 
 def scaled(value: int, factor: float, site: int) -> int:
-    """Return a duration times a number."""
     return duration(nanoseconds(value / 1e9 * factor, site), site)
 
 

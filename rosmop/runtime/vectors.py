@@ -89,7 +89,6 @@ def recast(context: Context, values: Values, convert: Callable[[Values], Values]
 
 
 def recast_each(context: Context, values: Values, convert: Callable[[Values], Values], site: int) -> Values:
-    """Convert each vector in a vector as `recast` does."""
     context.allocate(len(values), site)
     return [convert(value) for value in values]
 
@@ -136,7 +135,6 @@ def resized(  # noqa: PLR0917  the arguments are C++'s
 
 
 def assigned(values: Values, others: Values) -> Values:
-    """Replace all elements of a vector."""
     values[:] = others
     return values
 
@@ -176,7 +174,6 @@ def erase(context: Context, values: Values, first: int, last: int | None, site: 
 
 
 def insert(context: Context, values: Values, at: int, value: Any, width: int, site: int) -> None:  # noqa: PLR0917  the arguments are C++'s
-    """Insert an element: `values.insert(at, value)`."""
     _check_span(values, at, len(values), site)
     context.allocate(width, site)
     context.spend(len(values) // 64, site)

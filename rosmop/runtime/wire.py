@@ -112,7 +112,6 @@ def _skipped(
 
 
 def put_text(value: bytes, out: bytearray) -> None:
-    """Append a string."""
     out += len(value).to_bytes(4, "little")
     out += value
 

@@ -13,7 +13,6 @@ BILLION = 1_000_000_000
 
 
 def say_finding(finding: Diagnostic, *, as_json: bool) -> None:
-    """Write an error or a warning."""
     if not as_json:
         say(str(finding), "red" if finding.severity == "error" else "yellow")
         return

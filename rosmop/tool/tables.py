@@ -22,5 +22,4 @@ def add_row(table: Table, *cells: str) -> None:
 
 
 def say_table(table: Table) -> None:
-    """Write a table to standard output."""
     Console(highlight=False, width=None if sys.stdout.isatty() else _WIDE).print(table)

@@ -30,7 +30,6 @@ def refused(findings: Iterable[object]) -> typer.Exit:
 
 
 def say(line: str, style: str = "") -> None:
-    """Write one line to standard output."""
     shown = printable(line)
     if sys.stdout.isatty():
         from rich.console import Console  # noqa: PLC0415  `rosrv up` shall not load it

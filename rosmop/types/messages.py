@@ -135,5 +135,4 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def shown(name: str) -> str:
-    """Return a name for a message, shortened."""
     return f"`{name if len(name) <= 60 else name[:57] + '…'}`"

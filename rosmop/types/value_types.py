@@ -46,12 +46,10 @@ class IntegerType(_Kind, frozen=True):
 
     @property
     def least(self) -> int:
-        """Return the smallest value."""
         return -(1 << (self.bits - 1)) if self.signed else 0
 
     @property
     def most(self) -> int:
-        """Return the largest value."""
         return (1 << (self.bits - self.signed)) - 1
 
     def holds(self, other: "IntegerType") -> bool:
@@ -137,7 +135,6 @@ Type = (
     | VectorType
     | RecordType
 )
-"""Any type."""
 
 VOID, BOOL, STRING, CHARACTERS, TIME, DURATION, INDEX = (
     VoidType(), BoolType(), StringType(), CharactersType(), TimeType(), DurationType(), IteratorType()
