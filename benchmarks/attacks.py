@@ -90,7 +90,6 @@ _TRIES = 20
 
 
 def header(**fields: str) -> bytes:
-    """Return a connection header."""
     body = b"".join(
         struct.pack("<I", len(line)) + line for line in (f"{k}={v}".encode() for k, v in fields.items())
     )
@@ -119,12 +118,10 @@ def read_header(sock: socket.socket) -> dict[str, str]:
 
 
 def frame(body: bytes) -> bytes:
-    """Return one message on the wire."""
     return struct.pack("<I", len(body)) + body
 
 
 def text(value: bytes) -> bytes:
-    """Return a string field."""
     return frame(value)
 
 
@@ -162,11 +159,9 @@ class Nodes:
             threading.Thread(target=serve, daemon=True).start()
 
     def uri(self, address: str) -> str:
-        """Return the API URI of nodes at an address."""
         return f"http://{address}:{self._api.server_address[1]}/"
 
     def publish(self, address: str, node: str, topic: str, type_name: str) -> None:
-        """Register a publisher."""
         answer = call(address, "registerPublisher", node, topic, type_name, self.uri(address))
         assert answer[0] == 1, answer
 
@@ -671,7 +666,6 @@ class Rig:
         return [ours.recv() for ours, _ in self._probes]
 
     def round(self, names: Sequence[Callable[..., None]], addresses: Sequence[str]) -> dict[str, Any]:
-        """Measure during these attacks."""
         before = {role: {*self.appliance.pids(role)} for role in ("relay", "control")}
         started: list[tuple[Any, Event]] = []
         try:
@@ -701,7 +695,6 @@ def figures(delays: Sequence[float]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure and print."""
     parser = argparse.ArgumentParser(description="The robot's delays under attack")
     parser.add_argument("--only", help="attacks, separated by commas: " + ", ".join(ATTACKS))
     parser.add_argument("--by", default="guest,unknown", help="who attacks: guest, unknown")

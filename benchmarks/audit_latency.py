@@ -61,7 +61,6 @@ class Running:
         return (int(fields[11]) + int(fields[12])) / _TICKS
 
     def stop(self) -> None:
-        """End it."""
         self._process.terminate()
         self._process.wait(20)
 
@@ -106,7 +105,6 @@ def measure(one: Running, clients: int, seconds: float) -> tuple[float, float, f
 
 @contextlib.contextmanager
 def appliances(folder: Path, sink: Sink) -> Iterator[list[Running]]:
-    """Start the appliances that are compared."""
     forwarding = {"syslog": {"to": f"tcp://127.0.0.1:{sink.port}"}}
     wanted: dict[str, dict[str, object]] = {
         "batched": {"durability": "batched"},
@@ -124,7 +122,6 @@ def appliances(folder: Path, sink: Sink) -> Iterator[list[Running]]:
 
 
 def main() -> None:
-    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--rounds", type=int, default=3)

@@ -31,7 +31,6 @@ _ROWS: list[tuple[str, str]] = []
 
 
 def row(name: str, value: str) -> None:
-    """Print a line of the table."""
     _ROWS.append((name, value))
     print(f"{name:<66} {value:>16}", flush=True)
 
@@ -237,7 +236,6 @@ def measure_search(directory: Path, count: int) -> None:
 
 
 def main() -> None:
-    """Measure everything."""
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000
     print(f"{os.cpu_count()} cores, Python {sys.version.split()[0]}")
     with tempfile.TemporaryDirectory(prefix="audit-benchmark-") as name:

@@ -113,7 +113,6 @@ SYSTEMS: tuple[Callable[[], System], ...] = (
 
 @contextmanager
 def other_programs(number: int) -> Iterator[None]:
-    """Run this number of other programs."""
     programs = [
         subprocess.Popen([sys.executable, "-c", OTHER_PROGRAM], start_new_session=True) for _ in range(number)
     ]
@@ -142,7 +141,6 @@ def cell(runs: list[Result], base: list[Result], value: Callable[[Result], float
 
 
 def show(mode: str, size: int, results: dict[str, list[Result]]) -> None:
-    """Print the table of one mode and size."""
     columns: dict[str, Callable[[Result], float]] = {"processor µs": lambda one: one.cpu}
     if mode == "window":
         title, columns = "64 messages on their way", {"messages/s": lambda one: one.rate} | columns
@@ -157,7 +155,6 @@ def show(mode: str, size: int, results: dict[str, list[Result]]) -> None:
 
 
 def modes(text: str) -> list[str]:
-    """Return the modes in this argument."""
     found = text.split(",")
     wrong = [one for one in found if not re.fullmatch(r"window|paced[1-9]\d*", one)]
     if wrong:
@@ -168,7 +165,6 @@ def modes(text: str) -> list[str]:
 
 
 def main() -> None:
-    """Measure and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, help="of each run (2; window: 0.4)")

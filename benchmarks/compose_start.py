@@ -38,7 +38,6 @@ def stop(compose: Compose) -> float:
 
 
 def main() -> None:
-    """Measure and print."""
     runs = int(sys.argv[1]) if len(sys.argv) > 1 else RUNS
     build_images()
     with Lab("rosrv-bench") as lab, Engine(lab.host("machine", "10.79.0.1/24")) as engine:

@@ -53,7 +53,6 @@ LOADS = ((1, True), (1, False), (16, True), (16, False))
 
 
 def request(method: str, *params: Any, keep: bool) -> bytes:
-    """Return a complete HTTP request."""
     body = xmlrpc.client.dumps(params, method).encode()
     connection = "keep-alive" if keep else "close"
     head = f"POST / HTTP/1.1\r\nHost: x\r\nConnection: {connection}\r\nContent-Type: text/xml\r\n"
@@ -61,7 +60,6 @@ def request(method: str, *params: Any, keep: bool) -> bytes:
 
 
 def requests(operation: str, client: int, keep: bool) -> list[bytes]:
-    """Return the requests that one client repeats."""
     me, api = f"/bench_{client}", f"http://127.0.0.1:{40000 + client}/"
     topic, key = f"/bench/topic_{client}", f"/bench/key_{client}"
     if operation in READS:
@@ -175,7 +173,6 @@ def load(port: int, operation: str, clients: int, keep: bool, seconds: float) ->
 
 
 def free_port() -> int:
-    """Return a port that is currently free."""
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))
         return int(sock.getsockname()[1])

@@ -92,7 +92,6 @@ class _Measurement:
         self._robots = SimulatedRobots(site, self._names, given.processes, load)
 
     def run(self) -> None:
-        """Run all parts."""
         self._robots.start()
         enrol(self._site, self._names)
         self._site.start()
@@ -270,7 +269,6 @@ class _Searches:
         return {**found, "all": [one for times in found.values() for one in times]}, failed
 
     def end(self) -> None:
-        """End the thread."""
         self._ended.set()
         self._thread.join()
 
@@ -301,7 +299,6 @@ def _quantiles(times: Sequence[float]) -> str:
 
 
 def _family(pid: int) -> list[int]:
-    """Return a process and its children."""
     found = [pid]
     for one in found:
         for task in Path(f"/proc/{one}/task").glob("*/children"):

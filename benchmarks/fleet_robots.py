@@ -74,7 +74,6 @@ class SimulatedRobots:
             self._ready.acquire()
 
     def begin(self) -> None:
-        """Let all appliances push."""
         self._begin.set()
 
     def end(self) -> list[float]:
@@ -86,14 +85,12 @@ class SimulatedRobots:
         return lags
 
     def kill(self) -> None:
-        """Kill the processes that still run."""
         for process in self._processes:
             process.kill()
             process.join()
 
     @property
     def processes(self) -> list[BaseProcess]:
-        """Return the processes."""
         return list(self._processes)
 
     def _run(self, site: FleetSite, names: Sequence[str], load: SimulatedLoad) -> None:

@@ -36,7 +36,6 @@ def lateness(trials: int, silent: float) -> list[float | None]:
 
 
 def main() -> None:
-    """Print the quantiles."""
     arguments = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     arguments.add_argument("--trials", type=int, default=1000)
     arguments.add_argument("--silent", type=float, default=0.3)

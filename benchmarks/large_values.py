@@ -37,7 +37,6 @@ class Caller:
         self._connection = http.client.HTTPConnection("127.0.0.1", port, 120, source_address=(address, 0))
 
     def send(self, body: bytes) -> None:
-        """Send a call that is already encoded."""
         self._connection.request("POST", "/", body, {"Content-Type": "text/xml"})
         answer = self._connection.getresponse()
         answer.read()
@@ -78,7 +77,6 @@ def _call(method: str, *params: Any) -> bytes:
 
 
 def main() -> None:
-    """Measure and print."""
     parser = argparse.ArgumentParser(description="What one host's large parameters cost the others")
     parser.add_argument("--seconds", type=float, default=4.0, help="of each measurement")
     seconds = parser.parse_args().seconds

@@ -81,7 +81,6 @@ class Reports:
         return last
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
 
 
@@ -236,7 +235,6 @@ def deployed() -> Iterator[tuple[RosSession, list[int]]]:
 
 
 def main() -> None:
-    """Run both and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

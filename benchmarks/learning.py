@@ -317,7 +317,6 @@ class Judged:
 
 
 def judge(count: int, faults: int, seed: int) -> Judged:
-    """Drive, learn, and judge the result by other drives and by faults."""
     drives = [drive(number, seed) for number in range(count)]
     half = count // 2
     learnt = learn(drives[:half], KNOWN, 0.3, run_here(drives[:half], KNOWN))

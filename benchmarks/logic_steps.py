@@ -136,7 +136,6 @@ def beside(events: Sequence[int]) -> None:
 
 
 def main() -> None:
-    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--long", type=int, default=1_000_000, help="events of the long trace")
     parser.add_argument("--beside", action="store_true", help="reelay and rtamt, on 20,000 events")

@@ -78,7 +78,6 @@ class MinimalRelay:
         self._process: subprocess.Popen[str] | None = None
 
     def target(self, publisher: int) -> tuple[int, str]:
-        """Start a relay in front of this publisher."""
         self.close()
         self._process = subprocess.Popen(
             [*self._command, str(publisher)], stdout=subprocess.PIPE, text=True, start_new_session=True
@@ -88,7 +87,6 @@ class MinimalRelay:
         return int(self._process.stdout.readline()), "-"
 
     def close(self) -> None:
-        """End the relay."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -106,7 +104,6 @@ class CopyingRelay(MinimalRelay):
 
 
 def specification(name: str, topic: str) -> str:
-    """Return the monitor, on this topic."""
     return SPECIFICATION.replace("NAME", name).replace("TOPIC", topic)
 
 
@@ -127,7 +124,6 @@ def monitored(others: int) -> Relay:
 
 
 def of_kind(name: str) -> Relay:
-    """Return the relay with a monitor of this kind."""
     relay = Relay(name)
     definition = TEXT if name == "string" else DEFINITION.read_text()
     try:
@@ -223,7 +219,6 @@ def show(results: Results, mode: str, sizes: tuple[int, ...], names: list[str]) 
 
 
 def cell(results: Results, mode: str, size: int, name: str) -> str:
-    """Return one cell of the table."""
     runs, base = results[mode, size, name], results[mode, size, "C relay"]
 
     def value(one: Result) -> float:
@@ -253,7 +248,6 @@ def begin(systems: list[System], *, peers: bool, kinds: bool) -> None:
 
 
 def main() -> None:
-    """Measure and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--rounds", type=int, help="of each cell (3; with --all 5)")
     parser.add_argument("--seconds", type=float, help="of each run (0.4; with --all 1.5)")

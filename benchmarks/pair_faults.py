@@ -252,7 +252,6 @@ def keep(row: Noticed, results: Path | None) -> None:
 
 
 def shown(rows: list[Noticed]) -> Table:
-    """Return the table of all rows."""
     heads = (
         "",
         "fault",

@@ -79,7 +79,6 @@ def busy_programs(number: int) -> Iterator[None]:
 
 
 def main() -> None:
-    """Print the quantiles."""
     arguments = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     arguments.add_argument("--stops", type=int, default=400)
     arguments.add_argument("--deployed", action="store_true")

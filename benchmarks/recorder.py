@@ -226,7 +226,6 @@ def at_appliance(
 
 
 def main() -> None:
-    """Measure and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--seconds", type=float, default=15, help="that are recorded")
     parser.add_argument("--rounds", type=int, default=1)
@@ -264,7 +263,6 @@ def main() -> None:
 
 
 def show(title: str, results: Mapping[str, list[Result]]) -> None:
-    """Print the medians of the rounds."""
     table = Table("", "messages", "lost", "file after s", "percent of a core", "p50 µs", title=title)
     for name, runs in results.items():
         bags = [run.bag for run in runs if run.bag is not None]

@@ -171,7 +171,6 @@ class Relay:
             return int(listening.getsockname()[1]), topic
 
     def close(self) -> None:
-        """End the process."""
         self._relay.stop()
         self._link.close()
 
@@ -193,7 +192,6 @@ class LoadApi:
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
     def close(self) -> None:
-        """End the server."""
         self._server.shutdown()
         self._server.server_close()
 
@@ -250,7 +248,6 @@ class RosRelay:
         return int(call(uri, "requestTopic", "/load_listener", taken, [["TCPROS"]])[2][2]), taken
 
     def stop_relay(self) -> None:
-        """End this run's relay."""
         if self._relay is not None:
             self._relay.terminate()
             self._relay.wait(10)
@@ -299,7 +296,6 @@ def table(
 
 
 def main() -> None:
-    """Measure and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=1.5)

@@ -220,7 +220,6 @@ def effects(appliance: Appliance, seconds: float, rounds: int) -> list[dict[str,
 
 
 def beside(work: Callable[[], Any], measured: Callable[[], list[float]]) -> list[float]:
-    """Measure while other work is done."""
     thread = threading.Thread(target=work)
     thread.start()
     found = measured()

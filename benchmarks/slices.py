@@ -84,7 +84,6 @@ def resident() -> float:
 
 
 def main() -> None:
-    """Print all measurements."""
     few, many = ids(LIVE), ids(MANY + LIVE)
     for name, formula in PROPERTIES.items():
         plain = visited(SPECIFICATION % ("", formula), few)

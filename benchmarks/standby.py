@@ -54,7 +54,6 @@ class Successes:
         self._new = threading.Condition()
 
     def note(self) -> None:
-        """Note a success."""
         with self._new:
             self.times.append(time.monotonic())
             self._new.notify_all()
@@ -93,7 +92,6 @@ class Watch:
         return self
 
     def longest_pauses(self) -> dict[str, float]:
-        """Return the longest pause of each kind."""
         return {name: max(one.longest_pause() for one in these) for name, these in self.found.items()}
 
     def __exit__(self, *exc: object) -> None:
@@ -155,7 +153,6 @@ def _burn() -> None:
 
 
 def takeovers(number: int, load: int, seed: int, monitors: Path | None, *, planned: bool) -> None:
-    """Print a table of takeovers."""
     chance, pauses = random.Random(seed), dict[str, list[float]]()
     options = () if monitors is None else ("--monitors", str(monitors), "--enable", "all")
     with (
@@ -180,7 +177,6 @@ def takeovers(number: int, load: int, seed: int, monitors: Path | None, *, plann
 
 
 def print_pauses(pauses: dict[str, list[float]], title: str) -> None:
-    """Print a table of the pauses of each kind."""
     table = Table("seconds without", "least", "median", "most", title=title)
     pauses["any of them"] = [max(turn) for turn in zip(*pauses.values(), strict=True)]
     for name, times in pauses.items():
@@ -269,7 +265,6 @@ def _registered(master: str) -> list[float]:
 
 
 def main() -> None:
-    """Run one of the measurements."""
     arguments = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     arguments.add_argument("what", choices=("cuts", "switchovers", "registrations"))
     arguments.add_argument("--cuts", type=int, default=50, help="takeovers")

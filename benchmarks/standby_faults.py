@@ -202,7 +202,6 @@ def _seconds_until_back(successes: Successes, moment: float) -> float:
 
 
 def main() -> None:
-    """Run one of the measurements."""
     arguments = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     arguments.add_argument("kind", choices=FAULTS)
     arguments.add_argument("--number", type=int, default=20)

@@ -65,7 +65,6 @@ def plain(home: Path, _experiment: Experiment) -> Iterator[str]:
 
 @contextlib.contextmanager
 def appliance(enable: str, experiment: Experiment) -> Iterator[str]:
-    """Yield the URI of the appliance."""
     with tempfile.TemporaryDirectory(prefix="rosrv-monitors-") as name:
         folder = Path(name)
         folder.chmod(0o755)
@@ -100,7 +99,6 @@ def counted(node: Process, seconds: float) -> dict[str, int]:
 
 
 def main() -> None:
-    """Measure and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--scale", type=float, default=0.02, help="of the thesis's durations")
     parser.add_argument("--only", help="experiments whose number is this: 1, 2, 3 or 4")

@@ -73,7 +73,6 @@ class Robot:
 
 
 def main() -> None:
-    """Measure and print."""
     parser = argparse.ArgumentParser(description="Stock tools that ask for everything, beside a plain master")
     parser.add_argument("--rounds", type=int, default=3)
     given = parser.parse_args()

@@ -69,7 +69,6 @@ class Bench:
         )
 
     def measures(self) -> list[Measure]:
-        """Return all measures."""
         rows = [Measure(f"{size:,} bytes, flat out", "messages/s", self._flat(size)) for size in SIZES]
         rows.append(Measure(f"200 bytes, {PACED:.0f}/s: delay", "µs (median)", self._paced))
         rows.append(Measure("getSystemState, one caller", "calls/s", self._calls))
@@ -129,7 +128,6 @@ def first_message(site: TunnelSite) -> tuple[JoinedHost, list[tuple[str, float]]
 
 
 def measure(bench: Bench, rounds: int) -> Table:
-    """Return the table of all measures."""
     where = bench.site.appliance.status()["ipsec"]["esp"]
     table = Table("", "", *(path.name for path in bench.paths), "tunnel / clear", title=f"ESP in: {where}")
     for one in bench.measures():
@@ -141,7 +139,6 @@ def measure(bench: Bench, rounds: int) -> Table:
 
 
 def here(seconds: float, rounds: int) -> None:
-    """Measure on this machine."""
     console = Console(width=110)
     # For this comparison, the host in clear text is trusted by its address.
     policy = POLICY.replace("trusted = host:ocu-1,", f"trusted = host:ocu-1, {OCU},")
@@ -161,7 +158,6 @@ def here(seconds: float, rounds: int) -> None:
 
 
 def in_the_machine(seconds: float, rounds: int) -> None:
-    """Measure in the tests' virtual machine."""
     with tempfile.TemporaryDirectory(prefix="rosrv-bench-") as folder, Machine(Path(folder)) as machine:
         words = ["--seconds", str(seconds), "--rounds", str(rounds)]
         print(f"virtual machine: {machine.accelerator}, {machine.processors} processors")

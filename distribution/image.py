@@ -44,7 +44,6 @@ class Blob:
     size: int
 
     def described(self, media_type: str) -> dict[str, Any]:
-        """Return its descriptor for manifests."""
         return {"mediaType": media_type, "digest": f"sha256:{self.digest}", "size": self.size}
 
 

@@ -71,7 +71,6 @@ def _one_line(text: str) -> str:
 
 
 def _text(text: str) -> str:
-    """Escape a text for roff."""
     escaped = text.replace("\\", "\\e").replace("-", "\\-").replace("'", "\\(aq")
     return re.sub(r"^\.", r"\\&.", escaped, flags=re.MULTILINE)
 

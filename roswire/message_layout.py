@@ -112,7 +112,6 @@ class LayoutBuilder:
         self._add_part(StringPart(path))
 
     def add_array(self, path: str, type_name: str, count: int | None, layout: MessageLayout | None) -> None:
-        """Add an array; `layout` is the layout of its elements if they are messages."""
         size = PRIMITIVES[type_name][1] if type_name in PRIMITIVES else None
         if layout is not None:
             size = layout.size

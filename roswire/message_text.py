@@ -33,7 +33,6 @@ BUILTINS = frozenset({*PRIMITIVES, "string"})
 """Types that have no definition of their own."""
 
 MAX_FIELDS = 10_000
-"""Fields and constants of one message."""
 
 _INTEGERS = {
     name: (-(1 << (8 * size - 1)), (1 << (8 * size - 1)) - 1)

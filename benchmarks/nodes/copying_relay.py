@@ -18,7 +18,6 @@ def tuned(sock):
 
 
 def pass_header(source, target):
-    """Pass on one connection header."""
     size = source.recv(4, socket.MSG_WAITALL)
     target.sendall(size + source.recv(*struct.unpack("<I", size), socket.MSG_WAITALL))
 

@@ -17,7 +17,6 @@ LINGER = 1.0
 
 
 def main():
-    """Publish, receive and count."""
     words = dict(word.split(":=", 1) for word in sys.argv[1:] if ":=" in word and word[0] != "_")
     seconds = float(sys.argv[1])
     rospy.init_node("counting_node", argv=[word for word in sys.argv if word.startswith("__")])

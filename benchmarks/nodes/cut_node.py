@@ -59,7 +59,6 @@ def cut(publisher, arrivals, number, silent, pause):
 
 
 def main():
-    """Cut this number of times."""
     arrivals, writer = os.pipe()
     end, alive = os.pipe()
     if not os.fork():

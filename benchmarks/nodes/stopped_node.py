@@ -48,7 +48,6 @@ def measure(publisher, message, arrivals, patience=LIMIT):
 
 
 def main():
-    """Measure both paths in turns."""
     arrivals, writer = os.pipe()
     end, alive = os.pipe()
     if not os.fork():

@@ -104,7 +104,6 @@ class Show:
         return all(result.good for result in self.results)
 
     def introduce(self) -> None:
-        """Print what the demonstration shows."""
         self.console.print(
             "ROS 1 trusts everyone who reaches its master. Here the appliance protects a robot and decides every call\n"
             "by a policy. The demo creates four hosts as network namespaces here: the appliance, the robot,\n"
@@ -114,7 +113,6 @@ class Show:
         )
 
     def open(self) -> None:
-        """Start the appliance, then the robot."""
         self.headline("The appliance takes the place of the ROS master")
         ready = self.stage.start_appliance()
         self.say(f"nodes may connect: ROS_MASTER_URI={ready['master']}  (the real one is hidden)")
@@ -157,7 +155,6 @@ class Show:
                 self.decided("allowed", f"{record.get('category')} {topic} by {caller}", rule_of(record))
 
     def expect_allowed(self, attempt: Attack) -> None:
-        """Report an attempt that the policy allows."""
         outcome = "allowed" if attempt.succeeded else "DENIED"
         self.decided(outcome, f"{attempt.name}: {attempt.tried}", attempt.answer)
         self.results.append(Result(attempt.name, attempt.succeeded, "granted by the policy"))
@@ -227,11 +224,9 @@ class Show:
             self.console.print(f"  [bold red]NOT OK[/] {escape(result.what)}: {escape(result.remark)}")
 
     def headline(self, text: str) -> None:
-        """Begin an act."""
         self.console.print(f"\n[bold]{escape(text)}[/]", soft_wrap=True)
 
     def say(self, text: str) -> None:
-        """Print a line of an act."""
         self.console.print(f"  {escape(text)}", highlight=False, soft_wrap=True)
 
     def decided(self, outcome: str, what: str, why: str) -> None:

@@ -34,7 +34,6 @@ class Doorway:
         self._thread.start()
 
     def close(self) -> None:
-        """Close the port and all its connections."""
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)  # wakes `accept`
         self._listener.close()

@@ -128,7 +128,6 @@ class Simulation:
         self._monitors.start(START)
 
     def run(self, mission: Sequence[Part] = MISSION) -> Drive:
-        """Run the whole mission."""
         ticks, began = 0, self._now
         for part in mission:
             count = round(part.seconds * 10**9 / STEP)
@@ -233,7 +232,6 @@ def record(drive: Drive, path: Path) -> None:
 
 
 def main() -> None:
-    """Simulate, record, draw."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--bag", type=Path, metavar="FILE", help="record the drive without monitors")
     parser.add_argument("--svg", type=Path, metavar="FILE", help="draw the drive without and with monitors")

@@ -107,7 +107,6 @@ class Actor:
         return self.expect(event, seconds)
 
     def interrupt(self) -> None:
-        """Ask the process to end."""
         if self.running:
             self.process.send_signal(signal.SIGTERM)
 
@@ -304,7 +303,6 @@ class Stage:
         return plug
 
     def attack(self, name: str) -> Attack:
-        """Have the attacker try one attack."""
         attacker = self._start(
             self.attacker_host, "attacker", [NODE_PYTHON, str(self.nodes / "attacker.py"), name]
         )

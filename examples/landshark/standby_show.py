@@ -166,7 +166,6 @@ class StandbyShow:
         self.result("the logs prove the takeover", True, said.strip().splitlines()[-1])
 
     def result(self, what: str, good: bool, remark: str) -> None:
-        """Print and keep a result."""
         self.results.append(Result(what, good, remark))
         colour = "green" if good else "bold red"
         self.console.print(
@@ -176,9 +175,7 @@ class StandbyShow:
         )
 
     def headline(self, text: str) -> None:
-        """Begin an act."""
         self.console.print(f"\n[bold]{escape(text)}[/]", soft_wrap=True)
 
     def say(self, text: str) -> None:
-        """Print a line of an act."""
         self.console.print(f"  {escape(text)}", highlight=False, soft_wrap=True)

@@ -13,7 +13,6 @@ from examples.landshark.picture import draw_ways
 
 
 def main() -> None:
-    """Read and draw."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("ways", type=Path)
     parser.add_argument("svg", type=Path)

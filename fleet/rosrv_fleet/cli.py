@@ -70,7 +70,6 @@ def main() -> None:
 
 
 def reason_of(error: BaseException) -> str:
-    """Return what failed, where and what to do."""
     if not isinstance(error, OSError) or error.strerror is None or isinstance(error, ssl.SSLError):
         return str(error).strip()
     where = f"{error.filename}: " if error.filename else ""

@@ -170,7 +170,6 @@ class ClientConnections:
         return True
 
     def closed(self, number: int) -> None:
-        """Note that a descriptor is closed."""
         connection = self._open.pop(number, None)
         if connection is not None:
             if connection.due is not None:

@@ -46,7 +46,6 @@ class IndexDatabase:
         self._pool.open(wait=False)
 
     def close(self) -> None:
-        """Close all connections."""
         self._pool.close()
 
     @contextmanager

@@ -20,7 +20,6 @@ _ROLLOUT_STATES = ("running", "stopped", "reverted", "done")
 
 
 def health_router(collector: Collector) -> APIRouter:
-    """Return the routes of health and metrics."""
     router = APIRouter()
     viewer = [Depends(holder_of(collector.tokens, FleetRole.VIEWER))]
 

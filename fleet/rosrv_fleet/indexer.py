@@ -77,7 +77,6 @@ class Indexer:
         return bool(self._store.marked("damaged", robot, 1))
 
     def wake(self) -> None:
-        """Note that a segment waits."""
         for waking in self._wake.values():
             waking.set()
 

@@ -79,7 +79,6 @@ class Invitations:
                     self._remove(name)
 
     def _remove(self, name: str, appliance: str | None = None) -> None:
-        """Remove the invitations of a robot or of one of its appliances, and expired ones."""
         for file in self._folder.glob("*.json"):
             pending = _read(file)
             its = pending is not None and pending.name == name and appliance in (None, pending.appliance)

@@ -25,7 +25,6 @@ _log = structlog.get_logger()
 
 
 def join_router(collector: Collector) -> APIRouter:
-    """Return the route of robots that join."""
     router = APIRouter()
     invitations = Invitations(collector.config.data / "invitations")
     wrong = _WrongTokens()
@@ -85,5 +84,4 @@ class _WrongTokens:
             raise HTTPException(429, "too many wrong invitations were sent", {"Retry-After": "60"})
 
     def add(self, address: str) -> None:
-        """Count a wrong token."""
         self._sent.append((clock.now(), address))

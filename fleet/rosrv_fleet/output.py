@@ -17,7 +17,6 @@ def say(line: str) -> None:
 
 
 def say_json(fields: dict[str, Any]) -> None:
-    """Write one object on one line."""
     typer.echo(json.dumps(fields))
 
 

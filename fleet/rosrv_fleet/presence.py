@@ -24,7 +24,6 @@ class RobotPresence:
         """The time since which this process could hear robots."""
 
     def heard(self, robot: str, appliance: str) -> None:
-        """Note that an appliance was heard now."""
         now = clock.wall_ns()
         self._heard[robot, appliance] = now / _SECOND
         # On a full disk the time stays in memory; health reports the disk.

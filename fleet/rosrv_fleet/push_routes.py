@@ -33,7 +33,6 @@ SegmentName = Annotated[str, PathParameter(pattern="^[0-9a-f]{64}$")]
 
 
 def push_router(collector: Collector) -> APIRouter:
-    """Return the routes of robots."""
     router = APIRouter(prefix="/v1/logs/{log}")
     uploads = _Uploads(collector)
     RobotCaller = Annotated[Robot, Depends(robot_of(collector.robots))]  # noqa: N806  a type

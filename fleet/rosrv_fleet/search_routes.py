@@ -34,7 +34,6 @@ def filter_asked(**words: Any) -> Filter:
 
 
 def search_router(collector: Collector) -> APIRouter:
-    """Return the route of searches."""
     router = APIRouter()
     Viewer = Annotated[OperatorToken, Depends(holder_of(collector.tokens, FleetRole.VIEWER))]  # noqa: N806  a type
 

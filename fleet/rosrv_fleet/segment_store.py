@@ -82,7 +82,6 @@ class RemovalNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     @property
     def number(self) -> int:
-        """Return the last removed number."""
         return self.ends[0].end.number
 
 
@@ -234,7 +233,6 @@ class SegmentStore:
                 sync(folder.parent)
 
     def _mark(self, place: SegmentPlace, header: SegmentHeader, waiting: str) -> None:
-        """Write the markers that the segment needs, on the disk."""
         if not self._follows_a_stored_one(place, header):
             self._touch("gaps", place)
         others = self.numbered(place.robot, place.log, place.number)
@@ -293,11 +291,9 @@ class SegmentStore:
         return None
 
     def logs(self, robot: str) -> list[str]:
-        """Return the logs of which a robot has segments."""
         return [one.name for one in _folders(self._folder / "segments" / robot) if _LOG.fullmatch(one.name)]
 
     def segments(self, robot: str, log: str) -> Iterator[SegmentPlace]:
-        """Yield the stored segments of a log, by number."""
         for bucket in _folders(self._folder / "segments" / robot / log):
             yield from _in_bucket(robot, log, bucket)
 
@@ -318,7 +314,6 @@ class SegmentStore:
         return found
 
     def robots_with(self, kind: str) -> list[str]:
-        """Return the robots with markers of a kind."""
         return sorted(os.listdir(self._folder / kind))  # noqa: PTH208  names, not paths
 
     def waiting(self, most: int) -> int:

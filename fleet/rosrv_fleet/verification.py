@@ -40,7 +40,6 @@ class LogProof(msgspec.Struct, kw_only=True):
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is missing or wrong."""
         return not self.findings
 
 

@@ -106,14 +106,12 @@ class OwnedTasks:
         return len(self._tasks)
 
     def start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Start a task."""
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
 
     def own_current(self) -> None:
-        """Own the task that calls this."""
         task = asyncio.current_task()
         if task is not None:
             self._tasks.add(task)

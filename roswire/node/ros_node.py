@@ -72,7 +72,6 @@ class RosNode:
 
     @property
     def uri(self) -> str:
-        """Return the URI of the node API."""
         return self._uri
 
     @property

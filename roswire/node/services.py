@@ -105,7 +105,6 @@ class ServiceServer:
     async def serve(
         self, reader: asyncio.StreamReader, writer: ByteWriter, header: Mapping[str, str]
     ) -> None:
-        """Serve one client, from its header on."""
         if header.get("md5sum") not in (ANY, self.type.md5sum):
             refuse(writer, f"{self.name} has the type {self.type.name} with the md5sum {self.type.md5sum}")
             return

@@ -84,7 +84,6 @@ class NodeSubscription:
             self._received(body, header)
 
     async def close(self) -> None:
-        """End all connections."""
         self._followed.clear()
         await self._tasks.close()
 
@@ -119,7 +118,6 @@ class NodeSubscription:
 
     @contextlib.asynccontextmanager
     async def _connection_to(self, uri: str) -> AsyncIterator[tuple[asyncio.StreamReader, Mapping[str, str]]]:
-        """Yield a connection, and the header of the publisher."""
         host, port = await self._request_topic(uri)
         limits = self._link.limits
         async with asyncio.timeout(limits.call_seconds):
@@ -286,7 +284,6 @@ class NodePublication:
             writer.close()
 
     async def close(self) -> None:
-        """Send nothing more."""
         await self._tasks.close()
 
 
@@ -312,7 +309,6 @@ class _SendQueue:
         return dropped
 
     def clear(self) -> None:
-        """Drop all frames."""
         self.frames.clear()
         self._bytes = 0
 

@@ -39,7 +39,6 @@ FAILURES = (OSError, http.client.HTTPException, xmlrpc.client.Error)
 
 class _Transport(xmlrpc.client.Transport):
     def make_connection(self, host):
-        """Return a connection with a time limit."""
         connection = super().make_connection(host)
         connection.timeout = LIMIT
         return connection
@@ -240,7 +239,6 @@ def wipe_the_parameters():
 
 
 def stop_the_master():
-    """Shut down the master itself."""
     answer = call(MASTER, "shutdown", ME, "goodbye")
     return granted(answer), "shutdown() of the master (shutdownMaster)", answer
 
@@ -262,7 +260,6 @@ ATTACKS = {
 
 
 def main():
-    """Try the named attacks, or all."""
     unknown = [name for name in sys.argv[1:] if name not in ATTACKS]
     if unknown:
         sys.exit(f"attacker.py: no attack {unknown[0]!r}; there are: {', '.join(ATTACKS)}")

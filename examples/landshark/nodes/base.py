@@ -28,7 +28,6 @@ class Base:
         rospy.Subscriber("/landshark_control/base_velocity", TwistStamped, self.command)
 
     def command(self, message):
-        """Store the commanded velocity."""
         with self.lock:
             self.velocity = physics.possible(
                 physics.Velocity(message.twist.linear.x, message.twist.angular.z)

@@ -155,7 +155,6 @@ def fire():
 
 
 def main():
-    """Carry out one command."""
     what, *values = rospy.myargv()[1:] or ["nothing"]
     actions = {
         "drive": (drive, 3),

@@ -21,12 +21,10 @@ class Reached(rospy.SubscribeListener):
         self.somebody = threading.Event()
 
     def peer_subscribe(self, *_):
-        """Record that a driver has connected."""
         self.somebody.set()
 
 
 def main():
-    """Publish, report and end."""
     rospy.init_node(sys.argv[1], disable_signals=True)
     reached = Reached()
     gun = rospy.Publisher("/landshark_control/trigger", PaintballTrigger, reached, queue_size=10)

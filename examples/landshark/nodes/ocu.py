@@ -68,14 +68,12 @@ class Operator:
         self.velocity.publish(message)
 
     def aim(self, pan, tilt):
-        """Turn the gun."""
         message = JointState()
         message.header.stamp = rospy.Time.now()
         message.name, message.position = ["turret_pan", "turret_tilt"], [pan, tilt]
         self.turret.publish(message)
 
     def fire(self):
-        """Fire one shot."""
         message = PaintballTrigger(trigger=PaintballTrigger.SINGLE_SHOT)
         message.header.stamp = rospy.Time.now()
         self.trigger.publish(message)

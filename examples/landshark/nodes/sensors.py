@@ -23,7 +23,6 @@ class Gps:
     topic, kind = "/landshark/gps", NavSatFix
 
     def measure(self, odometry):
-        """Return one position."""
         message = NavSatFix()
         message.header.stamp, message.header.frame_id = odometry.header.stamp, "gps"
         message.status.status, message.status.service = NavSatStatus.STATUS_FIX, NavSatStatus.SERVICE_GPS
@@ -37,7 +36,6 @@ class Laser:
     topic, kind = "/landshark/scan", LaserScan
 
     def measure(self, odometry):
-        """Return one sweep."""
         step = FIELD_OF_VIEW / (BEAMS - 1)
         directions = [-FIELD_OF_VIEW / 2 + step * beam for beam in range(BEAMS)]
         message = LaserScan()
@@ -58,7 +56,6 @@ class Battery:
         self.last = None
 
     def measure(self, odometry):
-        """Return one reading."""
         now = odometry.header.stamp
         seconds = (now - self.last).to_sec() if self.last else 0.0
         self.last = now

@@ -43,7 +43,6 @@ class TurretDriver:
             )
 
     def fire(self, message):
-        """Shoot."""
         shots = SHOTS.get(message.trigger, 0)
         with self.lock:
             self.fired += shots

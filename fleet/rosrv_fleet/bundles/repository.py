@@ -192,11 +192,9 @@ class BundleRepository:
     # --- queries ---
 
     def roles(self) -> list[str]:
-        """Return the delegated roles."""
         return sorted(self._delegated(self._open("targets", Targets)))
 
     def bundles(self) -> Iterator[tuple[BundlePath, TargetFile]]:
-        """Yield the signed bundles."""
         for role in self.roles():
             for name, target in self._open(role, Targets).targets.items():
                 yield BundlePath.parse(name), target
@@ -229,7 +227,6 @@ class BundleRepository:
     def _save(
         self, role: str, signed: Root | Targets | Snapshot, keyids: Iterable[str] | None = None
     ) -> Path:
-        """Sign the next version of a role and write it."""
         signed.version = 1 + self._newest(role)
         signed.expires = self.now() + datetime.timedelta(days=self._days(role))
         document: Metadata[Any] = Metadata(signed)

@@ -95,7 +95,6 @@ class OwnGroups:
 
 
 def robot_routes(service: BundleService, identify: Identify) -> APIRouter:
-    """Return the routes for robots."""
     router = APIRouter(tags=["bundles"])
     caller = Annotated[Robot, Depends(identify)]
     groups = OwnGroups()

@@ -63,7 +63,6 @@ def text(value: object) -> str:
 
 
 def alert(reason: str) -> str:
-    """Return a paragraph with a problem."""
     return f'<p class="alert">{text(reason)}</p>'
 
 
@@ -119,7 +118,6 @@ def field(name: str, value: str) -> str:
 
 
 def ago(seconds: float) -> str:
-    """Return how long ago something was."""
     for unit, size in (("d", 86_400), ("h", 3600), ("min", 60)):
         if seconds >= 2 * size:
             return f"{seconds / size:.0f} {unit} ago"

@@ -52,7 +52,6 @@ class RobotRow(NamedTuple):
 
     @property
     def log(self) -> list[str]:
-        """Return the words about its log."""
         found = (
             ("fork", self.state.forks),
             ("gap", self.state.gaps),
@@ -64,7 +63,6 @@ class RobotRow(NamedTuple):
 
     @property
     def words(self) -> set[str]:
-        """Return all words about it."""
         return {*self.log, *(() if self.condition is None else (self.condition.kind.value,))}
 
     @property
@@ -90,7 +88,6 @@ def robot_rows(collector: Collector, health: FleetHealth) -> list[RobotRow]:
 
 
 def _bundles(service: BundleService) -> dict[str, tuple[RobotCondition, str]]:
-    """Return the condition of each robot of a group, and its bundle in force."""
     return {
         name: (condition, robots[name].in_force)
         for group, robots in service.robots.items()
@@ -165,7 +162,6 @@ def _page_of(shown: Sequence[RobotRow], asked: Mapping[str, str]) -> str:
 
 
 def robot_row(one: RobotRow) -> str:
-    """Return a robot's row."""
     state, condition = one.state, one.condition
     site, _, group = one.group.partition("/")
     return row(

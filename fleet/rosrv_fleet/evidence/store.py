@@ -106,7 +106,6 @@ class EvidenceStore:
         return about
 
     def path(self, evidence: str) -> Path:
-        """Return the file of a bundle."""
         return self._folder / evidence / BUNDLE
 
     def get(self, evidence: str) -> StoredEvidence | None:

@@ -95,7 +95,6 @@ class BundleRollout(msgspec.Struct, frozen=True):
 
     @property
     def bundle(self) -> BundlePath:
-        """Return the parsed path."""
         return BundlePath.parse(self.path)
 
 

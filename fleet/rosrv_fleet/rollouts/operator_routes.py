@@ -47,7 +47,6 @@ class NewRollout(BaseModel):
 
 
 def operator_routes(service: BundleService, may_read: Authorize, may_change: Authorize) -> APIRouter:
-    """Return the routes for operators."""
     router = APIRouter(prefix="/v1/rollouts", tags=["rollouts"])
     reader = Annotated[str, Depends(may_read)]
     changer = Annotated[str, Depends(may_change)]

@@ -164,7 +164,6 @@ class BundleService:
         return listener
 
     def unlisten(self, listener: SelectionListener) -> None:
-        """Remove a listener."""
         self.listeners.discard(listener)
 
     def end_streams(self) -> None:
@@ -245,7 +244,6 @@ class BundleService:
     def _by(
         self, changed: BundleRollout, before: BundleRollout, who: str, act: Literal["stop", "revert"]
     ) -> BundleRollout:
-        """Return a changed rollout with the operator's act."""
         if changed == before:
             return before
         return msgspec.structs.replace(changed, acts=[*before.acts, OperatorAct(self._clock(), who, act)])
@@ -354,7 +352,6 @@ class BundleService:
 def _by_group(
     members: Mapping[str, RobotGroup], reports: Mapping[str, StoredReport]
 ) -> dict[RobotGroup, dict[str, RobotSeen]]:
-    """Return the robots of each group; a report from another group is not one of this group."""
     found: dict[RobotGroup, dict[str, RobotSeen]] = {}
     for name, group in sorted(members.items()):
         report = reports.get(name, StoredReport(group, RobotSeen()))

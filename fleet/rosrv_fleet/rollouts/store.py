@@ -48,7 +48,6 @@ class RolloutStore:
     # --- robots ---
 
     def save_report(self, name: str, group: RobotGroup, seen: RobotSeen) -> None:
-        """Store a robot's last report."""
         query = """
             INSERT INTO bundle_robot (name, site, robot_group, report) VALUES (%s, %s, %s, %s)
             ON CONFLICT (name) DO UPDATE SET site = excluded.site, robot_group = excluded.robot_group,
