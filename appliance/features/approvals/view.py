@@ -36,7 +36,10 @@ def _alarms(state: ApprovalCounts) -> Iterator[Trouble]:
 
 def _line(state: ApprovalCounts) -> tuple[str, str]:
     calls = "call waits" if state.waiting == 1 else "calls wait"
-    return "approvals", f"{state.waiting} {calls}, {state.leases} {'lease' if state.leases == 1 else 'leases'}"
+    return (
+        "approvals",
+        f"{state.waiting} {calls}, {state.leases} {'lease' if state.leases == 1 else 'leases'}",
+    )
 
 
 APPROVALS_VIEW = FeatureView(
