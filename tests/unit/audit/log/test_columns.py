@@ -4,7 +4,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from appliance.audit.log.columns import LARGEST_DETAIL, LONGEST_TEXT, from_columns, to_columns
+from appliance.audit.log.columns import LARGEST_DETAIL, LONGEST_TEXT, from_columns, plain_record, to_columns
 from appliance.audit.log.record import AuditRecord, RuleReference, Severity
 
 
@@ -101,3 +101,13 @@ def test_small_details_survive_large_ones() -> None:
     assert (kept["sha256"], kept["revision"]) == ("a" * 64, 7)
     assert "monitors" in kept["keys"]
     assert kept["cut"] == "the details were too large to keep"
+
+
+def test_long_collections_say_how_many_parts_are_left_out() -> None:
+    numbers = list(range(258))
+    detail = {"list": numbers, "map": {str(number): number for number in numbers}}
+    shown = plain_record(make(detail=detail)).detail
+    assert shown["list"] == [*numbers[:256], "... 2 more"]
+    assert list(shown["map"].items())[-2:] == [("255", 255), ("...", "2 more")]
+    short = {"list": numbers[:256], "map": {"a": 1}}
+    assert plain_record(make(detail=short)).detail == short

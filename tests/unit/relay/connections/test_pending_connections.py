@@ -78,3 +78,12 @@ def test_a_host_at_its_quota_of_long_headers_ends_no_other() -> None:
     for peer in peers:
         world.room.leave(peer)
     assert world.held.total == 0
+
+
+def test_a_connection_with_a_short_header_gives_no_memory_back() -> None:
+    world = World()
+    long, short = world.guest("robot"), world.guest("robot")
+    world.room.hold(long, 64 << 10)
+    before = world.held.total
+    world.room.leave(short)
+    assert world.held.total == before
