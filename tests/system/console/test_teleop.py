@@ -41,6 +41,19 @@ PNG = bytes.fromhex(
     "89504e470d0a1a0a0000000d49484452000000030000000208020000001216f14d0000001049444154789c63f8cfc000410c"
     "70160041d205fb87f0b9480000000049454e44ae426082"
 )
+# What the page finds in the heads of pictures of 123 x 77 pixels, and says about one of 30,000 x 30,000.
+HEADS = """async () => {
+    const { decoded, sizeOf } = await import("/console/static/features/doors/teleop/pixels.js");
+    const canvas = Object.assign(document.createElement("canvas"), { width: 123, height: 77 });
+    const found = [];
+    for (const type of ["image/png", "image/jpeg", "image/webp"]) {
+        const blob = await new Promise((done) => canvas.toBlob(done, type));
+        found.push(sizeOf(new Uint8Array(await blob.arrayBuffer()), type));
+    }
+    const large = [0x89, 0x50, 0x4e, 0x47, ...Array(12).fill(0), 0, 0, 0x75, 0x30, 0, 0, 0x75, 0x30];
+    try { await decoded({ data: btoa(String.fromCharCode(...large)) }) } catch (error) { found.push(error.message) }
+    return found;
+}"""
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +88,9 @@ def test_a_person_sees_and_drives_the_robot_through_their_own_door(
         own.get_by_role("button", name="Open").click()
         expect(own.get_by_role("img", name="Picture of /camera/compressed")).to_have_attribute("width", "3")
         assert time.monotonic() - began < SECONDS_TO_A_PICTURE
+        *sizes, said = page.evaluate(HEADS)
+        assert sizes == [[123, 77]] * 3
+        assert re.search("30000 . 30000 is not shown", said), "before it is decoded"
         own.get_by_label("Topic").select_option("/battery")
         expect(own.get_by_role("img", name="data of /battery: 12.5")).to_be_visible()
         assert console.axe() == []

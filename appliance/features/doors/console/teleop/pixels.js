@@ -16,14 +16,42 @@ export function decoded(message) {
   if (message.encoding !== undefined) return createImageBitmap(pixels(message, bytes));
   const [, type] = MAGIC.find(([magic]) => magic.every((byte, at) => bytes[at] === byte)) ?? [];
   if (!type) throw new Error(`The format ${message.format || "without a name"} is not JPEG, PNG or WebP.`);
+  require(...sizeOf(bytes, type)); // before it is decoded: some kilobytes may be gigapixels
   return createImageBitmap(new Blob([bytes], { type }));
+}
+
+/** Throw unless an image of this size is shown. @param {number} width @param {number} height */
+function require(width, height) {
+  if (!width || !height || width * height > MOST_PIXELS) throw new Error(`An image of ${width} × ${height} is not shown; the limit is ${MOST_PIXELS / 1e6} million pixels.`);
+}
+
+/** The size of a compressed picture, by its head; zeros if it has none. @param {Uint8Array<ArrayBuffer>} bytes @param {string} type @returns {[number, number]} */
+export function sizeOf(bytes, type) {
+  const view = new DataView(bytes.buffer);
+  if (type === "image/png") return bytes.length < 24 ? [0, 0] : [view.getUint32(16), view.getUint32(20)];
+  if (type === "image/webp") return bytes.length < 31 ? [0, 0] : sizeOfWebp(view);
+  for (let at = 2; at + 9 <= bytes.length && bytes[at] === 0xff; ) {
+    const marker = bytes[at + 1];
+    if (marker === 0xff) at += 1; // a filler
+    else if (marker >= 0xc0 && marker <= 0xcf && ![0xc4, 0xc8, 0xcc].includes(marker)) return [view.getUint16(at + 7), view.getUint16(at + 5)];
+    else at += 2 + view.getUint16(at + 2);
+  }
+  return [0, 0];
+}
+
+function sizeOfWebp(/** @type {DataView} */ view) {
+  const kind = view.getUint8(15);
+  const bits = view.getUint32(kind === 0x4c ? 21 : 26, true);
+  if (kind === 0x4c) return /** @type {[number, number]} */ ([(bits & 0x3fff) + 1, ((bits >> 14) & 0x3fff) + 1]); // VP8L
+  if (kind === 0x20) return /** @type {[number, number]} */ ([bits & 0x3fff, (bits >> 16) & 0x3fff]); // VP8
+  return /** @type {[number, number]} */ ([(view.getUint32(24, true) & 0xffffff) + 1, (view.getUint32(27, true) & 0xffffff) + 1]); // VP8X
 }
 
 /** The pixels of an `Image`. Throws. @param {any} message @param {Uint8Array<ArrayBuffer>} bytes */
 export function pixels({ width, height, step, encoding, is_bigendian }, bytes) {
   const size = COLOURS[encoding]?.[0] ?? DEPTHS[encoding]?.[0];
   if (!size) throw new Error(`The encoding ${encoding || "without a name"} is not shown.`);
-  if (!width || !height || width * height > MOST_PIXELS) throw new Error(`An image of ${width} × ${height} is not shown; the limit is ${MOST_PIXELS / 1e6} million pixels.`);
+  require(width, height);
   if (step < width * size || bytes.length < step * height) throw new Error(`An image of ${width} × ${height} in ${encoding} has more than ${bytes.length} bytes.`);
   const image = new ImageData(width, height);
   if (COLOURS[encoding]) colours(image, bytes, step, COLOURS[encoding]);
