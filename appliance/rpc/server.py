@@ -119,6 +119,8 @@ class HttpServer:
     troubled: Callable[[Peer, str], None] = lambda peer, reason: None  # noqa: ARG005 - same
     malformed: Callable[[Peer, str], None] = lambda peer, reason: None  # noqa: ARG005 - same
     connections: "set[_Connection]" = field(default_factory=set, init=False)
+    buffer: bytearray = field(default_factory=lambda: bytearray(_READ_AT_ONCE), init=False)
+    """The buffer of all connections: the event loop fills it and calls `buffer_updated` in one step."""
     _acceptors: list[Acceptor] = field(default_factory=list, init=False)
     _queues: SourceQueues | None = field(default=None, init=False)
     _opening: set[asyncio.Task[None]] = field(default_factory=set, init=False)
@@ -234,11 +236,10 @@ class _Connection(Front, asyncio.BufferedProtocol):
         self.leave()
 
     def get_buffer(self, _size: int) -> bytearray:
-        self._buffer = bytearray(_READ_AT_ONCE)
-        return self._buffer
+        return self.server.buffer
 
     def buffer_updated(self, size: int) -> None:
-        data = bytes(memoryview(self._buffer)[:size])
+        data = bytes(memoryview(self.server.buffer)[:size])
         if self._unparsed:
             self._unparsed += data
             self.transport.pause_reading()

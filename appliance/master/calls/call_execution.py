@@ -126,12 +126,13 @@ class Execution:
                 outcome = self._settled(attempt)
             return await self._carry_out(visit, attempt, outcome)
 
-    async def answer_run(self, visit: ServedRequest, run: Sequence[Attempt]) -> list[Value]:
+    async def answer_run(self, visit: ServedRequest, run: Sequence[Attempt], weight: int) -> list[Value]:
         """Decide reads and writes of parameters one by one, and carry them out as if in order.
 
+        `weight` is the approximate number of bytes of the answers to reads.
         No call of the run reads a parameter that an earlier call of the run writes. So all reads are carried out first.
         """
-        if sum(map(self.parameters.weight_of_answer, run)) >= self.large:
+        if weight >= self.large:
             await visit.bulk.take()
         looks = [self._settled(attempt) for attempt in run]
         writing = [

@@ -50,7 +50,7 @@ class Multicall:
         while left and not (why := await self._why_no_more(visit, room)):
             if _in_run(visit, left[0]):
                 run = await self._run(visit, left, room)
-                answers = run.answered(await self.execution.answer_run(visit, run.attempts))
+                answers = run.answered(await self.execution.answer_run(visit, run.attempts, run.weight))
             else:
                 answers = [await self._one(visit, left.popleft())]
             room -= await self._weigh(visit, answers)
@@ -69,20 +69,19 @@ class Multicall:
 
     async def _run(self, visit: ServedRequest, left: "_Parts", room: int) -> "_Run":
         """Parse the next parts of a run, and remove them from `left`."""
-        run = _Run()
-        weight, most = 0, min(room, self.offload)
-        while left and len(run.answers) < run.longest and weight < most and _in_run(visit, left[0]):
+        run, most = _Run(), min(room, self.offload)
+        while left and len(run.answers) < run.longest and run.weight < most and _in_run(visit, left[0]):
             attempt = await self._understand(visit, left[0])
             if isinstance(attempt, Attempt):
                 if attempt.call.verb is CallVerb.WRITE:
                     run.written.append(attempt.resource)
-                elif touch([attempt.resource], run.written):
+                elif run.written and touch([attempt.resource], run.written):
                     left[0] = attempt
                     break
                 else:
                     run.reads = True
                 run.attempts.append(attempt)
-                weight += self.parameters.weight_of_answer(attempt)
+                run.weight += self.parameters.weight_of_answer(attempt)
             left.popleft()
             run.answers.append(None if isinstance(attempt, Attempt) else attempt)
         return run
@@ -128,12 +127,16 @@ class Multicall:
 
 @dataclass(slots=True)
 class _Run:
-    """Parts that are carried out together, and their answers. None stands for an attempt without an answer yet."""
+    """Parts that are carried out together, and their answers. None stands for an attempt without an answer yet.
+
+    `weight` is the approximate number of bytes of the answers to reads.
+    """
 
     answers: list[Value] = field(default_factory=list)
     attempts: list[Attempt] = field(default_factory=list)
     written: list[str] = field(default_factory=list)
     reads: bool = False
+    weight: int = 0
 
     @property
     def longest(self) -> int:
