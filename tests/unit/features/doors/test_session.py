@@ -97,8 +97,8 @@ async def test_a_will_is_published_within_seconds_after_the_network_is_cut() -> 
         assert heard == [string("stop")]
 
 
-async def test_what_a_door_keeps_of_its_clients_is_bounded() -> None:
-    """Wills, and arguments of calls; of each the bytes, and not its whole frame."""
+async def test_wills_and_arguments_of_waiting_calls_are_bounded() -> None:
+    """Each counts with its bytes, not with its whole frame."""
     async with door_world() as world:
         robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
         slow = ServiceType.defined(standard_definitions(), "roscpp/SetLoggerLevel")
