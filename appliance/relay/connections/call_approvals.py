@@ -2,7 +2,8 @@
 
 Invariants:
 - A request reaches the monitors and the service only after control has approved it.
-- A client waits for at most one answer, so the number of open questions is that of clients.
+- A client waits for at most one answer, so the number of open questions is that of clients. Control gets at most
+  `MOST_OF_HOST` of a host at once, because it answers other hosts in the same thread.
 - If control ends first, all open requests are refused.
 """
 
@@ -13,6 +14,7 @@ from appliance.channel.messages import ApprovalAnswered, ApprovalWanted, Message
 from appliance.relay.loop import EventLoop
 
 AWAY = "the appliance's control is not running: this call had no effect"
+MOST_OF_HOST = 2
 _SHOWN = 4096
 
 Answered = Callable[[str], None]
@@ -26,30 +28,62 @@ class CallApprovals:
         self._loop = loop
         self._send = send
         self._connected = False
-        self._open: dict[int, Answered] = {}
+        self._open: dict[int, tuple[str, Answered]] = {}  # by number: the host, and who waits
+        self._sent: dict[str, set[int]] = {}  # by host
+        self._unsent: dict[str, dict[int, ApprovalWanted]] = {}  # by host, the oldest first
         self._number = 0
 
-    def ask(self, caller: tuple[str, str, str], type_: str, body: bytes, answered: Answered) -> None:
-        """Ask control about a request. `caller` is the service, the host and the name of the client.
+    def ask(self, caller: tuple[str, str, str], type_: str, body: bytes, answered: Answered) -> int:
+        """Ask control about a request; return its number. `caller` is the service, the host and the name of the client.
 
-        `answered` is called once, in a later turn of the loop.
+        `answered` is called once, in a later turn of the loop, unless the request is forgotten.
         """
         self._number += 1
-        number, digest = self._number, hashlib.sha256(body).hexdigest()
-        self._open[number] = answered
+        number, host, digest = self._number, caller[1], hashlib.sha256(body).hexdigest()
+        self._open[number] = host, answered
         if self._connected:
-            self._send(ApprovalWanted(number, *caller, type_, digest, body[:_SHOWN]))
+            wanted = ApprovalWanted(number, *caller, type_, digest, body[:_SHOWN])
+            self._unsent.setdefault(host, {})[number] = wanted
+            self._send_next(host)
         else:
             self._loop.after(0, lambda: self.answered(ApprovalAnswered(number, AWAY)))
+        return number
+
+    def forget(self, number: int) -> None:
+        """Forget a request whose client has ended: control is not asked about it."""
+        if number not in self._open:
+            return
+        host, _answered = self._open[number]
+        if number in self._sent.get(host, ()):
+            self._open[number] = host, lambda _refused: None
+        else:
+            del self._open[number]
+            self._unsent.get(host, {}).pop(number, None)
 
     def answered(self, answer: ApprovalAnswered) -> None:
         """Give control's answer to the client that waits for it."""
-        waiting = self._open.pop(answer.number, None)
-        if waiting is not None:
-            waiting(answer.refused)
+        host, waiting = self._open.pop(answer.number, ("", None))
+        if waiting is None:
+            return
+        self._sent.get(host, set()).discard(answer.number)
+        self._send_next(host)
+        waiting(answer.refused)
 
     def attach(self, connected: bool) -> None:
         """Refuse all requests that wait for a control that has gone."""
         self._connected = connected
+        self._sent.clear()
+        self._unsent.clear()
         for number in list(self._open):
             self.answered(ApprovalAnswered(number, AWAY))
+
+    def _send_next(self, host: str) -> None:
+        sent, unsent = self._sent.setdefault(host, set()), self._unsent.setdefault(host, {})
+        while unsent and len(sent) < MOST_OF_HOST:
+            number = next(iter(unsent))
+            sent.add(number)
+            self._send(unsent.pop(number))
+        if not unsent:
+            del self._unsent[host]
+        if not sent:
+            del self._sent[host]

@@ -97,6 +97,7 @@ class ServiceClient:
         self._own = own
         self._approvals = approvals
         self._asks = asks
+        self._question = 0  # the last one to control
         self._number = 0
         self._live = True
         memory = context.memory
@@ -244,7 +245,7 @@ class ServiceClient:
         if not self._asks():
             return False
         caller = self.service.service, self.host, self.caller_id
-        self._approvals.ask(caller, self._header.get("type", ""), body, self._approved)
+        self._question = self._approvals.ask(caller, self._header.get("type", ""), body, self._approved)
         return True
 
     def _approved(self, refused: str) -> None:
@@ -325,6 +326,7 @@ class ServiceClient:
 
     def _release(self) -> None:
         self._live = False
+        self._approvals.forget(self._question)
         if self._timer is not None:
             self._timer.cancel()
         if self._server is not None:

@@ -31,6 +31,10 @@ class Relay:
     def after(self, _seconds: float, work: Any) -> None:
         self.later.append(work)
 
+    def question(self, host: str, body: bytes = b"") -> int:
+        """Ask about a request of a client on its own."""
+        return self.approvals.ask(("/home", host, "/it"), "std_srvs/SetBool", body, lambda _refused: None)
+
     def ask(self, body: bytes) -> bool:
         if self.asks:
             self.approvals.ask(("/home", "10.0.0.7", "/it"), "std_srvs/SetBool", body, self.exchange.settle)
@@ -95,3 +99,21 @@ def test_a_client_that_asks_no_longer_is_not_held() -> None:
     relay.asks = True
     relay.request(b"\x01")
     assert relay.service == encode_frame(b"\x01") and len(relay.asked) == 1
+
+
+def test_control_gets_few_questions_of_a_host_at_once() -> None:
+    """A flood of one host does not delay another; nobody asks for a client that has ended meanwhile."""
+    relay = Relay()
+    numbers = [relay.question("10.0.0.66") for _ in range(1000)]
+    other = relay.question("10.0.0.7")
+    assert [one.number for one in relay.asked] == [*numbers[:2], other]
+    for number in numbers[1:-1]:  # one of them is with control
+        relay.approvals.forget(number)
+    for number in (other, *numbers[:2]):
+        relay.approvals.answered(ApprovalAnswered(number, ""))
+    assert [one.number for one in relay.asked[3:]] == [numbers[-1]]
+    relay.approvals.attach(False)
+    relay.approvals.attach(True)
+    fresh = [relay.question("10.0.0.66") for _ in range(3)]
+    relay.approvals.answered(ApprovalAnswered(numbers[-1], ""))
+    assert [one.number for one in relay.asked[4:]] == fresh[:2]
