@@ -41,7 +41,7 @@ PNG = bytes.fromhex(
     "89504e470d0a1a0a0000000d49484452000000030000000208020000001216f14d0000001049444154789c63f8cfc000410c"
     "70160041d205fb87f0b9480000000049454e44ae426082"
 )
-# What the page finds in the heads of pictures of 123 x 77 pixels, and says about one of 30,000 x 30,000.
+# The page's findings in the heads of pictures of 123 x 77 pixels, and its words about one of 30,000 x 30,000.
 HEADS = """async () => {
     const { decoded, sizeOf } = await import("/console/static/features/doors/teleop/pixels.js");
     const canvas = Object.assign(document.createElement("canvas"), { width: 123, height: 77 });

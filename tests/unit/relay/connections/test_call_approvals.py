@@ -102,7 +102,7 @@ def test_a_client_that_asks_no_longer_is_not_held() -> None:
 
 
 def test_control_gets_few_questions_of_a_host_at_once() -> None:
-    """A flood of one host does not delay another; nobody asks for a client that has ended meanwhile."""
+    """A flood of one host does not delay another; a client that has ended asks no more."""
     relay = Relay()
     numbers = [relay.question("10.0.0.66") for _ in range(1000)]
     other = relay.question("10.0.0.7")
