@@ -1,8 +1,12 @@
-"""Single sign-on at a provider that is not ours (oidc-provider-mock), over REST as a browser does it."""
+"""Single sign-on at a provider that is not ours (oidc-provider-mock, over TLS), over REST as a browser does it."""
 
 import base64
 import contextlib
 import secrets
+import socket
+import socketserver
+import ssl
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +18,7 @@ import pytest
 
 from appliance.signing.request_signing import keys_of, reading_key
 from tests.support.appliance import Appliance
+from tests.support.certificates import Certificates, make_certificates
 
 # The provider, in a thread of the test, uses functions that its library will remove.
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -23,20 +28,80 @@ USERS: dict[str, dict[str, Any]] = {
 }
 
 
+NAME = "logs.example"  # no name is looked up: only the certificate has it
+
+
 @pytest.fixture(scope="module")
-def provider() -> Iterator[str]:
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Certificates:
+    return make_certificates(tmp_path_factory.mktemp("provider") / "tls")
+
+
+@pytest.fixture(scope="module")
+def provider(certificates: Certificates) -> Iterator[int]:
+    """Provide the port of a provider that speaks TLS."""
     users = [oidc_provider_mock.User(sub=name, claims=claims) for name, claims in USERS.items()]
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificates.certificate, certificates.key)
     with oidc_provider_mock.run_server_in_thread(user_claims=users) as server:
-        yield f"http://127.0.0.1:{server.server_port}"
+        server.ssl_context = context  # its answers have https URLs
+        server.socket = context.wrap_socket(server.socket, server_side=True)
+        yield server.server_port
+
+
+class Proxy(socketserver.ThreadingTCPServer):
+    """A proxy that knows one method, CONNECT, and resolves every name to the loopback."""
+
+    daemon_threads = True
+
+    def __init__(self) -> None:
+        self.connected: list[str] = []
+        super().__init__(("127.0.0.1", 0), _Tunnel)
+
+
+class _Tunnel(socketserver.StreamRequestHandler):
+    server: Proxy
+
+    def handle(self) -> None:
+        method, place, _version = self.rfile.readline().decode().split()
+        while self.rfile.readline().strip():
+            pass
+        self.server.connected.append(f"{method} {place}")
+        with socket.create_connection(("127.0.0.1", int(place.rpartition(":")[2]))) as upstream:
+            self.wfile.write(b"HTTP/1.1 200 OK\r\n\r\n")
+            threading.Thread(target=_copy, args=(upstream, self.connection), daemon=True).start()
+            _copy(self.connection, upstream)
+
+
+def _copy(source: socket.socket, target: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        while data := source.recv(65536):
+            target.sendall(data)
+        target.shutdown(socket.SHUT_WR)
 
 
 @pytest.fixture
-def running(provider: str, tmp_path: Path) -> Iterator[Appliance]:
+def proxy() -> Iterator[Proxy]:
+    with Proxy() as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield server
+        server.shutdown()
+
+
+@pytest.fixture
+def way(provider: int) -> str:
+    """Provide the setting that leads to the provider."""
+    return f"address: 127.0.0.1:{provider}"
+
+
+@pytest.fixture
+def running(provider: int, way: str, certificates: Certificates, tmp_path: Path) -> Iterator[Appliance]:
     (tmp_path / "secret").write_text("s3:cret/+\n")
+    (tmp_path / "ca.pem").write_bytes(certificates.ca.read_bytes())
     settings = f"""
 sso:
-  issuer: {provider}
-  address: {urlsplit(provider).netloc}
+  issuer: https://{NAME}:{provider}
+  {way}
+  ca: {tmp_path / "ca.pem"}
   client_id: rosrv
   client_secret_file: {tmp_path / "secret"}
   url: https://127.0.0.1:8443
@@ -52,7 +117,7 @@ class Browser:
 
     def __init__(self, appliance: Appliance) -> None:
         self.token = f"rosrv_{secrets.token_hex(6)}_{secrets.token_urlsafe(32)}"
-        self.rest = httpx.Client(base_url=str(appliance.ready["api"]), verify=False)  # noqa: S501  of the test
+        self.rest = httpx.Client(base_url=str(appliance.ready["api"]), verify=False, timeout=60)  # noqa: S501  of the test
 
     def begin(self) -> str:
         keys = keys_of(self.token)
@@ -62,7 +127,15 @@ class Browser:
 
     def return_from(self, url: str, person: str) -> dict[str, str]:
         """Sign in at the provider; return the parameters of the way back."""
-        answer = httpx.post(url, data={"sub": person})
+        parts = urlsplit(url)
+        assert parts.hostname == NAME
+        answer = httpx.post(
+            url.replace(NAME, "127.0.0.1"),
+            data={"sub": person},
+            headers={"Host": parts.netloc},
+            verify=False,  # noqa: S501  of the test
+            timeout=60,
+        )
         place = answer.headers["location"]
         assert place.startswith("https://127.0.0.1:8443/console?")
         given = dict(parse_qsl(urlsplit(place).query))
@@ -103,6 +176,33 @@ def test_a_person_signs_in_and_a_restart_ends_the_session(
     again = opened()
     again.token = browser.token
     assert again.who().status_code == 401
+
+
+class TestProxy:
+    """A provider that only a proxy reaches."""
+
+    @pytest.fixture
+    def way(self, proxy: Proxy) -> str:
+        return f"proxy: http://127.0.0.1:{proxy.server_address[1]}"
+
+    def test_tls_names_the_provider_through_the_proxy(
+        self,
+        opened: Callable[[], Browser],
+        proxy: Proxy,
+        provider: int,
+        tmp_path: Path,
+        certificates: Certificates,
+    ) -> None:
+        """The proxy sees no content. A certificate of another authority is refused, until the file is replaced."""
+        (tmp_path / "ca.pem").write_bytes(make_certificates(tmp_path / "other").ca.read_bytes())
+        keys = [base64.urlsafe_b64encode(bytes(32)).decode().rstrip("=")] * 2
+        body = {"id": "0" * 12, "reading": keys[0], "verifying": keys[1]}
+        refused = opened().rest.post("/v1/sso/begin", json=body)
+        assert refused.status_code == 503
+        assert "certificate verify failed" in refused.json()["detail"]
+        (tmp_path / "ca.pem").write_bytes(certificates.ca.read_bytes())
+        assert opened().sign_on("alice").raise_for_status().json()["role"] == "operator"
+        assert {*proxy.connected} == {f"CONNECT {NAME}:{provider}"}
 
 
 def test_a_person_without_a_role_and_a_used_code_get_no_session(opened: Callable[[], Browser]) -> None:
