@@ -165,3 +165,28 @@ def test_doors_survive_a_restart_and_a_removed_one_ends(appliance: Appliance, co
     assert before[0]["address"] not in new
     again = appliance.rosrv("door", "add", "agent-1", "--port", "9091").stdout
     assert before[0]["address"] in again
+
+
+def test_doors_of_an_appliance_in_its_own_namespace(lab: Lab, robot: Host) -> None:
+    """The machine forwards the port of an agent and the port of tickets, until the door is removed."""
+    machine = lab.host("appliance", "10.77.0.2/24")
+    settings, rest = "api_networks: [10.77.0.0/24]\n", ("--api", "0.0.0.0:8443")
+    call = json.dumps({"op": "call_service", "service": "/rosapi/get_time", "id": 1})
+    trusting = ssl.create_default_context()
+    trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE
+
+    def answered(url: str) -> bool:
+        with connect(url, ssl=trusting if url.startswith("wss:") else None) as client:
+            client.send(call)
+            return bool(frame(client, op="service_response", id=1)["result"])
+
+    with Appliance(machine, isolation="netns", policy=POLICY, settings=settings, options=rest) as running:
+        running.rosrv("door", "add", "agent-1", "--port", "9091", "--from", "10.77.0.10")
+        running.rosrv("door", "add", "alice")
+        ticket = running.rosrv("door", "ticket", "alice").stdout.strip().replace("ADDRESS", "10.77.0.2")
+        eventually(lambda: not any(row["trouble"] for row in running.rows("door", "list")), running.story)
+        assert on_robot(robot, lambda: answered(AGENT))
+        assert on_robot(robot, lambda: answered(ticket))
+        running.rosrv("door", "remove", "agent-1")
+        with pytest.raises(OSError, match="refused"):
+            on_robot(robot, lambda: eventually(lambda: connect(AGENT).close_code, "the port closes", 1))
