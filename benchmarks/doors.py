@@ -1,0 +1,371 @@
+"""A door beside rosbridge_suite and foxglove_bridge: `python -m benchmarks.doors [--rounds 3]`.
+
+A roscpp node publishes texts, and one WebSocket client on another host of a lab counts the frames that it receives. The
+ways take turns. Each is measured with 200 bytes and with 1 MB, as large as a frame of a camera: *paced* with a fixed
+rate (the delay from `publish` to the client, and the processor time for each message), and *most* (the most messages a
+second that the client received, with growing rates of the publisher). The path of a door has two processes, the relay
+and the door; their times are added. A door has a lower priority than the robot (nice 10), as on a robot.
+
+*Flooded*: a client sends messages to the door as fast as it can, while a node of the robot listens to another. The
+client has the least priority, because a flood comes from another machine.
+
+Neither peer is a Debian package. Give programs that start them, with `--rosbridge` (rosbridge_websocket.py of the
+branch ros1) and `--foxglove-bridge`; without one, its rows are left out.
+"""
+
+import argparse
+import json
+import os
+import re
+import signal
+import socket
+import statistics
+import struct
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+
+from examples.landshark.lab import Host, Lab
+from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.nodes import ROOT, RosSession
+from tests.support.rosmaster import PlainMaster
+from tests.support.waiting import eventually
+
+_BENCHMARKS = ROOT / "build" / "benchmarks"
+_LOAD, _ROBOT = _BENCHMARKS / "door_load", _BENCHMARKS / "recorder_load"
+_SIZES = {200: (100, (8_000, 32_000)), 1_000_000: (20, (100, 400))}
+"""The size of a message: the rate of *paced*, and the rates of *most*."""
+_STAMP = re.compile(rb"t=([0-9a-f]{16})")
+_HEAD_BYTES = 400
+_WARM_SECONDS = 1.0
+_CLIENTS = 20
+
+
+class Viewer:
+    """A WebSocket client that only finds the frames; a library would be slower than some of the servers."""
+
+    def __init__(self, address: str, port: int, subprotocol: str = "") -> None:
+        self.socket = socket.create_connection((address, port), timeout=20)
+        self._data = bytearray()
+        offered = f"Sec-WebSocket-Protocol: {subprotocol}\r\n" if subprotocol else ""
+        self.socket.sendall(
+            f"GET / HTTP/1.1\r\nHost: {address}:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            f"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n{offered}\r\n".encode()
+        )
+        while b"\r\n\r\n" not in self._data:
+            self._receive()
+        head, _, rest = bytes(self._data).partition(b"\r\n\r\n")
+        if b" 101 " not in head.partition(b"\r\n")[0]:
+            raise SystemExit(f"{address}:{port} refused the WebSocket: {head.decode()}")
+        self._data[:] = rest
+
+    def close(self) -> None:
+        self.socket.close()
+
+    def send(self, **message: object) -> None:
+        self.socket.sendall(frame_of(json.dumps(message).encode()))
+
+    def frames(self, head_bytes: int = _HEAD_BYTES) -> Iterator[tuple[int, bytes]]:
+        """Yield the opcode and the first bytes of each frame."""
+        data = self._data
+        while True:
+            length, head = (data[1] & 0x7F, 2) if len(data) >= 2 else (0, len(data) + 1)
+            if length >= 126:
+                head = 4 if length == 126 else 10
+                length = int.from_bytes(data[2:head], "big")
+            if len(data) < head + length:
+                self._receive()
+                continue
+            opcode, found = data[0] & 0x0F, bytes(data[head : head + min(length, head_bytes)])
+            del data[: head + length]
+            yield opcode, found
+
+    def _receive(self) -> None:
+        data = self.socket.recv(1 << 20)
+        if not data:
+            raise SystemExit("the server ended the connection")
+        self._data += data
+
+
+def frame_of(data: bytes) -> bytes:
+    """Return the text frame of a client; its mask is zero."""
+    length = bytes([0x80 | len(data)]) if len(data) < 126 else struct.pack(">BH", 0x80 | 126, len(data))
+    return b"\x81" + length + b"\0\0\0\0" + data
+
+
+def subscribe_rosbridge(viewer: Viewer, compression: str) -> None:
+    viewer.send(op="subscribe", topic="/load", type="std_msgs/String", compression=compression)
+
+
+def subscribe_foxglove(viewer: Viewer, _compression: str) -> None:
+    for opcode, data in viewer.frames(1 << 20):
+        for channel in json.loads(data).get("channels", ()) if opcode == 1 else ():
+            if channel["topic"] == "/load":
+                viewer.send(op="subscribe", subscriptions=[{"id": 1, "channelId": channel["id"]}])
+                return
+
+
+class Way(NamedTuple):
+    """A way from the topic to the client."""
+
+    name: str
+    system: "System"
+    compression: str = "none"
+    subprotocol: str = ""
+
+    def open(self) -> Viewer:
+        viewer = Viewer(self.system.address, self.system.port, self.subprotocol)
+        (subscribe_foxglove if self.subprotocol else subscribe_rosbridge)(viewer, self.compression)
+        return viewer
+
+
+@dataclass
+class System:
+    """A server for WebSocket clients, and the session of the robot's nodes behind it."""
+
+    session: RosSession
+    address: str
+    port: int
+    pids: Callable[[], Sequence[int]]
+    """The processes on the path of a message; the last one serves the clients."""
+    stop: Callable[[], object] = lambda: None
+    """Ends a peer, which may not end on SIGINT."""
+
+
+class Heard(NamedTuple):
+    """The frames of a client: how many a second, the median and the 99th percentile of the delay, processor time."""
+
+    rate: float
+    p50_us: float
+    p99_us: float
+    cpu_us: float
+
+
+def heard(way: Way, operator: Host, size: int, hertz: int, seconds: float) -> Heard:
+    """Let the publisher run with this rate, and count what the client receives."""
+    talker = way.system.session.start([str(_LOAD), str(size), str(hertz)], label="talker")
+    try:
+        talker.wait_for(event="ready")
+        return operator.run(lambda: _count(way, seconds))
+    finally:
+        talker.stop()
+
+
+def _count(way: Way, seconds: float) -> Heard:
+    viewer = way.open()
+    delays: list[int] = []
+    pids, before, begins, ends = way.system.pids(), 0.0, 0.0, float("inf")
+    for _opcode, data in viewer.frames():
+        stamp = _STAMP.search(data)
+        if stamp is None:
+            continue
+        now = time.monotonic_ns()
+        if not begins:
+            begins, ends = now + _WARM_SECONDS * 1e9, now + (_WARM_SECONDS + seconds) * 1e9
+        elif now >= begins:
+            before = before or sum(map(processor_seconds, pids))
+            delays.append(now - int(stamp[1], 16))
+        if now > ends:
+            break
+    spent = sum(map(processor_seconds, pids)) - before
+    viewer.close()
+    delays.sort()
+    return Heard(
+        len(delays) / seconds,
+        delays[len(delays) // 2] / 1e3,
+        delays[len(delays) * 99 // 100] / 1e3,
+        spent / len(delays) * 1e6,
+    )
+
+
+def processor_seconds(pid: int) -> float:
+    """Return the processor time of a process so far; `/proc/PID/stat` would have it in steps of 10 ms."""
+    tasks = Path(f"/proc/{pid}/task").iterdir()
+    return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) / 1e9
+
+
+def private_kb(pid: int) -> int:
+    """Return the memory that only this process has, in kB."""
+    text = Path(f"/proc/{pid}/smaps_rollup").read_text()
+    return sum(int(one) for one in re.findall(r"Private_(?:Clean|Dirty): +(\d+)", text))
+
+
+def memory(way: Way, operator: Host) -> tuple[float, float]:
+    """Return the memory of the server in MB, and what each of some idle subscribers adds, in kB."""
+    pid = way.system.pids()[-1]
+    first = operator.run(way.open)
+    threading.Event().wait(1)
+    before = private_kb(pid)
+    more = [operator.run(way.open) for _ in range(_CLIENTS)]
+    threading.Event().wait(2)
+    after = private_kb(pid)
+    for viewer in (first, *more):
+        viewer.close()
+    return before / 1024, (after - before) / _CLIENTS
+
+
+def robot_p50(way: Way, folder: Path, seconds: float) -> float:
+    """Return the median delay in microseconds between two nodes of the robot."""
+    talker = way.system.session.start([str(_ROBOT), "talk", "1", "200", "100"], label="robot talker")
+    talker.wait_for(event="ready")
+    listener = way.system.session.start([str(_ROBOT), "listen", "1", str(folder / "heard")], label="robot")
+    listener.wait_for(event="ready")
+    threading.Event().wait(seconds)
+    listener.interrupt()
+    p50 = float(listener.wait_for(event="heard")["p50_us"])
+    talker.stop()
+    return p50
+
+
+@contextmanager
+def flood(way: Way, operator: Host) -> Iterator[list[int]]:
+    """Send messages to a server during a block, with the least priority; yields their number at the end."""
+    over, sent = threading.Event(), [0]
+
+    def work() -> None:
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)
+        viewer = Viewer(way.system.address, way.system.port)
+        viewer.send(op="advertise", topic="/flood", type="std_msgs/String")
+        many = frame_of(b'{"op":"publish","topic":"/flood","msg":{"data":"flood"}}') * 100
+        while not over.is_set():
+            viewer.socket.sendall(many)
+            sent[0] += 100
+        viewer.close()
+
+    thread = threading.Thread(target=operator.run, args=(work,))
+    thread.start()
+    yield sent
+    over.set()
+    thread.join()
+
+
+def peer(command: str, master: PlainMaster, home: Path, robot: Host, port: int) -> System:
+    """Start a peer at the plain master."""
+    session = RosSession(master.master_uri, home, robot)
+    process = session.start([command, f"_port:={port}"], label=Path(command).name)
+
+    def listens() -> bool:
+        try:
+            robot.run(lambda: socket.create_connection((robot.address, port), 5)).close()
+        except OSError:
+            return False
+        return True
+
+    eventually(listens, process.story, 60)
+    return System(
+        session,
+        robot.address,
+        port,
+        lambda: [process.popen.pid],
+        stop=lambda: process.stop(with_signal=signal.SIGKILL),
+    )
+
+
+def door(appliance: Appliance, home: Path, robot: Host) -> System:
+    """Add the door of an agent."""
+    appliance.rosrv("door", "add", "viewer", "--port", "9091")
+    eventually(lambda: not appliance.row("door", "list")["trouble"], appliance.story)
+    address = appliance.host.address
+    pids = [*appliance.pids("relay"), *appliance.pids("door")]
+    return System(RosSession(appliance.master_uri, home, robot), address, 9091, lambda: pids)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=2.0)
+    parser.add_argument("--rosbridge", metavar="PROGRAM")
+    parser.add_argument("--foxglove-bridge", metavar="PROGRAM")
+    given = parser.parse_args()
+    for source, program in ((_LOAD.name, _LOAD), (_ROBOT.name, _ROBOT)):
+        file = ROOT / "benchmarks" / "nodes" / f"{source}.cpp"
+        subprocess.run([str(ROOT / "scripts" / "build-roscpp"), str(file), str(program)], check=True)
+    with ExitStack() as stack:
+        home = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rosrv-benchmark-")))
+        home.chmod(0o755)
+        lab = stack.enter_context(Lab("rosrv-doors"))
+        robot, operator = lab.host("robot", "10.77.0.10/24"), lab.host("operator", "10.77.0.20/24")
+        appliance = stack.enter_context(Appliance(lab.host("appliance", "10.77.0.2/24"), policy=OPEN_POLICY))
+        plain = stack.enter_context(PlainMaster(home, robot))
+        own = door(appliance, home, robot)
+        ways = [
+            Way("door, Foxglove", own, subprotocol="foxglove.websocket.v1"),
+            Way("door, cbor-raw", own, "cbor-raw"),
+            Way("door, JSON", own),
+        ]
+        if given.foxglove_bridge:
+            bridge = peer(given.foxglove_bridge, plain, home, robot, 8765)
+            ways.append(Way("foxglove_bridge", bridge, subprotocol="foxglove.websocket.v1"))
+        if given.rosbridge:
+            suite = peer(given.rosbridge, plain, home, robot, 9090)
+            ways += [Way("rosbridge_suite, cbor-raw", suite, "cbor-raw"), Way("rosbridge_suite, JSON", suite)]
+        for system in {id(way.system): way.system for way in ways}.values():
+            stack.enter_context(system.session)
+            stack.callback(system.stop)
+        for size in _SIZES:
+            show_speed(ways, operator, size, given.rounds, given.seconds)
+        show_memory(ways, operator)
+        show_flood(ways[2], operator, home, given.rounds, given.seconds)
+    Console().print(f"load average of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+
+
+def show_speed(ways: Sequence[Way], operator: Host, size: int, rounds: int, seconds: float) -> None:
+    """Print the medians of the rounds."""
+    hertz, rates = _SIZES[size]
+    paced: dict[str, list[Heard]] = {way.name: [] for way in ways}
+    most: dict[str, list[Heard]] = {way.name: [] for way in ways}
+    for _ in range(rounds):
+        for way in ways:
+            paced[way.name].append(heard(way, operator, size, hertz, seconds))
+            most[way.name].append(max(heard(way, operator, size, rate, seconds) for rate in rates))
+    table = Table(
+        "", "p50 µs", "p99 µs", "cpu µs", "most a second", "cpu µs", title=f"{size:,} bytes, {hertz} Hz"
+    )
+    for way in ways:
+        figures = [
+            statistics.median(getattr(one, field) for one in found[way.name])
+            for found, fields in ((paced, ("p50_us", "p99_us", "cpu_us")), (most, ("rate", "cpu_us")))
+            for field in fields
+        ]
+        table.add_row(way.name, *(f"{figure:,.0f}" for figure in figures))
+    Console().print(table)
+
+
+def show_memory(ways: Sequence[Way], operator: Host) -> None:
+    """Print the memory of each server."""
+    table = Table("", "private MB", f"kB for each of {_CLIENTS} idle clients")
+    for way in ways:
+        talker = way.system.session.start([str(_LOAD), "200", "1"], label="talker")
+        talker.wait_for(event="ready")
+        whole, each = memory(way, operator)
+        talker.stop()
+        table.add_row(way.name, f"{whole:.1f}", f"{each:.0f}")
+    Console().print(table)
+
+
+def show_flood(way: Way, operator: Host, home: Path, rounds: int, seconds: float) -> None:
+    """Print the delay of the robot's messages beside a flooded door."""
+    calm, flooded, frames = [], [], 0
+    for _ in range(rounds):
+        calm.append(robot_p50(way, home, 2 * seconds))
+        with flood(way, operator) as sent:
+            flooded.append(robot_p50(way, home, 2 * seconds))
+        frames += sent[0]
+    Console().print(
+        f"the robot's p50: {statistics.median(calm):.0f} µs, beside a flooded door {statistics.median(flooded):.0f} µs "
+        f"(rounds: {', '.join(f'{b / a:.2f}' for a, b in zip(calm, flooded, strict=True))}; {frames:,} frames)"
+    )
+
+
+if __name__ == "__main__":
+    main()
