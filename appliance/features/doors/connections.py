@@ -12,6 +12,7 @@ from http import HTTPStatus
 from roswire.node.network import BUFFER_BYTES, ByteWriter, OwnedTasks, Serve
 
 _REFUSAL_SECONDS = 5.0
+_MOST_REFUSALS = 64  # at the same time; further connections end without words
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +30,7 @@ class DoorConnections:
         self.refused = 0
         self._limits = limits
         self._open = 0
+        self._refusing = 0
         self._recent: deque[float] = deque()
         self._tasks = OwnedTasks()
 
@@ -47,8 +49,7 @@ class DoorConnections:
         """Serve a connection, or refuse it with HTTP 503 and the reason."""
         reason = self._excess()
         if reason:
-            self.refused += 1
-            await _refuse(writer, reason)
+            await self._refuse(reader, writer, reason)
             return
         self._open += 1
         try:
@@ -67,22 +68,33 @@ class DoorConnections:
         self._recent.append(now)
         return ""
 
+    async def _refuse(self, reader: asyncio.StreamReader, writer: ByteWriter, reason: str) -> None:
+        self.refused += 1
+        if self._refusing >= _MOST_REFUSALS:
+            writer.close()
+            return
+        self._refusing += 1
+        try:
+            async with asyncio.timeout(_REFUSAL_SECONDS):
+                # If bytes were unread at the end, the client would get a reset instead of the answer.
+                await reader.readuntil(b"\r\n\r\n")
+                writer.write(_refusal(reason))
+                await writer.drain()
+        except (OSError, EOFError, asyncio.LimitOverrunError):  # the client sent no request, or left
+            return
+        finally:
+            self._refusing -= 1
+            writer.close()
+
     async def close(self) -> None:
         await self._tasks.close()
 
 
-async def _refuse(writer: ByteWriter, reason: str) -> None:
+def _refusal(reason: str) -> bytes:
     status = HTTPStatus.SERVICE_UNAVAILABLE
     body = f"{reason}\n".encode()
     head = (
         f"HTTP/1.1 {status.value} {status.phrase}\r\nContent-Type: text/plain; charset=utf-8\r\n"
         f"Content-Length: {len(body)}\r\nRetry-After: 10\r\nConnection: close\r\n\r\n"
     )
-    writer.write(head.encode() + body)
-    try:
-        async with asyncio.timeout(_REFUSAL_SECONDS):
-            await writer.drain()
-    except OSError:
-        return
-    finally:
-        writer.close()
+    return head.encode() + body

@@ -246,6 +246,15 @@ class DoorSession:
             if self._pings > _MOST_PINGS:
                 await self._flush()
         self.end = self.end or f"the client ended the connection{_reason(self._socket)}"
+        if self._socket.parser_exc is not None:
+            await self._drop_rest()
+
+    async def _drop_rest(self) -> None:
+        """Read for a short time; else the client would get a reset instead of the closing frame with the reason."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_CLOSING_SECONDS):
+                while await self._reader.read(_READ_BYTES):
+                    pass
 
     async def _take(self, frame: WebSocketFrame) -> None:
         self._pings += frame.opcode is Opcode.PING

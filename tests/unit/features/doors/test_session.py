@@ -301,11 +301,13 @@ async def test_a_viewer_that_stops_reading_delays_no_other_and_takes_bounded_mem
 async def test_a_frame_that_is_too_large_even_inflated_ends_the_connection(
     deflate: bool, frame: str | bytes, code: int
 ) -> None:
+    """The door reads the rest of the frame: unread bytes would reset the connection before the closing frame."""
     async with door_world() as world:
         client = await world.client(deflate=deflate)
         client.send(frame)
         await client.closed()
         assert client.socket.close_code == code
+        assert client.writer.peer.reader.at_eof()
         other = await world.client()
         assert other.is_open
 
