@@ -108,8 +108,8 @@ class MemoryWriter:
         if not self.closed:
             self.closed = True
             self.has_room.set()
-            if self.reader._buffer:  # as with TCP, bytes that were not read reset the connection
-                self.peer.reader._buffer.clear()
+            if self.reader._buffer:  # type: ignore[attr-defined]  # as with TCP, unread bytes reset the connection
+                self.peer.reader._buffer.clear()  # type: ignore[attr-defined]
             for end in (self, self.peer):
                 if not end.reader.at_eof():
                     end.reader.feed_eof()
