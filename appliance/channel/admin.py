@@ -25,7 +25,6 @@ from typing import (
 
 import msgspec
 
-from appliance.channel import alarms
 from appliance.channel import rest_bodies as bodies
 from appliance.channel.answers import (
     graph_answers,
@@ -95,34 +94,6 @@ class StatusWanted(AdminRequest[status.Status], frozen=True, tag="status"):
 @rest("viewer", "GET", "/v1/inventory", name="inventory", tag="status")
 class InventoryWanted(AdminRequest[inventory_answers.Inventory], frozen=True, tag="inventory"):
     """The running software: version, build, parts with their licences, and the kernel's features in use."""
-
-
-@rest("viewer", "GET", "/v1/alarms", name="alarms", tag="status")
-class AlarmsWanted(AdminRequest[alarms.AlarmList], frozen=True, tag="alarms"):
-    """The present alarms, and the denials and drops of the last minute."""
-
-
-@rest(
-    "operator", "POST", "/v1/alarms/acknowledge", name="acknowledge_alarm", tag="status", body=bodies.OneAlarm,
-    problems={404: "There is no such alarm now."},
-)  # fmt: skip
-class AlarmAcknowledge(AdminRequest[alarms.AlarmList], frozen=True, tag="alarm acknowledge"):
-    """Record who takes care of an alarm. It stays an alarm, with that name, until its condition is over."""
-
-    kind: str
-    note: str = ""
-
-
-@rest(
-    "operator", "POST", "/v1/alarms/silence", name="silence_alarm", tag="status", body=bodies.SilencedAlarm,
-    problems={404: "There is no such alarm now."},
-)  # fmt: skip
-class AlarmSilence(AdminRequest[alarms.AlarmList], frozen=True, tag="alarm silence"):
-    """Make an alarm a notice for a time: `rosrv status` then exits with 0. Without `seconds`, end that."""
-
-    kind: str
-    seconds: float | None = None
-    note: str = ""
 
 
 @rest("operator", "POST", "/v1/policy/reload", _WITHIN, name="reload_policy", of=POLICY)

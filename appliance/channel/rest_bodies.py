@@ -8,7 +8,6 @@ from appliance.channel.answers.field_docs import doc
 
 WHOLE = r"(?!\n)"  # follows `$`, because Python's `$` also matches before a final newline
 LONGEST_REVISION = 10**15
-LONGEST_SILENCE_SECONDS = 7 * 86_400.0
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=1 << 20)]
 Signature = Annotated[
     str,
@@ -117,21 +116,3 @@ class SwitchMany(Switch, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The same for several monitors at once: all of them, or none when there is an unknown name."""
 
     names: Annotated[list[MonitorName], msgspec.Meta(min_length=1, max_length=1000)]
-
-
-class OneAlarm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An alarm to acknowledge."""
-
-    kind: Annotated[str, doc("the alarm's name", min_length=1, max_length=300)]
-    note: Annotated[str, doc("shown to operators", max_length=200)] = ""
-
-
-class SilencedAlarm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An alarm to silence."""
-
-    kind: Annotated[str, doc("the alarm's name", min_length=1, max_length=300)]
-    seconds: Annotated[
-        Annotated[float, msgspec.Meta(ge=1, le=LONGEST_SILENCE_SECONDS)] | None,
-        doc("the silence ends after this time; null: it ends now"),
-    ] = None
-    note: Annotated[str, doc("reason, shown to operators", max_length=200)] = ""

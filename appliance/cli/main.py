@@ -20,14 +20,6 @@ _CONFIRM = "Keep a change loaded with --confirm-within. Exit status 1 if there i
 VERBS: Verbs = {
     "up": Verb("up:up"),
     "status": Verb("status_verb:status"),
-    "alarm": Group(
-        "List the present alarms, and record who takes care of them.",
-        {
-            "list": Verb("alarm_verbs:list_alarms"),
-            "acknowledge": Verb("alarm_verbs:acknowledge"),
-            "silence": Verb("alarm_verbs:silence"),
-        },
-    ),
     "audit": Group(
         "Review the audit log and verify that it is complete.",
         {
@@ -84,7 +76,6 @@ VERBS: Verbs = {
             "rvstate": Verb("monitor.in_force:rv_state", hidden=True),
         },
     ),
-    "sign": Verb("sign:sign"),
     "version": Verb("version:version"),
     "config": Group(
         "Check or show the configuration.",

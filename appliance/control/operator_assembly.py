@@ -8,8 +8,8 @@ from appliance.channel.answers.status import AuditState
 from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.foundation import Current, Foundation
 from appliance.control.operators.administration import Administration
-from appliance.control.operators.alarm_orders import AlarmOrders, HandledAlarms
 from appliance.control.operators.clock_check import ClockCheck
+from appliance.control.operators.handled_alarms import HandledAlarms
 from appliance.control.operators.overview import graph_of
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
@@ -45,6 +45,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         parts.monitors, base.policies, base.store, trail, settings.forgotten_after
     )
     core = parts.core
+    handled, looks = HandledAlarms(base.store), Current[Queries]()
     base.features.operate(
         appliance=base.role.name,
         store=base.store,
@@ -55,9 +56,10 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         graph=partial(graph_of, parts),
         tokens_changed=lambda: rest().state_tokens(),
         bearers=lambda: frozenset(row.name for row in tokens.usable()),
+        status=lambda: looks().present(),
+        handled_alarms=handled,
     )
-    handled = HandledAlarms(base.store)
-    looks = Queries(
+    queries = Queries(
         parts,
         trail,
         base.policies,
@@ -73,15 +75,15 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         handled=handled.marked,
         name=base.settings.name,
     )
+    looks.set(queries)
     administration = Administration(
-        looks,
+        queries,
         base.features.methods()
         + request_methods(
-            queries=looks,
+            queries=queries,
             policies=base.policies,
             monitors=parts.monitors,
             tokens=tokens,
-            alarms=AlarmOrders(handled, trail, looks.present),
         ),
         durable=partial(_durable, base),
         require_room=base.store.database.require_room,

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from appliance.channel.admin import AdminRequest
     from appliance.channel.answers.graph_answers import Graph
     from appliance.channel.answers.limit_answers import LimitUse
-    from appliance.channel.answers.status import ProcessInfo
+    from appliance.channel.answers.status import ProcessInfo, Status
     from appliance.channel.link import Link
     from appliance.channel.messages import (
         ApprovalAnswered,
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         OwnServiceCalled,
     )
     from appliance.control.assembly.policies import Policies
+    from appliance.control.operators.handled_alarms import HandledAlarms
     from appliance.control.operators.request_method import RequestMethod
     from appliance.control.operators.sessions import Sessions
     from appliance.hosts.tunnel_hosts import TunnelHosts
@@ -73,7 +74,7 @@ class OperatorContext:
     `appliance` is the name of one of two appliances, empty on a single one. `processes` returns the processes of the
     appliance. `received` notes that another machine has all records up to a sequence. `graph` returns the present
     graph. `bearers` returns the names of the tokens and sessions that may be used now. `tokens_changed` sends the api
-    the usable tokens and sessions. `kept` has the results of `Feature.keep`.
+    the usable tokens and sessions. `status` returns the present status. `kept` has the results of `Feature.keep`.
     """
 
     core: FeatureContext
@@ -87,6 +88,8 @@ class OperatorContext:
     graph: "Callable[[], Graph]"
     tokens_changed: Callable[[], None]
     bearers: Callable[[], frozenset[str]]
+    status: "Callable[[], Status]"
+    handled_alarms: "HandledAlarms"
     kept: Mapping[str, KeptHosts]
 
 

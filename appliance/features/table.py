@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from appliance.configuration.sections import Sections
+from appliance.features.alarms.feature import ALARMS
 from appliance.features.approvals.feature import APPROVALS
 from appliance.features.authority.feature import AUTHORITY
 from appliance.features.backup.feature import BACKUP
@@ -24,6 +25,7 @@ from appliance.features.metrics.feature import METRICS
 from appliance.features.policy_tools.feature import POLICY_TOOLS
 from appliance.features.recorder.feature import RECORDER
 from appliance.features.selftest.feature import SELFTEST
+from appliance.features.sign.feature import SIGN
 from appliance.features.sso.feature import SSO
 from appliance.features.standby.feature import STANDBY
 from appliance.features.syslog.feature import SYSLOG
@@ -35,8 +37,10 @@ if TYPE_CHECKING:
     from appliance.supervisor.service_gate import Pairing
 
 FEATURES: tuple[Feature, ...] = (
-    BLOCKS,
+    ALARMS,
     LIMITS,
+    BLOCKS,
+    SIGN,
     TOPICS,
     TUNNELS,
     SYSLOG,

@@ -4,8 +4,10 @@ from typing import Any
 
 from appliance.audit.log.log import AuditLog
 from appliance.channel.answers.graph_answers import Graph
+from appliance.channel.answers.status import Status
 from appliance.configuration.sections import DEFAULTS
 from appliance.control.assembly.policies import Policies
+from appliance.control.operators.handled_alarms import HandledAlarms
 from appliance.features.feature import Feature, FeatureContext
 from appliance.features.parts import FeatureParts
 from appliance.features.table import FEATURES
@@ -26,7 +28,7 @@ def idle_parts() -> FeatureParts:
     parts.operate(
         appliance="", store=store, policies=idle(Policies), monitors=monitors, processes=tuple,
         received=lambda _sequence: None, graph=lambda: Graph([], [], []), tokens_changed=lambda: None,
-        bearers=frozenset,
+        bearers=frozenset, status=lambda: idle(Status), handled_alarms=idle(HandledAlarms),
     )  # fmt: skip
     return parts
 

@@ -32,7 +32,6 @@ from appliance.channel.operations import CHANGES, request_named
 from appliance.configuration.settings import ApiLimits, Settings
 from appliance.control.assembly.policies import Policies
 from appliance.control.operators.administration import Administration
-from appliance.control.operators.alarm_orders import AlarmOrders
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.request_methods import request_methods
@@ -143,7 +142,6 @@ class RestWorld:
             policies=idle(Policies),
             monitors=idle(SpecificationManager),
             tokens=idle(TokenOrders),
-            alarms=idle(AlarmOrders),
         )
         administration = Administration(
             queries,

@@ -4,6 +4,7 @@ import grimp
 import pytest
 
 _MOST_IMPORTS = 25
+_LIST = "appliance.features.table"  # it imports each feature
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +55,6 @@ def test_no_module_imports_too_many(imports: dict[str, set[str]]) -> None:
     wide = {
         module
         for module, imported in imports.items()
-        if not module.startswith("rosmop.tests") and len(imported) > _MOST_IMPORTS
+        if not module.startswith("rosmop.tests") and module != _LIST and len(imported) > _MOST_IMPORTS
     }
     assert wide == set()

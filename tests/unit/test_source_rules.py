@@ -308,7 +308,7 @@ WALL_CLOCK = {
         "signing/own_certificate.py",
     ],
     "a span that goes on over restarts of the machine, which has no other clock": [
-        "control/operators/alarm_orders.py", "features/standby/stored_times.py",
+        "control/operators/handled_alarms.py", "features/alarms/alarm_orders.py", "features/standby/stored_times.py",
         "control/operators/switched_off.py", "features/tunnels/self_service.py", "specifications/timed_switches.py",
         "store/revisions.py",
     ],

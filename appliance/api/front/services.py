@@ -12,13 +12,15 @@ from appliance.api.front.streams import Streams, Work
 from appliance.configuration.settings import Settings
 from appliance.quotas.table import REST_EXPORTS, REST_WORK
 
+_SEARCHES = 4
+
 
 @dataclass(frozen=True, slots=True)
 class Services:
     """The parts that the routes share; `stopping` is set when the process must end.
 
     `judging` shares the compiling of texts for queries and dry runs among tokens. `ordering` limits the same for
-    orders, so that orders never wait for queries. `exports` limits the exports of the audit log.
+    orders, so that orders never wait for queries. `searches` and `exports` limit those of the audit log.
     """
 
     settings: Settings
@@ -28,6 +30,7 @@ class Services:
     stopping: asyncio.Event
     history: SampleHistory
     judging: Work = field(default_factory=lambda: Work("dry runs and explanations", REST_WORK.bounds.whole))
+    searches: Work = field(default_factory=lambda: Work("searches of the audit log", _SEARCHES))
     ordering: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
     exports: Streams = field(
         default_factory=lambda: Streams(REST_EXPORTS, REST_EXPORTS, REST_EXPORTS.bounds.whole)

@@ -20,13 +20,11 @@ from starlette.responses import JSONResponse, StreamingResponse
 from appliance.api.front.access import Bearer
 from appliance.api.front.moments import given
 from appliance.api.front.problems import ProblemError
-from appliance.api.front.route_roles import Operator, Viewer, ask, ask_optional, reads_contents
+from appliance.api.front.route_roles import Operator, Viewer, ask, reads_contents
 from appliance.api.front.routing import Responses, Routes, file
 from appliance.api.front.services import Services
 from appliance.api.front.streams import StreamResponse, Streams, Work, in_thread, peer_of
-from appliance.api.routes.denials import asks_policy
-from appliance.api.routes.dry_run_policy import explained, granted
-from appliance.api.routes.named_hosts import has_name, host_in_words, with_networks
+from appliance.api.routes.named_hosts import has_name, with_networks
 from appliance.api.routes.shown_records import (
     PAGE,
     RECORD_REFERENCE,
@@ -44,14 +42,11 @@ from appliance.audit.proof.chain_proofs import evidence, evidence_line
 from appliance.audit.proof.copies import SignedCheckpoint, signed_checkpoints
 from appliance.audit.proof.verification import verify
 from appliance.audit.search.query import Filter, FilterError
-from appliance.audit.search.search import Follower, RecordInContext, export, recorded_in_full, show
+from appliance.audit.search.search import Follower, RecordInContext, export, show
 from appliance.channel.admin import PolicyWanted
-from appliance.channel.answers.policy_answers import Granted, Why
-from appliance.policy.grant import UngrantableError
 from appliance.quotas.table import REST_STREAM_PEERS, REST_STREAMS
 
 _T = TypeVar("_T")
-_SEARCHES = 4
 _POLL_SECONDS = 0.2
 _PING_SECONDS = 15
 _STREAM_PAGE = 500
@@ -150,13 +145,11 @@ class LogReader:
     def __init__(self, services: Services) -> None:
         self.path = services.audit_log
         self._control = services.control
-        self.searches = Work("searches of the audit log", _SEARCHES)
-        self.streams = Streams(REST_STREAMS, REST_STREAM_PEERS, services.settings.api_limits.streams)
-        self.verification = Work("verifications", 1)
+        self._searches = services.searches
 
     async def read(self, bearer: Bearer, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
         """Wait for a turn and call a function of `appliance.audit` in a thread. Raises `ProblemError`."""
-        async with self.searches.turn(bearer):
+        async with self._searches.turn(bearer):
             return await self.in_thread(function, *arguments, **named)
 
     async def named(self, bearer: Bearer, wanted: Filter) -> Filter:
@@ -182,8 +175,7 @@ class LogReader:
             raise ProblemError(503, "log-unreadable", str(error)) from error
 
 
-_NO_GRANT: Responses = {409: {"description": "No line of a policy grants it."}}
-_UNKNOWN: Responses = {404: {"description": "There is no such record."}}
+UNKNOWN: Responses = {404: {"description": "There is no such record."}}
 
 
 def _json(schema: dict[str, Any]) -> Responses:
@@ -195,11 +187,13 @@ def routes(services: Services) -> Routes:
     desk = LogReader(services)
     _add_searches(router, services, desk)
     _add_proofs(router, services, desk)
-    _add_one(router, services, desk)
+    _add_one(router, desk)
     return router
 
 
 def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
+    streams = Streams(REST_STREAMS, REST_STREAM_PEERS, services.settings.api_limits.streams)
+
     @router.get("", responses=_json(PAGE))
     async def search_audit(
         bearer: Viewer,
@@ -246,19 +240,21 @@ def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
         wanted = await desk.named(bearer, wanted)
         start = int(last_event_id) if last_event_id is not None else after
         follower = await desk.read(bearer, Follower, desk.path, wanted, start)
-        give_back = desk.streams.take(bearer, peer_of(request), "clients follow the audit log")
+        give_back = streams.take(bearer, peer_of(request), "clients follow the audit log")
         following = _follow(services, desk, follower, bearer, wanted.text, equality=equality)
         return StreamResponse(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
 
 
 def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
+    verification = Work("verifications", 1)
+
     @router.get("/verify")
     async def verify_audit(bearer: Operator) -> Verification:
         """Prove that the log is complete and unchanged; for operators, one at a time.
 
         The checkpoints of the signer are not compared; `rosrv audit verify` on the machine also does that.
         """
-        async with desk.verification.turn(bearer):
+        async with verification.turn(bearer):
             return await desk.in_thread(verify, desk.path)
 
     @router.get("/checkpoints")
@@ -287,8 +283,8 @@ def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
         )
 
 
-def _add_one(router: Routes, services: Services, desk: LogReader) -> None:
-    @router.get("/{record_id}", responses=_json(_ONE) | _UNKNOWN)
+def _add_one(router: Routes, desk: LogReader) -> None:
+    @router.get("/{record_id}", responses=_json(_ONE) | UNKNOWN)
     async def audit_record(
         bearer: Viewer, record_id: OneRecord, neighbours: Annotated[int, Query(ge=0, le=_MOST_NEIGHBOURS)] = 5
     ) -> JSONResponse:
@@ -299,38 +295,6 @@ def _add_one(router: Routes, services: Services, desk: LogReader) -> None:
             name: [as_object(readable_by(one, bearer)) for one in some] for name, some in around.items()
         }
         return JSONResponse({"record": as_object(readable_by(shown.entry, bearer)), **answer})
-
-    @router.get("/{record_id}/why", responses=_UNKNOWN)
-    async def why_of_record(record_id: OneRecord, bearer: Viewer) -> Why:
-        """Explain a record: its cause, the deciding events and values (not for viewers), and the places in the text.
-        For a monitor's verdict, these events alone lead to it. For a denial, the answer has the smallest change of the
-        policy in force that would allow it.
-        """
-        shown = await desk.record(bearer, record_id, 0)
-        record = readable_by(shown.entry, bearer).record
-        first = await desk.read(bearer, recorded_in_full, desk.path, shown.entry)
-        in_full = None if first is None else readable_by(first, bearer)
-        needed = asks_policy(record)
-        control = services.control
-        policy = await (ask if needed else ask_optional)(control, PolicyWanted(), bearer)
-        known = policy if needed else None
-        async with services.judging.turn(bearer):
-            words = await asyncio.to_thread(host_in_words, policy)
-            return await asyncio.to_thread(explained, record, known, in_full, words)
-
-    @router.get("/{record_id}/grant", responses=_UNKNOWN | _NO_GRANT)
-    async def grant_of_record(record_id: OneRecord, bearer: Viewer, *, tool: bool = False) -> Granted:
-        """Return the smallest change of the policy in force that grants what this record says was refused.
-
-        `tool`: the change also has all other rights that the stock tool of the record needs, such as rostopic.
-        """
-        shown = await desk.record(bearer, record_id, 0)
-        known = await ask(services.control, PolicyWanted(), bearer)
-        async with services.judging.turn(bearer):
-            try:
-                return await asyncio.to_thread(granted, shown.entry.record, known, whole_tool=tool)
-            except UngrantableError as error:
-                raise ProblemError(409, "not-by-a-policy", str(error)) from None
 
 
 async def _follow(

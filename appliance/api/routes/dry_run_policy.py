@@ -5,37 +5,21 @@ Every function here is pure, takes texts, and runs in a thread, so a client's lo
 """
 
 from collections.abc import Iterable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import msgspec
 
 from appliance.api.front.problems import Finding, ProblemError
-from appliance.api.routes.denials import asked_of, is_denial
 from appliance.api.routes.policy_models import Change, Ended, Report
-from appliance.audit.log.record import AuditRecord
-from appliance.audit.log.record_format import LogEntry
-from appliance.audit.search.why import lines_of
 from appliance.channel.admin import PolicyLoad
 from appliance.channel.answers.graph_answers import Registration
-from appliance.channel.answers.policy_answers import Granted, PolicyKnown, Why
-from appliance.policy.actions import BadWordError, check_resource, find_host
-from appliance.policy.decision_reasons import DecisionExplanation, explain
+from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.policy.diff import diff
-from appliance.policy.grant import UngrantableError, grant
-from appliance.policy.host_names import HostInWords
-from appliance.policy.judgement import PolicyContext, PolicyJudgement, judge
+from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.live_rights import LiveRight, endings
-from appliance.policy.model import Category, Request
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
-from appliance.policy.rights import needs_node
-from appliance.policy.stock_tools import stock_tool
-
-_GRANTED = (
-    "the policy in force has every right that it needs: it was denied for its recorded reason, or before this"
-    " revision"
-)
 
 
 def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterable[Registration]) -> Report:
@@ -45,7 +29,7 @@ def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterabl
     try:
         policy = judge(order.text, "policy", known, order.signature).accepted()
     except PolicyError as error:
-        raise _refused(error) from error
+        raise refused_text(error) from error
     live = [LiveRight.of(msgspec.structs.asdict(row)) for row in registrations]
     changes = diff(before, policy, (request for thing in live for request in thing.requests()))
     return Report(
@@ -62,90 +46,11 @@ def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterabl
     )
 
 
-def granted(record: AuditRecord, current: PolicyKnown, *, whole_tool: bool = False) -> Granted:
-    """Return the policy change that allows the denied request of a record. Raises `UngrantableError` if none does.
-
-    `whole_tool`: the change also has all other rights that the stock tool of the record needs.
-    """
-    known, asked = PolicyContext.of(msgspec.structs.asdict(current)), asked_of(record)
-    tool = stock_tool(asked.request.caller_id)
-    if whole_tool:
-        if tool is None:
-            raise UngrantableError(f"{asked.request.caller_id or 'the caller'} is not a stock tool of ROS")
-        asked = asked.with_tool(tool)
-    found = grant(current.text, current.file, known, asked)
-    needs = [] if tool is None else grant(found.text, current.file, known, asked.with_tool(tool)).added
-    return Granted(
-        revision=current.revision,
-        reason=record.reason,
-        added=list(found.added),
-        diff=found.diff(current.text, current.file),
-        text=found.text,
-        findings=found.findings("policy", known) if found.added else [],
-        tool=tool.name if tool is not None else "",
-        tool_needs=list(needs),
-    )
-
-
-def explained(
-    record: AuditRecord,
-    current: PolicyKnown | None,
-    in_full: LogEntry | None = None,
-    host_in_words: HostInWords = str,
-) -> Why:
-    """Explain a record; if it is a denial that a policy might allow, `current` must be given.
-
-    `in_full`: the record that a record of repetitions continues.
-    """
-    found, refusal = None, ""
-    try:
-        if current is not None:
-            found = granted(record, current)
-            refusal = "" if found.added else _GRANTED
-        elif is_denial(record):
-            asked_of(record)
-    except UngrantableError as error:
-        refusal = str(error)
-    added = [f"would be allowed by: {line}" for line in found.added] if found is not None else []
-    return Why(lines=[*lines_of(record, in_full, host_in_words), *added], grant=found, refusal=refusal)
-
-
-def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> PolicyJudgement:
-    """Check a policy text, signed or not; `cases`: also run the test cases in the file next to the policy file.
-
-    Raises `ProblemError` with every finding if the text or the cases are invalid.
-    """
-    text, file = (current.text, current.file) if text is None else (text, "policy")
-    known = PolicyContext.of(msgspec.structs.asdict(current))
-    try:
-        known = replace(known, site_keys=()) if cases else PolicyContext(known.hosts, known.robot)
-        return judge(text, file, known)
-    except PolicyError as error:
-        raise _refused(error) from error
-
-
-def explanation(
-    text: str | None, current: PolicyKnown, *, host: str, node: str, category: Category, resource: str
-) -> DecisionExplanation:
-    """Return the reasons for the decision of a request. Raises `ProblemError` if the request is invalid."""
-    fields = msgspec.structs.asdict(current)
-    known = PolicyContext.of(fields)
-    policy = judge_text(text, current, cases=False).policy
-    policy = replace(policy, blocks=known.blocks, holders=known.holders, approved=known.approved)
-    try:
-        request = Request(find_host(host, policy), node, category, check_resource(category, resource))
-    except BadWordError as error:
-        raise ProblemError(422, "bad-input", str(error)) from error
-    if needs_node(request) and not node:
-        raise ProblemError(422, "bad-input", "the name of the node is missing: add `node`")
-    return explain(policy, request)
-
-
 def _findings_of(findings: Iterable[Any]) -> list[Finding]:
     return [Finding(**asdict(finding)) for finding in findings]
 
 
-def _refused(error: PolicyError) -> ProblemError:
+def refused_text(error: PolicyError) -> ProblemError:
     findings = sorted(error.findings, key=lambda finding: finding.severity != "error")
     errors = sum(finding.severity == "error" for finding in findings)
     more = f", and {errors - 1} more" if errors > 1 else ""

@@ -6,7 +6,6 @@ import msgspec
 
 from appliance.api.front.problems import Finding
 from appliance.channel.answers.field_docs import Moment, doc
-from appliance.policy.model import Category
 
 Decided = Literal["allow", "deny", "would deny", "ask"]
 
@@ -46,52 +45,3 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     warnings: list[Finding]
     changes: list[Change]
     ends: Annotated[list[Ended], doc("live registrations and connections that end with the change")]
-
-
-class RuleText(msgspec.Struct, frozen=True):
-    """Where a rule stands."""
-
-    section: str
-    key: str
-    file: str
-    line: int
-
-
-class LostRule(msgspec.Struct, frozen=True):
-    """A rule that speaks of the resource and does not decide."""
-
-    rule: RuleText
-    would: Literal["allow", "deny"]
-    why: str
-
-
-class Explained(msgspec.Struct, frozen=True, kw_only=True):
-    """Why a request is decided as it is; `node` is the right to the node's name, where that is needed too."""
-
-    host: str
-    caller_id: str
-    category: str
-    resource: str
-    decision: Decided
-    rule: RuleText | None
-    reason: str
-    told: Annotated[str | None, doc("text of the answer to a denied host ([Options] tell); null: allowed")]
-    through: Annotated[list[str], doc("words of the rule that match the host")]
-    limit: Annotated[str, doc("the limit on allowed messages, and its line of [Limits]; empty: none")]
-    lost: list[LostRule]
-    node: Annotated["Explained | None", doc("the node name that the host gives, if the action needs a node")]
-    command: Annotated[
-        "Explained | None",
-        doc("the rule for the command that does it: `lookupService`, `getParam`, `setParam`"),
-    ]
-    allowed: Annotated[bool, doc("the decision on the whole call")]
-
-
-class Question(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A request to explain; `text`: under this policy instead of the one in force."""
-
-    host: Annotated[str, doc("an address, or `robot`", min_length=1, max_length=100)]
-    node: Annotated[str, msgspec.Meta(max_length=256)] = ""
-    category: Category
-    resource: Annotated[str, msgspec.Meta(min_length=1, max_length=256)]
-    text: Annotated[str, msgspec.Meta(max_length=1 << 20)] | None = None

@@ -4,7 +4,6 @@ from typing import Any
 
 from appliance.channel import admin
 from appliance.control.assembly.policies import Policies
-from appliance.control.operators.alarm_orders import AlarmOrders
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.token_orders import TokenOrders
@@ -17,15 +16,11 @@ def request_methods(
     policies: Policies,
     monitors: SpecificationManager,
     tokens: TokenOrders,
-    alarms: AlarmOrders,
 ) -> tuple[RequestMethod[Any], ...]:
     """Return the methods of these parts: one for each request of the core."""
     return (
         RequestMethod(admin.StatusWanted, queries.status, order=False),
         RequestMethod(admin.InventoryWanted, queries.inventory, order=False),
-        RequestMethod(admin.AlarmsWanted, alarms.listed, order=False),
-        RequestMethod(admin.AlarmAcknowledge, alarms.acknowledge, who=True),
-        RequestMethod(admin.AlarmSilence, alarms.silence, who=True),
         RequestMethod(admin.GraphWanted, queries.graph, order=False),
         RequestMethod(admin.MonitorsWanted, queries.monitors, order=False),
         RequestMethod(admin.TopicLook, queries.topic_look, who=True, order=False),

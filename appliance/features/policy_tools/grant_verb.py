@@ -43,9 +43,9 @@ def why(appliance: Appliance, record: RecordArgument) -> None:
 def _explained(appliance: Appliance, record: str) -> Why:
     if appliance.place is not None:
         return msgspec.convert(_over_rest(appliance, record, "why"), Why)
-    from appliance.api.routes.denials import asks_policy  # noqa: PLC0415  not for every verb
-    from appliance.api.routes.dry_run_policy import explained  # noqa: PLC0415  as above
     from appliance.audit.search.search import recorded_in_full  # noqa: PLC0415  as above
+    from appliance.features.policy_tools.denials import asks_policy  # noqa: PLC0415  not for every verb
+    from appliance.features.policy_tools.explanations import explained  # noqa: PLC0415  as above
 
     with Errors():
         entry = _entry(appliance, record)
@@ -138,7 +138,7 @@ def _granted(appliance: Appliance, record: str, *, tool: bool) -> Granted:
     """Compute the change in this program, or over REST in the appliance."""
     if appliance.place is not None:
         return msgspec.convert(_over_rest(appliance, record, "grant", tool=tool), Granted)
-    from appliance.api.routes.dry_run_policy import granted  # noqa: PLC0415  not for every verb
+    from appliance.features.policy_tools.explanations import granted  # noqa: PLC0415  not for every verb
     from appliance.policy.grant import UngrantableError  # noqa: PLC0415  as above
 
     with Errors():

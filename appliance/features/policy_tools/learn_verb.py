@@ -16,6 +16,7 @@ from appliance.base.timestamps import TimestampError, parse_timestamp
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json
+from appliance.features.policy_tools.learn import LearnedPolicy, Observation, covered, learn
 from appliance.features.policy_tools.policy_input import (
     Robot,
     networks_of,
@@ -24,7 +25,6 @@ from appliance.features.policy_tools.policy_input import (
     usage_error,
 )
 from appliance.policy.host_sets import Network
-from appliance.policy.learn import LearnedPolicy, Observation, covered, learn
 from appliance.policy.model import Category
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError

@@ -1,4 +1,4 @@
-"""The gate, `explain`, the cases, `diff`, `grant`, learning and revocation agree on each call.
+"""The gate, `explain`, the cases, `diff`, `grant` and revocation agree on each call.
 
 Each rule includes or excludes a host. `NEEDS` lists the rights for each call again, by section, as docs/policy.md does.
 """
@@ -36,7 +36,6 @@ from appliance.policy.decision_reasons import explain
 from appliance.policy.diff import diff
 from appliance.policy.grant import DecidedRequest, UngrantableError, grant
 from appliance.policy.judgement import PolicyContext
-from appliance.policy.learn import Observation, learn
 from appliance.policy.live_rights import LiveRight, may_keep
 from appliance.policy.model import Category, Decision, Request
 from appliance.policy.policy import Policy
@@ -45,7 +44,6 @@ from appliance.policy.rights import needs_node, rights_of
 from appliance.rpc.server import Peer
 from roswire.parameter_tree import Tree
 from roswire.uris import parse_node_uri
-from roswire.xmlrpc import Value
 from tests.support.control_parts import ControlParts
 from tests.support.examples import examples
 
@@ -256,20 +254,6 @@ async def test_live_registrations_are_decided_as_their_calls(kind: Kind) -> None
             given_by = MASTER_CALLS.get(name) or NODE_CALLS[name]
             may = may_keep(world.current, LiveRight(HOST, NAME, name, THING)).allowed
             assert may == gate_says(world.current, given_by, {}).allowed, live
-
-
-@pytest.mark.parametrize("call", ROWS, ids=lambda one: one.name)
-@pytest.mark.parametrize(
-    "tree", [{}, {"arm": {"speed": 1}}, {"arm": {"speed": {"max": 1}}}], ids=["empty", "value", "namespace"]
-)
-def test_a_policy_learned_from_a_call_grants_it(call: RosCall[Any], tree: dict[str, Value]) -> None:
-    key = KEY_GIVEN if call.touches is not None else ""
-    learned = learn([Observation(deeds(call)[0], call.name, key)])
-    assert not learned.left_out
-    policy = compile_policy(learned.text, file="learned")
-    assert gate_says(policy, call, tree).allowed
-    other = Request(ipaddress.ip_address("10.0.0.66"), NAME, call.category, deeds(call)[0].resource)
-    assert not explain(policy, other).allowed
 
 
 def test_every_command_can_be_granted() -> None:

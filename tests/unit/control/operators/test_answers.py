@@ -12,7 +12,6 @@ from appliance.channel.messages import api
 from appliance.channel.operations import AnyRequest, RestRequest
 from appliance.control.assembly.policies import Policies
 from appliance.control.operators.administration import Administration
-from appliance.control.operators.alarm_orders import AlarmOrders
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.token_orders import TokenOrders
@@ -24,7 +23,6 @@ CLASSES: dict[str, Any] = {
     "policies": Policies,
     "monitors": SpecificationManager,
     "tokens": TokenOrders,
-    "alarms": AlarmOrders,
 }
 METHODS = idle_parts().methods() + request_methods(**CLASSES)
 OF_FEATURES = [request for _feature, request in answered_later()]

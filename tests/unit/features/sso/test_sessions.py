@@ -8,7 +8,7 @@ import pytest
 
 from appliance.base import clock
 from appliance.base.deadlines import Deadlines
-from appliance.channel.admin import AlarmSilence, StatusWanted, TokenAdd
+from appliance.channel.admin import PolicyReload, StatusWanted, TokenAdd
 from appliance.channel.messages.api import RequestMade
 from appliance.control.errors import TokenRefusedError, UnavailableError, UnknownThingError
 from appliance.control.operators.token_orders import TokenOrders
@@ -88,7 +88,7 @@ async def test_a_session_has_the_rights_of_its_role_and_is_recorded(world: World
     shown = reading_key(_token(1))
     assert await world.checks.asker(RequestMade(1, StatusWanted(), shown)) == "sso:alice"
     with pytest.raises(UnprovenError, match="an order without its HTTP request"):
-        await world.checks.asker(RequestMade(2, AlarmSilence("x"), shown))
+        await world.checks.asker(RequestMade(2, PolicyReload(), shown))
     with pytest.raises(UnprovenError, match="this is for admins; the token sso:alice has the role operator"):
         await world.checks.asker(RequestMade(3, requests.SessionsWanted(), shown))
     session = world.sso.sessions.of(f"{1:012x}")

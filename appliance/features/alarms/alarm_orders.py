@@ -1,64 +1,33 @@
-"""Keep which alarms operators have acknowledged or silenced.
-
-An alarm is a present condition (`channel/alarms.py`). An acknowledged alarm names the operator who takes care of it. A
-silenced alarm is a notice for a time. Both are stored, so they survive a restart and a takeover.
-
-Invariants:
-1. An acknowledgement ends with its alarm, so the same condition is a new alarm when it comes back.
-2. A silence ends at its time, also without its alarm. It ends early if the clock was set back before its beginning, so
-   a wrong clock never extends it.
-"""
+"""Answer operators' requests about alarms. `control/operators/handled_alarms.py` keeps what they decide."""
 
 from collections.abc import Callable
 
-import msgspec
-
 from appliance.base import clock
-from appliance.channel import admin
 from appliance.channel.alarms import AlarmList, activity, open_alarms
 from appliance.channel.answers.status import HandledAlarm, Status
-from appliance.channel.rest_bodies import LONGEST_SILENCE_SECONDS
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.store.state_file import StateStore
+from appliance.control.operators.handled_alarms import HandledAlarms
+from appliance.control.operators.request_method import RequestMethod
+from appliance.features.alarms.alarm_requests import (
+    LONGEST_SILENCE_SECONDS,
+    AlarmAcknowledge,
+    AlarmSilence,
+    AlarmsWanted,
+)
+from appliance.features.feature import FeaturePart, OperatorContext
 from appliance.telemetry.audit_trail import AuditTrail
 
-_SETTING = "handled alarms"
 
-
-class HandledAlarms:
-    """The alarms that an operator has acknowledged or silenced, by kind."""
-
-    def __init__(self, store: StateStore) -> None:
-        self._store = store
-        self._rows = msgspec.json.decode(store.settings().get(_SETTING, "{}"), type=dict[str, HandledAlarm])
-
-    def marked(self, status: Status) -> Status:
-        """Return the status with the acknowledged and silenced alarms; forget those that are over."""
-        present = {alarm.kind for alarm in (*open_alarms(status), *activity(status))}
-        now = clock.wall()
-        kept = {
-            kind: row
-            for kind, row in self._rows.items()
-            if (kind in present if row.until is None else row.since <= now < row.until)
-        }
-        if len(kept) < len(self._rows):
-            self._keep(kept)
-        return msgspec.structs.replace(status, handled_alarms=list(kept.values()))
-
-    def put(self, row: HandledAlarm) -> None:
-        """Store an acknowledgement or a silence, in place of an earlier one of the alarm."""
-        self._keep({**self._rows, row.kind: row})
-
-    def end(self, kind: str) -> bool:
-        """Forget what was stored for an alarm; return whether there was anything."""
-        if kind not in self._rows:
-            return False
-        self._keep({other: row for other, row in self._rows.items() if other != kind})
-        return True
-
-    def _keep(self, rows: dict[str, HandledAlarm]) -> None:
-        self._rows = rows
-        self._store.save_setting(_SETTING, msgspec.json.encode(rows).decode())
+def operate(context: OperatorContext) -> FeaturePart:
+    """Return the part of control."""
+    orders = AlarmOrders(context.handled_alarms, context.core.trail, context.status)
+    return FeaturePart(
+        methods=(
+            RequestMethod(AlarmsWanted, orders.listed, order=False),
+            RequestMethod(AlarmAcknowledge, orders.acknowledge, who=True),
+            RequestMethod(AlarmSilence, orders.silence, who=True),
+        )
+    )
 
 
 class AlarmOrders:
@@ -69,18 +38,18 @@ class AlarmOrders:
         self._trail = trail
         self._status = status
 
-    async def listed(self, _request: admin.AlarmsWanted) -> AlarmList:
+    async def listed(self, _request: AlarmsWanted) -> AlarmList:
         """Return the present alarms, the most severe first."""
         return self._list()
 
-    async def acknowledge(self, request: admin.AlarmAcknowledge, who: str) -> AlarmList:
+    async def acknowledge(self, request: AlarmAcknowledge, who: str) -> AlarmList:
         """Record who takes care of an alarm. Raises `UnknownThingError` if there is no such alarm."""
         self._must_be_present(request.kind)
         self._handled.put(HandledAlarm(request.kind, who, clock.wall(), None, request.note))
         self._record("alarm acknowledged", f"{request.kind} is acknowledged", request.kind, who, request.note)
         return self._list()
 
-    async def silence(self, request: admin.AlarmSilence, who: str) -> AlarmList:
+    async def silence(self, request: AlarmSilence, who: str) -> AlarmList:
         """Make an alarm a notice for a time, or end that. Raises `UnknownThingError` and `SenselessError`."""
         kind, seconds = request.kind, request.seconds
         if seconds is None:

@@ -5,11 +5,12 @@ from typing import Any
 import pytest
 
 from appliance.base.clock import using
-from appliance.channel.admin import AlarmAcknowledge, AlarmSilence, AlarmsWanted
 from appliance.channel.alarms import Alarm
 from appliance.channel.answers.status import Status
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.control.operators.alarm_orders import AlarmOrders, HandledAlarms
+from appliance.control.operators.handled_alarms import HandledAlarms
+from appliance.features.alarms.alarm_orders import AlarmOrders
+from appliance.features.alarms.alarm_requests import AlarmAcknowledge, AlarmSilence, AlarmsWanted
 from appliance.store.state_file import StateStore
 from tests.support.answers import example
 from tests.support.engines import InlineDatabase

@@ -1,15 +1,19 @@
 import ipaddress
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from appliance.features.policy_tools.learn import LearnedPolicy, Observation, covered, learn
+from appliance.master.calls.call import RosCall
 from appliance.policy.commands import COMMANDS
-from appliance.policy.learn import LearnedPolicy, Observation, covered, learn
 from appliance.policy.model import Category, Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.rights import decide, rights_of, rights_of_call
+from roswire.xmlrpc import Value
+from tests.unit.master.test_rights import KEY_GIVEN, NAME, ROWS, deeds, gate_says
 
 ROBOT = ipaddress.ip_address("192.0.2.10")
 HOSTS = [ipaddress.ip_address(text) for text in ("10.0.0.1", "10.0.0.2", "fd00::5", "192.0.2.10")]
@@ -190,3 +194,26 @@ def test_a_host_that_did_nothing_may_do_nothing(observations: list[Observation],
         ipaddress.ip_address("203.0.113.9"), "/n", other.request.category, other.request.resource
     )
     assert not decide(policy, rights_of(unknown)).allowed
+
+
+def test_a_right_that_needed_an_approval_is_learned_behind_ask() -> None:
+    """Only the right that was approved is behind `ask`."""
+    request = Request(HOSTS[0], "/it", Category.PUBLISH, "/cmd_vel")
+    learned = learn([Observation(request, "registerPublisher", asked=True)]).text
+    assert "/cmd_vel = ask 10.0.0.1" in learned
+    assert "[Nodes]\n/it = 10.0.0.1" in learned
+    assert not compile_policy(learned, file="learned").decide(request).allowed
+
+
+@pytest.mark.parametrize("call", ROWS, ids=lambda one: one.name)
+@pytest.mark.parametrize(
+    "tree", [{}, {"arm": {"speed": 1}}, {"arm": {"speed": {"max": 1}}}], ids=["empty", "value", "namespace"]
+)
+def test_a_policy_learned_from_a_call_grants_it(call: RosCall[Any], tree: dict[str, Value]) -> None:
+    key = KEY_GIVEN if call.touches is not None else ""
+    learned = learn([Observation(deeds(call)[0], call.name, key)])
+    assert not learned.left_out
+    policy = compile_policy(learned.text, file="learned")
+    assert gate_says(policy, call, tree).allowed
+    other = Request(ipaddress.ip_address("10.0.0.66"), NAME, call.category, deeds(call)[0].resource)
+    assert not decide(policy, rights_of(other)).allowed

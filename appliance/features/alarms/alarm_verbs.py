@@ -4,12 +4,16 @@ from typing import Annotated
 
 import typer
 
-from appliance.channel.admin import AlarmAcknowledge, AlarmSilence, AlarmsWanted
 from appliance.channel.alarms import AlarmList
-from appliance.channel.rest_bodies import LONGEST_SILENCE_SECONDS
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import say_json, usage_error
+from appliance.features.alarms.alarm_requests import (
+    LONGEST_SILENCE_SECONDS,
+    AlarmAcknowledge,
+    AlarmSilence,
+    AlarmsWanted,
+)
 from rosmop.tool.terminal import say
 
 _STYLES = {"alarm": "bold red", "warning": "yellow", "notice": ""}

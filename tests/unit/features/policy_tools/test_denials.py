@@ -7,12 +7,12 @@ from typing import get_args, get_type_hints
 import msgspec
 import pytest
 
-from appliance.api.routes.denials import DENIALS, asks_policy, is_denial
-from appliance.api.routes.dry_run_policy import explained, granted
 from appliance.audit.log.events import EVENTS
 from appliance.audit.log.record import AuditRecord, RuleReference
 from appliance.channel.answers.policy_answers import PolicyKnown, Why
 from appliance.channel.messages.relay_link import Violation
+from appliance.features.policy_tools.denials import DENIALS, asks_policy, is_denial
+from appliance.features.policy_tools.explanations import explained, granted
 from appliance.master.graph.graph import revocation
 from appliance.policy.grant import UngrantableError
 from appliance.policy.live_rights import LiveRight, may_keep

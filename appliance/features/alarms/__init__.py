@@ -1,0 +1,1 @@
+"""Alarms: operators list, acknowledge and silence them."""

@@ -1,0 +1,91 @@
+"""Structs of `/v1/policy/explain` and `/v1/policy/test`."""
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from appliance.api.routes.policy_models import Decided
+from appliance.channel.answers.field_docs import doc
+from appliance.channel.rest_bodies import Text
+from appliance.policy.model import Category
+
+
+class RuleText(msgspec.Struct, frozen=True):
+    """Where a rule stands."""
+
+    section: str
+    key: str
+    file: str
+    line: int
+
+
+class LostRule(msgspec.Struct, frozen=True):
+    """A rule that speaks of the resource and does not decide."""
+
+    rule: RuleText
+    would: Literal["allow", "deny"]
+    why: str
+
+
+class Explained(msgspec.Struct, frozen=True, kw_only=True):
+    """Why a request is decided as it is; `node` is the right to the node's name, where that is needed too."""
+
+    host: str
+    caller_id: str
+    category: str
+    resource: str
+    decision: Decided
+    rule: RuleText | None
+    reason: str
+    told: Annotated[str | None, doc("text of the answer to a denied host ([Options] tell); null: allowed")]
+    through: Annotated[list[str], doc("words of the rule that match the host")]
+    limit: Annotated[str, doc("the limit on allowed messages, and its line of [Limits]; empty: none")]
+    lost: list[LostRule]
+    node: Annotated["Explained | None", doc("the node name that the host gives, if the action needs a node")]
+    command: Annotated[
+        "Explained | None",
+        doc("the rule for the command that does it: `lookupService`, `getParam`, `setParam`"),
+    ]
+    allowed: Annotated[bool, doc("the decision on the whole call")]
+
+
+class Question(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A request to explain; `text`: under this policy instead of the one in force."""
+
+    host: Annotated[str, doc("an address, or `robot`", min_length=1, max_length=100)]
+    node: Annotated[str, msgspec.Meta(max_length=256)] = ""
+    category: Category
+    resource: Annotated[str, msgspec.Meta(min_length=1, max_length=256)]
+    text: Annotated[str, msgspec.Meta(max_length=1 << 20)] | None = None
+
+
+class Draft(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The text to run them on; null: the policy in force."""
+
+    text: Text | None = None
+
+
+class Case(msgspec.Struct, frozen=True, kw_only=True):
+    """One case: what it expects, and what is decided; `line` and `column` are its place in `file`."""
+
+    file: str
+    line: int
+    column: int
+    host: str
+    caller_id: str
+    category: str
+    resource: str
+    expected: Literal["allow", "deny", "ask"]
+    decision: Decided
+    reason: str
+    passed: bool
+
+
+class Tested(msgspec.Struct, frozen=True, kw_only=True):
+    """The cases of the policy's tests, at most a thousand of them; none when the file does not exist."""
+
+    file: str
+    exists: bool
+    passed: int
+    failed: int
+    cases: Annotated[list[Case], doc("failed cases first")]

@@ -1,0 +1,172 @@
+"""`/v1/policy/explain`, `/v1/policy/test`, and `/v1/audit/ID/why` and `/grant`: nothing is loaded."""
+
+import asyncio
+from dataclasses import asdict
+from typing import Annotated
+
+import msgspec
+from fastapi import Query
+
+from appliance.api.front.access import Bearer
+from appliance.api.front.problems import ProblemError
+from appliance.api.front.route_roles import Viewer, ask, ask_optional
+from appliance.api.front.routing import Responses, Routes, body
+from appliance.api.front.services import Services
+from appliance.api.routes.audit import UNKNOWN, LogReader, OneRecord
+from appliance.api.routes.named_hosts import host_in_words
+from appliance.api.routes.shown_records import readable_by
+from appliance.audit.search.search import recorded_in_full
+from appliance.channel.admin import PolicyWanted
+from appliance.channel.answers.policy_answers import Granted, Why
+from appliance.features.policy_tools.denials import asks_policy
+from appliance.features.policy_tools.explanations import explained, explanation, granted, judge_text
+from appliance.features.policy_tools.policy_models import (
+    Case,
+    Draft,
+    Explained,
+    LostRule,
+    Question,
+    RuleText,
+    Tested,
+)
+from appliance.policy.cases import CaseResult
+from appliance.policy.decision_reasons import DecisionExplanation
+from appliance.policy.grant import UngrantableError
+from appliance.policy.model import Category
+
+_NO_GRANT: Responses = {409: {"description": "No line of a policy grants it."}}
+_MOST_SHOWN = 1000
+
+
+def routes(services: Services) -> Routes:
+    """Return the routes."""
+    router = Routes(prefix="/v1")
+    router.include_router(_of_policy(services))
+    router.include_router(_of_records(services))
+    return router
+
+
+def _of_policy(services: Services) -> Routes:
+    router = Routes(prefix="/policy", tags=["policy"])
+    control = services.control
+
+    async def explained(question: Question, bearer: Bearer) -> Explained:
+        current = await ask(control, PolicyWanted(), bearer)
+        async with services.judging.turn(bearer):
+            asked = msgspec.structs.asdict(question)
+            return _explained(await asyncio.to_thread(explanation, current=current, **asked))
+
+    @router.get("/explain", operation_id="explain")
+    async def explain_request(
+        bearer: Viewer,
+        host: Annotated[
+            str, Query(min_length=1, max_length=100, description="an address, or the name of a host")
+        ],
+        category: Category,
+        resource: Annotated[str, Query(min_length=1, max_length=256)],
+        node: Annotated[
+            str,
+            Query(
+                max_length=256, description="the node name that the host gives, if the action needs a node"
+            ),
+        ] = "",
+    ) -> Explained:
+        """Why the policy in force decides a request as it does."""
+        return await explained(Question(host=host, node=node, category=category, resource=resource), bearer)
+
+    @router.post("/explain")
+    async def explain_under(question: Annotated[Question, body(Question)], bearer: Viewer) -> Explained:
+        """Return the same under another text, which is not loaded."""
+        return await explained(question, bearer)
+
+    @router.post("/test")
+    async def test_policy(draft: Annotated[Draft, body(Draft)], bearer: Viewer) -> Tested:
+        """Run the policy's tests on a text; nothing is loaded. A text with errors is refused with every finding."""
+        current = await ask(control, PolicyWanted(), bearer)
+        async with services.judging.turn(bearer):
+            ran = (await asyncio.to_thread(judge_text, draft.text, current, cases=True)).results
+        cases = sorted(map(_case, ran), key=lambda case: case.passed)
+        passed = sum(case.passed for case in cases)
+        return Tested(
+            file=current.cases_file,
+            exists=current.cases is not None,
+            passed=passed,
+            failed=len(cases) - passed,
+            cases=cases[:_MOST_SHOWN],
+        )
+
+    return router
+
+
+def _of_records(services: Services) -> Routes:
+    router = Routes(prefix="/audit", tags=["audit"])
+    desk = LogReader(services)
+
+    @router.get("/{record_id}/why", responses=UNKNOWN)
+    async def why_of_record(record_id: OneRecord, bearer: Viewer) -> Why:
+        """Explain a record: its cause, the deciding events and values (not for viewers), and the places in the text.
+        For a monitor's verdict, these events alone lead to it. For a denial, the answer has the smallest change of the
+        policy in force that would allow it.
+        """
+        shown = await desk.record(bearer, record_id, 0)
+        record = readable_by(shown.entry, bearer).record
+        first = await desk.read(bearer, recorded_in_full, desk.path, shown.entry)
+        in_full = None if first is None else readable_by(first, bearer)
+        needed = asks_policy(record)
+        control = services.control
+        policy = await (ask if needed else ask_optional)(control, PolicyWanted(), bearer)
+        known = policy if needed else None
+        async with services.judging.turn(bearer):
+            words = await asyncio.to_thread(host_in_words, policy)
+            return await asyncio.to_thread(explained, record, known, in_full, words)
+
+    @router.get("/{record_id}/grant", responses=UNKNOWN | _NO_GRANT)
+    async def grant_of_record(record_id: OneRecord, bearer: Viewer, *, tool: bool = False) -> Granted:
+        """Return the smallest change of the policy in force that grants what this record says was refused.
+
+        `tool`: the change also has all other rights that the stock tool of the record needs, such as rostopic.
+        """
+        shown = await desk.record(bearer, record_id, 0)
+        known = await ask(services.control, PolicyWanted(), bearer)
+        async with services.judging.turn(bearer):
+            try:
+                return await asyncio.to_thread(granted, shown.entry.record, known, whole_tool=tool)
+            except UngrantableError as error:
+                raise ProblemError(409, "not-by-a-policy", str(error)) from None
+
+    return router
+
+
+def _case(case: CaseResult) -> Case:
+    return Case(
+        file=case.file,
+        line=case.line,
+        column=case.column,
+        **case.request.fields(),
+        expected=case.expected,
+        decision=case.decision.verdict,
+        reason=case.decision.reason,
+        passed=case.passed,
+    )
+
+
+def _explained(found: DecisionExplanation) -> Explained:
+    decision = found.decision
+    return Explained(
+        **found.request.fields(),
+        decision=decision.verdict,
+        rule=RuleText(**asdict(decision.rule)) if decision.rule else None,
+        reason=decision.reason,
+        told=found.told,
+        through=list(found.through),
+        limit=found.limit,
+        lost=[
+            LostRule(
+                rule=RuleText(**asdict(rule.rule)), would="allow" if rule.grants else "deny", why=rule.why
+            )
+            for rule in found.lost
+        ],
+        node=_explained(found.node) if found.node is not None else None,
+        command=_explained(found.command) if found.command is not None else None,
+        allowed=found.allowed,
+    )

@@ -1,0 +1,1 @@
+"""Sign: signatures of the site beside policies and specifications."""

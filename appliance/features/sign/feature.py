@@ -1,0 +1,6 @@
+"""The feature sign: `rosrv sign`. The core checks the signatures."""
+
+from appliance.cli.verb_table import Verb
+from appliance.features.feature import Feature
+
+SIGN = Feature("sign", verbs={"sign": Verb("appliance.features.sign.sign_verb:sign", after="monitor")})
