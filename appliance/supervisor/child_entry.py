@@ -89,7 +89,7 @@ def _prepare(plan: LaunchPlan) -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     privileges.raise_file_limit(plan.files)
     privileges.raise_oom_score(plan.ended_early)
-    os.nice(plan.nice)
+    privileges.add_niceness(plan.nice)
     if plan.slice_ns:
         privileges.shorten_slice(plan.slice_ns)
     if plan.view is not None:

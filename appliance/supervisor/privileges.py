@@ -16,6 +16,7 @@ import os
 import resource
 import signal
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from appliance.supervisor.users import Account
@@ -29,6 +30,7 @@ _PR_CAP_AMBIENT_CLEAR_ALL = 4
 _PR_SET_KEEPCAPS = 8
 _CLONE_NEWNET = 0x40000000
 _LAST_CAPABILITY_FILE = "/proc/sys/kernel/cap_last_cap"
+_AUTOGROUP = Path("/proc/self/autogroup")
 _CAPABILITY_VERSION_3 = 0x20080522
 _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 
@@ -77,6 +79,18 @@ def raise_priority(by: int) -> int:
     return by
 
 
+def add_niceness(by: int) -> None:
+    """Add to the niceness of this process, and give its session the result; do nothing that is not permitted.
+
+    Where the kernel shares the processor among sessions (autogroups), the niceness of a process has an effect only
+    inside its session. So call this in a session of this process alone.
+    """
+    with contextlib.suppress(PermissionError):
+        os.nice(by)
+    with contextlib.suppress(OSError):
+        _AUTOGROUP.write_text(str(os.getpriority(os.PRIO_PROCESS, 0)), encoding="ascii")
+
+
 def shorten_slice(nanoseconds: int) -> None:
     """Ask the scheduler for short turns, so that this process runs soon after it wakes; its share stays the same.
 
@@ -112,7 +126,7 @@ SUPERVISOR_CAPABILITIES = {
     "NET_RAW": 13,  # the firewall's iptables back end
     "SYS_PTRACE": 19,  # find the process that uses a port, and processes that a crash left in the namespace
     "SYS_ADMIN": 21,  # make and enter namespaces
-    "SYS_NICE": 23,  # one of two appliances: no load delays its lease
+    "SYS_NICE": 23,  # no load delays a stop, nor the lease of one of two appliances
     "SYS_RESOURCE": 24,  # raise the limit on open files
 }
 

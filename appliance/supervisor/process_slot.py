@@ -102,7 +102,7 @@ class ProcessSlot:
             path=str(role.path(facts)) if role.path else None,
             capabilities=role.capabilities,
             ended_early=role.ended_early,
-            nice=max(0, role.nice + facts.raised),
+            nice=role.nice + facts.raised,
             slice_ns=role.slice_ns,
             takes_secret=role.secret is not None,
             secret=str(secret) if role.secret is not None and (secret := role.secret(facts)) else None,

@@ -87,9 +87,9 @@ class Role:
     role if the role's user may not reach them. `sandbox` has the permitted system calls, and the files and ports
     besides the role's part and the system. `ended_early` is the role's `oom_score_adj` (0 to 1000): the kernel
     kills a higher one earlier if memory is short. `nice` is its niceness: a higher one yields the processor, so that
-    no console delays a stop. A negative one has effect if the supervisor could lower its own. `slice_ns` is the length
-    of its turns at the processor (0: the kernel's): a process with short turns waits less for each. `receiver` is the
-    only other machine that the firewall lets the user reach.
+    no console delays a stop. A negative one has effect if the supervisor may give it (CAP_SYS_NICE). `slice_ns` is
+    the length of its turns at the processor (0: the kernel's): a process with short turns waits less for each.
+    `receiver` is the only other machine that the firewall lets the user reach.
 
     A feature's role runs if the settings of features let it (`configured`), and a `paired` one only on one of two
     appliances.
