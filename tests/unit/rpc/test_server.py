@@ -287,6 +287,25 @@ async def test_pieces_that_arrive_while_a_host_waits_for_its_turn_are_read_in_or
         assert [one.body for one in server.requests] == [bytes(range(256))]
 
 
+async def test_a_request_that_has_begun_keeps_its_connection_for_a_while() -> None:
+    """A kept connection with an unfinished request is not evicted at once, unlike an idle one."""
+
+    async def handler(request: HttpRequest) -> bytes:
+        return request.body
+
+    async with serving(handler, shares=Shares(connections=Bounds(1, 1, 0, 0))) as server:
+        client = await server.connect()
+        await client.send(post(b"first"))
+        await client.response()
+        request = post(b"second")
+        await client.send(request[:20])
+        await until(lambda: any(connection.in_request for connection in server.http.connections))
+        other = await server.connect("127.0.0.2")
+        assert (await other.response())[0] == 503
+        await client.send(request[20:])
+        assert (await client.response())[0] == 200
+
+
 async def test_a_request_in_service_keeps_its_connection() -> None:
     begun, go = asyncio.Event(), asyncio.Event()
 
