@@ -45,11 +45,6 @@ def test_the_kernels_esp(machine: Machine) -> None:
     passes(machine, f"{HERE}/inside_kernel_esp.py")
 
 
-def test_a_takeover_through_the_kernels_esp(machine: Machine) -> None:
-    """After a power cut of the active one of two appliances, a host in a tunnel of the kernel is back."""
-    passes(machine, f"{HERE}/inside_kernel_takeover.py")
-
-
 def test_the_appliance_on_a_machine(machine: Machine) -> None:
     passes(machine, f"{HERE}/inside_whole_machine.py", "-k", "appliance")
 
