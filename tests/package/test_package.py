@@ -22,6 +22,14 @@ from tests.support.machine_disk import ROOT
 # Packages are built, and a machine boots twice, emulated, perhaps on a busy processor.
 pytestmark = pytest.mark.timeout(5400)
 EVERYWHERE = {"ROS_MASTER_URI": "http://localhost:11311"}
+VISITOR = """\
+ip netns add visitor
+ip link add site type veth peer name site netns visitor
+ip address add 192.168.1.5/24 dev site
+ip link set site up
+ip -n visitor address add 192.168.1.66/24 dev site
+ip -n visitor link set site up
+"""
 
 
 @pytest.fixture
@@ -68,6 +76,16 @@ def ros(machine: Machine, *command: str) -> Done:
     )
 
 
+def denies_a_visitor(machine: Machine) -> None:
+    """Assert that a host on the network that no rule names is denied, with a record."""
+    machine.run("sh", "-euc", VISITOR)
+    there = ("env", "ROS_MASTER_URI=http://192.168.1.5:11311", "ROS_IP=192.168.1.66", "rosnode", "list")
+    denied = machine.run("ip", "netns", "exec", "visitor", *there, seconds=SLOW_SECONDS, check=False)
+    assert "no rule of the policy names 192.168.1.66" in denied.output
+    assert "DENY decision 192.168.1.66" in machine.run("rosrv", "audit", "search", "--deny").output
+    machine.run("ip", "netns", "delete", "visitor")
+
+
 def serves(machine: Machine) -> dict[str, object]:
     """Return the status of the appliance, once systemd reports that it is ready."""
     machine.run("systemctl", "start", "rosrv", seconds=SLOW_SECONDS)  # waits for a start in progress
@@ -93,6 +111,8 @@ def test_the_life_of_the_package(machine: Machine) -> None:
                 "rostopic", "pub", "--rate=5", "/chatter", "std_msgs/String", "data: hello")  # fmt: skip
     assert "hello" in ros(machine, "rostopic", "echo", "-n", "1", "/chatter").output
 
+    denies_a_visitor(machine)
+
     main = machine.run("systemctl", "show", "--property=MainPID", "--value", "rosrv").output.strip()
     machine.run("systemctl", "kill", "--kill-whom=main", "--signal=KILL", "rosrv")
     machine.run(
@@ -117,6 +137,7 @@ def test_the_life_of_the_package(machine: Machine) -> None:
     assert machine.stop(), machine.story()
     machine.start()
     serves(machine)
+    denies_a_visitor(machine)
     machine.run("rosrv", "audit", "verify")
 
     machine.run("dpkg", "--remove", "rosrv", seconds=SLOW_SECONDS)
