@@ -78,7 +78,6 @@ def appliance(masters: Masters) -> Iterator[Appliance]:
 
 @pytest.fixture(params=["plain", "appliance"])
 def site(request: pytest.FixtureRequest, masters: Masters) -> Iterator[Site]:
-    """A robot behind a plain master, and the same robot behind the appliance: a test of it runs with both."""
     with masters.lend(request.param, "lab") as site:
         yield site
 
@@ -94,7 +93,6 @@ def ros(request: pytest.FixtureRequest, appliance: Appliance, tmp_path: Path) ->
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Add what the nodes and the appliance said to the report of a failure."""
     report = yield
     if report.failed and isinstance(item, pytest.Function):
         running: dict[int, tuple[str, Any]] = {

@@ -111,12 +111,10 @@ def open_folders_above(checkout: Path) -> None:
 
 
 def lane_of(file: str) -> str:
-    """Return the lane of a test file, by its path in the repository."""
     return next((lane for lane, parts in LANES.items() if any(part in file for part in parts)), "core")
 
 
 def files_of_stages() -> dict[str, list[str]]:
-    """Return the test files of each stage. A file belongs to the first stage that names it most precisely."""
     found: dict[str, list[str]] = {stage.name: [] for stage in STAGES}
     roots = {folder: stage.name for stage in STAGES for folder in stage.folders}
     tests = [ROOT / "tests", ROOT / "rosmop" / "tests"]

@@ -23,7 +23,6 @@ PAINTBALL = "uint8 NONE=0\nuint8 SINGLE_SHOT=1\nHeader header\nuint8 trigger\n"
 
 @functools.cache
 def definitions() -> Definitions:
-    """Return ROS's own definitions, and those of the LandShark."""
     return standard_definitions().extended(
         Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": PAINTBALL})
     )
@@ -35,7 +34,6 @@ def message(kind: str, **fields: object) -> bytes:
 
 
 def fields(kind: str, data: bytes) -> Any:
-    """Return a message's fields, read by another library's decoder."""
     return STORE.deserialize_ros1(data, _long(kind))
 
 
@@ -56,7 +54,6 @@ def _long(kind: str) -> str:
 
 
 def _value(kind: str, given: object) -> Any:
-    """Return an object of the other library with the given fields, and zero for the rest."""
     if not isinstance(given, dict):
         return given
     import numpy as np  # noqa: PLC0415  only for the other library's arrays
@@ -110,7 +107,6 @@ def act(body: str, *, before: str = "", data: int = 0, most: int = BUDGET) -> Ou
 
 
 def shown(expression: str, *, conversion: str = "%s", before: str = "", data: int = 0) -> str:
-    """Return the output of an expression, or the text of its fault."""
     outcome = act(f'ROS_INFO("{conversion}", {expression});', before=before, data=data)
     if outcome.faults:
         return f"fault: {outcome.faults[0].text}"

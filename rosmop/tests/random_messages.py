@@ -81,6 +81,5 @@ def lie(whole: bytes, at: int, length: int) -> bytes:
 
 
 def lies(whole: bytes, random: Random, lengths: Sequence[int] = LIES) -> list[bytes]:
-    """Return a message with each of these numbers at a dozen offsets, with whole messages in between."""
     places = sorted(random.sample(range(len(whole) - 3), k=min(12, len(whole) - 3))) if len(whole) > 4 else []
     return [body for at in places for length in lengths for body in (lie(whole, at, length), whole)]

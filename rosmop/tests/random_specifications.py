@@ -34,7 +34,6 @@ PLAIN = ("/plain", "/serve request")
 
 
 def ways(seed: int) -> tuple[str, ...]:
-    """Return the choices for a topic, or for a part of a service, which some seeds have."""
     served = ("/serve request", "/serve request", "/serve response", "/plain")
     return served if seed % 4 == 3 else ("/plain", "/plain", "/stamped")
 
@@ -66,7 +65,6 @@ _HANDLERS = (*[""] * 8, "@{} {{ }}", '@{} {{ ROS_WARN("{}"); }}', "@{} {{ DROP; 
 
 
 def definitions() -> Definitions:
-    """Return ROS's definitions, and those of these tests."""
     return acting.definitions().extended(OWN)
 
 

@@ -25,8 +25,6 @@ WALKS = {
 
 
 def ticking(readings: list[None]) -> Callable[[], float]:
-    """Return a clock that advances by one millisecond with each reading."""
-
     def read() -> float:
         readings.append(None)
         return len(readings) / 1000

@@ -23,7 +23,6 @@ def kept(
     more: str = "",
     before: str = 'std::string a; std::string b; std::string c = "abc"; int n = 0;',
 ) -> str:
-    """Return a specification with an event that reads a string and a number."""
     return f"""s() {{ {before}
         event e(std::string f, int x) /stamped own/Stamped '{{frame:f, count:x}}' {{ {body} }} {more} }}"""
 

@@ -23,7 +23,6 @@ TENTH = unpack("<f", pack("<f", 0.1))[0]
 
 
 def speeds(monitors: MonitorSet, time: int = 1) -> tuple[float, float]:
-    """Return the speeds that the base gets of a fast command, and the small one that the monitor writes."""
     linear = fields("geometry_msgs/Twist", bytes(monitors.judge("/cmd_vel", FAST, time).buffer)).linear
     return linear.x, linear.y
 

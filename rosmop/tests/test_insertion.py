@@ -49,7 +49,6 @@ class Phase:
         return "" if event is None else f"PUBLISH(/{event}, std_msgs/Empty, m);"
 
     def forbids(self, time: int, event: str) -> bool:
-        """Whether a message would violate a property, by its definition on the trace."""
         return any(one.unmet((*self.seen, (time, event)), time)[0] for one in self.forbidden)
 
     def deadlines(self) -> Iterator[tuple[int, int]]:

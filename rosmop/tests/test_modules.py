@@ -44,7 +44,6 @@ print(hashlib.sha256(encoded_part(part_of(compiled("b", "a"), ["a"], []))).hexdi
 
 
 def rule(name: str) -> str:
-    """Return a specification of this name, with one part of every kind."""
     head, _, rest = RULE.format(name).partition("event")
     body, _, said = rest.partition("    std_msgs::Int32 said;\n")
     return f"{head}std_msgs::Int32 said; event{body}{said}"

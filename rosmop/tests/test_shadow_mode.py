@@ -85,7 +85,6 @@ class Both:
         self.with_shadow = following
 
     def go_on(self, topic: str, body: bytes, time: int) -> None:
-        """Send a message to the sets in which all specifications are now enabled."""
         self.stories[0] += self.story(self.enabled.process(topic, bytearray(body), time))
         self.stories[1] += self.story(self.with_shadow.process(topic, bytearray(body), time))
 

@@ -38,7 +38,6 @@ TRIGGER = message("std_msgs/Header", frame_id="ocu") + b"\x01"
 
 
 def joints(tilt: float) -> bytes:
-    """Return the joint states for a direction of the gun."""
     return message("sensor_msgs/JointState", name=["turret_pan", "turret_tilt"], position=[0.1, tilt])
 
 

@@ -27,7 +27,6 @@ ACTING, OBSERVING = GOALS % "DROP;", GOALS % 'ROS_WARN("twice");'
 
 
 def begun(text: str, slices: int) -> MonitorSet:
-    """Return a started set in which each source is a host."""
     monitors = MonitorSet.of(compiled_from({"x.rv": text}, definitions()), slices=slices, holder_of=HOSTS.get)
     monitors.start(0)
     return monitors

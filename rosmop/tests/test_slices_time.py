@@ -59,7 +59,6 @@ Entry = tuple[int, int, tuple[tuple[str, str], ...]]
 
 
 def entries(outcomes: Iterable[Outcome], place: int) -> list[Entry]:
-    """Return the reports of these events, and of the deadlines before them."""
     found: list[Entry] = []
     for outcome in outcomes:
         found += entries(outcome.before, -1)
@@ -150,7 +149,6 @@ def a_timed_property(random: Random) -> str:
 
 
 def timed(random: Random) -> Made:
-    """Draw a random specification with a timed property, and perhaps another property."""
     one = made(random)
     others = one.properties[:1] if random.random() < 0.4 else ()
     return replace(one, properties=(a_timed_property(random), *others))

@@ -63,7 +63,6 @@ def seconds_for(listener: Process, count: int, since: float) -> float:
 
 
 def judged(appliance: Appliance) -> int:
-    """Return the number of messages that the monitor has judged."""
     [row] = [one for one in appliance.rosrv("monitor", "list").stdout.splitlines() if "counter" in one]
     return int(row.split()[3])
 

@@ -42,7 +42,6 @@ def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
 
 
 def refused(appliance: Appliance, method: str, *arguments: object) -> str:
-    """Return the id of the record of a denied call."""
     with ServerProxy(appliance.master_uri) as master:
         code, text, _value = getattr(master, method)(*arguments)
     assert code == 0

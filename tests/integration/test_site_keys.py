@@ -42,7 +42,6 @@ def sign(file: Path) -> None:
 
 
 def post(appliance: Appliance, path: str, **body: Any) -> Answer:
-    """Send a POST with the first token, whatever revision is in force."""
     headers = {"If-Match": "*", "Content-Type": "application/json"}
     return appliance.rest().request("POST", path, json.dumps(body).encode(), headers)
 

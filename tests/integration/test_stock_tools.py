@@ -36,7 +36,6 @@ PACKAGE = """\
 
 @pytest.fixture
 def ros(site: Site, tmp_path: Path) -> Iterator[RosSession]:
-    """Provide the robot's nodes and tools of one test."""
     with RosSession(site.master_uri, tmp_path, site.robot) as session:
         yield session
 

@@ -27,7 +27,6 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(program: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run the command in an empty folder, with an environment that has no reference to the checkout."""
     environment = {"PATH": "/usr/bin:/bin", "HOME": str(folder)}
     return subprocess.run(
         [program, *arguments], cwd=folder, env=environment, capture_output=True, text=True, check=False

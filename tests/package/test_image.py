@@ -66,14 +66,12 @@ EXPECTED = re.compile(
 
 @pytest.fixture(scope="module")
 def engine() -> Iterator[Engine]:
-    """Provide an engine that has the base, and a clock that can be changed."""
     with builder(clock=True) as engine:
         yield engine
 
 
 @pytest.fixture(scope="module")
 def unpacked(engine: Engine, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build the archive with the documented command, unpack it, and load its image into the engine."""
     command = [sys.executable, "-m", "distribution.site", *OPTIONS]
     environment = os.environ | {"DOCKER_HOST": engine.address}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
@@ -100,7 +98,6 @@ def run(engine: Engine, *command: str, text: str = "") -> str:
 
 
 def of(parts: list[dict[str, Any]], kind: str) -> set[tuple[str, str]]:
-    """Return names and versions of the components of a kind."""
     return {(one["name"], one["version"]) for one in parts if one["purl"].startswith(f"pkg:{kind}/")}
 
 
@@ -210,7 +207,6 @@ def test_two_builds_are_the_same(engine: Engine, unpacked: Path, tmp_path: Path)
 
 
 def differences(first: Path, second: Path) -> list[str]:
-    """Return the files that differ between two images, with their differences."""
     if first.read_bytes() == second.read_bytes():
         return []
     with tarfile.open(first) as one, tarfile.open(second) as other:

@@ -47,7 +47,6 @@ def newer(package: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def machine(package: Path, newer: Path, tmp_path: Path) -> Iterator[Machine]:
-    """Return a clean machine with both packages in its folder, not started."""
     machine = clean_machine(tmp_path, package, {"old.deb": package, "new.deb": newer})
     try:
         yield machine
@@ -56,7 +55,6 @@ def machine(package: Path, newer: Path, tmp_path: Path) -> Iterator[Machine]:
 
 
 def state_of(machine: Machine) -> dict[str, str]:
-    """Return the settings of a machine that the appliance changes while it runs."""
     looks = {
         "rules": ("nft", "list", "ruleset"),
         "legacy rules": ("iptables-legacy-save",),

@@ -39,7 +39,6 @@ def rosrv() -> Iterator[Path]:
 
 
 def run(rosrv: Path, *arguments: str, folder: Path, seconds: float = 60) -> subprocess.CompletedProcess[str]:
-    """Run one command in an empty folder, with an environment that has no reference to the checkout."""
     environment = {
         "PATH": f"{rosrv.parent}:/usr/sbin:/usr/bin:/sbin:/bin",
         "HOME": str(folder),

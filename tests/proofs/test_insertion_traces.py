@@ -69,7 +69,6 @@ def trace() -> Trace:
 
 
 def followed(appliance: Appliance, ros: RosSession, folder: Path) -> Trace:
-    """Make one change after the other, and receive a message after each."""
     trace: Trace = []
     listener = ros.listener("rospy", "/chatter")
     talker = ros.talker("rospy", "/chatter", "--rate", "20")
@@ -106,7 +105,6 @@ def followed(appliance: Appliance, ros: RosSession, folder: Path) -> Trace:
 
 
 def bounds(trace: Trace) -> Bounds:
-    """Allow as many changes as the trace has, and a crash."""
     happened = [what for what, _, _ in trace]
     again = max(0, happened.count("subscription") - 1)
     return Bounds(loads=happened.count("loaded"), policies=happened.count("revoked") + again, crashes=1)
@@ -123,7 +121,6 @@ def test_a_run_is_an_execution_of_the_model(trace: Trace, tmp_path: Path) -> Non
 
 
 def past_its_monitor(trace: Trace) -> Trace:
-    """Let the previous revision judge a message that was sent after the new one had been answered."""
     place = trace.index(("heard", 2, 2))
     return [*trace[:place], ("heard", 1, 2)]
 
@@ -134,7 +131,6 @@ def undecided(trace: Trace) -> Trace:
 
 
 def after_the_end(trace: Trace) -> Trace:
-    """Add a message after the connection with the revoked permission is closed."""
     return [*trace[: trace.index(("closed", 0, 0)) + 1], ("heard", 2, 2)]
 
 

@@ -17,7 +17,6 @@ TABLET = "172.29.78.66"
 
 @pytest.fixture(scope="module")
 def machine() -> Iterator[Host]:
-    """Return a machine for an engine, which has the images of this checkout."""
     need_root()
     build_images()
     with Lab("rosrv-engine") as lab:

@@ -23,7 +23,6 @@ def _fields(kind: Any, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _value(kind: Any, given: Any) -> Any:
-    """Return the given value, with its nested structs filled in."""
     if get_origin(kind) is Annotated:
         return _value(get_args(kind)[0], given)
     if get_origin(kind) in (Union, types.UnionType):

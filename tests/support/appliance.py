@@ -94,7 +94,6 @@ class Appliance:
         return str(self.ready["master"])
 
     def start(self) -> Self:
-        """Start the appliance (again, on the same state) and return when nodes may connect."""
         if self.isolation == "netns" and not self._has_turn:
             self._turn.enter_context(own_namespace())
             self._has_turn = True
@@ -236,7 +235,6 @@ class Appliance:
         return pid
 
     def story(self) -> str:
-        """Return the appliance's output, for the message of a failure."""
         return self.process.story() if self.process else "rosrv up was not started"
 
     def __enter__(self) -> Self:

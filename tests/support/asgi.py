@@ -14,5 +14,4 @@ async def sent(app: Any, method: str, path: str, host: str = "10.0.0.1", **given
 
 
 def requested(app: Any, method: str, path: str, host: str = "10.0.0.1", **given: Any) -> httpx.Response:
-    """Return the answer to one request, which runs in a loop of its own."""
     return run(sent(app, method, path, host, **given))

@@ -17,6 +17,5 @@ def header(name: str, size: int = 0, kind: bytes = tarfile.REGTYPE, **fields: ob
 
 
 def archive(file: Path, *blocks: bytes) -> Path:
-    """Write an archive of these blocks, after the audit log that every backup has."""
     file.write_bytes(gzip.compress(header(LOG) + b"".join(blocks) + bytes(1024)))
     return file

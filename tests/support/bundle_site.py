@@ -37,7 +37,6 @@ def bundle_files(policy: str = POLICY, **more: str) -> dict[str, bytes]:
 
 
 def everywhere(signed: float | None = None, *rings: Ring) -> Terms:
-    """Return terms with one ring of all robots, or with these rings."""
     return Terms(int(time.time() if signed is None else signed), [*rings] or [Ring("all", [], 100)])
 
 

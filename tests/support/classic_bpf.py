@@ -8,12 +8,10 @@ from appliance.policy.model import Address
 
 
 def _packet(source: Address) -> tuple[int, bytes]:
-    """Return the ethertype of a packet from this source, and its header up to the source."""
     return (0x0800, bytes(12) + source.packed) if source.version == 4 else (0x86DD, bytes(8) + source.packed)
 
 
 def choose(program: bytes, source: Address) -> int:
-    """Run a program as the kernel does, and return the number of the socket."""
     ethertype, header = _packet(source)
     code = list(struct.iter_unpack("HBBI", program))
     accumulator, stored, at = 0, dict[int, int](), 0

@@ -456,7 +456,6 @@ class ControlParts:
             self.fill_part_of_queue(host)
 
     def fill_part_of_queue(self, host: str) -> None:
-        """Let as many changes of a host wait as it may have."""
         node = self.node("/filler", 999, ipaddress.ip_address(host))
         for number in range(MASTER_CHANGES.bounds.host):
             self.entries.make(node, NodeRegistration(Kind.PUBLICATION, f"/filler_{number}", "t", number))
@@ -472,7 +471,6 @@ class ControlParts:
         await self.reconciler.round()
 
     async def look(self, node: Incarnation) -> None:
-        """Check a node now, and wait for everything that follows."""
         await self.liveness.look(node)
         await self.settle()
 

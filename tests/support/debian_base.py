@@ -187,7 +187,6 @@ def _make(archive: Path, packages: Sequence[str], suite: str, settings: MachineS
 
 
 def _key(packages: Iterable[str], settings: MachineSettings) -> str:
-    """Return a name for the archive that depends on all its inputs."""
     parts = [_IN_TREE, settings.mirror, *sorted(packages)]
     parts += [text for one in sorted(settings.files.items()) for text in one]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]

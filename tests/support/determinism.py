@@ -98,7 +98,6 @@ WATCH = Watch()
 
 
 def may_depend_on_chance(item: pytest.Item) -> bool:
-    """Return whether a test has a marker that permits real threads, processes, sockets and clocks."""
     return any(item.get_closest_marker(name) for name in ("real", "nightly"))
 
 

@@ -94,7 +94,6 @@ class Engine:
         return self._run([self._client, *arguments], check=check, timeout=timeout, text=text)
 
     def inspect(self, name: str) -> dict[str, Any]:
-        """Return the engine's description of a container, image, network or volume."""
         found: list[dict[str, Any]] = json.loads(self.docker("inspect", name).stdout)
         return found[0]
 
@@ -359,7 +358,6 @@ def project(directory: Path) -> Path:
 
 
 def namespace_of(engine: Engine, container: str) -> Namespace:
-    """Return the network namespace of a running container, to try connections from it."""
     pid = engine.inspect(container)["State"]["Pid"]
     return _ContainerNamespace(int(pid))
 

@@ -18,7 +18,6 @@ from tests.support.idle import idle
 
 
 def idle_parts() -> FeatureParts:
-    """Return the parts of all features, with default settings and a log that records nothing."""
     store, monitors = idle(StateStore), idle(SpecificationManager)
     store.settings = dict  # type: ignore[method-assign]  # an idle store has no settings
     early = FeatureContext(

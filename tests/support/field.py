@@ -127,7 +127,6 @@ class Field:
         return int(re.search(r"VmRSS:\s+(\d+) kB", status)[1]) << 10  # type: ignore[index]  # the kernel always writes it
 
     def story(self) -> str:
-        """Return the output of all processes, for the message of a failure."""
         return "\n".join([self.appliance.story(), self.trail.story(), self.ros.story()])
 
 

@@ -112,7 +112,6 @@ class Fork(subprocess.Popen[Any]):
 
 @functools.cache
 def _server() -> socket.socket:
-    """Return the socket to this process's server, which ends with it."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("ROS", "PYTHON"))}
     with theirs:

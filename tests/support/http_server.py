@@ -32,7 +32,6 @@ LARGE = 24 << 20  # more than the kernel's buffers take
 
 
 def two_hosts(host: int) -> Bounds:
-    """Return a pool with room for the quotas of two hosts."""
     return Bounds(whole=2 * host, host=host, unknown=0, kept=0)
 
 

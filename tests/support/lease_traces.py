@@ -98,7 +98,6 @@ def _fields(line: str, names: tuple[str, str]) -> dict[str, str]:
 
 
 def _step(one: dict[str, str], names: tuple[str, str]) -> Step:
-    """Return the step of the model that leaves this event."""
     event = one["event"]
     first = (*names, _WITNESS).index(one.get("process") or one["who"])
     second = 0

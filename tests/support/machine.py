@@ -155,7 +155,6 @@ class Machine:
         self._line.sendall(json.dumps(order).encode() + b"\n")
 
     def story(self) -> str:
-        """Return the end of the console, for the message of a failure."""
         words = self.console.read_text(errors="backslashreplace")[-3000:] if self.console.exists() else ""
         log = self.directory / "qemu.log"
         return f"--- the machine's console\n{words}\n--- qemu\n{log.read_text() if log.exists() else ''}"

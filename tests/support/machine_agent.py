@@ -59,7 +59,6 @@ def _run(argv: list[str], seconds: float, root: str) -> tuple[int, str]:
 
 
 def _line(port: BinaryIO) -> bytes:
-    """Return one line. Without a reader on the other side the port returns nothing, and is read again."""
     line = b""
     while not line.endswith(b"\n"):
         part = port.read(65536)

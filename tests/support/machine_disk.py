@@ -153,7 +153,6 @@ def _packages() -> tuple[str, ...]:
 
 
 def _furnish(tree: Path, kernel: Kernel) -> None:
-    """Add the settings of this machine to a Debian tree."""
     shutil.copytree(kernel.modules, tree / "lib" / "modules" / kernel.release, symlinks=True)
     agent = tree / "usr/local/lib/rosrv-agent.py"
     agent.parent.mkdir(parents=True, exist_ok=True)

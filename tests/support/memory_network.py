@@ -44,7 +44,6 @@ class MemoryNetwork:
         await serve(end.reader, end)
 
     def break_off(self, address: tuple[str, int]) -> None:
-        """End all connections to an address, as its machine does when it is switched off."""
         for end in self._open:
             if end.address == address:
                 end.close()

@@ -140,7 +140,6 @@ class RosSession:
         return done
 
     def story(self) -> str:
-        """Return the output of every process, for the message of a failure."""
         return "\n".join(process.story() for process in self.processes)
 
     def __enter__(self) -> Self:
@@ -160,12 +159,10 @@ class RosSession:
 
 
 def numbers(events: Iterable[Event]) -> list[int]:
-    """Return the numbers of a talker's messages in these events."""
     return [int(event["data"].split()[-1]) for event in events]
 
 
 def without_gap(numbers: Sequence[int]) -> bool:
-    """Whether no number is missing between the first and the last, none is repeated, and the order is kept."""
     return list(numbers) == list(range(numbers[0], numbers[0] + len(numbers)))
 
 
@@ -184,5 +181,4 @@ def roscpp_program(name: str) -> Path:
 
 
 def has_ros() -> bool:
-    """Whether the stock nodes and tools are installed on this machine."""
     return all(shutil.which(tool, path="/usr/bin") for tool in ("rosmaster", "rostopic", "roslaunch", "g++"))

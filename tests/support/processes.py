@@ -184,7 +184,6 @@ class Process:
         return int(status)
 
     def output(self) -> str:
-        """Return the plain text the program printed so far."""
         with self._changed:
             return "\n".join(
                 event["text"] if set(event) == {"text"} else json.dumps(event) for event in self.events
@@ -229,7 +228,6 @@ class Process:
         self.popen.wait(LIMIT)
 
     def story(self) -> str:
-        """Return the output of the process, for the message of a failure."""
         with self._changed:
             events = [json.dumps(event) for event in self.events[-40:]]
             errors = self.errors[-40:]

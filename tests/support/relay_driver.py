@@ -185,7 +185,6 @@ class RelayProcess:
             self.lifeline.wait_for(answer.__eq__, after=after)
 
     def stop(self) -> int:
-        """Stop the relay as the supervisor does, and return its exit status."""
         if self.process.poll() is None:
             self.lifeline.send(Stop())
         status = self.process.wait(LIMIT)
@@ -299,7 +298,6 @@ class RelayDriver:
         self.relay.ping(7)
 
     def environment(self) -> dict[str, str]:
-        """Return the environment in which a node finds this master."""
         return {**os.environ, "ROS_MASTER_URI": self.uri, "ROS_IP": LOOPBACK, "PYTHONWARNINGS": "ignore"}
 
     def _face(self, name: str, uri: str) -> Face:

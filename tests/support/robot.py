@@ -48,7 +48,6 @@ _LENGTH = struct.Struct("<I")
 
 
 def nodes() -> Iterator[tuple[str, str]]:
-    """Return the robot's nodes, with the address of each node's machine."""
     for machine, spaces in MACHINES.items():
         for space, part in itertools.product(spaces, PARTS):
             yield f"/{space}/{part}", machine
@@ -94,7 +93,6 @@ class Robot:
         return self._machines[self._machine[node]].uri
 
     def call(self, node: str, method: str, *arguments: Any) -> Any:
-        """Make a call of the Master API as this node, from its machine."""
         with _proxy(self._master_uri, self._machine[node]) as master:
             return getattr(master, method)(node, *arguments)
 
@@ -236,7 +234,6 @@ def _exactly(connection: socket.socket, size: int) -> bytes:
 
 
 def _read(connection: socket.socket) -> None:
-    """Read to the end: the appliance may end before the robot, and reset connections."""
     with contextlib.suppress(ConnectionError):
         while connection.recv(65536):
             pass

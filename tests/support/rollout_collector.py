@@ -57,7 +57,6 @@ class RolloutCollector:
         self._thread = threading.Thread(target=self.loop.run_until_complete, args=(self._run(),), daemon=True)
 
     def enrol(self, group: RobotGroup, *names: str) -> None:
-        """Enrol robots, whose certificates have these names, in a group."""
         self.groups |= dict.fromkeys(names, group)
 
     def _robot(self, request: Request) -> Robot:
@@ -68,7 +67,6 @@ class RolloutCollector:
         return Robot(name=name, group=group, key="", certificate="", added=0)
 
     def call(self, work: Coroutine[Any, Any, T]) -> T:
-        """Run a coroutine in the collector's loop and return its result."""
         return asyncio.run_coroutine_threadsafe(work, self.loop).result(60)
 
     def start(self) -> None:

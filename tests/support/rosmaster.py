@@ -41,7 +41,6 @@ class PlainMaster:
             process.stop()
 
     def story(self) -> str:
-        """Return the output of both programs, for the message of a failure."""
         return "\n".join(process.story() for process in self.processes)
 
     def __enter__(self) -> Self:

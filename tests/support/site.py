@@ -65,7 +65,6 @@ class Site:
         return self._lab
 
     def story(self) -> str:
-        """Return the output of the master, for the message of a failure."""
         return self.master.story()
 
     def state(self) -> dict[str, Any]:

@@ -20,7 +20,6 @@ _standard = cache(standard_definitions)
 
 
 async def parts_here(compiled: bytes, wanted: list[PartNames]) -> list[bytes]:
-    """Return the programs that relays run, compiled in this process."""
     return parts(compiled, wanted)
 
 

@@ -91,7 +91,6 @@ class _Collector:
             return list(self.messages)
 
     def sequences(self) -> list[int]:
-        """Return the sequence numbers of the received records, in order."""
         with self._changed:
             return [int(one.fields["sequence"]) for one in self.messages if "rosrv@32473" in one.elements]
 

@@ -61,7 +61,6 @@ class TunnelSite:
         self.kits = 0
 
     def kit(self, verb: str = "add", name: str = "ocu-1", *options: str) -> Path:
-        """Enrol a host, or renew its certificate, and return its kit."""
         self.kits += 1
         path = self.home / f"kit-{self.kits}.tar.gz"
         self.appliance.rosrv("host", verb, name, "--appliance", MIDDLE, "--output", str(path), *options)
@@ -93,7 +92,6 @@ class TunnelSite:
 
     @contextlib.contextmanager
     def talking(self, joined: JoinedHost, rate: int = 10) -> Iterator[tuple[Process, Process]]:
-        """Run a talker on the host behind its tunnel, and a listener on the robot that receives it."""
         with (
             RosSession(joined.master, self.home, joined) as there,
             RosSession(MASTER, self.home, self.robot) as here,
@@ -104,7 +102,6 @@ class TunnelSite:
             yield talker, listener
 
     def stands(self, address: str) -> bool:
-        """Whether the tunnel of this virtual address is up, by the audit log."""
         changes = [
             one for one in self.trail.seen(host=address) if one["event"] in ("tunnel up", "tunnel down")
         ]
@@ -139,7 +136,6 @@ class TunnelSite:
         return found | {"reason": " ".join([found["reason"], *found["detail"].get("reasons", ())])}
 
     def story(self) -> str:
-        """Return the appliance's output, for the message of a failure."""
         return self.appliance.story()
 
     def rest(self) -> Rest:
@@ -196,5 +192,4 @@ def left_behind(host: Host) -> dict[str, str]:
 
 
 def numbers(listener: Process) -> list[int]:
-    """Return the numbers of the messages that a listener received from a talker, in order."""
     return [int(re.split(r"\s", str(event["data"]))[-1]) for event in listener.seen(event="received")]

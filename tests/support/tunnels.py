@@ -156,6 +156,5 @@ class JoinedHost:
 
 
 def _established(event: Event) -> str | None:
-    """Return the number of the IKE_SA that a line of charon reports as established."""
     found = re.search(r"IKE_SA rosrv\S*\[(\d+)\] established", str(event.get("text")))
     return found and found[1]

@@ -23,7 +23,6 @@ class VirtualClock:
         return self._wall
 
     def since_boot_ns(self) -> int:
-        """Return the monotonic time and the time that the machine slept."""
         return self._now + self._asleep
 
     def advance(self, seconds: float) -> None:
@@ -58,7 +57,6 @@ def let_time_pass(seconds: float) -> None:
 
 
 def set_wall(seconds: float) -> None:
-    """Set the system time of the virtual clock of the present context."""
     present = clock.source()
     assert isinstance(present, VirtualClock)
     present.set_wall(seconds)

@@ -52,7 +52,6 @@ class Frame:
 
     @property
     def ports(self) -> tuple[int, int]:
-        """Return source and destination port of a TCP or UDP packet."""
         start = self.header
         return (
             int.from_bytes(self.data[start : start + 2]),

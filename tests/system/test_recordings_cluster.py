@@ -68,7 +68,6 @@ class Cluster:
         assert done.returncode == 0, done.stdout + done.stderr
 
     def processes(self, node: str = "") -> list[int]:
-        """Return the processes of a node, or of all, with their children: some overwrite their environment."""
         mark = f"TEST_NODE={self.mark}.{node}".encode()
         found, parents = set[int](), dict[int, int]()
         for process in Path("/proc").glob("[0-9]*"):

@@ -12,7 +12,6 @@ _NAME = re.compile(r"^(?:/\*|  +/\*|) *= (appliance/\S+\.py) (\w+(?:\.\w+)?)", r
 
 
 def named(model: Model) -> list[tuple[str, str]]:
-    """Return the code that a model names: files, and functions in them."""
     return sorted(set(_NAME.findall(model.path.read_text())))
 
 

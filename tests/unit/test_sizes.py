@@ -23,5 +23,4 @@ def test_each_part_stays_within_its_budget() -> None:
 
 
 def lines_in(folder: str | Path) -> int:
-    """Return the number of lines of the Python files in a folder."""
     return sum(path.read_bytes().count(b"\n") for path in (ROOT / folder).rglob("*.py"))

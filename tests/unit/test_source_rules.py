@@ -46,7 +46,6 @@ class Rule(NamedTuple):
 
 
 def forbid(instead: str) -> Judge:
-    """Return a judge to whom everything that is seen is wrong."""
     return lambda seen: [f"{one.path}:{one.line}: {one.what}: {instead}" for one in seen]
 
 
@@ -96,7 +95,6 @@ def narrow_handlers(source: Source) -> Iterator[tuple[int, str]]:
 
 
 def closed_descriptors(source: Source) -> Iterator[tuple[int, str]]:
-    """Yield each attribute that a function closes as a descriptor but does not reset."""
     if "os.close" not in source.text:
         return
     for function in source.nodes:
@@ -121,7 +119,6 @@ def closed_descriptors(source: Source) -> Iterator[tuple[int, str]]:
 
 
 def public_classes(source: Source) -> Iterator[tuple[int, str]]:
-    """Yield each class whose name has no underscore before it."""
     for node in source.nodes:
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
             yield node.lineno, node.name
@@ -194,7 +191,6 @@ LOOKUPS = {
 
 
 def lookups(source: Source) -> Iterator[tuple[int, str]]:
-    """Yield the innermost function of each lookup of an attribute, class or parameter by its name."""
     if any(map(_is_lookup, source.nodes)):
         yield from ((line, f"{source.path} {name}") for line, name in _lookups_in(source.nodes[0], ""))
 
@@ -413,7 +409,6 @@ def quoted(seen: Sequence[Seen]) -> Iterator[str]:
 
 
 def habits(source: Source) -> Iterator[tuple[int, str]]:
-    """Yield the bad habits in docstrings, comments and names of tests."""
     yield from bad_habits(said_in(source.text, source.nodes))
 
 
@@ -433,7 +428,6 @@ def shown_habits(source: Source) -> Iterator[tuple[int, str]]:
 
 
 def foreign_imports(source: Source) -> Iterator[tuple[int, str]]:
-    """Yield each import by a test of the language that needs the appliance or its tests."""
     for node in source.nodes:
         match node:
             case ast.ImportFrom(module=str(module)) if module.split(".")[0] in ("appliance", "tests"):
@@ -540,7 +534,6 @@ def parsed(path: str, text: str) -> Source:
 
 
 def applies(rule: Rule, path: str) -> bool:
-    """Whether a rule is about this file: rules on the product are not about the tests of the language."""
     tested = path.startswith(LANGUAGE_TESTS) and LANGUAGE_TESTS not in rule.folders
     return path.startswith(rule.folders) and not tested
 

@@ -33,12 +33,10 @@ def test_a_test_that_was_removed_is_missed(tmp_path: Path) -> None:
 
 
 def named(text: str) -> list[str]:
-    """Return the tests that a page names: functions, and the transcripts with a title in a file."""
     return re.findall(r"`([^`\s]*test_[^`\s]*|[^`\s]+\.txt: [^`]+)`", text)
 
 
 def missing(text: str, tests: Path) -> list[str]:
-    """Return the tests that a page names but that do not exist or do not run."""
     return [one for one in named(text) if not _runs(tests, *one.partition("::")[::2])]
 
 

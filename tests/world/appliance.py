@@ -44,7 +44,6 @@ class Connection(NamedTuple):
 
     @property
     def fields(self) -> dict[str, str]:
-        """Return the header by which the peer asked for it."""
         return {self.kind: self.resource, "callerid": self.caller_id, "md5sum": "*"}
 
 

@@ -156,7 +156,6 @@ class WorldLoop(asyncio.BaseEventLoop):
         return task
 
     def add_reader(self, file: Any, act: Callable[..., object], *arguments: Any) -> None:  # type: ignore[override]  # the world's own files
-        """Call a function of the present process when a file is readable."""
         process = present_process()
         file.readable = lambda: process.run(partial(act, *arguments))
 

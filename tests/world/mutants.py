@@ -51,7 +51,6 @@ async def _at_once(*_given: Any, **_named: Any) -> None:
 
 
 def _without(kind: type[Any]) -> Callable[[Enactor, Any], None]:
-    """Return an enactor that leaves out effects of a kind."""
     whole = Enactor.carry_out
     return lambda enactor, effects: whole(enactor, [one for one in effects if not isinstance(one, kind)])
 

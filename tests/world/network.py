@@ -55,7 +55,6 @@ class Network:
         return self._port
 
     def serve(self, address: Address, answer: Answer) -> None:
-        """Serve an address by the present process, in place of an ended one."""
         process = present_process()
         self._servers[address] = _Served(process, answer)
 

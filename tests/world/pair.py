@@ -109,7 +109,6 @@ class PairWorld(World):
         """Leave it open which policy is in force: a takeover may still change it."""
 
     def control_ready(self, appliance: Appliance) -> None:
-        """Assert that the policy in force is one that may be."""
         self.loop.outside.start(self._check_policy(appliance))
 
     async def _check_policy(self, appliance: Appliance) -> str | None:
@@ -144,7 +143,6 @@ class PairWorld(World):
         ]  # fmt: skip
 
     def crashes(self) -> None:
-        """Take the power from an appliance, more often from the active one."""
         appliance = self.random.choice([self.appliance, *self.appliances])
         self.say(f"{appliance.address} crashes")
         appliance.crash()
@@ -155,7 +153,6 @@ class PairWorld(World):
         self.say(f"{sorted(pair)} {'are cut off' if pair in self.network.cut else 'reach each other'}")
 
     def is_cut_off(self) -> None:
-        """Cut a node's host off from both appliances, or connect it again."""
         host = self.random.choice([one.host for one in self.nodes] or [WITNESS])
         if host != WITNESS:
             pairs = {frozenset((host, address)) for address in ADDRESSES.values()}

@@ -92,7 +92,6 @@ class _AdminServer:
 
 
 def _assemble(base: Any) -> Any:
-    """Return the parts of control, and show them to the world."""
     parts = assembly.assemble(base)
     present_process().assembled(parts)
     return parts
@@ -104,12 +103,10 @@ def _listening(address: tuple[str, int], **_options: Any) -> Iterator[Socket]:
 
 
 async def _forever() -> None:
-    """Do nothing, in place of work that measures this process."""
     await asyncio.get_running_loop().create_future()
 
 
 def _handle(descriptor: Any = None, *_given: Any, **named: Any) -> Any:
-    """Return a descriptor's object, in place of a socket or channel made from it."""
     return named.get("fileno", descriptor)
 
 

@@ -106,7 +106,6 @@ class Streams:
         return end
 
     def socket(self, *kind: Any, fileno: Any = None) -> Any:
-        """Return a socket of datagrams, or the object behind a descriptor."""
         return DatagramSocket(self) if kind else fileno
 
     def free_port(self) -> int:

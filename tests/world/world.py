@@ -123,7 +123,6 @@ class World:
 
     @property
     def durability(self) -> Literal["strict", "batched"]:
-        """Return the durability of the audit log in this history."""
         return "strict" if self.strict else "batched"
 
     def start(self) -> None:
@@ -145,7 +144,6 @@ class World:
         return process
 
     def number(self) -> int:
-        """Return a new number: of a process, or of a value."""
         self._numbers += 1
         return self._numbers
 
@@ -169,7 +167,6 @@ class World:
         self.fail(f"unhandled: {context.get('message')}: {context.get('exception')!r}")
 
     def done(self, task: asyncio.Task[Any]) -> None:
-        """Note the error that ended a task of the product."""
         if not task.cancelled() and task.exception() is not None:
             self.fail(f"control ended: {task.exception()!r}")
 
@@ -194,11 +191,9 @@ class World:
                 other.superseded = True
 
     def acknowledged(self, node: Node, method: str, resource: str) -> None:
-        """Assert that an acknowledged registration has its decision in the log."""
         self.decided(method, resource, node.host, node.name)
 
     def granted(self, grant: messages.GrantInstalled | messages.ClientGranted) -> None:
-        """Assert that a grant that reaches the relay has its decision in the log."""
         if isinstance(grant, messages.GrantInstalled):
             self.decided("requestTopic", grant.topic, grant.host, grant.caller_id)
         else:
@@ -257,7 +252,6 @@ class World:
     # --- promises ---
 
     def carries(self, connection: Connection) -> None:
-        """Assert that a policy that may be in force lets a connection carry messages."""
         if not any(POLICIES[one].may_use(connection.resource, connection.host) for one in self.possible):
             self.fail(f"{connection} carries messages, which no policy allows")
 
@@ -295,7 +289,6 @@ class World:
             self.fail(f"a restart of control interrupts {connection}")
 
     def control_ready(self, _appliance: Appliance) -> None:
-        """Learn which policy is in force, and assert that no acknowledged one was lost."""
         self.loop.outside.start(self._learn())
 
     async def _learn(self) -> None:
@@ -472,7 +465,6 @@ class World:
     # --- the history ---
 
     async def run(self) -> None:
-        """Run the history to its end, and check the promises."""
         self.start()
         usual = (
             self.starts, self.starts, self.changes_its_mind, self.uses_service, self.sets_parameter, self.reloads,
@@ -573,7 +565,6 @@ class World:
             raise BrokenPromiseError(f"{node} hears {heard} on {topic}, knows {told}, and may have {wanted}")
 
     def _check_parameters(self, parts: Parts) -> None:
-        """Assert that each parameter has a value that was acknowledged last."""
         rosmaster = self.appliance.rosmaster
         for key, values in self.parameters.items():
             value, _above = standing_at(parts.core.parameters.tree, key)

@@ -27,7 +27,6 @@ RUN = "run limit.rv --bags bags"
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return the current folder, with a specification and two recordings."""
     monkeypatch.chdir(tmp_path)
     Path("limit.rv").write_text(SPECIFICATION)
     Path("bags").mkdir()

@@ -43,7 +43,6 @@ def make_bag(path: Path, seed: int, count: int = 400, step: int = 10**8) -> Path
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return the current folder, with a specification and six recordings."""
     monkeypatch.chdir(tmp_path)
     Path("limit.rv").write_text(SPECIFICATION)
     Path("bags/inner").mkdir(parents=True)

@@ -48,7 +48,6 @@ RECORDING = st.lists(st.tuples(MESSAGES, st.integers(1, 10**9)), min_size=1, max
 
 
 def recorded(number: int, rows: list[tuple[tuple[str, bytes], int]]) -> Recorded:
-    """Return a recording of messages, each with the time since the one before."""
     time = START + number * 10**12
     found = []
     for (topic, data), gap in rows:

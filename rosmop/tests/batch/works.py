@@ -24,7 +24,6 @@ def fragile(job: bytes) -> bytes:
 
 
 def counted_work(job: bytes) -> bytes:
-    """Execute a job, and append a line to the file in the environment."""
     with Path(os.environ["COUNTED"]).open("a") as file:
         file.write("job\n")
     return work(job)

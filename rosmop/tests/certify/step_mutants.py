@@ -79,7 +79,6 @@ def _ways(one: decoding.WasmInstruction) -> Iterator[tuple[str, bytes]]:
 
 
 def walks(module: WasmModule) -> Iterator[tuple[str, str, WasmModule]]:
-    """Yield each fault in the code of the first walk: its kind, the instruction, and the module that has it."""
     code = module.code
     at = 8
     while code[at] != 10:

@@ -69,7 +69,6 @@ def machine(random: Random, _depth: int, events: Sequence[str]) -> str:
 
 
 def timed_machine(random: Random, depth: int, events: Sequence[str]) -> str:
-    """Draw a state machine with some states that are left after a time."""
     states = machine(random, depth, events).split("] ")
     limits = ["timeout 2s -> s0", "timeout 0.5 ms -> fail", "timeout 3 -> s0"]
     return "] ".join(

@@ -23,7 +23,6 @@ SPECIFICATION = """m{0}(int key) {{
 
 
 def lines_run(number: int) -> Counter[str]:
-    """Return the number of compiler lines that run for this number of specifications, by file."""
     counted: Counter[str] = Counter()
 
     def trace(frame: FrameType, event: str, _argument: Any) -> Callable[..., Any] | None:

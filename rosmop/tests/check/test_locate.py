@@ -22,7 +22,6 @@ KINDS = (
 
 
 def content(random: Random, kind: value_types.Type) -> object:
-    """Return a random value of a type, for the other library's encoder."""
     if isinstance(kind, value_types.RecordType):
         slots = MessageTypes(definitions()).slots(kind.name)
         return {name: content(random, slot.type) for name, slot in slots.items()}
@@ -43,7 +42,6 @@ def content(random: Random, kind: value_types.Type) -> object:
 
 
 def paths(kind: value_types.Type, value: object, path: str = "") -> Iterator[tuple[str, value_types.Type]]:
-    """Yield every path to a value in a message, with the value's type."""
     if path:
         yield path, kind
     if isinstance(kind, value_types.RecordType) and isinstance(value, dict):

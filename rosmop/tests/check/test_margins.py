@@ -40,7 +40,6 @@ def give(monitors: MonitorSet, form: str, *values: int | float, walking: bool = 
 
 
 def said(margins: Sequence[Margin]) -> list[tuple[int, bool, float, float, float | None]]:
-    """Return the line, whether the comparison held, both sides, and the threshold that would change the result."""
     return [
         (one.position.line, one.holds, one.left, one.right, one.threshold_at)
         for one in sorted(margins, key=lambda one: (one.position, not one.holds))

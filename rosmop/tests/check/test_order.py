@@ -90,7 +90,6 @@ class Programs:
         return f"{text}{look} return h % 1000003; }}\n"
 
     def statements(self, count: int) -> list[str]:
-        """Return statements that change values which their own parts read."""
         return [self._statement() for _ in range(count)]
 
     def _draw(self, choices: list[str]) -> str:

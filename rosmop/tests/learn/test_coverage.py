@@ -29,7 +29,6 @@ TEXT = """gate() {
 
 
 def counted(text: str, recordings: Sequence[Recorded]) -> dict[CoverageItem, int]:
-    """Return how often the recordings exercise each item of a specification."""
     texts = {"gate.rv": text}
     items = items_of(texts)
     counts = [0] * len(items)
@@ -39,7 +38,6 @@ def counted(text: str, recordings: Sequence[Recorded]) -> dict[CoverageItem, int
 
 
 def recorded(name: str, messages: Sequence[tuple[str, int]]) -> Recorded:
-    """Return a recording of numbers, one second apart."""
     rows = tuple(
         (topic, START + place * 10**9, message("std_msgs/Int32", data=value))
         for place, (topic, value) in enumerate(messages)

@@ -81,7 +81,6 @@ def learnt_from(recordings: Sequence[Recorded], held_out: float) -> LearningResu
 
 
 def warnings(learnt: LearningResult, rows: Sequence[Row]) -> list[str]:
-    """Return the warnings that the learnt text gives for a recording."""
     monitors = MonitorSet.of(compiled_from({"learnt.rv": learnt.text}, standard_definitions()))
     monitors.start(rows[0][1], frozenset(TYPES))
     found = []
@@ -104,7 +103,6 @@ def test_the_recordings_are_split_and_named(learnt: LearningResult) -> None:
 
 
 def faulty(kind: str) -> list[Row]:
-    """Return a drive with a fault that begins at its twentieth second."""
     rows = list(drive(30).rows)
     from_then = rows[0][1] + 20 * 10**9
     at = next(place for place, row in enumerate(rows) if row[0] == "/speed" and row[1] >= from_then)

@@ -10,7 +10,6 @@ from rosmop.logics.interface import CompiledProperty, FormulaError, Run
 
 
 def seeded(seed: int) -> Random:
-    """Return settings for random examples that are the same in every run."""
     return Random(seed)  # noqa: S311  # draws examples, not keys
 
 
@@ -24,7 +23,6 @@ def compiled(logic: str, formula: str, events: Sequence[str] = ABC) -> CompiledP
 
 
 def told(compiled: CompiledProperty, trace: Iterable[str]) -> list[tuple[str, ...]]:
-    """Return the categories after each event of an untimed trace."""
     run = compiled.start(0)
     return [run.step(compiled.events.index(event), 0) for event in trace]
 

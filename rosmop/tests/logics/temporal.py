@@ -21,7 +21,6 @@ SPELLED = {
 def draw(
     random: Random, depth: int, operators: Sequence[str], arity: Mapping[str, int], events: Sequence[str]
 ) -> Tree:
-    """Draw a random formula with some temporal operators and all boolean ones."""
     if depth == 0 or random.random() < 0.12:
         return random.choice(
             [

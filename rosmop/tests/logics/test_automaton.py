@@ -8,7 +8,6 @@ from rosmop.tests.logics.driving import seeded
 
 
 def drawn(random: Random) -> Automaton:
-    """Return a random automaton whose states can all be entered."""
     size, letters = random.randint(1, 9), random.randint(1, 3)
     table = [[random.randrange(size) for _ in range(letters)] for _ in range(size)]
     for state in range(1, size):

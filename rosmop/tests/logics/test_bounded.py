@@ -129,7 +129,6 @@ def told(text: str, trace: Timed, end: int) -> list[tuple[int, str]]:
 
 
 def with_bounds(tree: Tree, random: Random) -> Tree:
-    """Return the formula with random bounds on all its temporal operators."""
     operands = tuple(with_bounds(part, random) if isinstance(part, tuple) else part for part in tree[1:])
     if tree[0] not in (*PAST, *FUTURE):
         return (tree[0], *operands)

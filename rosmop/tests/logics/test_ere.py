@@ -50,7 +50,6 @@ def show(tree: Tree, random: Random) -> str:
 
 @cache
 def member(tree: Tree, word: tuple[str, ...]) -> bool:  # noqa: PLR0911  # one per operator
-    """Whether a trace is in the language, by the definition of each operator."""
     kind = tree[0]
     if kind in ABC:
         return word == (kind,)
@@ -96,7 +95,6 @@ def machine(finals: set[int], moves: dict[int, dict[str, int]]) -> Fsm:
 
 
 def other_library(tree: Tree) -> Fsm:  # noqa: PLR0911  # one per operator
-    """Return the expression, built with the operations of the other library."""
     kind = tree[0]
     if kind in ABC:
         return machine({1}, {0: {kind: 1}, 1: {}})

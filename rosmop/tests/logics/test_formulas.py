@@ -32,7 +32,6 @@ def test_these_facts_are_known_of_a_formula_before_it_runs(case: Case) -> None:
 
 
 def judged(case: Case) -> tuple[str, ...]:
-    """Return the lines of a formula that a table expects."""
     logic, _, formula = case.source.partition(": ")
     try:
         monitor = compile_property(logic, formula, tuple(case.beside.split()) or ABC, ORIGIN)

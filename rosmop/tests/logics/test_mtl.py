@@ -26,7 +26,6 @@ Timed = list[tuple[int, str]]
 
 
 def bounded(tree: Tree, random: Random, largest: int) -> Tree:
-    """Return the formula with random bounds on its temporal operators."""
     if tree[0] in ("event", "true", "false"):
         return tree
     operands = tuple(bounded(operand, random, largest) for operand in tree[1:])
@@ -106,7 +105,6 @@ def test_long_traces_by_definition() -> None:
 
 
 def reelay_text(tree: Tree) -> str:  # noqa: PLR0911  # one per operator
-    """Return the formula in the language of the other monitor."""
     operator, *rest = tree
     bounds = ""
     if rest and isinstance(rest[-1][0], int):

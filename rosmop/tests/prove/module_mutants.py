@@ -113,7 +113,6 @@ def operands(code: Code) -> Iterator[tuple[WasmInstruction, ...]]:
 
 
 def mutants(code: Code) -> Iterator[tuple[str, Code]]:
-    """Yield the kind of each fault, and the function that has it."""
     for kind, change in FAULTS.items():
         for body in _trees(code.body, change):
             yield kind, replace(code, body=body)

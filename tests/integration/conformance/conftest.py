@@ -14,7 +14,6 @@ from tests.support.site import Masters, Site
 
 @pytest.fixture(params=["plain", "appliance"])
 def local(request: pytest.FixtureRequest, masters: Masters) -> Iterator[Site]:
-    """Provide a master of either mode: a test runs with both and expects the same of both."""
     with masters.lend(request.param, "loopback") as site:
         yield site
 
@@ -44,7 +43,6 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Site, Site]
 
 @pytest.fixture
 def both(pair: tuple[Site, Site], fakes: tuple[FakeNodes, FakeNodes]) -> Iterator[BothMasters]:
-    """Provide both masters, side by side, and reset them after the test."""
     sides = MasterSide(pair[0].master_uri, fakes[0]), MasterSide(pair[1].master_uri, fakes[1])
     both = BothMasters(*sides)
     yield both

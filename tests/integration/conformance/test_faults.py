@@ -81,7 +81,6 @@ class RobotAtWork:
             return graph, master.getParam("/test", "/")[2]
 
     def rosout(self) -> str:
-        """Return the address of the aggregator's node, which changes with each of its lives."""
         with self.master() as master:
             return str(master.lookupNode("/test", "/rosout")[2])
 
@@ -171,8 +170,6 @@ def processes(robot: RobotAtWork) -> dict[str, int]:
 
 
 def strike(robot: RobotAtWork, number: signal.Signals, *roles: str) -> None:
-    """Send a signal to the process of each role, as simultaneously as possible."""
-
     def running() -> list[int] | None:
         pids = processes(robot)
         return [pids[role] for role in roles] if pids.keys() >= set(roles) else None

@@ -39,7 +39,6 @@ WRONG: st.SearchStrategy[Any] = st.sampled_from([None, "", 5, True, [], {}, ["/c
 
 @st.composite
 def node_with_api(draw: st.DrawFn) -> tuple[str, Api]:
-    """Generate a node's name, and an API URI that nearly always belongs to this node alone."""
     node = draw(NODES)
     return node, Api(node.rpartition("/")[2])
 

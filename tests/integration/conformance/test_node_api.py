@@ -58,7 +58,6 @@ def formed(answer: Any) -> Any:
 
 
 def asked(pair: tuple[str, str], step: tuple[Any, ...]) -> Answers:
-    """Make the same call through both masters, and remove differences by design."""
     plain, appliance = (formed(call_on(ThisMachine(), uri, *step)) for uri in pair)
     return Answers(plain, appliance)
 

@@ -22,6 +22,5 @@ def battlefield(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPat
 
 @pytest.fixture
 def field(battlefield: Field) -> Iterator[Field]:
-    """Provide the field for one attack, and check afterwards that talker and listener continued unharmed."""
     yield battlefield
     battlefield.unharmed()

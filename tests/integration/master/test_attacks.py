@@ -59,7 +59,6 @@ LOOPBACK = "0100007F"  # as /proc/net/tcp writes 127.0.0.1
 
 @pytest.fixture(scope="module", autouse=True)
 def graph(battlefield: Field) -> None:
-    """Add a service and a topic for every host to the graph."""
     battlefield.ros.service_server("roscpp", "/shared/negate", name="shared_negator")
     battlefield.ros.talker("roscpp", "/shared/talk", name="shared_voice")
 
@@ -85,7 +84,6 @@ def no_hidden_port_is_revealed(field: Field) -> Iterator[None]:
 
 
 def outer(field: Field, node: str) -> str:
-    """Return the address of a node that the rogue gets."""
     code, _text, uri = field.rogue("lookupNode", "/looker", node)
     assert code == 1
     return str(uri)
@@ -265,7 +263,6 @@ def test_loopback_listeners_from_another_host(field: Field) -> None:
 
 
 def silent(_connection: socket.socket, _request: bytes) -> None:
-    """Never answer."""
     threading.Event().wait(60)
 
 

@@ -21,7 +21,6 @@ LONG = "k" * 900
 
 @pytest.fixture(scope="module")
 def siege(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Siege]:
-    """Start a robot at work, and a crowd that has not begun."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with Lab("rosrv-test") as lab, Siege(lab, tmp_path_factory.mktemp("siege"), "relays: 2\n") as there:
@@ -33,7 +32,6 @@ def log_bytes(siege: Siege) -> int:
 
 
 def reads(prefix: str) -> list[dict[str, Any]]:
-    """Return the parts of a multicall that reads many different parameters with long names."""
     return [
         {"methodName": "hasParam", "params": ["/flooder", f"/{prefix}{number}/{LONG}"]}
         for number in range(PARTS)

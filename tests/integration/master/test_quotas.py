@@ -41,7 +41,6 @@ def http_request(method: str, *parameters: str) -> bytes:
 
 @pytest.fixture(scope="module")
 def siege(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Siege]:
-    """Start a robot at work, and a crowd that has not begun."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with Lab("rosrv-test") as lab, Siege(lab, tmp_path_factory.mktemp("siege"), CONFIGURATION) as there:

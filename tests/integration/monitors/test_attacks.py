@@ -35,7 +35,6 @@ def tag(version: int) -> str:
 
 
 def beside(version: int) -> str:
-    """Return a monitor of another topic and of the latched topic, whose messages it changes."""
     return (
         "beside() { event other(std::string text) /elsewhere std_msgs/String '{data:text}' { }"
         f" event map(std::string text) /map std_msgs/String '{{data:text}}' {{ text = text + \" m{version}\"; }} }}"
@@ -72,7 +71,6 @@ def caught_up(listener: Process, last: int) -> Event:
 
 
 def missing(count: Event) -> int:
-    """Return the number of missing messages between the first and the last."""
     return sum(after - before - 1 for before, after in count["gaps"])
 
 

@@ -28,7 +28,6 @@ stop() {
 
 @pytest.fixture(scope="module")
 def stopped(common_lab: Lab) -> Iterator[Appliance]:
-    """Run an appliance with two relays and the stop loaded."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     host = common_lab.host("stopped", "10.77.0.3/24")
     with Appliance(host, options=("--api", "off"), relays=2) as running:

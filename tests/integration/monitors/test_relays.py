@@ -34,7 +34,6 @@ begin NAME() {
 
 
 def specification(name: str, topic: str) -> str:
-    """Return a monitor that numbers its messages, and publishes an alarm at the third."""
     return SPECIFICATION.replace("NAME", name).replace("TOPIC", topic)
 
 
@@ -63,7 +62,6 @@ def rows(appliance: Appliance) -> dict[str, dict[str, object]]:
 
 
 def is_connected(listener: Process) -> bool:
-    """Whether a listener is connected to a publisher of its topic, by its own account."""
     with ServerProxy(str(listener.wait_for(event="ready")["uri"])) as node:
         answer: Any = node.getBusInfo("/tests")
     return any(topic != "/rosout" and connected for _, _, _, _, topic, connected, *_ in answer[2])

@@ -37,7 +37,6 @@ def scan(_: Appliance, ros: RosSession, ranges: str) -> None:
 
 
 def change(appliance: Appliance, _: RosSession) -> None:
-    """Load the guard with another text, which loses its state."""
     spec = appliance.directory / "guard.rv"
     spec.write_text(spec.read_text().replace("near", "nearest"))
     appliance.rosrv("monitor", "load", "--hold", str(spec))

@@ -55,7 +55,6 @@ def field() -> Iterator[tuple[Appliance, Host]]:
 
 @pytest.fixture
 def ros(field: tuple[Appliance, Host], tmp_path: Path) -> Iterator[RosSession]:
-    """Provide the nodes and tools of one test, on the robot."""
     appliance, robot = field
     with RosSession(appliance.master_uri, tmp_path, robot) as session:
         yield session

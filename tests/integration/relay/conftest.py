@@ -19,6 +19,5 @@ def driver() -> Iterator[RelayDriver]:
 
 @pytest.fixture
 def ros(driver: RelayDriver, tmp_path: Path) -> Iterator[RosSession]:
-    """Provide nodes of the test with the driver as their master."""
     with RosSession(driver.uri, tmp_path) as session:
         yield session

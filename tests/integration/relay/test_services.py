@@ -15,7 +15,6 @@ BOTH: tuple[Client, Client] = ("rospy", "roscpp")
 
 
 def ask_header(face: Face, fields: dict[str, str]) -> dict[str, str]:
-    """Return the header that a relay port sends in answer to this header."""
     with socket.create_connection((LOOPBACK, face.port), timeout=20) as sock:
         sock.sendall(encode_header(fields))
         parser = HeaderParser()

@@ -39,7 +39,6 @@ sys.exit(3)
 
 
 def looked(host: Host | Forking, command: list[str], environment: Mapping[str, str], folder: Path) -> Any:
-    """Return what the program sees of its own process, and its exit."""
     started = host.popen(
         command, env=environment, cwd=str(folder), start_new_session=True, text=True,
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,

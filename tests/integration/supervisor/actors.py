@@ -52,7 +52,6 @@ def relay(lifeline_fd: int, index: int, config: Path) -> None:
 
 
 def crowded(lifeline_fd: int, config: Path) -> None:
-    """Act as a control with as many ports as a large robot needs."""
     asyncio.run(_Crowded(lifeline_fd, load_resolved(config).rosmaster_port).run())
 
 
@@ -61,7 +60,6 @@ def signer(lifeline_fd: int, directory: Path, passphrase: int | None) -> None:
 
 
 def stubborn(lifeline_fd: int, index: int, config: Path) -> None:
-    """Act as a relay that ends neither when asked nor by SIGTERM."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     asyncio.run(_Stubborn("relay", lifeline_fd, RelayLink).run())
 

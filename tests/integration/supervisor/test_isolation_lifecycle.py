@@ -32,7 +32,6 @@ def host() -> Iterator[Host]:
 
 @pytest.fixture
 def hidden(host: Host) -> Iterator[int]:
-    """Return the port of a listener on the host's loopback."""
     with host.run(lambda: socket.create_server(("127.0.0.1", 0))) as listener:
         yield listener.getsockname()[1]
 
@@ -48,8 +47,6 @@ def isolation(host: Host, hidden: int) -> Iterator[ContainerIsolation]:
 
 
 def reachable(host: Host, port: int) -> bool:
-    """Whether root of the host can connect to a port."""
-
     def connect() -> bool:
         try:
             socket.create_connection(("127.0.0.1", port), timeout=5).close()

@@ -104,7 +104,6 @@ class Place:
         self.state.close()
 
     def trial(self, role: Role, pid: int) -> dict[str, Any]:
-        """Write the attempts of this role to the file from which its process reads them."""
         part = self.state.path / role.part
         (self.theirs / "new").unlink(missing_ok=True)
         wanted = {

@@ -30,7 +30,6 @@ USERS = {"control": "rosrv", "rosmaster": "rosmaster"}
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """Run an appliance that root started and that has written all files of a start."""
     need_root()
     with Appliance(options=("--api", "127.0.0.1:0")) as running:
         assert running.rest().get("/v1/audit").status == 200

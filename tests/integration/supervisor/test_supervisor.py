@@ -46,14 +46,12 @@ class Running:
         return self
 
     def pid(self, role: str, *, restarts: int = 0) -> int:
-        """Return the process id of a role after this many restarts."""
         return int(self.process.wait_for(event="process started", role=role, restarts=restarts)["pid"])
 
     def restarts(self, role: str) -> int:
         return len(self.process.seen(event="process started", role=role)) - 1
 
     def next_pid(self, role: str, pid: int) -> int:
-        """Return the process id of the next life of a role."""
         starts = [event["pid"] for event in self.process.seen(event="process started", role=role)]
         return self.pid(role, restarts=starts.index(pid) + 1)
 
@@ -109,7 +107,6 @@ def _wait(descriptor: int, seconds: float) -> bool:
 
 @contextlib.contextmanager
 def state_directory() -> Iterator[Path]:
-    """Return a state directory that the users of the roles can reach."""
     needs(ROSMASTER.exists() and ROSOUT.exists(), "rosmaster and rosout (run `make setup`)")
     directory = Path(tempfile.mkdtemp(prefix="rosrv-supervisor-"))
     directory.chmod(0o755)
@@ -139,7 +136,6 @@ def start(state: Path) -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def common() -> Iterator[Running]:
-    """Run a supervisor for all tests of this file that do not end its processes."""
     with state_directory() as state:
         running = Running(state)
         yield running.until_ready()

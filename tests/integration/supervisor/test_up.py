@@ -31,7 +31,6 @@ ENVIRONMENT = {"PATH": os.environ["PATH"], "PYTHONUNBUFFERED": "1"}
 
 @pytest.fixture
 def directory() -> Iterator[Path]:
-    """Provide a directory with a policy, open to the users of the roles."""
     needs(ROSMASTER.exists() and ROSOUT.exists(), "rosmaster and rosout (run `make setup`)")
     made = Path(tempfile.mkdtemp(prefix="rosrv-up-"))
     made.chmod(0o755)
@@ -76,7 +75,6 @@ def refusal(directory: Path, *more: str, before: tuple[str, ...] = ()) -> str:
 
 
 def pid_of_master(uri: str) -> str:
-    """Return the process id that the master at this address reports."""
     with xmlrpc.client.ServerProxy(uri) as master:
         return str(master.getPid("/tester"))
 

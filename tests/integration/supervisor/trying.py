@@ -56,7 +56,6 @@ def run_modules(*_given: Any) -> None:
 
 
 def _executable() -> list[str]:
-    """Return the protection of each executable range of anonymous memory."""
     lines = [line.split(maxsplit=5) for line in Path("/proc/self/maps").read_text().splitlines()]
     return [parts[1] for parts in lines if "x" in parts[1] and (len(parts) < 6 or "w" in parts[1])]
 

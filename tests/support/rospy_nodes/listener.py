@@ -8,7 +8,6 @@ from std_msgs.msg import String
 
 
 def heard(message):
-    """Report one message with the publishing node in its header."""
     report("received", data=message.data, publisher=message._connection_header["callerid"])
 
 

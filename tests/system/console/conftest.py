@@ -48,7 +48,6 @@ def playwright() -> Iterator[Playwright]:
 
 @pytest.fixture(scope="module")
 def browser(chromium: str, playwright: Playwright) -> Iterator[Browser]:
-    """Start this machine's browser for the tests of a file."""
     started = launch(playwright, chromium)
     yield started
     started.close()
@@ -62,7 +61,6 @@ def launch(playwright: Playwright, program: str) -> Browser:
 
 @pytest.fixture(scope="module")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
-    """Run an appliance with the monitors of the repository, for the tests of a file."""
     config = tmp_path_factory.mktemp("console") / "appliance.yaml"
     config.write_text(CONFIG)
     options = ("--config", str(config), "--monitors", str(REPOSITORY / "monitors"))
@@ -72,8 +70,6 @@ def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
 
 @pytest.fixture
 def token(appliance: Appliance) -> Callable[..., str]:
-    """Return a function that makes a token of a role."""
-
     def make(role: str, name: str | None = None, expires: str = "1d") -> str:
         made = appliance.rosrv(
             "token", "add", name or f"some-{role}", "--role", role, "--for", expires, "--json"

@@ -292,7 +292,6 @@ def test_grant_this_does_not_take_the_place_of_a_text_that_is_written(
 
 
 def drop(number: int, reason: str = "", monitor: str = "limit", **detail: Any) -> LogEntry:
-    """Return the record of a message that a monitor dropped."""
     said = reason or f"{monitor}.drive dropped it: speed 0.{number}"
     record = AuditRecord(
         id=f"{number:020x}", time=number * 10**9, event="message dropped", severity=Severity.WARNING, reason=said,
@@ -312,7 +311,6 @@ def denial(number: int, resource: str) -> LogEntry:
 
 
 def page_of(entries: list[LogEntry]) -> dict[str, Any]:
-    """Return the answer of a search with equality, the newest record first."""
     return {
         "records": [as_object(entry) for entry in entries[::-1]],
         "equality": [equality_of(entry.record) for entry in entries[::-1]],

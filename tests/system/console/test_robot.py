@@ -142,7 +142,6 @@ def test_a_refusal_runs_behind_no_box(
 
 
 def _graph(reader: Reader) -> Page:
-    """Return the graph when it is complete: groups, and the denied attempt."""
     page = reader.go("graph")
     expect(page.locator(".box.many")).to_have_count(10)
     expect(page.locator("g.attempt")).to_have_count(1)
@@ -150,7 +149,6 @@ def _graph(reader: Reader) -> Page:
 
 
 def _corners(page: Page) -> dict[str, tuple[float, float]]:
-    """Return the upper left corner of each box in the drawing, independent of zoom and position."""
     return {str(one.get_attribute("data-key")): _corner(one) for one in page.locator(".box").all()}
 
 
@@ -177,7 +175,6 @@ def _overlap(one: _Box, other: _Box) -> bool:
 
 
 def _smallest_name(page: Page) -> float:
-    """Return the size of the smallest name in the drawing, in pixels on the screen."""
     return float(
         page.evaluate(
             "Math.min(...[...document.querySelectorAll('.box-name')].map((one) =>"

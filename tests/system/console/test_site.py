@@ -16,7 +16,6 @@ SPECIFICATION = "count() { event said() /chatter std_msgs/String '{}' { } }\n"
 
 @pytest.fixture(scope="module")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
-    """Run an appliance with a site key and a notice."""
     config = tmp_path_factory.mktemp("console") / "appliance.yaml"
     config.write_text(f"{CONFIG}site_keys: [{LINE}]\napi_notice: {json.dumps(NOTICE)}\n")
     running = Appliance(policy=POLICY, options=("--config", str(config)))

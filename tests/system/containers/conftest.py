@@ -22,7 +22,6 @@ class Site:
     laptop: Host
 
     def story(self) -> str:
-        """Return the engine's output, for the message of a failure."""
         return self.engine.story()
 
 

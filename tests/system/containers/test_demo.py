@@ -188,7 +188,6 @@ def test_nothing_listens_on_ipv6(demo: Compose) -> None:
 
 
 def documented_rights() -> dict[str, tuple[str, frozenset[str]]]:
-    """Return the table of processes in the documentation: user and capabilities of each."""
     rows = re.findall(r"^\| `([a-z]+)` \| `([a-z-]+)` \| ([^|]*) \|", PAGE.read_text(), re.MULTILINE)
     return {name: (user, frozenset(re.findall(r"[A-Z][A-Z_]+", rights))) for name, user, rights in rows}
 

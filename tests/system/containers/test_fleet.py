@@ -110,7 +110,6 @@ class Walk:
         return {proof["robot"]: proof["last"] for proof in found if proof["ok"] and not proof["missing"]}
 
     def push(self) -> None:
-        """Push the sealed segments of the simulated robots, as the appliance's process does."""
         for robot in self.simulated:
             self.machine.run(lambda robot=robot: push_joined(robot, self.folder / "robots" / robot.name))  # type: ignore[misc]  # mypy does not infer it
 
@@ -146,7 +145,6 @@ class Walk:
 
 
 def _work(appliance: Appliance) -> None:
-    """Make a record: a call of a node on the robot itself."""
     with master_at(appliance.master_uri) as master:
         assert master.setParam("/walker", "/value", 1)[0] == 1
 

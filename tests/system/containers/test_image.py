@@ -44,12 +44,10 @@ def members(site: Site, image: str) -> Iterator[tuple[str, tarfile.TarInfo, byte
 
 @pytest.fixture(scope="module")
 def contents(site: Site) -> list[tuple[str, tarfile.TarInfo, bool]]:
-    """Return every file of the appliance's image: path, entry, whether it contains a private key."""
     return [(path, entry, bool(SECRET.search(data))) for path, entry, data in members(site, APPLIANCE)]
 
 
 def run(site: Site, *command: str, image: str = APPLIANCE) -> str:
-    """Return the output of a program in a new container of the image."""
     return site.engine.docker("run", "--rm", "--entrypoint", command[0], image, *command[1:]).stdout
 
 

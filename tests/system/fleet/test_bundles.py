@@ -53,7 +53,6 @@ class Operator:
         return done.stdout + done.stderr
 
     def publish(self, folder: Path) -> None:
-        """Make a repository with one bundle, and publish it to the collector's folder."""
         here = ("--repository", str(self.repository))
         secret = ("--passphrase-file", str(self._passphrase))
         self.run("bundle", "init", *here, *secret)

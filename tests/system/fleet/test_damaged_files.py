@@ -127,7 +127,6 @@ def test_the_tokens(site: FleetSite, make_robot: MakeRobot) -> None:
 
 
 def _require_complete(site: FleetSite) -> None:
-    """Require that all segments are indexed and proven, and none has a gap before it."""
     site.indexed()
     site.run("verify", "arm1")
     assert site.health()["robots"][0]["gaps"] == 0

@@ -48,7 +48,6 @@ class Carrier:
 
 
 def acts_of(site: FleetSite) -> list[tuple[str, str, str]]:
-    """Return the author, the act and the robot of each act about evidence that was done."""
     assert site.data is not None
     acts = map(json.loads, (site.data / "acts.ndjson").read_text().splitlines())
     return [

@@ -36,7 +36,6 @@ USED = "the invitation is wrong, already used or expired"
 
 @pytest.fixture
 def inviting(site: FleetSite) -> FleetSite:
-    """Return a collector whose certificate file ends with its authority's certificate."""
     site.server.certificate.write_bytes(site.server.certificate.read_bytes() + site.server.ca.read_bytes())
     return site
 
@@ -78,7 +77,6 @@ def pushes_all(robot: FleetRobot) -> bool:
 
 
 def request_of(robot: FleetRobot, file: Path) -> dict[str, str]:
-    """Return the request of a join with a new certificate."""
     certificate = make_own_certificate(robot.name, 1)[1].decode()
     key = (robot.folder / "audit.pub.pem").read_text()
     return {"token": json.loads(file.read_text())["token"], "key": key, "certificate": certificate}

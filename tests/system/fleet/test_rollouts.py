@@ -44,7 +44,6 @@ class Robot:
     taken: list[str] = field(default_factory=list)
 
     def offered(self, bundle: BundleOffered) -> None:
-        """Judge a bundle, as control does: take it, or refuse it with a reason."""
         reason = self.judge(bundle)
         if reason:
             refused = RefusedBundle(bundle.path, bundle.sha256, reason)

@@ -113,7 +113,6 @@ def lab_host(site: TunnelSite) -> Host:
 
 
 def esp_is_charons(site: TunnelSite) -> bool:
-    """Return whether ESP runs in user space, where charon sees dropped packets."""
     return USER_SPACE_INTERFACE in interfaces.links(lab_host(site).namespace)
 
 
@@ -292,7 +291,6 @@ with socket.socket() as client:
 
 
 def _ask(host: Host, source: str, target: str, *, user: int | None = None, free: bool = False) -> str:
-    """Return the result of a connection to RVMaster from this source address."""
     asking = host.popen(
         [sys.executable, "-c", ASK, source, target, "11311", "free" if free else "plain"],
         stdout=subprocess.PIPE,

@@ -98,7 +98,6 @@ def test_a_laptop_joins_renews_and_leaves(site: TunnelSite, laptop: ScriptHost, 
 
 
 def nodes_talk(site: TunnelSite, laptop: ScriptHost, address: str) -> None:
-    """Assert that unmodified nodes of both sides hear each other."""
     laptop.address = address
     with (
         RosSession(MASTER, site.home, site.robot) as on_robot,

@@ -60,7 +60,6 @@ def revoke_many(state: Path) -> None:
 
 
 def takes_such_a_list_itself(joined: JoinedHost, directory: Path) -> None:
-    """Assert that swanctl on a host loads a list of the same length."""
     (directory / "ca").mkdir()
     signed = CertificateAuthority(directory / "ca").revocations(
         (f"{_FIRST + one:x}", 1.0) for one in range(2_200)

@@ -10,7 +10,6 @@ from tests.support.requirements import need_program, need_root
 
 @pytest.fixture
 def lab(request: pytest.FixtureRequest) -> Iterator[Lab]:
-    """Make a lab with the name of the test's file."""
     need_root()
     need_program("nft", "nftables")
     with Lab(request.path.stem.replace("test_", "rosrv-").replace("_", "-")) as one:

@@ -436,7 +436,6 @@ def test_a_rejected_transaction_keeps_the_old_rules(protected: Host) -> None:
 
 
 def broken_rule() -> PacketRule:
-    """Return a rule with a comment that is too long for nft."""
     return PacketRule(chain=Chain.IN, purpose="x" * 500, verdict=PacketVerdict.DROP)
 
 

@@ -27,7 +27,6 @@ except OSError as error:
 
 @pytest.fixture
 def host(lab: Lab) -> Host:
-    """Return a host with the real rosmaster on it, bound to loopback."""
     return lab.host("host", "10.77.0.2/24", "fd77::2/64")
 
 

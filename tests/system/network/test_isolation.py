@@ -43,7 +43,6 @@ def settings(tmp_path: Path, name: str | None = None) -> IsolationSettings:
 
 @contextlib.contextmanager
 def isolated(bare: Host, tmp_path: Path) -> Iterator[Isolation]:
-    """Set up the isolation for the length of a block."""
     isolation = Isolation(bare.namespace, settings(tmp_path))
     isolation.up()
     try:
@@ -72,7 +71,6 @@ def source_seen(server: socket.socket, host: Host, address: str, port: int) -> s
 
 
 def state(host: Host) -> tuple[str, ...]:
-    """Return all state of a host that the isolation may change."""
     process = host.popen(["nft", "-s", "list", "ruleset"], stdout=subprocess.PIPE, text=True)
     rules, _ = process.communicate(timeout=30)
     keys = ["net/ipv4/ip_forward", "net/ipv6/conf/all/forwarding"]

@@ -53,7 +53,6 @@ def host(lab: Lab) -> Host:
 
 
 def run(host: Host, uid: int, program: str, *arguments: str) -> str:
-    """Return the output of a Python program that runs on a host as this user."""
     process = host.popen(
         [sys.executable, "-I", "-S", "-c", program, *arguments],
         user=uid, group=uid, extra_groups=[], cwd="/", stdout=subprocess.PIPE, text=True,
@@ -62,7 +61,6 @@ def run(host: Host, uid: int, program: str, *arguments: str) -> str:
 
 
 def connect(host: Host, uid: int, *targets: tuple[str, int]) -> list[str]:
-    """Return the result of connections to these addresses as this user."""
     found: list[str] = json.loads(run(host, uid, CONNECT, json.dumps(targets)))
     return found
 

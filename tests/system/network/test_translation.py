@@ -42,7 +42,6 @@ def machine(lab: Lab) -> Host:
 
 @pytest.fixture
 def behind(lab: Lab) -> Namespace:
-    """Return a namespace for the guest, which the lab removes with its host."""
     host = lab.host("guest", "10.76.0.2/24")
     interfaces.delete_link(host.namespace, "eth0")
     return host.namespace

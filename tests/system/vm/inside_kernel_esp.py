@@ -104,6 +104,5 @@ def _spis(host: Host) -> list[str]:
 
 
 def stop_and_look(site: TunnelSite) -> None:
-    """Assert that a clean stop leaves no rule, no state, no policy, no interface and no address."""
     assert site.appliance.stop() == 0
     assert left_behind(middle(site)) == {}

@@ -29,7 +29,6 @@ def lab() -> Iterator[Lab]:
 
 
 def told(*command: str) -> str:
-    """Return the output of a program on the machine itself."""
     done = subprocess.run(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=LIMIT, check=False
     )

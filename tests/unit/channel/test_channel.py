@@ -35,7 +35,6 @@ def _is_open(descriptor: int) -> bool:
 
 
 def _copies_of(descriptor: int) -> int:
-    """Return how many descriptors of this process are of the same file."""
     same, copies = os.fstat(descriptor), 0
     for other in os.listdir("/proc/self/fd"):  # noqa: PTH208  of the kernel, not a folder
         with suppress(OSError):  # the descriptor of the list itself is closed

@@ -36,7 +36,6 @@ def values(kind: Any) -> st.SearchStrategy[Any]:
 
 @st.composite
 def orders(draw: st.DrawFn, operation: Operation) -> Any:
-    """Draw an order that can be requested in the way of a row."""
     fields = dict(operation.fixed)
     for name, field in operation.fields().items():
         if field.name == "expected" or field.name in fields:

@@ -153,7 +153,6 @@ print(process.answer(messages.ContentsWanted(1, {{"a.rv": sys.stdin.read()}}, {{
 
 @contextlib.contextmanager
 def started(program: str) -> Iterator[tuple[subprocess.Popen[str], Channel, Channel]]:
-    """Start a compiler in its own process, with its lifeline and its link to control."""
     lifeline, its_lifeline = socket.socketpair()
     ours, theirs = socket.socketpair()
     supervisor, control = Channel(lifeline, messages.Lifeline), Channel(ours, messages.CompilerLink)

@@ -159,7 +159,6 @@ def test_it_is_hardened(original: Checkout) -> None:
 
 
 def pins() -> Iterator[str]:
-    """Yield what each file says of the version of Cython."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     yield from project["build-system"]["requires"]
     yield from project["project"]["optional-dependencies"]["dev"]

@@ -13,7 +13,6 @@ CLOUD = ROOT / "examples/cloud-init/user-data.yaml"
 
 
 def written() -> dict[str, str]:
-    """Return the files that cloud-init writes: path, text."""
     data: dict[str, Any] = yaml.safe_load(CLOUD.read_text())
     return {one["path"]: one["content"] for one in data["write_files"]}
 

@@ -29,7 +29,6 @@ def said(*arguments: str) -> list[str]:
 
 
 def shown(command: str) -> list[str]:
-    """Return the outputs that the page prints below a command."""
     return [
         line.strip()
         for block in re.findall(rf"    \$ {re.escape(command)}\n((?:    [^$\n].*\n)*)", PAGE)

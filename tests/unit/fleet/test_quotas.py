@@ -27,7 +27,6 @@ def clock() -> _Clock:
 
 
 def quotas(folder: Path, clock: _Clock) -> RobotQuotas:
-    """Return the quotas of a collector that has just started."""
     limits = Limits(robot_bytes_per_day=1_000_000, robot_unpacked_bytes_per_day=4_000_000)
     return RobotQuotas(folder, limits, clock)
 

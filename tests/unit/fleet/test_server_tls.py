@@ -11,7 +11,6 @@ from tests.support.certificates import Certificates, make_certificates
 
 
 def _shown(tls: ServerTls, client: Certificates, server: Certificates) -> bytes | None:
-    """Return the certificate (DER) that the server verified in a handshake with a client."""
     context = ssl.create_default_context(cafile=server.ca)
     context.load_cert_chain(client.certificate, client.key)
     up, down = ssl.MemoryBIO(), ssl.MemoryBIO()

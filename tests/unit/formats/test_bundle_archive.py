@@ -16,7 +16,6 @@ names = st.sampled_from(
 
 
 def tar(*members: tuple[tarfile.TarInfo, bytes], form: int = tarfile.USTAR_FORMAT) -> bytes:
-    """Return a tar file with these members after those of a bundle."""
     output = io.BytesIO()
     with tarfile.open(fileobj=output, mode="w", format=form) as file:
         for name, data in sorted(FILES.items()):

@@ -26,7 +26,6 @@ from tests.support.virtual_clock import VirtualClock
 def request_of(
     key: ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey | rsa.RSAPrivateKey, name: str = "whoever"
 ) -> bytes:
-    """Return a signing request by this key that also asks to be an authority."""
     digest = None if isinstance(key, ed25519.Ed25519PrivateKey) else hashes.SHA384()
     return (
         x509.CertificateSigningRequestBuilder()

@@ -41,7 +41,6 @@ class Desk:
         self.texts.append(text)
 
     def approve(self, number: int) -> str:
-        """Ask for the removal of all records up to this checkpoint."""
         return self.removals.approve(self.texts[number - 1], self.texts[-1]).decode()
 
 

@@ -121,7 +121,6 @@ async def token(world: World) -> str:
 
 @pytest.fixture
 async def api(world: World, token: str) -> Api:
-    """Return the api's end of a link that is opened after the token was made."""
     return Api(world)
 
 

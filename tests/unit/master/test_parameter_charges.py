@@ -43,7 +43,6 @@ STEP = st.one_of(
 
 
 def quota_class(host: Address) -> QuotaClass:
-    """Return the class of three hosts that the policy names, one of them with nodes."""
     return STANDINGS.get(host, QuotaClass.UNKNOWN)
 
 

@@ -208,7 +208,6 @@ def _value(word: str) -> Any:
 
 
 def agrees(found: Any, words: tuple[str, ...], string: Callable[[str], bytes] = str.encode) -> bool:
-    """Whether a struct or a dictionary has the fields in these words."""
     for word in words:
         same = "=" in word and ("~" not in word or word.index("=") < word.index("~"))
         name, text = word.split("=" if same else "~", 1)

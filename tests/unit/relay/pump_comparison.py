@@ -121,7 +121,6 @@ class ComparedRelay(Monitored):
         self.subscribers[name] = peer
 
     def arrived(self, topic: str) -> bool:
-        """Whether the relay has received all whole messages that were sent."""
         return self.engine.topics["k", topic][0].counters.following - 1 == self.expected[topic]
 
     def take_all(self) -> None:
@@ -152,7 +151,6 @@ class ComparedRelay(Monitored):
         self.counted[row.resource, "delayed"] += sum(row.delays)
 
     def totals(self) -> dict[str, Any]:
-        """Return all counts so far, and the state of monitors."""
         self.loop.turn(0)
         self.collect()
         for topic in _TOPICS:
@@ -309,11 +307,9 @@ class PumpComparison:
         self._settle()
 
     def _break(self) -> None:
-        """Declare a message that is too long: the relay closes the connection, and asks for the publisher again."""
         self._end_with(struct.pack("<I", self._random.choice((5 << 20, 0xFFFFFFFF))))
 
     def _end(self) -> None:
-        """Close a publisher's connection, perhaps within a message."""
         self._end_with(self._message()[: self._random.randrange(6)])
 
     def _end_with(self, data: bytes) -> None:

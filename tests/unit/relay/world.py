@@ -92,7 +92,6 @@ class Peer:
         return fields
 
     def reset(self) -> None:
-        """Close the connection with a reset, as the kernel does after a crash."""
         self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self.sock.close()
 
@@ -191,7 +190,6 @@ class World:
         return found
 
     def connect(self, *parts: bytes, host: str = LOOPBACK) -> Peer:
-        """Return a peer that connects to the relay's port from this address."""
         where = (LOOPBACK, self.port.getsockname()[1])
         peer = Peer(socket.create_connection(where, source_address=(host, 0)))
         self.open.append(peer.sock)

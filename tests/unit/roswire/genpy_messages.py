@@ -24,7 +24,6 @@ chance = random.Random(1)  # noqa: S311 - the same examples at every run
 
 
 def example(notation: str) -> tuple[Any, Any]:
-    """Return a value of a type as genpy accepts it, and the same value as JSON."""
     base, _, size = notation.partition("[")
     if size:
         pairs = [example(base) for _ in range(int(size[:-1]) if size != "]" else chance.randrange(4))]
@@ -46,7 +45,6 @@ def example(notation: str) -> tuple[Any, Any]:
 
 
 def message(cls: Any) -> tuple[Any, dict[str, Any]]:
-    """Return a message with random fields, and the same message as JSON."""
     pairs = [example(notation) for notation in cls._slot_types]
     shown = {name: pair[1] for name, pair in zip(cls.__slots__, pairs, strict=True)}
     return cls(*(pair[0] for pair in pairs)), shown

@@ -20,7 +20,6 @@ for line in sys.stdin:
 
 
 def some_tree(chance: random.Random, depth: int) -> Tree:
-    """Draw a tree with all kinds of keys and some empty namespaces."""
     keys = chance.sample(KEYS, chance.randrange(5))
     return {key: some_tree(chance, depth - 1) if depth and chance.random() < 0.4 else 1 for key in keys}
 

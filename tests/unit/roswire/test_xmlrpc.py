@@ -58,7 +58,6 @@ def read(value: str, limits: XmlRpcLimits | None = None) -> Value:
 
 
 def python_loads(body: bytes) -> tuple[tuple[Any, ...], str | None]:
-    """Return the result of the parser of rosmaster and rospy."""
     return xmlrpc.client.loads(body, use_builtin_types=True)  # noqa: TID251 - the oracle of these tests
 
 

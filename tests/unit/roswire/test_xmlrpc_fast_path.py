@@ -42,7 +42,6 @@ def dumped(values: list[Value], method: str | None) -> bytes:
 
 
 def parts(*params: list[Value]) -> list[Value]:
-    """Return the parameter of a multicall that sets parameters, as roslaunch writes it."""
     return [[{"methodName": "setParam", "params": one} for one in params]]
 
 

@@ -13,7 +13,6 @@ from tests.support.http_server import Client, Server, serving
 def anyio_backend(
     request: pytest.FixtureRequest, anyio_backend: tuple[str, dict[str, Any]]
 ) -> tuple[str, dict[str, Any]]:
-    """Return the loop that control runs on, for tests with real connections."""
     return ("asyncio", {"use_uvloop": True}) if may_depend_on_chance(request.node) else anyio_backend
 
 

@@ -38,7 +38,6 @@ REQUEST = {
 
 
 def stated(challenge: str = "60.000.abc.def", **parts: object) -> bytes:
-    """Return the statement of the request above, with other parts."""
     return statement(challenge, **{**REQUEST, **parts})  # type: ignore[arg-type]  # each part is what it is there
 
 

@@ -41,14 +41,12 @@ class Keeper(Revisions[MonitorRevisionRow]):
         self._put_in_force(to, within)
 
     def started(self, *, restarted: bool) -> bool:
-        """Return whether a start takes the kept revision whatever the disk has."""
         return self._find_last(restarted=restarted)
 
     async def wanted(self, revision: int | None) -> MonitorRevisionRow:
         return await self._wanted(revision)
 
     def limit(self) -> list[str]:
-        """Return the time limit in the store: the revision to go back to, the deadline, the length."""
         return self.store.settings()["limit"].split()
 
 

@@ -31,7 +31,6 @@ ALSO: Final = {
 
 
 def imported(*modules: str) -> set[str]:
-    """Return the names of all modules that these imports load."""
     program = (
         "import importlib, sys; [importlib.import_module(one) for one in sys.argv[1:]]; print(*sys.modules)"
     )

@@ -67,7 +67,6 @@ def borrower(home: Path) -> Iterator[Borrower]:
 
 
 def text(descriptor: int | None) -> str:
-    """Return the text of an open file, and close it."""
     assert descriptor is not None
     with os.fdopen(descriptor, encoding="utf-8") as file:
         return file.read()

@@ -44,7 +44,6 @@ class Surroundings(NoIsolation):
         self.closed.append(inner_port)
 
     def open_tunnels(self, pool: str, address: str) -> Esp:
-        """Fail as on a machine that has no process left."""
         raise OSError(errno.EAGAIN, "no process can be made")
 
 

@@ -16,7 +16,6 @@ def process(*, lived: float) -> Any:
 
 @pytest.fixture
 def slot() -> ProcessSlot:
-    """Return the slot of the second relay."""
     return ProcessSlot(Role(name="relay", user="rosrv-relay", part="relay", entry="m:f", indexed=True), 1)
 
 

@@ -9,7 +9,6 @@ from appliance.supervisor.service_manager import ServiceManager
 
 
 def listening(path: Path) -> socket.socket:
-    """Return a socket like the one that systemd gives to a service."""
     heard = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     heard.bind(str(path))
     heard.settimeout(10)

@@ -54,7 +54,6 @@ def trees(words: str) -> Iterator[tuple[str, ast.Module]]:
 
 
 def private(tree: ast.Module) -> Iterator[str]:
-    """Yield the attributes with an underscore that are not the object's own."""
     for node in ast.walk(tree):
         if not isinstance(node, ast.Attribute) or node.attr in PUBLISHED:
             continue

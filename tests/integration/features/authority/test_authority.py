@@ -43,7 +43,6 @@ class Site(NamedTuple):
     tablet: RosSession
 
     def heard(self, name: str) -> set[str]:
-        """Return the talkers of the next messages, from the first message of this talker on."""
         self.listener.wait_for(event="received", publisher=name, since=self.listener.mark())
         first = self.listener.mark()
         self.listener.wait_for_count(SOME, event="received", publisher=name, since=first)

@@ -69,7 +69,6 @@ def recordings(appliance: Appliance, count: int = 1) -> list[dict[str, Any]]:
 
 
 def fetched(appliance: Appliance, recording: str, folder: Path) -> Path:
-    """Return the bag of a recording, as an operator gets it."""
     bag = folder / f"{recording}.bag"
     appliance.rosrv("record", "fetch", recording, "--output", str(bag))
     assert stat.S_IMODE(bag.stat().st_mode) == 0o600
@@ -104,7 +103,6 @@ def test_a_recording_has_the_timestamps_of_the_monitors(
 
 
 def viewers_see_no_contents(appliance: Appliance, dropped: str) -> None:
-    """Assert that viewers see neither the dropped message nor anything that reveals it."""
     path, every = f"/v1/audit/{dropped}?neighbours=0", "event=message+dropped"
     for role in ("viewer", "investigator", "operator"):
         made = appliance.rosrv("token", "add", f"a-{role}", "--role", role, "--json").stdout

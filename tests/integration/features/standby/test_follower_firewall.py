@@ -85,7 +85,6 @@ def connected(site: Site) -> socket.socket | None:
 
 
 def reaches(site: Site, name: str) -> bool:
-    """Whether the follower reaches this appliance at the fixed address, and the appliance the follower."""
     try:
         site.connect(site.follower, FIXED, MASTER, 1).close()
     except OSError:

@@ -119,7 +119,6 @@ class Site:
             ]
 
     def held(self) -> bool:
-        """Whether the last report says that the lease is held."""
         return bool(self.reports) and isinstance(self.reports[-1], messages.LeaseHeld)
 
     def close(self) -> None:

@@ -30,7 +30,6 @@ def appliance(collector: StreamCollector) -> Iterator[Appliance]:
 
 
 def work(appliance: Appliance, count: int) -> None:
-    """Make calls of a node, each of which is a record."""
     with master_at(appliance.master_uri) as master:
         for number in range(count):
             assert master.setParam("/worker", f"/value{number}", number)[0] == 1

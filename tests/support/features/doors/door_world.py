@@ -145,7 +145,6 @@ class DoorWorld:
     async def client(
         self, *, origin: str | None = None, subprotocols: Sequence[str] = (), deflate: bool = False
     ) -> WebSocketClient:
-        """Connect a client, and wait for the answer to its handshake."""
         client = WebSocketClient(
             *self.network.connect("10.0.0.9", DOOR),
             origin=None if origin is None else Origin(origin),

@@ -74,7 +74,6 @@ async def real_door(
 
 
 async def _accept(listener: socket.socket, connections: DoorConnections, serve: Serve) -> None:
-    """Pass each connection on as a descriptor, as the front process does."""
     while True:
         connection, _address = await asyncio.get_running_loop().sock_accept(listener)
         with connection:

@@ -104,7 +104,6 @@ class Member:
             await asyncio.gather(following, return_exceptions=True)
 
     def timed(self) -> AbstractContextManager[None]:
-        """Return a block in which records of the trail have this machine's time."""
         return using(VirtualClock(wall=self.clock() / SECOND, now=now()))
 
     async def decide(self, count: int, seconds: float) -> None:
@@ -127,7 +126,6 @@ class Member:
         return None if text is None else msgspec.json.decode(text, type=SignedCheckpoint)
 
     def replicate_to(self, other: "Member") -> None:
-        """Copy the state to the other appliance, as the link between them does."""
         for name, value in self.store.settings().items():
             other.store.save_setting(name, value)
 

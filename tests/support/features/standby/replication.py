@@ -82,7 +82,6 @@ def _kept_certificate(home: Path) -> LinkCertificate:
 
 
 def listening_socket() -> socket.socket:
-    """Return a listening socket on a free port of the loopback."""
     listening = socket.socket()
     listening.bind(("127.0.0.1", 0))
     listening.listen()

@@ -36,7 +36,6 @@ PORTS = ["11311", "19001-26000"]
 
 
 def memberships(folder: Path) -> tuple[dict[str, Membership], dict[str, Any], dict[str, Any]]:
-    """Return the memberships of both appliances, and the settings of the witness and of a follower."""
     plan = PairPlan(
         name="a",
         address=ADDRESSES["a"],
@@ -177,7 +176,6 @@ class StandbySite:
         self.start(name)
 
     def pair(self) -> tuple[str, str]:
-        """Return the names of the active and the passive appliance."""
         holder = self.holder()
         return holder, {"a": "b", "b": "a"}[holder]
 
@@ -188,7 +186,6 @@ class StandbySite:
         one.wait_for(event="ready", timeout=2 * LIMIT)
 
     def promote(self, name: str) -> None:
-        """Let an active appliance hand over by an operator's order, again while it refuses and is active."""
         eventually(
             lambda: self.holder() != name or self.appliances[name].rosrv("standby", "promote"), self.story
         )
@@ -239,7 +236,6 @@ class StandbySite:
         return "\n".join([witness_said, *(one.story() for one in self.appliances.values())])
 
     def ros(self) -> RosSession:
-        """Return nodes on the robot, which use the fixed address."""
         return RosSession(MASTER, self.home, self.robot)
 
     def __enter__(self) -> Self:

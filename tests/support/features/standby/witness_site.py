@@ -155,7 +155,6 @@ class Site:
         return self.sockets.enter_context(made)
 
     def connecting(self, address: str) -> socket.socket:
-        """Begin a connection of the robot to the port of the ROS master."""
         made = self.sockets.enter_context(self.robot.run(socket.socket))
         made.setblocking(False)
         made.connect_ex((address, MASTER))

@@ -40,6 +40,5 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
 
 @pytest.fixture(scope="module")
 def robot(site: StandbySite) -> Iterator[StandbyRobot]:
-    """The robot with its nodes, which run through all tests of the file."""
     with StandbyRobot(site) as robot:
         yield robot

@@ -30,7 +30,6 @@ from tests.support.waiting import allowed, eventually
 
 @pytest.fixture(autouse=True)
 def nothing_is_lost(site: StandbySite, robot: StandbyRobot) -> Iterator[None]:
-    """Check before each test that the site is whole, and after it that the same appliance is active."""
     site.until_both_in_sync()
     before = site.pair()
     control = site.pids(before[0], "control")
@@ -82,7 +81,6 @@ def grow(robot: StandbyRobot, site: StandbySite, until: Callable[[], bool]) -> N
 
 
 def slowest_answer(robot: StandbyRobot, since: float) -> float:
-    """Return the longest time that the registrar waited for an answer since then."""
     events = robot.registrar.seen(event="acknowledged")
     return float(max(event["longest"] for event in events if event["at"] >= since))
 
@@ -164,7 +162,6 @@ async def lied(link: ReplicationLink[Any], lie: Callable[[str], Any]) -> bool:
 
 
 async def reads_nothing(link: ReplicationLink[Any], robot: StandbyRobot) -> None:
-    """Ask for everything and read nothing, while the nodes change parameters."""
     await link.send(Stored(0, "", 0))
     await asyncio.to_thread(robot.works)
 
@@ -203,7 +200,6 @@ def test_floods_and_replayed_datagrams(site: StandbySite, robot: StandbyRobot) -
 
 
 def connects(address: str) -> bool:
-    """Whether a host that is not the standby can connect for replication."""
     try:
         with socket.create_connection((address, PORT), 1.0):
             return True

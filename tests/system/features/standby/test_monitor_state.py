@@ -37,7 +37,6 @@ def monitor(site: StandbySite, name: str) -> dict[str, Any]:
 
 
 def dropped(site: StandbySite, name: str, least: int) -> bool:
-    """Whether the monitor of an active appliance has dropped this number of messages."""
     return int(monitor(site, name)["drops"]) >= least
 
 

@@ -17,7 +17,6 @@ BACK_SECONDS = 3.0
 
 @pytest.fixture(autouse=True)
 def nothing_is_lost(site: StandbySite, robot: StandbyRobot) -> Iterator[None]:
-    """Check before each test that the site is whole, and after it that the same appliance is active."""
     site.until_both_in_sync()
     robot.works()
     before = site.pair()

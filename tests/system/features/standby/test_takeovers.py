@@ -48,7 +48,6 @@ def orders(site: StandbySite, name: str) -> list[Any]:
 
 @pytest.fixture(autouse=True)
 def nothing_is_lost(site: StandbySite, robot: StandbyRobot) -> Iterator[None]:
-    """Check before each test that the site is whole, and after it the promises of the file."""
     site.until_both_in_sync()
     before = eventually(lambda: orders(site, site.holder()), site.story)
     yield
@@ -101,7 +100,6 @@ def test_a_paused_appliance_answers_nothing_when_it_wakes_up(site: StandbySite, 
 
 
 def request(site: StandbySite, name: str, method: str) -> socket.socket:
-    """Send a request to an appliance from a host that the robot does not fence."""
     values = "".join(
         f"<param><value>{text}</value></param>"
         for text in ("/late", "/large", "late")[: 3 if method == "setParam" else 2]
@@ -172,7 +170,6 @@ def rest_of(one: Appliance, token: str) -> Callable[[str], Answer]:
 
 
 def learn_of_the_pause(one: Appliance, get: Callable[[str], Answer]) -> None:
-    """Check that each way to the appliance gives the reason of its pause, and soon."""
     began = time.monotonic()
     for verb in (("status",), ("standby", "status"), ("policy", "show")):
         done = one.rosrv(*verb, check=False)

@@ -127,7 +127,6 @@ def reaches(joined: JoinedHost) -> bool:
 
 
 def is_later(number: int, event: Event) -> bool:
-    """Whether an event of a listener is a message with a greater number."""
     return event.get("event") == "received" and int(str(event["data"]).split()[-1]) > number
 
 

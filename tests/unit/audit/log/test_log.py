@@ -34,7 +34,6 @@ _LIMIT_SECONDS = 30
 
 
 def events(path: Path) -> Counter[str]:
-    """Return the number of records of each event in the log."""
     return Counter(entry.record.event for entry in export(path, Filter()))
 
 

@@ -29,7 +29,6 @@ def first_sequence(path: Path) -> int:
 
 
 def retain(log: AuditLog) -> None:
-    """Let a minute pass, in which the log removes what it may."""
     let_pass(log, 60)
 
 

@@ -27,7 +27,6 @@ _SECOND = 1_000_000_000
 def denial(
     second: int, host: str | None = "10.0.0.1", reason: str = "no rule", **changes: object
 ) -> AuditRecord:
-    """Return a denial at this second."""
     at = BEGIN + second * _SECOND
     fields = {"id": f"{second:020x}", "event": "decision", "decision": "deny", "caller_id": "/a"} | changes
     return AuditRecord(time=at, host=host, reason=reason, **fields)  # type: ignore[arg-type]  # as the caller says

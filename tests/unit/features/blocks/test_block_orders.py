@@ -63,7 +63,6 @@ class Clock:
         return self.now
 
     def read_again(self) -> Callable[[], bool]:
-        """Return the condition that the timer has read the clock twice more, so it has acted on one of the answers."""
         reads = self.reads
         return lambda: self.reads >= reads + 2
 

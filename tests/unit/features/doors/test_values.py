@@ -71,7 +71,6 @@ def random_message(random: Random, name: str) -> dict[str, Any]:
 
 
 def as_seen_by_rosbags(message: Any) -> Any:
-    """Return the values that an independent implementation reads from a message."""
     if isinstance(message, list):
         return [as_seen_by_rosbags(one) for one in message]
     if hasattr(message, "nanosec"):

@@ -164,12 +164,10 @@ class Control:
         return None
 
     def exported(self, place: Path, since: int | None = None, until: int | None = None) -> Path:
-        """Write a bundle to a file and return its path."""
         span = TimeSpan(self.begun if since is None else since, wall_ns() + 1 if until is None else until)
         return self.export(span, place)
 
     def export(self, wanted: TimeSpan | RecordingSelection, place: Path) -> Path:
-        """Write the bundle of a period or a recording to a file and return its path."""
         place.write_bytes(b"".join(export(self.log.path, wanted, self.ask, NAMES)))
         return place
 

@@ -38,7 +38,6 @@ Client = Callable[[str], str]
 
 
 def drips_the_handshake(visitor: Visitor) -> None:
-    """Begin a long handshake record, and send a byte now and then."""
     visitor.stream.sendall(b"\x16\x03\x03\x40\x00")
     visitor.repeat(b"\x02", 0.02)
 
@@ -73,7 +72,6 @@ def sends_an_endless_body(visitor: Visitor) -> None:
 
 
 def closes_midway(visitor: Visitor) -> None:
-    """Send a part of the body, and close the connection."""
     visitor.stream.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 500\r\n\r\n{")
     visitor.stream.close()
 
@@ -244,8 +242,6 @@ def test_a_collector_that_misbehaves_after_an_upload(
 
 
 def honest_until_the_upload(lie: Lie) -> Lie:
-    """Return a collector that has no segment yet, and lies after it got the first one."""
-
     def answer(visitor: Visitor) -> None:
         visitor.request()
         visitor.give(json.dumps({"robot": ROBOT, "log": "", "number": 0, "hashes": []}).encode())

@@ -71,7 +71,6 @@ class Collector(CollectorConnection):
 
 @pytest.fixture
 def collector(make_log: MakeLog, path: Path) -> Collector:
-    """Return a collector, and make a log with three sealed segments."""
     log = make_log(checkpoint_every=10)
     for _ in range(3):
         for number in range(10):
@@ -82,7 +81,6 @@ def collector(make_log: MakeLog, path: Path) -> Collector:
 
 @pytest.fixture
 def make(collector: Collector, path: Path, tmp_path: Path) -> Callable[[], SegmentPusher]:
-    """Return a function that makes a pusher, as a process does at its start."""
     (tmp_path / "state").mkdir()
     key = collector.key.public_key().public_bytes_raw()
     return lambda: SegmentPusher(path, tmp_path / "state", collector, key, jitter=lambda: 0.5)

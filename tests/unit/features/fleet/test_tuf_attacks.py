@@ -52,7 +52,6 @@ class Field:
         self.site.lies[path] = lambda handler: give(handler, body)
 
     def timestamp(self, snapshot: int, version: int | None = None, days: float = 1.0) -> bytes:
-        """Return a timestamp that the stolen online key has signed."""
         signed = Timestamp(
             version=version or int(time.time()) + 1000,
             expires=(datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)).replace(
@@ -67,7 +66,6 @@ class Field:
 
 @pytest.fixture
 def field(tmp_path: Path) -> Iterator[Field]:
-    """Return a site with a first bundle, which the robot has verified."""
     site = RobotSite(tmp_path / "site")
     site.add()
     with site.served() as url:
@@ -77,7 +75,6 @@ def field(tmp_path: Path) -> Iterator[Field]:
 
 
 def refused(field: Field, word: str, robot: VerifiedBundles | None = None) -> None:
-    """Require that a poll is rejected with a reason that has this word, and gives no bundle."""
     with pytest.raises(BundleRejectedError, match=word):
         field.poll(robot)
 

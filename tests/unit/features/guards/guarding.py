@@ -24,7 +24,6 @@ SPEEDS = (0.0, -0.0, 0.2, -0.2, 0.5, -0.5, 0.5000001, 1.0, -3.0, 1e300, math.inf
 
 
 def twist(*legs: float) -> bytes:
-    """Return a command with these velocities: x, y, z, and around them."""
     names = [f"{part}__{axis}" for part in ("linear", "angular") for axis in "xyz"]
     return message(TWIST, **dict(zip(names, legs, strict=False)))
 
@@ -85,5 +84,4 @@ class Guarded:
 
 
 def seeded(seed: int) -> random.Random:
-    """Return a source of the same numbers in every run."""
     return random.Random(seed)  # noqa: S311  of tests

@@ -270,7 +270,6 @@ def test_a_trajectory_keeps_the_limits_of_its_joints(points: Any, passes: bool) 
 
 
 def with_id(name: str, before: int, behind: int) -> bytes:
-    """Return a message that has an id of a goal between zeros."""
     return bytes(before) + len(name).to_bytes(4, "little") + name.encode() + bytes(behind)
 
 

@@ -44,7 +44,6 @@ def why(record: AuditRecord, text: str = CLOSED) -> Why:
 
 
 def allowing(found: Why) -> list[str]:
-    """Return the lines of the policy that would allow the denied request."""
     start = "would be allowed by: "
     return [line.removeprefix(start) for line in found.lines if line.startswith(start)]
 

@@ -78,7 +78,6 @@ class Scene:
         return record.id
 
     def later(self, seconds: float, *said: Any) -> list[messages.Message]:
-        """Let the time pass, then let the recorder take its next step."""
         self.clock.now += int(seconds * SECOND)
         return self.recorder.step(said)
 

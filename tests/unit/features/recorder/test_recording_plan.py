@@ -32,8 +32,6 @@ def made(**rules: object) -> RecordingPlan:
 
 @pytest.fixture
 def dropped() -> Callable[..., dict[str, str]]:
-    """Return the plan for the record of a dropped message."""
-
     def say(plan: RecordingPlan, host: str | None, now: int) -> dict[str, str]:
         return plan.detail("message dropped", None, Severity.WARNING, host, now)
 

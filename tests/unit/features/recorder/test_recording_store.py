@@ -17,7 +17,6 @@ SECOND = 1_000_000_000
 def recording(
     number: int, what: TriggerKind = "drop", size: int = MIB, charged_to: str = OPERATORS
 ) -> Recording:
-    """Return the recording of this second."""
     time = number * SECOND
     trigger = Trigger(time, what, "record", "")
     return Recording(

@@ -49,7 +49,6 @@ class Clock:
 
 
 def ring(memory: memoryview, clock: Clock | None = None) -> RingWriter:
-    """Return a writer that drops messages older than a microsecond first."""
     return RingWriter(memory, topic_share=0.25, host_share=0.5, seconds=1e-6, clock=clock or Clock())
 
 

@@ -30,7 +30,6 @@ def _unsigned(header: dict[str, Any], signature: bytes = b"") -> str:
 
 
 def _hmac_with_public_key() -> str:
-    """Return a token whose HMAC has the provider's public key as its key."""
     text = f"{part({'alg': 'HS256', 'kid': 'one'})}.{part(_claims())}"
     return f"{text}.{part(hmac.digest(rsa('one').as_pem(private=False), text.encode(), 'sha256'))}"
 
@@ -41,7 +40,6 @@ def _changed_payload() -> str:
 
 
 def _own_key(**header: Any) -> str:
-    """Return a token that brings the key that verifies it."""
     return token(_claims(), rsa("attacker"), {"kid": "one", **header})
 
 

@@ -144,7 +144,6 @@ class Host:
             self.inbox.append((sender, message))
 
     def resume(self) -> None:
-        """End a pause, which replaces the timer that waits for it."""
         if self.up:
             self.paused_until = self.history.now
             self._timer += 1
@@ -188,7 +187,6 @@ class SimulatedAppliance(Host):
         self.was_active = 0
 
     def started(self) -> None:
-        """Start passive, with the log and the epoch of the disk."""
         session = f"{self.history.random.getrandbits(64):x}"
         self.lease = self.history.product.lease.ApplianceLease(
             self.name, self.other, session, self.epoch, self.now
@@ -224,7 +222,6 @@ class SimulatedAppliance(Host):
             self._answer()
 
     def switch_over(self) -> None:
-        """Take the order of an operator, which may be impossible."""
         if self.running:
             with suppress(self.history.product.lease.LeaseError):
                 self._send(self.lease.switch_over(self.now))
@@ -372,14 +369,12 @@ class SimulatedRobot(Host):
             self.history.trace(f"{request['do'].rstrip('e')}ed {other} {by}")
 
     def admitted(self) -> set[str]:
-        """Return the appliances that the rules admit. Without a table both are."""
         shut = {
             name for name, one in SETTINGS.appliances.items() if f"ip saddr {one.address} drop" in self.rules
         }
         return set(NAMES) - shut
 
     def translated_to(self) -> set[str]:
-        """Return the addresses to which the fixed address is translated."""
         return set(re.findall(r"dnat to (\S+)", self.rules))
 
     def _save(self, record: Any) -> None:

@@ -86,7 +86,6 @@ class Robot:
         assert self.witness.handle(name, "claim", 0, "") == ""
 
     def answer(self, datagram: bytes | None = None, address: str = "10.0.0.20") -> bytes | None:
-        """Return the witness's answer to a new request, or to this one."""
         return self.gate.answer(datagram or self.follower.request(), address)
 
     def look(self) -> str:

@@ -61,7 +61,6 @@ class Pairs:
         return state.lost, state.left
 
     def hand_over(self, content: bytes) -> None:
-        """Leave the state of one relay in a planned switchover."""
         asyncio.run(leave_state(self.present, self.store, cast(Rollout, Relays(content))))
 
     @property
@@ -69,7 +68,6 @@ class Pairs:
         return self.members["a"]._replace(epoch=self.epoch)
 
     def copies(self, *contents: bytes | None, followed: bool = True) -> StateCopies:
-        """Return the copies of the present epoch, after one turn."""
         made = StateCopies(self.present, self.store, cast(Rollout, Relays(*contents)), lambda: followed)
         asyncio.run(made.copy_once())
         return made

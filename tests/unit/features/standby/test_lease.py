@@ -20,7 +20,6 @@ BOTH, ALONE = frozenset("ab"), frozenset("a")
 
 
 def answer_of(**changes: object) -> WitnessAnswer:
-    """Return an answer of the witness: granted, except for these fields."""
     full = {
         "ok": True, "reason": "", "epoch": 2, "holder": "a", "in_sync": BOTH, "expired": False
     } | changes  # fmt: skip
@@ -276,7 +275,6 @@ def test_it_waits_for_the_standby_before_it_is_added() -> None:
 
 
 def in_a_switchover() -> tuple[Lease, TakeOver]:
-    """Return a lease that is handed over, and its order to the other appliance."""
     lease = active_lease()
     asked = asked_by(lease.later(0.3))
     lease.lease.received(lease.now, ClaimPromise(asked.epoch, asked.session, asked.number))

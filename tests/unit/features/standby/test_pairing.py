@@ -14,7 +14,6 @@ from tests.support.features.standby.standby_site import memberships
 
 @pytest.fixture
 def state(tmp_path: Path) -> Path:
-    """Return the state directory of an appliance that joined before its first start."""
     made, *_settings = memberships(tmp_path / "made")
     save_membership(path_of(tmp_path / "state"), made["a"])
     return tmp_path / "state"

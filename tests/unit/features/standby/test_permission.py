@@ -91,7 +91,6 @@ class Pair:
         self.client: LeaseClient
 
     def start_control(self, *, taken_over: bool) -> None:
-        """Start control: it has no link to the standby, and the lease no report."""
         for task in self.waiting:
             task.cancel()
         self.waiting.clear()

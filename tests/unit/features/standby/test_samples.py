@@ -6,7 +6,6 @@ from tests.support.answers import example
 
 
 def numbers(state: StandbyState) -> dict[str, float]:
-    """Return the samples as a page of metrics names them."""
     return {
         f'{name}{{role="{labels[0]}"}}' if labels else name: float(value)
         for name, samples in samples_of(state).items()

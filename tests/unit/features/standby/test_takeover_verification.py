@@ -101,7 +101,6 @@ def execute(path: Path, *statements: str) -> None:
 
 
 def setting(field: str, value: str, epoch: int, event: str = "took over") -> str:
-    """Return SQL that changes a field in the detail of the takeover of an epoch."""
     return (
         f"UPDATE record SET detail = CAST(json_set(CAST(detail AS TEXT), '$.{field}', {value}) AS BLOB)"
         f" WHERE event = '{event}' AND json_extract(CAST(detail AS TEXT), '$.epoch') = {epoch}"
@@ -185,7 +184,6 @@ def test_an_unsigned_tail_is_counted(tmp_path: Path) -> None:
 
 
 def begun_after(path: Path, removed: int) -> VerifiedLog:
-    """Remove the first records of a log, with the result of a verification before it, as retention leaves it."""
     result = msgspec.structs.replace(verify(path), removed=removed)
     execute(path, f"DELETE FROM record WHERE sequence <= {removed}")
     return VerifiedLog(path, result)

@@ -39,13 +39,11 @@ def near(tmp_path: Path, name: str) -> NearAuthority:
 
 
 def introduction(endpoint: str = SECOND, key: bytes | None = None) -> Introduction:
-    """Return the introduction of an appliance, by default with a new key."""
     key = key or make_key()
     return Introduction(signing_request(key, "rosrv-appliance"), fingerprint(key), endpoint, PIN)
 
 
 def table(store: StateStore, endpoint: str = FIRST) -> ApplianceTable:
-    """Return the table of an appliance that hosts reach at this address."""
     return ApplianceTable(store.hosts, RevokedCertificates(store.hosts), endpoint)
 
 

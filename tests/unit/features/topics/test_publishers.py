@@ -10,7 +10,6 @@ from appliance.features.topics.publishers import PastPublishers, publishers_at
 
 
 def entry(sequence: int, event: str, **fields: Any) -> LogEntry:
-    """Return a record at the second of its sequence."""
     return LogEntry(sequence, AuditRecord(id=str(sequence), time=sequence * 10**9, event=event, **fields))
 
 

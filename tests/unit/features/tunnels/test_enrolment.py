@@ -158,7 +158,6 @@ class Bench:
         return self.hosts.itself.renew(HostRenewItself(name, request, sign(former, request), peer))
 
     def renewed(self, name: str) -> Coroutine[Any, Any, Any]:
-        """A host reports that the new certificate is in place."""
         return self.hosts.itself.renewed(HostRenewed(name, "10.113.11.2"))
 
     def recorded(self, event: str) -> list[str]:

@@ -40,7 +40,6 @@ class Machine:
         self._path = f"{programs}:{os.environ['PATH']}"
 
     def put(self, where: str, name: str, days: float) -> None:
-        """Write a certificate into the kit, or into its final place."""
         made = self._authority.issue(signing_request(make_key(), name), name, days).certificate
         root = self._kit if where == "kit" else self._etc
         (root / "x509/rosrv.pem").write_bytes(made)

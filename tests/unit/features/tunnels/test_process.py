@@ -152,8 +152,6 @@ async def test_no_report_is_older_than_the_changes_before_it(tmp_path: Path) -> 
 
 
 def failure_of(directory: Path, esp: Esp) -> Failed:
-    """Return the failure that the supervisor gets at the start of charon."""
-
     async def work() -> Failed:
         (ours, theirs), (lifeline, child) = socket.socketpair(), socket.socketpair()
         own, supervisor, link = (

@@ -12,7 +12,6 @@ from appliance.supervisor.state_directory import StateDirectory
 
 @pytest.fixture
 def state(tmp_path: Path) -> Path:
-    """Return the state directory of a stopped appliance with an authority."""
     StateDirectory(tmp_path).close()
     (tmp_path / "signer").mkdir(mode=0o700)
     CertificateAuthority(tmp_path / "signer").revocations([])

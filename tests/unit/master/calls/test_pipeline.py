@@ -150,7 +150,6 @@ async def others() -> None:
 
 
 def sets(*keys: str) -> list[Value]:
-    """Return the parts of a multicall that sets these keys."""
     return [part("setParam", key, 1) for key in keys]
 
 

@@ -57,7 +57,6 @@ class Post:
         return node
 
     def push(self, *topics: str, publishers: list[str]) -> None:
-        """Queue an updated list of publishers for each of these topics."""
         for topic in topics:
             self.delivery.push(self.incarnation, NodeCall("publisherUpdate", (topic, list(publishers))))
 

@@ -16,7 +16,6 @@ _EFFECTS = {"Effects", "list[Durable]"}
 
 
 def verbs() -> set[tuple[str, str]]:
-    """Names a part of the core, and its methods that return effects."""
     return {
         (part.__name__.removeprefix("Ros").lower(), node.name)
         for part in (RosGraph, Registry, Grants, Revocation)

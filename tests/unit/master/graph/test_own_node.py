@@ -30,7 +30,6 @@ ROSOUTS = [
 
 
 def decide(caller_id: str, method: str, resource: str) -> Decision:
-    """Return the decision on a call at the listener of the appliance's own nodes."""
     policy, call = compile_policy("[Nodes]\n", file="p.ini"), MASTER_CALLS[method]
     peer = Peer(ipaddress.ip_address("127.0.0.1"), "127.0.0.1", "127.0.0.1")
     arguments = tuple(

@@ -52,7 +52,6 @@ def oracle() -> Any:
 
 
 def in_order(told: list[Any]) -> list[str]:
-    """Return the updates, sorted within each call, where their order has no meaning."""
     return sorted(json.dumps(one, sort_keys=True) for one in told)
 
 

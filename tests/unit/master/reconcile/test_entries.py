@@ -45,7 +45,6 @@ class Requests:
 
 
 async def started() -> tuple[ControlParts, Requests]:
-    """Return control after its first round, and its ROS master."""
     world = await ControlParts.begun()
     requests = Requests(world)
     world.hidden.calls.clear()
@@ -53,7 +52,6 @@ async def started() -> tuple[ControlParts, Requests]:
 
 
 def changes(world: ControlParts) -> list[tuple[Any, Any]]:
-    """Return the changes that the ROS master carried out, with their topics."""
     return [(call[0], call[2]) for call in world.hidden.calls if "egister" in str(call[0])]
 
 

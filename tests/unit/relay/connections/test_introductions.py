@@ -12,7 +12,6 @@ DEFINED = {"type": STRING, "md5sum": MD5, "message_definition": "string data\n"}
 
 
 def asked(claims: list[dict[str, str]], registered: str) -> list[str]:
-    """Return the headers that a publisher gets that refuses all of them."""
     introductions = Introductions(lambda: claims, lambda: registered)
     shown = [_shown(introductions)]
     while introductions.refused():

@@ -113,7 +113,6 @@ def served() -> Iterator[Monitored]:
 
 
 def asked(world: Monitored) -> Peer:
-    """Return the service's end of the call, after the request."""
     peer = world.accept(world.service)
     header = world.gets_header(peer)
     assert (header["callerid"], header["md5sum"]) == ("/rosrv", SET_BOOL_MD5)
@@ -123,7 +122,6 @@ def asked(world: Monitored) -> Peer:
 
 
 def grant(world: Monitored) -> None:
-    """Grant the call that a monitor wants, as control does."""
     wanted = world.hears(MonitorCallWanted, service="/arm")
     world.state(ClientGranted("srv", "/arm", LOOPBACK, "/rosrv"))
     port: int = world.port_of_server  # type: ignore[attr-defined]  # of the fixture

@@ -59,7 +59,6 @@ def turn_until(loop: EventLoop, done: Callable[[], bool]) -> None:
 
 
 def accept(loop: EventLoop, publisher: socket.socket) -> tuple[socket.socket, dict[str, str]]:
-    """Return the next connection at the publisher, and its header."""
     found: list[tuple[socket.socket, dict[str, str]]] = []
     parser, connections = HeaderParser(65536), list[socket.socket]()
 

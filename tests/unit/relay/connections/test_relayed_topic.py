@@ -269,7 +269,6 @@ def test_nothing_is_latched_for_a_publisher_that_does_not_latch() -> None:
 
 
 def monitored(*, latching: str = "0", fresh: bool = True) -> Story:
-    """Return a topic that a monitor needs, with a publisher and no subscriber."""
     story = Story(fresh=fresh)
     story.topic.monitor(lambda batch: batch, wanted=True)
     story.topic.upstream_opened(HEADER | {"latching": latching})

@@ -64,7 +64,6 @@ class Monitored(World):
         )
 
     def taken(self, kind: type[Any], revision: int) -> Any:
-        """Return the answer of this kind to a statement, and remove it."""
         for message in self.told:
             if isinstance(message, kind) and message.revision == revision:
                 self.told.remove(message)
@@ -72,8 +71,6 @@ class Monitored(World):
         return None
 
     def event(self, kind: str, **fields: Any) -> MonitorEvent:
-        """Return this action of a monitor, and remove it from the reports."""
-
         def find() -> MonitorEvent | None:
             for message in self.told:
                 if isinstance(message, MonitorsReported):

@@ -94,7 +94,6 @@ class Monitored:
     def through(
         self, traffic: Traffic, first: int = 1, publisher: str = "/talker"
     ) -> tuple[int, bytes, bytes]:
-        """Return the messages that passed: their number, all of them, and the last one."""
         if " " in traffic.topic:
             return self._asked(traffic, publisher)
         scratch = Scratch()
@@ -131,7 +130,6 @@ class Monitored:
         return told
 
     def sent(self) -> Iterable[object]:
-        """Yield everything sent to control, with rows and events as single items."""
         for one in self.heard.messages:
             yield from getattr(one, "events", None) or getattr(one, "rows", None) or [one]
 

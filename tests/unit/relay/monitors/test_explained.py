@@ -108,7 +108,6 @@ def events_of(
 
 
 def told(row: Row, given: Iterable[Given], *, together: bool, shadow: bool = False) -> MonitorEvent | None:
-    """Return the first fully reported event of the row's kind."""
     names = [row.text.removeprefix("hold ").split("(")[0].strip()] if shadow else []
     kind = f"shadow {row.kind}" if shadow else row.kind
     found = events_of(row, given, together=together, shadows=names)

@@ -16,7 +16,6 @@ ERROR = "0.rv:1:5: error: unknown variable `missing`"
 
 @pytest.fixture
 def monitors() -> Iterator[QuietMonitors]:
-    """Yield the monitors of a relay, with a clock that stands still."""
     with clock.using(VirtualClock()):
         yield QuietMonitors()
 

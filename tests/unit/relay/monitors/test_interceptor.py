@@ -65,7 +65,6 @@ def world() -> Iterator[Monitored]:
 
 
 def passes_by(relayed: RelayedTopic) -> bool:
-    """Whether the next small messages need no monitor."""
     simple = relayed.simple()
     return simple is not None and simple[1] is None
 

@@ -36,7 +36,6 @@ class Told:
         self.monitored.through(Traffic("/cmd", frames, len(bodies)))
 
     def events(self, kind: str) -> list[MonitorEvent]:
-        """Return the reports of this kind at the end of the second."""
         self.monitored.interceptor.tick()
         self.monitored.interceptor.observations.flush()
         found: list[Any] = [one for one in self.monitored.sent() if getattr(one, "kind", "") == kind]

@@ -16,7 +16,6 @@ CAP = """cap() { event c(double v) /cmd_vel geometry_msgs/Twist '{linear.x:v}' {
 
 @pytest.fixture
 def monitors() -> Iterator[QuietMonitors]:
-    """Yield the monitors of a relay, with a clock that stands still."""
     with clock.using(VirtualClock()):
         yield QuietMonitors()
 

@@ -44,7 +44,6 @@ def killed_anywhere(data: bytearray, act: Callable[[Any], object]) -> list[Store
 
 
 def write_both(memory: StateMemory) -> None:
-    """Write a section's cells, then its base."""
     memory.write_cells(1, b"........")
     memory.write_base(1, b"base")
 
