@@ -4,8 +4,29 @@ import asyncio
 from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import dataclass
 
+from appliance.master.endpoints.relay_control import RelayControl
+from appliance.master.graph.registry import Kind
+from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
+from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
+
+_READY_SECONDS = 0.1
+
+Commands = set[tuple[str, str]]
+"""Hosts, each with a topic that it published."""
+
+
+def published_before(store: StateStore, concerns: Callable[[Address, str], bool]) -> Commands:
+    """Return what hosts published when the earlier control ended, of the hosts and topics that this concerns."""
+    nodes, registrations = store.load_registry()
+    hosts = {node.key: node.host for node in nodes if not node.own}
+    return {
+        (host, one.resource)
+        for one in registrations
+        if one.kind == Kind.PUBLICATION and (host := hosts.get(one.key)) is not None
+        if concerns(address_of(host), one.resource)
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +51,15 @@ class MotionStop:
         elif commanded := [topic for topic in wanted if self.policy().commanded(topic) is not None]:
             text = f"no enabled guard has a safe message for {', '.join(commanded)}, so nothing stops the robot: {why}"
             self._record("motion not stopped", text, host, commanded)
+
+    async def at_start(self, lost: Commands, relay: RelayControl) -> None:
+        """Stop what hosts commanded by a right that ended with the earlier control, once no relay lets them through."""
+        while lost and relay.presence != "connected":
+            await asyncio.sleep(_READY_SECONDS)
+        await relay.carried_out()
+        while lost:
+            host, topic = lost.pop()
+            await self.after(host, {topic}, "RVMaster started again, and the right of the host is not kept")
 
     def _record(self, event: str, reason: str, host: str, topics: Iterable[str]) -> None:
         self.trail.happened(event, reason, host=host, resource=next(iter(topics)), whole=True)

@@ -1,14 +1,17 @@
 """Make the part of approvals in control."""
 
 import secrets
+from functools import partial
 from typing import TYPE_CHECKING
 
-from appliance.control.motion_stop import MotionStop
+from appliance.control.motion_stop import Commands, MotionStop, published_before
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.approvals import approval_requests as requests
 from appliance.features.approvals.approval_orders import ApprovalOrders
 from appliance.features.feature import FeaturePart
 from appliance.master.endpoints.host_signs import host_signs
+from appliance.policy.model import Address, Category, Request
+from appliance.policy.policy import Policy
 
 if TYPE_CHECKING:
     from appliance.control.assembly.assembly import Parts
@@ -16,20 +19,25 @@ if TYPE_CHECKING:
 
 
 async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
-    """Return the part. It begins without an approval.
+    """Return the part. It begins without an approval, and stops what hosts commanded by an earlier one.
 
     The first number is random. So an operator who answers late, after a restart, does not approve another call.
     """
-    relay = parts.endpoints.relay
+    relay, policy = parts.endpoints.relay, base.policies.policy
+    stop = MotionStop(relay.stop, base.trail, policy)
+    lost: Commands = set()
+    if any(rule.asked for rule in policy().rules(Category.PUBLISH)):
+        lost = published_before(base.store, lambda host, topic: _asks(policy(), host, topic))
     orders = ApprovalOrders(
-        base.policies.policy,
+        policy,
         base.trail,
         host_signs(parts.core.registry, parts.core.carried),
-        MotionStop(relay.stop, base.trail, base.policies.policy),
+        stop,
         first=10_000 + secrets.randbelow(80_000),
         decide_again=base.policies.decide_again,
         carried_out=relay.carried_out,
     )
+
     return FeaturePart(
         methods=(
             RequestMethod(requests.ApprovalsWanted, orders.listed),
@@ -41,5 +49,12 @@ async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
         approved=orders.approved,
         hold_call=orders.hold_call,
         approve=orders.approve_call,
-        work={"the end of approvals": orders.watch},
+        work={
+            "the end of approvals": orders.watch,
+            "the stop of what was commanded before approvals ended": partial(stop.at_start, lost, relay),
+        },
     )
+
+
+def _asks(policy: Policy, host: Address, topic: str) -> bool:
+    return policy.decide(Request(host, "", Category.PUBLISH, topic)).asks is not None

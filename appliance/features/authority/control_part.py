@@ -1,8 +1,9 @@
 """Make the part of command authority in control."""
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from appliance.control.motion_stop import MotionStop
+from appliance.control.motion_stop import Commands, MotionStop, published_before
 from appliance.control.operators.request_method import RequestMethod
 from appliance.features.authority import drive_requests as requests
 from appliance.features.authority.drive_orders import DriveOrders
@@ -16,22 +17,30 @@ if TYPE_CHECKING:
 
 
 async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
-    """Return the part. It begins without a holder of any group."""
-    relay = parts.endpoints.relay
+    """Return the part. It begins without a holder of any group, and stops what earlier ones commanded."""
+    relay, policy = parts.endpoints.relay, base.policies.policy
+    stop = MotionStop(relay.stop, base.trail, policy)
+    lost: Commands = set()
+    if policy().authority:
+        lost = published_before(base.store, lambda _host, topic: policy().commanded(topic) is not None)
     orders = DriveOrders(
-        base.policies.policy,
+        policy,
         base.trail,
         host_signs(parts.core.registry, parts.core.carried),
-        MotionStop(relay.stop, base.trail, base.policies.policy),
+        stop,
         decide_again=base.policies.decide_again,
         carried_out=relay.carried_out,
         relays_ready=lambda: relay.presence == "connected",
     )
+
     return FeaturePart(
         methods=request_methods(orders),
         called={TAKE: orders.take_called, GIVE: orders.give_called},
         holders=orders.holders,
-        work={"the leases of command authority": orders.watch},
+        work={
+            "the leases of command authority": orders.watch,
+            "the stop of what was commanded before groups ended": partial(stop.at_start, lost, relay),
+        },
     )
 
 

@@ -174,6 +174,7 @@ MOTION = POLICY + "[Authority]\nbase = /cmd_vel\ntake base = site agent\nlease b
 def test_a_lease_on_a_motion_ends_by_silence_and_the_guard_stops_the_robot(
     appliance: Appliance, robot: Host, tmp_path: Path
 ) -> None:
+    """Without a guard, a record says that nothing stops the robot. A restart of control ends a lease too."""
     appliance.reload(MOTION)
     publish = {"op": "publish", "topic": "/cmd_vel", "msg": TWIST, "id": "p"}
     advertise = {"op": "advertise", "topic": "/cmd_vel", "type": "geometry_msgs/Twist", "id": "a"}
@@ -181,7 +182,8 @@ def test_a_lease_on_a_motion_ends_by_silence_and_the_guard_stops_the_robot(
         echo = ros.start(["/usr/bin/rostopic", "echo", "-p", "/cmd_vel"])
 
         def drive() -> None:
-            held = number_in(agent(robot, advertise, answer="status")["msg"])
+            # A door that still has the publication refuses the message, not the advertisement.
+            held = number_in(agent(robot, advertise, publish, answer="status")["msg"])
             appliance.rosrv("approve", held, "--for", "60s")
             appliance.rosrv("drive", "take", "base", "--host", "door:agent-1")
             robot.run(lambda: refused(publish))
@@ -195,4 +197,9 @@ def test_a_lease_on_a_motion_ends_by_silence_and_the_guard_stops_the_robot(
         drive()
         stops = appliance.recorded("--event", "motion stopped", count=1)
         assert "speed on /cmd_vel" in stops[0]["reason"], stops
+        echo.wait_for_text(STOPS, since=mark)
+        appliance.reload(MOTION.replace("2s", "60s"))  # the lease does not end by silence
+        drive()
+        mark = echo.mark()
+        appliance.kill("control")
         echo.wait_for_text(STOPS, since=mark)
