@@ -1,4 +1,4 @@
-"""The services of rosapi, answered from the part of the graph that the identity of the door may see.
+"""The services of rosapi, answered from the graph, if the policy lets the door call getSystemState and getTopicTypes.
 
 The answers have the fields of rosapi's own service types. `get_ros_version` belongs to ROS 2: clients call it to find
 out which ROS this is, and it fails at once. A call that the policy denies fails with the master's words.
