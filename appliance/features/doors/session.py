@@ -277,21 +277,26 @@ class DoorSession:
                 self._disconnect(CloseCode.POLICY_VIOLATION, str(error))
 
     async def _carry_out(self, frame: Frame) -> None:
-        """Carry out the requests of a frame; after a refusal, drop the rest."""
+        """Carry out the requests of a frame; after a refusal, drop later ones on the same topic."""
         self.received += 1
         requests = self._protocol.receive(frame)
         self._wake.set()
+        refused: set[str] = set()
         for request in requests:
             if self._over.is_set():
                 return
+            topic = getattr(request, "topic", "")
+            if topic in refused:
+                continue
             try:
                 await self._door.carry_out(request, self)
                 self._note_will(request)
             except RosError as error:
                 self.refusals += 1
+                if topic:
+                    refused.add(topic)
                 self._protocol.failed(request, str(error))
                 self._wake.set()
-                return
 
     def _note_will(self, request: DoorRequest) -> None:
         match request:

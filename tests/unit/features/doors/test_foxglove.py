@@ -94,6 +94,21 @@ async def test_a_viewer_publishes_bytes_and_json() -> None:
         assert world.master.publishers["/text"] == []
 
 
+async def test_a_refusal_drops_no_other_topic_of_the_frame() -> None:
+    async with door_world() as world:
+        sees(world, topics={})
+        client = await world.client(subprotocols=SUBPROTOCOLS)
+        types = {"/a": "own/Unknown", "/b": "std_msgs/String"}
+        channels = [
+            {"id": number, "topic": topic, "encoding": "ros1", "schemaName": kind}
+            for number, (topic, kind) in enumerate(types.items())
+        ]
+        client.send({"op": "advertise", "channels": channels})
+        assert "does not know this message type" in (await next_op(client, "status"))["message"]
+        await asyncio.sleep(1)
+        assert [*world.master.publishers] == ["/b"]
+
+
 async def test_a_viewer_calls_services_and_reads_parameters() -> None:
     async with door_world() as world:
         robot = await world.robot("10.0.0.3", "/robot")
