@@ -77,7 +77,6 @@ def build_app(services: Services) -> FastAPI:
         return JSONResponse(app.openapi())
 
     async def page() -> Response:
-        """Return the contract as a page."""
         text = await asyncio.to_thread(page_of, app.openapi())
         return Response(text, headers=console.HEADERS, media_type="text/html")
 

@@ -27,12 +27,12 @@ class BackupError(Exception):
 
 
 def is_passing(name: str) -> bool:
-    """Whether the file is not backed up because a start makes it again."""
+    """Return whether the file is not backed up because a start makes it again."""
     return name.endswith(_PASSING)
 
 
 def is_database(name: str) -> bool:
-    """Whether the file is a database, which SQLite copies and whose size is not limited."""
+    """Return whether the file is a database, which SQLite copies and whose size is not limited."""
     return name.startswith(_DATABASES) and name.endswith(".db")
 
 
@@ -48,7 +48,7 @@ def trouble_with(name: str, size: int) -> str:
 
 
 def belongs(name: str, parts: frozenset[str]) -> bool:
-    """Whether a name in an archive is the name of a backed-up file below one of `parts`."""
+    """Return whether a name in an archive is the name of a backed-up file below one of `parts`."""
     path = PurePosixPath(name)
     below = len(path.parts) > 1 and path.parts[0] in parts and ".." not in path.parts
     return below and str(path) == name and not is_passing(name)

@@ -56,7 +56,7 @@ def open_named(path: Path) -> int:
 
 
 def is_named_there(path: Path) -> bool:
-    """Whether a file or folder that an operator names exists, also where root may not look as itself."""
+    """Return whether a file or folder that an operator names exists, also where root may not look as itself."""
     try:
         os.close(open_named(path))
     except (FileNotFoundError, NotADirectoryError):

@@ -1,7 +1,6 @@
 """Describe an invalid value for users: what it must be, and the nearest known value.
 
-pydantic reads the configuration, the command line and REST parameters; msgspec reads REST bodies. Their own messages
-are for programmers and are never shown.
+pydantic reads the configuration, the command line and REST parameters; msgspec reads REST bodies.
 """
 
 import difflib

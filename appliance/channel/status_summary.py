@@ -6,7 +6,7 @@ from appliance.channel.answers.status import ProcessInfo, Status
 
 
 def probe_failed(status: Status) -> bool:
-    """Whether the probe reached the hidden ROS master past the appliance; False before the first probe."""
+    """Return whether the probe reached the hidden ROS master past the appliance; False before the first probe."""
     return status.probe not in ("", "passed")
 
 

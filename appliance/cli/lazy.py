@@ -1,7 +1,6 @@
 """Make typer commands that import their modules only when they run.
 
-Importing all modules takes a second of processor time, so `rosrv status` must not import the compiler. `--help` and
-completion take the verbs' names from the table of verbs, and the first sentences of help from the source files.
+Importing all modules takes a second of processor time, so `rosrv status` must not import the compiler.
 """
 
 import functools

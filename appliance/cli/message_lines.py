@@ -26,7 +26,7 @@ def lines_of(value: Any, depth: int) -> Iterator[str]:
 
 
 def _is_deep(value: Any) -> bool:
-    """Whether a value has fields, each of which needs its own line."""
+    """Return whether a value has fields, each of which needs its own line."""
     return isinstance(value, Mapping) or (isinstance(value, list) and any(map(_is_deep, value)))
 
 

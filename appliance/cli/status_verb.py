@@ -113,7 +113,7 @@ def _view(body: Status) -> StatusView:
 
 
 def _is_attention(alarm: Alarm, body: Status) -> bool:
-    """Whether an alarm is shown without being a trouble: recent denials and drops, and silenced alarms."""
+    """Return whether an alarm is shown without being a trouble: recent denials and drops, and silenced alarms."""
     return alarm in activity(body) or (alarm.severity == "notice" and alarm.handled != "")
 
 

@@ -5,9 +5,8 @@
     3. the environment: `ROSRV_LISTEN`, and `ROSRV_LIMITS__BODY_BYTES` for the key `body_bytes` under `limits`
     4. flags
 
-All mistakes are reported at once, each with its location. For an unknown key, the nearest known key is also suggested.
-With a file, its relative paths and relative defaults (`policies/default.ini`) are below the file's folder; all other
-paths, and without a file the defaults, are below the working directory.
+With a file, its relative paths and relative defaults (`policies/default.ini`) are below the file's folder;
+all other paths, and without a file the defaults, are below the working directory.
 """
 
 import dataclasses

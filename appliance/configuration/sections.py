@@ -70,7 +70,7 @@ def checked_receiver(text: str) -> str:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a configured host is a loopback address, which only this machine reaches."""
+    """Return whether a configured host is a loopback address, which only this machine reaches."""
     if host == "localhost":
         return True
     try:

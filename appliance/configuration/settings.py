@@ -1,7 +1,6 @@
 """Define every setting with its default, as in `appliance.yaml`.
 
-`appliance.configuration.config_sources` fills `Settings` from the file, the environment and the flags. The supervisor
-writes the result to `run/config.json` in the state directory for the other processes.
+The supervisor writes the result to `run/config.json` in the state directory for the other processes.
 """
 
 import ipaddress
@@ -444,7 +443,6 @@ class Settings:
 
     @property
     def rest_names(self) -> list[str]:
-        """Return the names of REST that the configuration gives."""
         return [*self.api_names, *filter(None, [self.name])]
 
     def __post_init__(self) -> None:

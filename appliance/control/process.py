@@ -1,7 +1,5 @@
 """Run the control process: start its parts, serve until the supervisor stops the process, end the parts.
 
-A feature can make control wait before (`StartGate`).
-
 The order of the start:
 
 1. Receive the listening sockets of an earlier control process.

@@ -47,7 +47,6 @@ class FeatureParts:
                 self.kept[feature.name] = await keep(self._core.sections, store, lifeline)
 
     def addresses(self) -> "dict[str, Address]":
-        """Return the addresses of the features' hosts, by their names in the policy."""
         return {name: address for kept in self.kept.values() for name, address in kept.addresses().items()}
 
     def connected(self, door: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
@@ -96,7 +95,6 @@ class FeatureParts:
         return {field: state for part in self._parts for field, state in part.status_fields().items()}
 
     def limits(self) -> "tuple[LimitUse, ...]":
-        """Return how much of the features' resources is used."""
         return tuple(use for part in self._parts for use in part.limits())
 
     def details(

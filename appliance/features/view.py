@@ -52,7 +52,6 @@ class PairView:
     """The views of two appliances; this class is for a product without pairs."""
 
     def request(self) -> Any:
-        """Return the request for the state of both appliances."""
         raise _NO_PAIRS
 
     def samples(self, state: Any) -> Mapping[str, Samples]:

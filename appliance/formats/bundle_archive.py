@@ -56,7 +56,7 @@ class BundleArchiveError(Exception):
 
 
 def is_bundle_file(name: str) -> bool:
-    """Whether a file of this name, relative to the bundle's folder, belongs to a bundle."""
+    """Return whether a file of this name, relative to the bundle's folder, belongs to a bundle."""
     whole = name.removesuffix(_SIGNATURE)
     if whole in (POLICY, CASES, HOSTS):
         return whole in (name, POLICY)

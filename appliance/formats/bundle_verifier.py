@@ -212,7 +212,7 @@ class Runs:
         self.beside = {edge: False for first, last in pairs for edge in (first - 1, last + 1)}
 
     def meet(self, first: int, last: int) -> bool:
-        """Whether one of these records is in a run."""
+        """Return whether one of these records is in a run."""
         after = bisect_left(self.last, first)
         return after < len(self.last) and self.first[after] <= last
 
@@ -415,7 +415,7 @@ class Verifier:
         return right and checkpoint["key"] == self.raw_key
 
     def has_signed(self, data: bytes, signed: bytes) -> bool:
-        """Whether the key made this signature."""
+        """Return whether the key made this signature."""
         text, signature = (self.key.with_name(name) for name in ("text", "signature"))
         text.write_bytes(data)
         signature.write_bytes(signed)

@@ -34,7 +34,7 @@ class SegmentReceipt(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         return msgspec.structs.replace(self, signature=key.sign(self.text()).hex())
 
     def is_signed(self, key: bytes) -> bool:
-        """Whether the collector with the raw public key `key` signed this receipt."""
+        """Return whether the collector with the raw public key `key` signed this receipt."""
         try:
             Ed25519PublicKey.from_public_bytes(key).verify(bytes.fromhex(self.signature), self.text())
         except (InvalidSignature, ValueError):

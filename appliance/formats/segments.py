@@ -58,7 +58,7 @@ class SegmentHeader(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         return msgspec.json.encode(self) + b"\n"
 
     def follows(self, other: "SegmentHeader") -> bool:
-        """Whether this segment continues `other`: the same log, and no record between them."""
+        """Return whether this segment continues `other`: the same log, and no record between them."""
         before = (other.end.sequence, bytes.fromhex(other.end.hash))
         return self.end.previous == checkpoint_hash(other.end.text()) and self.start == before
 
@@ -79,12 +79,10 @@ class SegmentSummary(NamedTuple):
 
     @property
     def first(self) -> int:
-        """Return the sequence of its first record."""
         return self.header.start[0] + 1
 
     @property
     def last(self) -> int:
-        """Return the sequence of its last record."""
         return self.header.end.sequence
 
 

@@ -27,7 +27,6 @@ class Authority:
         self._signer = signer
 
     async def stated(self) -> messages.AuthorityStated:
-        """Return the certificate of the authority whose key the signer has."""
         return await self._ask(messages.AuthorityRequest, messages.AuthorityStated)
 
     async def issue(

@@ -68,7 +68,6 @@ class HostTable:
 
     @property
     def own_address(self) -> str:
-        """Return the appliance's address in the tunnels."""
         return str(self.pool.network_address + 1)
 
     def require(self, expected: int | None) -> None:
@@ -83,7 +82,6 @@ class HostTable:
     # --- hosts in the table ---
 
     def enrolled(self) -> list[HostRow]:
-        """Return the hosts with a certificate that was not revoked."""
         return [row for row in self.rows.values() if row.revoked is None]
 
     def admitted(self) -> list[HostRow]:
@@ -103,7 +101,6 @@ class HostTable:
         return row
 
     def at(self, address: str) -> HostRow | None:
-        """Return the enrolled host with this virtual address."""
         return next((row for row in self.enrolled() if row.address == address), None)
 
     def listed_as_revoked(self) -> list[RevokedCertificateRow]:

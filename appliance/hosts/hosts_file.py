@@ -100,7 +100,7 @@ class DeclaredHosts:
         return IN_BUNDLE if self.bundled else str(self.path)
 
     def wants(self, name: str) -> bool:
-        """Whether a host's tunnel may be open."""
+        """Return whether a host's tunnel may be open."""
         host = self.hosts.get(name)
         return host is None or host.wanted
 

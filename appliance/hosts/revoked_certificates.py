@@ -45,7 +45,6 @@ class RevokedCertificates:
             self._kept.forget_revoked(before)
 
     def listed(self, enrolled: Set[str]) -> list[RevokedCertificateRow]:
-        """Return the rows of the list, the most recently revoked first."""
         rows = self._not_ended()
         if _bytes_of(rows) > ENTRIES_BYTES:
             rows = [row for row in rows if _matters(row, enrolled)]

@@ -37,7 +37,6 @@ class StoredAuthority:
         return own
 
     def _keeps(self, kept: AuthorityRow, own: bytes) -> bool:
-        """Whether the stored authority is used, although the signer has this one."""
         return kept.certificate == own.decode()
 
     async def obstacle(self) -> str:

@@ -112,7 +112,6 @@ class Tunnels:
 
     @property
     def obstacle(self) -> str:
-        """Return why no tunnels are open."""
         return self._enclosed.reason if self._enclosed else "the supervisor has not answered yet"
 
     @property

@@ -50,7 +50,6 @@ def read_passphrase(descriptor: int) -> bytes:
 
 
 def is_encrypted(data: bytes) -> bool:
-    """Whether a private key in PEM is encrypted."""
     return data.lstrip().startswith(_ENCRYPTED)
 
 

@@ -83,7 +83,6 @@ class CertificateAuthority:
 
     @property
     def certificate(self) -> bytes:
-        """Return the authority's own certificate, in PEM."""
         return self._certificate.public_bytes(Encoding.PEM)
 
     def issue(

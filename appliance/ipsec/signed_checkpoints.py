@@ -146,7 +146,6 @@ def _digest(checkpoint: Checkpoint) -> bytes:
 
 
 def _extent(descriptor: int) -> tuple[int, int]:
-    """Return the number of the first remembered checkpoint, and the count of remembered checkpoints."""
     first = int.from_bytes(os.pread(descriptor, _NUMBER, 0), "big")
     # A partial hash from a crash was not approved.
     return first, (os.fstat(descriptor).st_size - _NUMBER) // _HASH

@@ -86,7 +86,6 @@ def proposals_of(key_exchanges: Iterable[str]) -> Proposals:
 
 
 def connection_name(host: str) -> str:
-    """Return the name of a host's connection and pool in charon."""
     return _PREFIX + host
 
 

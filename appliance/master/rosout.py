@@ -63,7 +63,6 @@ class Rosout:
 
 
 def header(definitions: Definitions) -> OwnHeaderStated:
-    """Return the header with which the relay serves the topic."""
     return OwnHeaderStated(TOPIC, TYPE, definitions.md5sum(TYPE), definitions.full_text(TYPE))
 
 

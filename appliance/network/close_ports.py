@@ -137,7 +137,6 @@ def remove() -> None:
 
 
 def is_applied() -> bool:
-    """Whether a protection is in force on this machine."""
     return f"table inet {TABLE}" in _nft(["list", "tables"], "").splitlines()
 
 

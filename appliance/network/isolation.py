@@ -111,7 +111,7 @@ class _IpForwarding:
         return self._host.sysctl("net/ipv6/conf/all/disable_ipv6") == "0"
 
     def before(self, family: Family) -> bool:
-        """Whether the host forwards packets of a family, before `enable` changes that."""
+        """Return whether the host forwards packets of a family, before `enable` changes that."""
         return self._host.sysctl(_GLOBAL[family]) != "0"
 
     def record(self) -> dict[str, str]:
@@ -247,12 +247,10 @@ class Isolation:
         return isolation_rules(self.settings, self.ends, self._routers, tcp=self._tcp, udp=self._udp)
 
     def put_rules_back(self) -> None:
-        """Install the rules on the host again."""
         if self._rules:
             self._install(self._rules)
 
     def rules(self) -> tuple[FirewallRule, ...]:
-        """Return the rules on the host with their counters."""
         return statuses(self._rules, self._backend.counters())
 
     def _install(self, rules: tuple[PacketRule, ...]) -> None:
@@ -261,7 +259,6 @@ class Isolation:
         self._forget_tunnels()
 
     def _forget_tunnels(self) -> None:
-        """Delete the tunnels' entries in the connection tracker, so their next packets follow the present rules."""
         from appliance.network import conntrack  # noqa: PLC0415  pyroute2: see `links`
 
         conntrack.forget(self._host, [port.first for port in _TUNNELS])
@@ -418,7 +415,6 @@ def isolation_rules(
 
 
 def _true_sources(family: Family, end: LinkAddresses, inward: Interface) -> tuple[PacketRule, ...]:
-    """Drop packets that forge addresses of the link, and keep the sources of packets that enter it."""
     elsewhere = partial(PacketRule, chain=Chain.ARRIVING, arrives_on=Interface(inward.name, other=True))
     entering = partial(PacketRule, chain=Chain.KEPT_SOURCE, family=family, leaves_on=inward)
     return (

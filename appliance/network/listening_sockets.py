@@ -14,7 +14,6 @@ def listening_addresses(port: int) -> tuple[str, ...]:
 
 
 def listening_ports() -> set[int]:
-    """Return the TCP ports with a listener on any address."""
     return {row.port for row in _listeners()}
 
 
@@ -23,7 +22,6 @@ def listening_inodes(port: int) -> set[str]:
 
 
 def udp_ports_in_use() -> set[int]:
-    """Return the UDP ports that are bound on any address."""
     return {row.port for row in _rows("udp", "udp6")}
 
 

@@ -54,7 +54,7 @@ class PrivilegeError(NetworkError):
 
 
 def has_privileges() -> bool:
-    """Whether this process has CAP_SYS_ADMIN and CAP_NET_ADMIN, which making namespaces needs."""
+    """Return whether this process has CAP_SYS_ADMIN and CAP_NET_ADMIN, which making namespaces needs."""
     return _has_capabilities(1 << _CAP_NET_ADMIN | 1 << _CAP_SYS_ADMIN)
 
 
@@ -108,7 +108,7 @@ class Namespace:
         return hash(self.path)
 
     def exists(self) -> bool:
-        """Whether a namespace is mounted under this name (not a bare file from a crash)."""
+        """Return whether a namespace is mounted under this name (not a bare file from a crash)."""
         try:
             here, above = self.path.stat(), self.path.parent.stat()
         except OSError:
@@ -194,7 +194,7 @@ class Namespace:
             raise NetworkError(f"sysctl {key} in {self.name}: {error.strerror}") from error
 
     def lacks_syn_cookies(self) -> bool:
-        """Whether forged first packets can fill a listener's queue of half-open connections."""
+        """Return whether forged first packets can fill a listener's queue of half-open connections."""
         try:
             return self.sysctl("net.ipv4.tcp_syncookies") == "0"
         except NetworkError:  # the kernel was built without SYN cookies
@@ -292,7 +292,7 @@ def _directory_lock() -> Iterator[None]:
 
 
 def _is_mount_point(path: Path) -> bool:
-    """Whether `path` is a mount point (`os.path.ismount` misses a bind mount onto itself)."""
+    """Return whether `path` is a mount point (`os.path.ismount` misses a bind mount onto itself)."""
     with Path("/proc/thread-self/mountinfo").open(encoding="utf-8", errors="replace") as lines:
         return any(line.split(" ", 5)[4] == str(path) for line in lines)
 
@@ -318,12 +318,11 @@ def _os_failure(call: str, name: str) -> NetworkError:
 
 
 def lives_on_the_machines_network(proc: Path = Path("/proc")) -> bool:
-    """Whether this is the machine's first network namespace, and not a container's."""
     return (proc / _ONLY_THERE).exists()
 
 
 def is_contained(root: Path = Path("/")) -> bool:
-    """Whether this process is in a container, with or without its own network."""
+    """Return whether this process is in a container, with or without its own network."""
     if any((root / mark).exists() for mark in _CONTAINER_MARKS):
         return True
     try:

@@ -107,7 +107,7 @@ def _try(address: str, port: int, seconds: float) -> tuple[bool, int]:
 
 
 def _is_own(address: str) -> bool:
-    """Whether an address is this machine's own: packets to it would have the same address as source."""
+    """Return whether an address is this machine's own: packets to it would have the same address as source."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     try:
         with socket.socket(family, socket.SOCK_DGRAM) as probe:

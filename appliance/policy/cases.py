@@ -116,7 +116,6 @@ class _CaseReader:
             yield from self._case(case)
 
     def _give(self, node: _Node) -> None:
-        """Compile the policy again with the given addresses."""
         given = self._mapping(node, "given", ("robot", "hosts"))
         robot: list[Address] = list(self._addresses(given["robot"][1])) if "robot" in given else []
         hosts: dict[str, Address] = {}

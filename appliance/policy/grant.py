@@ -42,7 +42,6 @@ class DecidedRequest:
     takeover: bool = False
 
     def with_tool(self, tool: StockTool) -> Self:
-        """Return the request with all rights that a stock tool on its host needs."""
         return replace(self, rights=[*tool.rights(self.request.host), *self.rights])
 
 
@@ -125,7 +124,6 @@ def _sections(text: str) -> list[SectionText]:
 
 
 def _changed(policy: Policy, text: str, right: Right, word: str) -> tuple[str, str]:
-    """Add a line, or a word to a line. Return the new text and the line."""
     request = right.request
     rule, key = decide_right(policy, right).rule, _key(request)
     name = BY_CATEGORY[request.category].name

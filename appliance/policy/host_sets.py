@@ -80,7 +80,6 @@ class HostSets:
             self._parents[member].append(group)
 
     def parents(self, atom: Atom) -> list[Atom]:
-        """Return the groups that contain the atom directly."""
         return self._parents[atom]
 
     def atoms_of(self, address: Address) -> frozenset[Atom]:
@@ -111,7 +110,7 @@ class HostSets:
         return self._named_as(address)[1]
 
     def names(self, address: Address) -> bool:
-        """Whether the policy names the address or a network that contains it; `*` does not count."""
+        """Return whether the policy names the address or a network that contains it; `*` does not count."""
         return self._named_as(address)[2]
 
     def _named_as(self, address: Address) -> tuple[Network, str, bool]:
@@ -145,5 +144,4 @@ class HostSets:
         return frozenset(found)
 
     def networks(self) -> dict[Network, Atom]:
-        """Return every network of the policy and its atom."""
         return dict(self._networks)

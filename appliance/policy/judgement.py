@@ -15,7 +15,6 @@ from appliance.signing.site_keys import UnsignedError, signer
 
 
 def approvals_of(rows: Iterable[tuple[str, str, str]]) -> frozenset[Approval]:
-    """Return approvals that were sent as text."""
     return frozenset((ipaddress.ip_address(host), Category(category), name) for host, category, name in rows)
 
 

@@ -38,7 +38,6 @@ class Key:
 
     @property
     def exact(self) -> bool:
-        """Whether the key is a name, not a pattern."""
         return "*" not in self.text
 
     @property
@@ -63,7 +62,7 @@ class Key:
         )
 
     def ties_with(self, other: "Key") -> bool:
-        """Whether the keys are equally specific and some name matches both."""
+        """Return whether the keys are equally specific and some name matches both."""
         if self.specificity != other.specificity:
             return False
         if len(self.steps) != len(other.steps) and not self.subtree:
@@ -72,7 +71,7 @@ class Key:
 
 
 def _compatible(one: Step, other: Step) -> bool:
-    """Whether these levels of two keys can match the same level of a name."""
+    """Return whether these levels of two keys can match the same level of a name."""
     (text, star), (other_text, other_star) = one, other
     fits = star and other_text.startswith(text)
     return fits or (other_star and text.startswith(other_text)) or text == other_text
@@ -110,7 +109,7 @@ def command_key(name: str) -> Key:
 
 
 def is_parameter_key(text: str) -> bool:
-    """Whether `text` is a parameter's name, or `/`, in canonical spelling."""
+    """Return whether `text` is a parameter's name, or `/`, in canonical spelling."""
     try:
         return text.startswith("/") and resolve_parameter(text, "") == text
     except InvalidNameError:

@@ -49,7 +49,6 @@ def known_name(word: str) -> str | None:
 
 
 def word_of(name: str) -> str:
-    """Return the policy's word for a name in a mapping of names."""
     return name if name.startswith(DOOR) else f"{HOST}{name}"
 
 

@@ -61,11 +61,10 @@ class CompiledRule:
         return self.atoms | self.asked
 
     def asks(self, atoms: frozenset[Atom]) -> bool:
-        """Whether a host with these atoms needs an approval."""
+        """Return whether a host with these atoms needs an approval."""
         return self.atoms.isdisjoint(atoms) and not self.asked.isdisjoint(atoms)
 
     def grants(self, atoms: frozenset[Atom]) -> bool:
-        """Whether a host with these atoms is among the hosts of the rule."""
         return not self.atoms.isdisjoint(atoms)
 
     def granted_through(self, atoms: frozenset[Atom]) -> tuple[str, ...]:
@@ -219,7 +218,7 @@ class Policy:
         return standing
 
     def knows(self, address: Address) -> bool:
-        """Whether any rule includes this address and the host is not blocked. Other hosts are unknown hosts.
+        """Return whether any rule includes this address and the host is not blocked. Other hosts are unknown hosts.
 
         In audit-only mode without a rule that names a host, every host is known, because a robot is being learned.
         """
@@ -259,7 +258,7 @@ class Policy:
         return host
 
     def asks_for(self, category: Category, name: str) -> bool:
-        """Whether some hosts need an approval to access this name."""
+        """Return whether some hosts need an approval to access this name."""
         rule = self.tables[category].tree.find(name) or self.tables[category].default
         return rule is not None and bool(rule.asked)
 
@@ -283,7 +282,7 @@ class Policy:
         return category in self.present
 
     def audit_only(self, category: Category) -> bool:
-        """Whether requests of this category pass although the rules deny them."""
+        """Return whether requests of this category pass although the rules deny them."""
         return self.tables[category].audit_only
 
     def atoms_of(self, address: Address) -> frozenset[Atom]:

@@ -91,7 +91,6 @@ def rights_of(request: Request, touched: Iterable[Right] = ()) -> list[Right]:
 
 
 def right_to_read(request: Request, value: Value) -> Right:
-    """Return the right to learn the value of a parameter."""
     return Right(request, namespace=holds_others(value))
 
 
@@ -101,7 +100,7 @@ def right_to_find(request: Request) -> Right:
 
 
 def needs_node(request: Request) -> bool:
-    """Whether the action makes a node part of the graph, so that `[Nodes]` also decides."""
+    """Return whether the action makes a node part of the graph, so that `[Nodes]` also decides."""
     if request.category is Category.COMMAND:
         return policy_call(request.resource).node
     return request.category in _NODE_CATEGORIES
@@ -133,7 +132,6 @@ def decide_right(policy: Policy, right: Right) -> Decision:
 
 
 def asks_to_call(policy: Policy, host: Address, service: str) -> bool:
-    """Whether a host needs an approval for each request to a service."""
     return policy.decide(Request(host, "", Category.CALL, service)).asks is not None
 
 

@@ -340,11 +340,9 @@ class DataPlane:
         }
 
     def _header_of(self, topic: str) -> dict[str, str] | None:
-        """Return the connection header of a topic of the appliance, from the monitors' definitions or from control."""
         return self.interceptor.header_of(topic) or self._own_headers.get(topic)
 
     def _publish(self, topic: str, data: bytes) -> None:
-        """Publish on a topic of the appliance. Do not call this while a batch of the same topic is processed."""
         publisher = self._own.get(topic)
         if publisher is not None:
             publisher.publish(data)
@@ -463,7 +461,6 @@ class DataPlane:
             self._serve_client(incoming, sock, kept(fields), rest)
 
     def _not_all_is_stated(self) -> bool:
-        """Whether control may still state a grant that is missing."""
         return self._table.restating or self.interceptor.preparing
 
     def _recheck_waiting(self, message: Statement) -> None:

@@ -76,7 +76,6 @@ class GrantTable:
 
     @property
     def restating(self) -> bool:
-        """Whether a restatement is under way."""
         return self._restated is not None
 
     def begin(self, epoch: int) -> None:
@@ -148,11 +147,10 @@ class GrantTable:
         return grant if isinstance(grant, messages.GrantInstalled) else None
 
     def may_call(self, key: str, service: str, host: str, caller_id: str) -> bool:
-        """Whether this client may call this service of that incarnation."""
         return ("client", key, service, host, caller_id) in self._facts
 
     def asks(self, key: str, service: str, host: str, caller_id: str) -> bool:
-        """Whether control approves each request of this client."""
+        """Return whether control approves each request of this client."""
         granted = self._facts.get(("client", key, service, host, caller_id))
         return not isinstance(granted, messages.ClientGranted) or granted.asks
 

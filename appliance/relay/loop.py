@@ -81,7 +81,6 @@ class LoopTimer:
         self.callback: Callable[[], None] | None = callback
 
     def cancel(self) -> None:
-        """Do not call the callback."""
         self.callback = None
 
 
@@ -253,7 +252,7 @@ class EventLoop:
         return now - self._since
 
     def over(self) -> bool:
-        """Whether the running handler has used up its quantum; it should then pass the rest to `later`."""
+        """Return whether the running handler has used up its quantum; it should then pass the rest to `later`."""
         return self.used() >= QUANTUM
 
     def charge(self, payer: str, used: int) -> None:

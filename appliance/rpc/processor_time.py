@@ -114,12 +114,10 @@ class ProcessorTime:
 
     @property
     def waiting(self) -> int:
-        """Return the number of waiting pieces of work."""
         return len(self._classes)
 
     @property
     def running(self) -> bool:
-        """Whether a piece of work is running."""
         return self._since is not None
 
     @property

@@ -86,7 +86,6 @@ Refusal = Callable[[bytes], bytes]
 
 
 def not_at_once(_request: HttpRequest) -> bytes | None:
-    """Leave every request to the handler."""
     return None
 
 
@@ -268,7 +267,6 @@ class _Connection(Front, asyncio.BufferedProtocol):
 
     @property
     def is_quiet(self) -> bool:
-        """Whether no answer is in progress. An answer ends when the peer has read it."""
         return self._busy is None and self._writable
 
     @property
@@ -380,7 +378,6 @@ class _Connection(Front, asyncio.BufferedProtocol):
         return True
 
     def _refuse_request(self, refusal: Refusal) -> None:
-        """Answer with a refusal, made from the beginning of the body."""
         if self._patience is not None:
             self._patience.cancel()
         self._write(b"200 OK", refusal(bytes(self._body[:_BEGINNING])), keep=False, unread=True)
@@ -407,7 +404,6 @@ class _Connection(Front, asyncio.BufferedProtocol):
     # --- serving ---
 
     def _go_on(self) -> None:
-        """After an answer, serve the next request or wait for one."""
         self.allow(self.limits.idle_seconds)
         closing = self.transport.is_closing()
         finished = not (self._pending or self.in_request or closing)
@@ -574,5 +570,5 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def exceeds_limit(status: bytes) -> bool:
-    """Whether a request with this answer exceeds a limit. Otherwise it is wrong, however small it is."""
+    """Return whether a request with this answer exceeds a limit. Otherwise it is wrong, however small it is."""
     return status[:3] in (b"413", b"431", b"503")

@@ -88,7 +88,7 @@ class XmlRpcClient:
             raise CallFailedError(f"{self._where} answered {method} with nonsense: {error}") from error
 
     async def refuses(self, seconds: float) -> bool:
-        """Whether the server's address refuses connections. One that is silent for these seconds does not."""
+        """Return whether the server's address refuses connections. One that is silent for these seconds does not."""
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(seconds):

@@ -93,7 +93,7 @@ def parse_proof(header: str) -> tuple[str, bytes]:
 
 
 def is_signed(verifying: bytes, stated: bytes, signature: bytes) -> bool:
-    """Whether the holder of the token with this public key signed the statement."""
+    """Return whether the holder of the token with this public key signed the statement."""
     try:
         Ed25519PublicKey.from_public_bytes(verifying).verify(signature, stated)
     except InvalidSignature:

@@ -69,7 +69,6 @@ class Allocation:
         self._plan = AllocationPlan()
 
     def of(self, kind: str, name: str) -> int:
-        """Return the relay of a topic or service."""
         return self._of(self._plan.resources, (kind, name))
 
     def of_file(self, file: str) -> int:

@@ -126,7 +126,6 @@ class Rollout:
 
     @property
     def held(self) -> set[str]:
-        """Return the monitors that hold their topics."""
         return set(self.why_held)
 
     @property
@@ -176,7 +175,7 @@ class Rollout:
             self.relays.send(self.statement(relay), relay)
 
     def has_state(self) -> bool:
-        """Whether monitors run whose state may be copied: no relay leaves it, and all have the inherited one."""
+        """Return whether monitors run whose state may be copied: no relay leaves it, and all have the inherited one."""
         return bool(self._now.checked.monitors) and not self._leaving and not self._heirs
 
     def inherit(self, state: InheritedState, taken: Callable[[], None]) -> None:

@@ -132,11 +132,9 @@ class CheckedSpecifications(messages.Contents, frozen=True):
         return "" if definitions is None else definitions.md5sum(name)
 
     def of_topic(self, topic: str) -> bool:
-        """Whether a monitor has an event on a topic."""
         return any(topic in topics for topics in self.topics.values())
 
     def of_service(self, service: str) -> bool:
-        """Whether a monitor has an event on a service."""
         return any(service in services for services in self.services.values())
 
 
@@ -244,7 +242,7 @@ def _unreadable(path: Path, error: OSError) -> SpecificationsRefusedError:
 
 
 def _is(kind: Callable[[int], bool], path: Path) -> bool:
-    """Whether a path exists and is of this kind. Raises `OSError` if that is unknown."""
+    """Return whether a path exists and is of this kind. Raises `OSError` if that is unknown."""
     try:
         return kind(stat_given(path).st_mode)
     except (FileNotFoundError, NotADirectoryError):

@@ -44,17 +44,14 @@ class StoredSpecifications(Sources, frozen=True):
 
 
 def text_of(sources: Sources) -> str:
-    """Return the sources in the form that is stored."""
     return msgspec.json.encode(sources).decode()
 
 
 def kept_in(row: MonitorRevisionRow) -> StoredSpecifications:
-    """Return a stored revision's texts and switches."""
     return msgspec.json.decode(row.sources, type=StoredSpecifications)
 
 
 def sources_of(row: MonitorRevisionRow) -> Sources:
-    """Return a stored revision's texts."""
     return msgspec.json.decode(row.sources, type=Sources)
 
 

@@ -30,11 +30,11 @@ class Switches:
         self.said = json.loads(text)
 
     def enabled(self, name: str) -> bool:
-        """Whether a monitor is enabled, so that its actions take effect."""
+        """Return whether a monitor is enabled, so that its actions take effect."""
         return self.states.get(name) is True
 
     def in_shadow(self, name: str) -> bool:
-        """Whether a monitor is in shadow mode: it gets copies of messages, and its actions are only recorded."""
+        """Return whether a monitor is in shadow mode: it gets copies of messages, and its actions are only recorded."""
         return self.states.get(name) == SHADOW
 
     def shadowed(self) -> list[str]:
@@ -58,7 +58,6 @@ class Switches:
         return frozenset(name for name, state in self.states_of(checked).items() if state == SHADOW)
 
     def _own(self, name: str) -> Switch:
-        """Return a monitor's own switch, ignoring the monitors with which it shares variables."""
         return self.said.get(name, self._all or name in self.named)
 
     def enforce(self, checked: CheckedSpecifications) -> list[str]:

@@ -43,7 +43,7 @@ class TokenRow(NamedTuple):
     keys: TokenKeys | None = None  # None: made by a version that derived no keys
 
     def usable(self, ends: Deadlines) -> bool:
-        """Whether the token is valid now; `ends` has its end since it is known."""
+        """Return whether the token is valid now; `ends` has its end since it is known."""
         return self.revoked is None and not ends.passed(self.id, self.expires)
 
 
@@ -78,5 +78,5 @@ def hash_secret(secret: str, salt: bytes) -> bytes:
 
 
 def is_secret(secret: str, salt: bytes, kept: bytes) -> bool:
-    """Whether `kept` was made from this secret."""
+    """Return whether `kept` was made from this secret."""
     return hmac.compare_digest(hash_secret(secret, salt), kept)

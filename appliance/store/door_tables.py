@@ -65,7 +65,6 @@ class DoorTables:
         self._database.delete("door_ticket", id=ticket)
 
     def tickets(self) -> list[TicketRow]:
-        """Return all tickets, the oldest first."""
         return [
             TicketRow(*row) for row in self._database.query("SELECT * FROM door_ticket ORDER BY created, id")
         ]

@@ -148,7 +148,6 @@ class HostTables:
         self._database = database
 
     def save(self, row: HostRow) -> None:
-        """Store a host, its new certificate, or its revocation."""
         self._database.put("host", *row)
 
     def hosts(self) -> list[HostRow]:
@@ -167,7 +166,6 @@ class HostTables:
         ]
 
     def save_ports(self, row: PortsRow) -> None:
-        """Store the port check of a machine."""
         self._database.put("host_ports", row.name, row.state, json.dumps(row.open), row.checked, row.who)
 
     def ports(self) -> list[PortsRow]:
@@ -179,7 +177,6 @@ class HostTables:
         self._database.put("enrolment_token", *row[:-2], json.dumps(row.kit), row.who)
 
     def forget_awaited(self, name: str) -> None:
-        """Remove a token that was used or has expired."""
         self._database.delete("enrolment_token", name=name)
 
     def awaited(self) -> list[EnrolmentTokenRow]:
@@ -206,18 +203,15 @@ class HostTables:
         return [RevokedCertificateRow(*row) for row in rows]
 
     def save_block(self, row: HostBlockRow) -> None:
-        """Store that a host is blocked, replacing its earlier block."""
         self._database.put("host_block", *row)
 
     def forget_block(self, address: str) -> None:
         self._database.delete("host_block", address=address)
 
     def blocks(self) -> list[HostBlockRow]:
-        """Return the blocked hosts, the earliest block first."""
         return [HostBlockRow(*row) for row in self._database.query("SELECT * FROM host_block ORDER BY since")]
 
     def save_authority(self, row: AuthorityRow) -> None:
-        """Store the certificate and the list of the authority."""
         self._database.put("authority", 1, *row)
 
     def authority(self) -> AuthorityRow | None:

@@ -262,7 +262,6 @@ class StateStore:
             self.database.delete("parameter_owner", ("key", ">", f"{above}/"), ("key", "<", f"{above}0"))
 
     def parameter_owners(self) -> list[tuple[str, str]]:
-        """Return each key with a stored owner, and the host that owns this key and the keys below it."""
         return [(key, host) for key, host in self.database.query("SELECT key, host FROM parameter_owner")]
 
     def load_parameters(self) -> dict[str, Any]:

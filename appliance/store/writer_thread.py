@@ -201,13 +201,11 @@ class Database:
         return feed
 
     def unfollow(self, feed: ChangeFeed) -> None:
-        """Add no further changes to this feed."""
         with self._order:
             self._feeds = tuple(other for other in self._feeds if other is not feed)
 
     @property
     def number(self) -> int:
-        """Return the number of the last change that was made."""
         return self._number
 
     def copy(self) -> sqlite3.Connection:
@@ -354,7 +352,6 @@ class Database:
             self._failed(reason)
 
     def _execute(self, statements: list[tuple[str, list[Value]]], number: int) -> None:
-        """Execute statements and store the number of the last change, in one transaction."""
         self._connection.execute("BEGIN")
         for sql, values in statements:
             self._connection.execute(sql, values)

@@ -27,7 +27,7 @@ _libc = ctypes.CDLL(None)
 
 
 def clock_is_synchronised() -> bool | None:
-    """Whether the clock is synchronised; None if the kernel denies the call, as in some containers."""
+    """Return whether the clock is synchronised; None if the kernel denies the call, as in some containers."""
     timex = Timex()
     if _libc.adjtimex(ctypes.pointer(timex)) < 0:
         return None

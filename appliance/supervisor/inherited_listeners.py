@@ -50,7 +50,6 @@ class InheritedListeners:
             os.close(descriptor)
 
     def copy_of(self, name: str) -> socket.socket:
-        """Return a copy of a kept socket, which the caller closes."""
         return socket.socket(fileno=os.dup(self._sockets[name]))
 
     def close(self) -> None:

@@ -48,7 +48,6 @@ class IsolationWatchdog:
         self._report = messages.FirewallReported(isolation=isolation.kind, report=FirewallState())
 
     def news(self) -> list[messages.Message]:
-        """Return the messages for a new control process."""
         return [self._report] if self._probe is None else [self._report, self._probe]
 
     async def look(self) -> str | None:

@@ -77,7 +77,7 @@ class ProcessCallbacks:
 
 
 def is_hanging(silent: float, *, starting: bool, still: float) -> bool:
-    """Whether a process hangs after `silent` seconds without an answer and `still` seconds without progress.
+    """Return whether a process hangs after `silent` seconds without an answer and `still` seconds without progress.
 
     During a start, `silent` counts from the start; a start that progresses may take long.
     """

@@ -29,7 +29,6 @@ class Facts:
     raised: int = 0  # by which the supervisor has lowered its own niceness; its children inherit this
 
     def part(self, name: str) -> Path:
-        """Return the part of the state directory with this name."""
         return self.state / name
 
     def run(self, name: str) -> Path:

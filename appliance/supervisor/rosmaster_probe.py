@@ -21,7 +21,7 @@ _REQUEST = (
 
 
 async def answers(port: int, account: Account, inside: AbstractContextManager[None], seconds: float) -> bool:
-    """Whether `rosmaster` on this loopback port answers a call within `seconds`.
+    """Return whether `rosmaster` on this loopback port answers a call within `seconds`.
 
     `inside` enters rosmaster's network namespace while the socket is made.
     """

@@ -79,7 +79,6 @@ class StateDirectory:
 
     @property
     def config(self) -> Path:
-        """Return the path of the resolved configuration for the children."""
         return self.path / "run" / "config.json"
 
     def prepare(self, roles: Collection[Role]) -> None:

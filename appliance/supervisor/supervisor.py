@@ -286,7 +286,6 @@ class Supervisor:
         self._tell_processes()
 
     def _may_start(self, slot: ProcessSlot) -> bool:
-        """Whether a role may run now: while this appliance is passive, most that follow control do not."""
         return self._gate.active or slot.role.after is None or slot.role.stands_by
 
     def _equip_control(self, process: ProcessHandle) -> None:
@@ -615,7 +614,7 @@ class Supervisor:
             process.note_answer()
 
     async def answers(self, seconds: float) -> bool:
-        """Whether `rosmaster` answers within `seconds`."""
+        """Return whether `rosmaster` answers within `seconds`."""
         inside = self._watchdog.isolation.inside()
         return await rosmaster_probe.answers(self._facts.rosmaster_port, account_of("rosrv"), inside, seconds)
 
@@ -713,7 +712,6 @@ def _about(slot: ProcessSlot) -> messages.ProcessInfo:
 
 
 def _printable(text: str) -> str:
-    """Escape the characters that are not printable, except line ends."""
     return "".join(
         character if character.isprintable() or character == "\n" else ascii(character)[1:-1]
         for character in text

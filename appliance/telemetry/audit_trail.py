@@ -173,7 +173,7 @@ class AuditTrail:
         )
 
     def _marked(self, host: str | None, decision: str | None, detail: dict[str, Any]) -> bool:
-        """Whether an unknown host is denied; if so, set the mark in `detail`."""
+        """Return whether an unknown host is denied; if so, set the mark in `detail`."""
         if host is None or decision != "deny" or self._log.budget.quota_class(host) is not QuotaClass.UNKNOWN:
             return False
         detail["unknown_host"] = True
@@ -181,5 +181,4 @@ class AuditTrail:
 
 
 def rule_reference(rule: Rule | None) -> RuleReference | None:
-    """Return a rule in the form that a record stores."""
     return None if rule is None else RuleReference(rule.section, rule.key, rule.file, rule.line)

@@ -137,7 +137,6 @@ def views() -> tuple[str, ...]:
 
 
 def _parts(features: Iterable[Feature]) -> str:
-    """Return the module that lists the features' components."""
     imports: list[str] = []
     rows: list[str] = []
     for feature in features:

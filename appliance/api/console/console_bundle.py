@@ -202,7 +202,7 @@ def _tightened(pieces: list[_Token]) -> str:
 
 
 def _apart(before: str, after: str) -> bool:
-    """Whether two tokens of one line stay two tokens without a space between them."""
+    """Return whether two tokens of one line stay two tokens without a space between them."""
     return before in _SEPARATING or after in _SEPARATING
 
 

@@ -92,7 +92,7 @@ class TokenAuthenticator:
         self._of_token = {}
 
     def still_good(self, bearer: Bearer) -> bool:
-        """Whether a previously valid token may still be used."""
+        """Return whether a previously valid token may still be used."""
         kept = self._tokens.get(bearer.id)
         # A rotation may have brought its end forward.
         return kept is not None and not self._ends.passed(kept.id, kept.expires)

@@ -84,7 +84,6 @@ class ControlLink:
 
     @property
     def connected(self) -> bool:
-        """Whether control is connected and has sent its list of tokens."""
         return self._link.channel is not None and self.known
 
     def attach(self, channel: Channel) -> None:

@@ -1,7 +1,6 @@
 """Accept connections of REST with `rpc/front`, which RVMaster also uses; uvicorn serves them.
 
-uvicorn's configuration, a public interface, makes each connection's protocol for HTTP and ASGI. This protocol gets the
-bytes that the front accepts. Invariants besides those of `rpc/front`:
+Invariants besides those of `rpc/front`:
 
 1. A connection is entered in the connection table before anything (such as TLS) is set up for it. If the table is full,
    the connection is closed at once.
@@ -200,7 +199,7 @@ class Listener:
         self._time = ProcessorTime(partial(_class_of, quota_class))
 
     def opens_websocket(self, target: bytes) -> bool:
-        """Whether a request that wants an upgrade opens the WebSocket of a door."""
+        """Return whether a request that wants an upgrade opens the WebSocket of a door."""
         return self._websockets is not None and target.startswith(PREFIX)
 
     def pass_on(self, passage: WebSocketPassage, head: bytes) -> None:

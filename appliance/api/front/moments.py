@@ -1,7 +1,6 @@
 """Write each time in JSON twice: as the number in the struct's field (`since`), then as RFC 3339 (`since_utc`).
 
-A field is marked as a time by its type (`Moment`, `NanoMoment`), so answers need no code for times. The contract gets
-the additional fields from the same types.
+A field is marked as a time by its type (`Moment`, `NanoMoment`), so answers need no code for times.
 """
 
 import functools

@@ -62,7 +62,7 @@ _HEADERS = {
 
 
 def is_console(path: str) -> bool:
-    """Whether a path is one of the console's files, which are served without a token."""
+    """Return whether a path is one of the console's files, which are served without a token."""
     return path in ("/", "/console") or path.startswith("/console/")
 
 

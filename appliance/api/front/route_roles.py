@@ -33,7 +33,6 @@ class _Requires:
 
 
 def requires(least: TokenRole) -> Any:
-    """Return the dependency for a bearer with this role or a higher one."""
     return Depends(_Requires(least))
 
 
@@ -48,7 +47,7 @@ Admin = Annotated[Bearer, requires("admin")]
 
 
 def reads_contents(bearer: Bearer) -> bool:
-    """Whether a bearer may read message contents in records of monitors; only viewers may not."""
+    """Return whether a bearer may read message contents in records of monitors; only viewers may not."""
     return bearer.role != "viewer"
 
 

@@ -39,7 +39,6 @@ class WebSocketPassage(asyncio.Protocol):
 
     @property
     def peer(self) -> str:
-        """Return the client's address."""
         return str(self.client.get_extra_info("peername")[0])
 
     def from_client(self, data: bytes) -> None:

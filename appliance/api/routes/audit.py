@@ -1,7 +1,7 @@
 """`/v1/audit`: search, one record, follow live, verify, export. The api reads the log's file, but cannot write it.
 
-Costly work is limited: the numbers of searches, exports and followers have limits, and only one verification runs at a
-time. A request above a limit waits briefly; then the answer is 503.
+Costly work is limited: the numbers of searches, exports and followers have limits, and only one verification
+runs at a time.
 """
 
 import asyncio

@@ -87,7 +87,6 @@ def _described(kind: str, schema: dict[str, Any]) -> None:
 
 
 def is_described(field: dict[str, Any]) -> bool:
-    """Whether the field or one of its possible types has a description."""
     return "description" in field or any(map(is_described, field.get("anyOf", ())))
 
 

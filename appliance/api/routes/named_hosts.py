@@ -42,7 +42,7 @@ def host_in_words(known: PolicyInForce | None) -> HostInWords:
 
 
 def has_name(wanted: Filter) -> bool:
-    """Whether a search names its host, or gives a network: addresses and globs need no policy."""
+    """Return whether a search names its host, or gives a network: addresses and globs need no policy."""
     if wanted.host is None or not _GLOB.isdisjoint(wanted.host):
         return False
     try:

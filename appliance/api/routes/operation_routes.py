@@ -1,8 +1,8 @@
 """Derive routes from the table of operations (`channel/admin.py`): parameters, role, ETag, answer, contract.
 
-A route reads its order with the function that control also uses (`channel/rest_meaning.py`), so that both understand a
-request in the same way. Before that, FastAPI only checks parameters and body. The answer is control's, unless the
-operation's module has an `Answer` for the request.
+A route reads its order with the function that control also uses (`channel/rest_meaning.py`), so that both
+understand a request in the same way. The answer is control's, unless the operation's module has an `Answer`
+for the request.
 """
 
 import inspect

@@ -39,7 +39,6 @@ class StoredColumns(NamedTuple):
 
 
 def genesis(log_id: str) -> bytes:
-    """Return the hash before the first record of a log."""
     return hashlib.sha256(b"rosrv audit log\n" + log_id.encode()).digest()
 
 
@@ -60,7 +59,7 @@ def record_hash(previous: bytes, columns: tuple[object, ...]) -> bytes:
 
 
 def follows(previous: bytes, columns: tuple[object, ...], digest: bytes) -> bool:
-    """Whether `digest` is the hash of this record after `previous`, as this version or 0.1.0 computes it."""
+    """Return whether `digest` is the hash of this record after `previous`, as this version or 0.1.0 computes it."""
     if record_hash(previous, columns) == digest:
         return True
     return hashlib.sha256(previous + _encoder.encode(columns)).digest() == digest

@@ -102,7 +102,6 @@ def plain_record(record: AuditRecord) -> AuditRecord:
 
 
 def _shortened(detail: dict[str, Any]) -> dict[str, Any]:
-    """Return the smallest details, and the names of the omitted ones."""
     sizes = {key: len(_encoder.encode({key: value})) for key, value in detail.items()}
     kept, room = {}, LARGEST_DETAIL // 4
     for key in sorted(sizes, key=sizes.__getitem__):

@@ -44,7 +44,7 @@ def read_public_key(path: Path) -> bytes:
 
 
 def signature_is_valid(public_key: bytes, signature: bytes, text: bytes) -> bool:
-    """Whether the private key of `public_key` signed `text`."""
+    """Return whether the private key of `public_key` signed `text`."""
     try:
         Ed25519PublicKey.from_public_bytes(public_key).verify(signature, text)
     except (InvalidSignature, ValueError):
@@ -63,7 +63,6 @@ class Signatures:
 
     @property
     def has_signer(self) -> bool:
-        """Whether checkpoints of this log are signed."""
         return self._signer is not None
 
     @property

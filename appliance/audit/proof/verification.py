@@ -1,12 +1,9 @@
 """Verify that a log is complete and unchanged, or report which records are missing or changed, and how.
 
-The verifier walks the chain once, from the first record to the last. If a record does not follow from the previous one,
-the verifier tries the next records in other positions. This distinguishes a change, a removal, an insertion and a
-reordering. Then it checks the checkpoints against the chain, the key, and the signer's memory.
+The verifier walks the chain once, from the first record to the last.
 
-The log alone cannot show whether records after the last signed checkpoint were cut off or rewritten; `unsealed` is the
-number of records present there. Root can rewrite both the log and the signer's memory. Only checkpoints on another
-machine reveal this.
+The log alone cannot show whether records after the last signed checkpoint were cut off or rewritten;
+`unsealed` is the number of records present there.
 """
 
 import re
@@ -108,7 +105,7 @@ class _Row(NamedTuple):
     detail: bytes
 
     def follows(self, previous: bytes, sequence: int) -> bool:
-        """Whether this record was written as `sequence` after the hash `previous`."""
+        """Return whether this record was written as `sequence` after the hash `previous`."""
         try:
             return follows(previous, (sequence, *self.columns[1:]), self.hash)
         except UnicodeEncodeError:  # bytes that no writer stored

@@ -142,7 +142,6 @@ def summarised(denials: Iterable[LogEntry], limit: int) -> DenialSummary:
 
 
 def _event_of(record: AuditRecord) -> object:
-    """Return the event of a record, or the event whose repetitions it counts."""
     return record.detail.get("of") if record.event in FOLDED else record.event
 
 

@@ -82,7 +82,6 @@ def time_span(record: AuditRecord) -> tuple[int, int]:
 
 
 def times(record: AuditRecord) -> int:
-    """Return how often the event of a record happened."""
     return times_of(record.event, record.detail)
 
 
@@ -137,7 +136,6 @@ def _hash(text: str) -> str:
 
 
 def _reach(record: AuditRecord) -> int:
-    """Return how many of the last rows a record can join."""
     return _BETWEEN + 1 if "monitor" in record.detail else 1
 
 
@@ -152,5 +150,4 @@ def _add(row: EqualRecords, entry: LogEntry) -> None:
 
 
 def _continues(record: AuditRecord) -> bool:
-    """Whether a record counts repetitions of one kind, whose first record is in full."""
     return record.event in FOLDED and record.detail.get("scope") == KIND

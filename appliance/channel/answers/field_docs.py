@@ -9,7 +9,6 @@ UNIT = "x-epoch"
 
 
 def doc(description: str, **bounds: Any) -> msgspec.Meta:
-    """Return the contract's description of a field, and its bounds."""
     return msgspec.Meta(description=description, **bounds)
 
 

@@ -1,7 +1,4 @@
-"""The link control <-> api. The api passes on each client's request and credentials; control verifies them.
-
-The api's requests are the union `RestRequest`. No request in it can make a token.
-"""
+"""The link control <-> api. The api passes on each client's request and credentials; control verifies them."""
 
 import math
 from typing import Annotated, ClassVar

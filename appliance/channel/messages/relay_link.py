@@ -1,7 +1,6 @@
 """The link control <-> relay. Control sends the wanted state; the relay reports connections, traffic and events.
 
-`key` is the key of an incarnation. All messages of the link are in this file, so that related messages are changed
-together.
+`key` is the key of an incarnation.
 """
 
 from typing import Any, ClassVar, Literal

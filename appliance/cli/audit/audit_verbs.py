@@ -1,8 +1,4 @@
-"""`rosrv audit tail|search|show|verify|checkpoints|export`: review the audit log.
-
-With a state directory, the verbs read the log's file; the appliance may be stopped, and the directory may be a copy.
-With `--api`, they read the running appliance's log over REST.
-"""
+"""`rosrv audit tail|search|show|verify|checkpoints|export`: review the audit log."""
 
 import json
 import os

@@ -139,7 +139,7 @@ def write(text: str) -> None:
 
 
 def _has_room(rows: list[tuple[Text, ...]], width: int) -> bool:
-    """Whether a table of this width has room for the reasons beside the longest names."""
+    """Return whether a table of this width has room for the reasons beside the longest names."""
     columns = list(zip(map(Text, _COLUMNS), *rows, strict=True))[:-1]
     names: int = sum(max(cell.cell_len for cell in column) + _GAP for column in columns)
     return names + _LEAST_WHY <= width

@@ -1,8 +1,8 @@
 """Choose the running appliance for a verb: over the socket in its state directory, or over REST.
 
-A verb takes an `Appliance`, typer's context of the call, as its first parameter; the decorator `speaks` adds the
-options `--state`, `--api`, `--api-ca` and `--json`. The socket and REST give the same answers. The command line
-overrides the environment; within the environment, REST overrides the socket.
+A verb takes an `Appliance`, typer's context of the call, as its first parameter; the decorator `speaks` adds
+the options `--state`, `--api`, `--api-ca` and `--json`. The command line overrides the environment; within
+the environment, REST overrides the socket.
 """
 
 import ipaddress

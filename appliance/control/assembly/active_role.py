@@ -63,7 +63,7 @@ class ActiveRole:
         """Give a link that is already open to the tunnels."""
 
     def in_doubt(self) -> bool:
-        """Whether computers of the robot may refuse the connections of this appliance now."""
+        """Return whether computers of the robot may refuse the connections of this appliance now."""
         return False
 
     def on_end_of_gap(self, ended: Callable[[], None]) -> None:

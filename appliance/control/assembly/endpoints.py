@@ -47,7 +47,6 @@ class Endpoints:
 
 
 def make_endpoints(base: Foundation, core: Core) -> Endpoints:
-    """Make the endpoints. They do not serve yet."""
     settings, policies, handler = base.settings, base.policies, Current[Callable[[Incarnation], Handler]]()
     places = NodePorts(
         settings.listen_address[0],

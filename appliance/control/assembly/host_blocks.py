@@ -35,7 +35,6 @@ class BlockTable:
         return len(self._rows)
 
     def rows(self) -> dict[Address, HostBlockRow]:
-        """Return all blocks, the earliest first."""
         return dict(self._rows)
 
     def read_clock(self) -> None:
@@ -75,7 +74,6 @@ class BlockTable:
         return row
 
     def due(self) -> list[Address]:
-        """Return the hosts whose blocks are over."""
         return [
             address for address, row in self._rows.items() if row.ends is not None and row.ends <= self._now
         ]

@@ -56,7 +56,6 @@ class PolicyCases(NamedTuple):
 
 
 def kept_policy(row: RevisionRow) -> KeptPolicy:
-    """Return a stored revision for the gate."""
     return KeptPolicy(row.revision, row.text, row.file, row.who, row.signature)
 
 

@@ -62,7 +62,7 @@ class AdminServer:
 
 
 def _given_up(writer: asyncio.StreamWriter) -> bool:
-    """Whether the client closed the connection or its sending side. If so, its request is withdrawn."""
+    """Return whether the client closed the connection or its sending side. If so, its request is withdrawn."""
     if writer.is_closing():
         return True
     found = select.poll()

@@ -1,8 +1,6 @@
 """Carry out operators' orders and queries, from the admin socket and from REST.
 
-Each request is a class in `appliance.channel.admin`. To add a request, define its class with a row in the table of
-operations, write the method that answers it, and add the method to the table in `control/operators/request_methods.py`.
-A request of a feature is in the feature's `operations`, and its method in `FeaturePart.methods`.
+Each request is a class in `appliance.channel.admin`.
 """
 
 from collections.abc import Awaitable, Callable, Iterable

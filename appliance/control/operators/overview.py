@@ -1,6 +1,6 @@
 """Describe the graph for operators: nodes, topics, services, connections, traffic.
 
-All values are a snapshot of the registry and the relay's reports. The appliance's own nodes are left out.
+All values are a snapshot of the registry and the relay's reports.
 """
 
 from collections.abc import Iterator

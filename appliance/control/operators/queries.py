@@ -81,7 +81,6 @@ class Queries:
     _shown: dict[tuple[str, str], float] = field(default_factory=dict)
 
     async def status(self, _request: admin.StatusWanted) -> Status:
-        """Return the status of all parts of the appliance."""
         return self.present()
 
     async def inventory(self, _request: admin.InventoryWanted) -> Inventory:
@@ -104,7 +103,6 @@ class Queries:
         return graph_of(self.parts)
 
     async def monitors(self, request: admin.MonitorsWanted) -> Monitors:
-        """Return all monitors with state and counters."""
         return monitors_of(self.parts.monitors, self.parts.monitor_calls.rv_state(), texts=request.texts)
 
     async def topic_look(self, request: admin.TopicLook, who: str) -> TopicMessages:
@@ -163,7 +161,6 @@ class Queries:
         return Registrations([Registration(**live.fields()) for live in self.live()])
 
     def present(self) -> Status:
-        """Return the status of all parts of the appliance."""
         return self.handled(self._status())
 
     def _status(self) -> Status:

@@ -206,7 +206,6 @@ class TokenOrders:
         return revoked
 
     def _named(self, name: str) -> list[TokenRow]:
-        """Return the valid tokens of a name: several while earlier ones have their grace time."""
         return [row for row in self._rows.values() if row.name == name and row.usable(self._ends)]
 
     def _require_named(self, name: str) -> list[TokenRow]:

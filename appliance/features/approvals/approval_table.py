@@ -89,7 +89,6 @@ class ApprovalTable:
         return None
 
     def most(self) -> tuple[Address | None, int]:
-        """Return the host with the most entries, and their number."""
         return next(iter(self._of_host.most_common(1)), (None, 0))
 
     def hold(

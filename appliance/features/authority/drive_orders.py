@@ -54,7 +54,6 @@ class DriveOrders:
         self._turn = asyncio.Lock()
 
     def holders(self) -> dict[str, Address]:
-        """Return the host that holds each group."""
         return {name: holding.host for name, holding in self._groups.holdings().items()}
 
     # --- operators ---

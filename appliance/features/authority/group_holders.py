@@ -39,7 +39,6 @@ class GroupHolders:
         self._waiting: dict[str, dict[Address, float]] = {}
 
     def holdings(self) -> dict[str, Holding]:
-        """Return the holder of each group that is not free."""
         return dict(self._held)
 
     def holder(self, group: str) -> Holding | None:
@@ -57,7 +56,7 @@ class GroupHolders:
         return list(left)
 
     def may_take(self, group: AuthorityGroup, host: Address) -> bool:
-        """Whether a host may take the group now: it is free or its own, or the host may override its holder."""
+        """Return whether a host may take the group now: it is free or its own, or the host may override its holder."""
         claim, holding = self._claim_of(group, host), self._held.get(group.name)
         if holding is None or holding.host == host:
             return claim in (Claim.TAKE, Claim.OVERRIDE)

@@ -301,7 +301,7 @@ def _require_sensible(request: HostBlock) -> None:
 
 
 def _is_own(address: Address) -> bool:
-    """Whether this machine has the address: only then can a socket be bound to it."""
+    """Return whether this machine has the address: only then can a socket be bound to it."""
     family = socket.AF_INET if address.version == 4 else socket.AF_INET6
     with socket.socket(family, socket.SOCK_DGRAM) as sock:
         try:

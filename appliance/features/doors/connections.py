@@ -35,7 +35,6 @@ class DoorConnections:
         self._tasks = OwnedTasks()
 
     def adopt(self, descriptor: int, serve: Serve) -> None:
-        """Serve the connection behind a descriptor, which this object then owns."""
         self._tasks.start(self._adopt(socket.socket(fileno=descriptor), serve))
 
     async def _adopt(self, connection: socket.socket, serve: Serve) -> None:

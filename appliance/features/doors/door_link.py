@@ -142,5 +142,4 @@ DoorLink = (
 
 
 def node_name(name: str) -> str:
-    """Return the name of the door's ROS node."""
     return f"/door_{name.replace('-', '_')}"

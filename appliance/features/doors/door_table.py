@@ -52,7 +52,6 @@ class DoorTable:
         return address_of(address) in self._network and address != self._gateway
 
     def live(self) -> list[DoorRow]:
-        """Return the doors that exist, the oldest first."""
         return [row for row in self._rows.values() if row.removed is None]
 
     def ports(self) -> list[int]:

@@ -1,8 +1,7 @@
 """The tickets with which people's viewers open a door. A viewer can carry nothing but a URL.
 
-A ticket is `ID.SECRET`: 48 bits that name it in records, and 256 random bits. The secret is stored as its hash only:
-256 bits cannot be guessed, so a fast hash is enough. A ticket ends by `StoredDeadlines`, as tokens do: neither a step
-of the clock nor a restart gives it more time.
+A ticket is `ID.SECRET`: 48 bits that name it in records, and 256 random bits. A ticket ends by
+`StoredDeadlines`, as tokens do: neither a step of the clock nor a restart gives it more time.
 """
 
 import hashlib
@@ -56,7 +55,7 @@ class DoorTickets:
         return None if row is None or row.door != door or self._ends.passed(row.id, row.expires) else row
 
     def ended(self, ticket: str) -> bool:
-        """Whether a ticket that was valid is over."""
+        """Return whether a ticket that was valid is over."""
         row = self._rows.get(ticket)
         return row is None or self._ends.passed(row.id, row.expires)
 

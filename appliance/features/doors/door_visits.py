@@ -48,7 +48,6 @@ class DoorVisits:
         return None if row is None or row.door != door or not self._may_open(self._visits[row.id]) else row
 
     def opened(self, ticket: str) -> None:
-        """Note that a connection was made with a ticket."""
         self._visits[ticket].until = None
 
     def left(self, door: str, ticket: str) -> None:
@@ -62,7 +61,6 @@ class DoorVisits:
         self._visits = {ticket: one for ticket, one in self._visits.items() if one.row.door != door}
 
     def present(self, door: str) -> list[TicketRow]:
-        """Return the visits of a door that are not over."""
         return [one.row for one in self._visits.values() if one.row.door == door and not one.over]
 
     def ended(self) -> list[TicketRow]:

@@ -1,8 +1,8 @@
 """Foxglove's WebSocket protocol of one connection, without I/O: `foxglove.websocket.v1`, also named `foxglove.sdk.v1`.
 
-Channels carry the bytes of ROS messages unchanged, in the encoding `ros1`. The rules of `rosbridge.py` also hold here.
-The door announces what its identity may see, and refuses in words: a status with the level error, or
-`serviceCallFailure`. It has no assets and no updates of parameters, and does not announce these capabilities.
+Channels carry the bytes of ROS messages unchanged, in the encoding `ros1`. The door announces what its
+identity may see, and refuses in words: a status with the level error, or `serviceCallFailure`. It has no
+assets and no updates of parameters, and does not announce these capabilities.
 """
 
 import struct

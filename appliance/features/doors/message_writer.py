@@ -94,7 +94,6 @@ class _FieldError(Exception):
         self.path = ""
 
     def inside(self, step: str) -> Self:
-        """Return the error with the path extended by a field or an element around it."""
         self.path = step + self.path
         return self
 

@@ -146,7 +146,6 @@ class DoorSession:
 
     @property
     def protocol_name(self) -> str:
-        """Return the name of the protocol that the client speaks."""
         return self._socket.subprotocol or "rosbridge"
 
     def _choose(self, offered: Sequence[Subprotocol]) -> Subprotocol | None:
@@ -221,7 +220,6 @@ class DoorSession:
             await asyncio.sleep(_WATCH_SECONDS)
 
     async def _leave(self) -> None:
-        """Give a client that is disconnected a short time to close its end."""
         await self._over.wait()
         await asyncio.sleep(_CLOSING_SECONDS)
 

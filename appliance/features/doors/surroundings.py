@@ -15,7 +15,6 @@ class VisibleGraph:
 
     @property
     def topics(self) -> list[str]:
-        """Return the names of all topics, sorted."""
         return sorted({*self.publishers, *self.subscribers})
 
 

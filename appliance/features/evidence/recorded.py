@@ -1,7 +1,6 @@
 """The fields of a recording that evidence shows.
 
-The recorder answers `recording fetch`. Evidence imports nothing of the recorder, so an appliance without a recorder
-exports the log only.
+Evidence imports nothing of the recorder, so an appliance without a recorder exports the log only.
 """
 
 from collections.abc import Sequence

@@ -77,7 +77,6 @@ class Trial(msgspec.Struct, frozen=True):
 
     @property
     def who(self) -> str:
-        """Return the author of the bundle's revisions."""
         return f"bundle {self.path}"
 
 

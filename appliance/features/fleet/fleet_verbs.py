@@ -150,7 +150,7 @@ def prepare_membership(folder: Path, invitation: Invitation) -> str:
 
 
 def _is_for(folder: Path, token: str) -> bool:
-    """Whether `folder` has the key and a certificate of an earlier try with this token. Raises `OSError`.
+    """Return whether `folder` has the key and a certificate of an earlier try with this token. Raises `OSError`.
 
     A certificate that is not valid now was made before the clock was corrected: no collector has enrolled it.
     """

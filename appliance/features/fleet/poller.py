@@ -127,7 +127,6 @@ def _fate_of(report: RobotReport) -> RobotReport:
 
 
 def _is_news(selected: SelectedBundle, stated: BundleStated) -> bool:
-    """Whether control does not know the bundle yet."""
     path, sha256 = str(selected.path), selected.sha256
     if path in (stated.in_force, stated.trying):
         return False

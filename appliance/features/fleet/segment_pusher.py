@@ -126,7 +126,7 @@ class SegmentPusher:
         return kept.sequence if (kept.log, kept.number) == (log, number) else 0
 
     def _has_log(self) -> bool:
-        """Whether there is a log, or was: only an appliance that was never active has none."""
+        """Return whether there is a log, or was: only an appliance that was never active has none."""
         return self.log.exists() or (self.folder / "position.json").exists()
 
     def _state_presence(self, position: PushPosition) -> bool:

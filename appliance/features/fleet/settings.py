@@ -143,7 +143,6 @@ class Fleet(FeatureSection):
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files of the operator that the processes read."""
         return tuple(filter(None, (self.ca, self.certificate, self.key, self.receipt_key, self.bundles.root)))
 
     @property

@@ -223,7 +223,6 @@ def _limits() -> UpdaterConfig:
 
 @contextmanager
 def _translated() -> Iterator[None]:
-    """Translate the errors of TUF, the network and the disk."""
     try:
         yield
     except (RepositoryError, DownloadLengthMismatchError) as error:

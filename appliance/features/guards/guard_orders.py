@@ -48,12 +48,11 @@ _ACTS = ("drop", "change", "publish", "call")
 
 
 def _written(value: bool | int | float | str) -> str:
-    """Return a value in force as operators write it."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _same(one: str, other: str) -> bool:
-    """Whether two values of a parameter are equal, as numbers if they are numbers."""
+    """Return whether two values of a parameter are equal, as numbers if they are numbers."""
     try:
         return float(one) == float(other)
     except ValueError:
@@ -108,7 +107,6 @@ class GuardOrders:
         )
 
     async def suggestions(self, _request: guard_requests.GuardSuggestionsWanted) -> Suggestions:
-        """Return guards that fit the present graph."""
         return Suggestions(_suggestions_of(self._graph()))
 
     async def new(self, request: guard_requests.GuardNew, who: str) -> Replacement:

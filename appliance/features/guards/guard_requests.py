@@ -1,7 +1,4 @@
-"""The requests of operators' tools about guards.
-
-A guard is a monitor, so the operations of monitors bring it into force, confirm, disable, resume and remove it.
-"""
+"""The requests of operators' tools about guards."""
 
 from typing import Annotated
 

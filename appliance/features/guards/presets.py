@@ -328,5 +328,4 @@ def _with_table(text: str, name: str, cells: Sequence[str]) -> str:
 
 
 def file_of(name: str, folder: Path) -> Path:
-    """Return the file of a guard in a folder of specifications."""
     return folder / f"{name}.rv"

@@ -60,7 +60,7 @@ def proposals(graph: Iterable[TopicFacts]) -> list[Proposal]:
 
 
 def _commands_a_base(topic: TopicFacts, topics: Iterable[TopicFacts]) -> bool:
-    """Whether a subscriber is the base, not a node that passes commands on, such as a multiplexer."""
+    """Return whether a subscriber is the base, not a node that passes commands on, such as a multiplexer."""
     passing = {
         node
         for one in topics
@@ -129,7 +129,6 @@ def _sources(
 
 
 def _shared(one: str, other: str) -> int:
-    """Return the number of namespaces that two names have in common."""
     pairs = zip(one.split("/")[:-1], other.split("/")[:-1], strict=False)
     return next(
         (place for place, (a, b) in enumerate(pairs) if a != b), min(one.count("/"), other.count("/"))

@@ -237,7 +237,7 @@ def remove(appliance: Appliance, name: _Name, confirm_within: ConfirmWithin = No
 
 
 def _runs(appliance: Appliance) -> bool:
-    """Whether an appliance answers; presets are listed without one also."""
+    """Return whether an appliance answers; presets are listed without one also."""
     from appliance.cli.connection.admin_client import NotRunningError  # noqa: PLC0415  only for this verb
 
     try:

@@ -26,7 +26,7 @@ def is_denial(record: AuditRecord) -> bool:
 
 
 def asks_policy(record: AuditRecord) -> bool:
-    """Whether a change of the policy might allow a denied request."""
+    """Return whether a change of the policy might allow a denied request."""
     try:
         return is_denial(record) and asked_of(record) is not None
     except UngrantableError:

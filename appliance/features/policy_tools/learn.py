@@ -84,7 +84,7 @@ def learn(observations: Iterable[Observation], robot: Collection[Address | Netwo
 
 
 def covered(given: Network, places: Iterable[Network]) -> bool:
-    """Whether all addresses of a network are among these places."""
+    """Return whether all addresses of a network are among these places."""
     return any(
         given.version == place.version and given.subnet_of(place)  # type: ignore[arg-type]  # both are of one version
         for place in places

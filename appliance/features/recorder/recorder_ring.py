@@ -75,5 +75,4 @@ class ExcludedStream:
 
 
 def open_ring(terms: Mapping[str, Any], descriptor: int, now: Callable[[], int]) -> RecorderRing:
-    """Open the memory that the supervisor gave a relay."""
     return RecorderRing(msgspec.convert(terms, RingTerms), descriptor, now)

@@ -193,7 +193,6 @@ class RecordingInProgress:
         return number
 
     def leave(self) -> None:
-        """Stop, and keep the files for the next recorder."""
         self._bag.leave()
 
     def finish(self, records: Iterable[LogEntry], revisions: RevisionsStated) -> Recording:

@@ -139,7 +139,6 @@ class RecordingOrders:
         return begun
 
     async def fetch(self, request: recording_requests.RecordingFetch, who: str) -> Recording:
-        """Record who fetches a recording. The api reads its messages from the disk."""
         return await self._given_out(request.id, "recording fetched", f"by {who}", who)
 
     async def read(self, request: recording_requests.RecordingRead, who: str) -> Recording:

@@ -96,7 +96,6 @@ class RecordingStore:
         return shutil.disk_usage(self._folder).free
 
     def part(self, recording_id: str) -> Path:
-        """Return the folder of a recording while it is being made."""
         return self._folder / f".{recording_id}.part"
 
     def parts(self) -> list[Path]:
@@ -155,7 +154,7 @@ class RecordingStore:
         return next((found for found in self.recordings if found.id == recording_id), None)
 
     def knows(self, recording_id: str) -> bool:
-        """Whether a recording with this id is stored, or its removal is not in the audit log yet."""
+        """Return whether a recording with this id is stored, or its removal is not in the audit log yet."""
         return self.find(recording_id) is not None or self._gone(recording_id).exists()
 
     def remove(self, recording: Recording, who: str, reason: str) -> None:

@@ -185,7 +185,6 @@ class RingStream:
         self.block, self._place, self._end = -1, 0, 0
 
     def _append(self, head: memoryview, frames: memoryview) -> None:
-        """Append a record that does not fit in the current block."""
         ring = self._ring
         left = len(head) + len(frames)
         if left > _LONG * ring.block and self._place + _PAD.size <= self._end:
@@ -350,7 +349,7 @@ class RingWriter:
             loser.writer.lose_block()
 
     def _room_for_header(self, needed: int, host: _Share) -> bool:
-        """Whether a header has room in the ring and in the host's part; remove closed streams if needed."""
+        """Return whether a header has room in the ring and in the host's part; remove closed streams if needed."""
 
         def crowded(*, of_host: bool) -> bool:
             has, whole = (

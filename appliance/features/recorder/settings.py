@@ -51,5 +51,4 @@ class RecorderRules(FeatureSection):
             raise ValueError(f"longest is {self.longest:g}, but before and after together are longer")
 
     def services(self) -> tuple[str, ...]:
-        """Return the service with which nodes start a recording."""
         return ("record_now",) if self.enabled and "service" in self.triggers else ()

@@ -1,7 +1,7 @@
 """Compute a recording's timeline, and find its messages around a time, for the analysis of an incident.
 
-The numbers of columns, topics, events and messages are limited, however large the recording is. Omissions are reported.
-`roswire/message_view.py` bounds the values shown of a message.
+The numbers of columns, topics, events and messages are limited, however large the recording is. Omissions are
+reported.
 
 Events come from the audit records in the bag, because retention may have removed them from the log since. In the bag, a
 publisher's header has a host, and the recorder's own header has none.
@@ -258,7 +258,6 @@ def _kind(said: _Said | AuditRecord) -> EventKind | None:
 
 
 def is_record(text: str) -> bool:
-    """Whether a text has the form of a record's id."""
     return _RECORD_ID.fullmatch(text) is not None
 
 

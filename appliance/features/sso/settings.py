@@ -200,7 +200,6 @@ class Sso(FeatureSection):
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files of the operator that the process reads."""
         return tuple(filter(None, (self.ca, self.client_secret_file)))
 
     def receivers(self) -> dict[str, tuple[str | None, str | None]]:

@@ -168,17 +168,17 @@ class ApplianceLease:
         return f"the witness could not save the takeover: {self._trouble}" if self._trouble else ""
 
     def is_active(self, now: float) -> bool:
-        """Whether this appliance may decide, relay and answer."""
+        """Return whether this appliance may decide, relay and answer."""
         return self.held is not None and self._promised_until <= now < self._valid_until
 
     def may_be_renewed(self, now: float) -> bool:
-        """Whether a lapsed lease may soon be renewed in its epoch; then no other appliance was active since."""
+        """Return whether a lapsed lease may soon be renewed in its epoch; then no other appliance was active since."""
         if self.held is None or self._switching_until is not None:
             return False
         return self.answers_alone or now < self._valid_until + _RENEWABLE
 
     def may_answer(self, now: float, *, acknowledged: bool) -> bool:
-        """Whether a change may be answered now; `acknowledged` by the standby."""
+        """Return whether a change may be answered now; `acknowledged` by the standby."""
         return self.is_active(now) and (acknowledged or self.answers_alone)
 
     def next_event(self, now: float) -> float:
@@ -187,7 +187,7 @@ class ApplianceLease:
         return min([self._next_round, *(time for time in changes if time > now)])
 
     def follow(self, epoch: int) -> bool:
-        """Whether data of an active appliance with this epoch is accepted; a smaller epoch never is."""
+        """Return whether data of an active appliance with this epoch is accepted; a smaller epoch never is."""
         if epoch < self.epoch or epoch == self.held:
             return False
         if epoch - self.epoch > FARTHEST:
@@ -321,7 +321,7 @@ class ApplianceLease:
         self._switching_until, self._released = now + 2 * EXPIRY, released
 
     def _is_cut_off(self, now: float) -> bool:
-        """Whether only the other appliance reaches the robot. A witness that has ended answers neither."""
+        """Return whether only the other appliance reaches the robot. A witness that has ended answers neither."""
         other = self._other_witnessed
         return (
             self.is_active(now)

@@ -69,11 +69,11 @@ class LeaseClient:
         self._link.send(message)
 
     def active(self) -> bool:
-        """Whether this appliance may answer now."""
+        """Return whether this appliance may answer now."""
         return self.state is not None and clock.since_boot() < self.state.until
 
     def hears_witness(self) -> bool:
-        """Whether the witness on the robot has just answered this appliance."""
+        """Return whether the witness on the robot has just answered this appliance."""
         answered = None if self.state is None else self.state.answered
         return answered is not None and clock.since_boot() - answered <= EXPIRY
 

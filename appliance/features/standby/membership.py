@@ -103,5 +103,4 @@ def save_membership(path: Path, membership: Membership, owner: tuple[int, int] |
 
 
 def encoded(membership: Membership) -> bytes:
-    """Return the contents of a file with a membership."""
     return msgspec.json.format(msgspec.json.encode(membership))

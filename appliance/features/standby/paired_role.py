@@ -40,7 +40,6 @@ class PairedRole(ActiveRole):
 
     @property
     def before_answer(self) -> Callable[[], Awaitable[None]]:
-        """Return the wait for the standby and the lease."""
         return self.replication.stored
 
     def inherit(self, store: StateStore, age: Callable[[], int]) -> None:
@@ -74,11 +73,10 @@ class PairedRole(ActiveRole):
         self.pair.tunnels.hand_to(tunnels)
 
     def in_doubt(self) -> bool:
-        """Whether computers of the robot may refuse the connections of this appliance now."""
+        """Return whether computers of the robot may refuse the connections of this appliance now."""
         return self.replication.admission.in_doubt()
 
     def on_end_of_gap(self, ended: Callable[[], None]) -> None:
-        """Call this at the first answer of the witness after a gap."""
         self.replication.admission.on_end_of_gap(ended)
 
     def close(self) -> None:

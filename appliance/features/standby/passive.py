@@ -241,7 +241,7 @@ class PassiveControl:
         self._lifeline.say(messages.TunnelsWanted(str(pool), str(pool.network_address + 1)))
 
     def _accepts(self, epoch: int) -> bool:
-        """Whether data of an active appliance with this epoch is accepted: it must be the greatest known."""
+        """Return whether data of an active appliance with this epoch is accepted: it must be the greatest known."""
         lease = self._lease.state
         if lease is None or epoch < max(self._epoch, lease.epoch):
             return False

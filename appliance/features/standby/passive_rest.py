@@ -66,7 +66,6 @@ class ReplicatedTokens:
         return row if row is not None and row.usable(self._ends) else None
 
     def usable(self) -> list[TokenKept]:
-        """Return the data by which the api recognises tokens."""
         return [kept_by_api(row) for row in (self._rows or {}).values() if row.usable(self._ends)]
 
 

@@ -81,7 +81,7 @@ class Replica:
                 raise
 
     def has_hosts(self) -> bool:
-        """Whether a host is enrolled that may open a tunnel. Raises `StoreError`."""
+        """Return whether a host is enrolled that may open a tunnel. Raises `StoreError`."""
         with self._lock, self._explained():
             query = "SELECT EXISTS (SELECT 1 FROM host WHERE revoked IS NULL)"
             return bool(self._connection.execute(query).fetchone()[0])

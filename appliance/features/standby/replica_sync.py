@@ -46,7 +46,7 @@ class ReplicaSync:
             await asyncio.sleep(_SYNC_SECONDS)
 
     def _is_complete(self) -> bool:
-        """Whether the machine was not started again since the replica was complete; a new one is."""
+        """Return whether the machine was not started again since the replica was complete; a new one is."""
         try:
             return self._mark.read_text("ascii") == self._boot
         except FileNotFoundError:

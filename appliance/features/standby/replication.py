@@ -45,7 +45,6 @@ class RobotAdmission:
         self._gap_ended: Callable[[], None] = lambda: None
 
     def on_end_of_gap(self, gap_ended: Callable[[], None]) -> None:
-        """Call this at the first answer after each gap."""
         self._gap_ended = gap_ended
 
     def note_answer(self, at: float) -> None:
@@ -56,7 +55,7 @@ class RobotAdmission:
             self._gap_ended()
 
     def in_doubt(self) -> bool:
-        """Whether a computer of the robot may shut out this appliance."""
+        """Return whether a computer of the robot may shut out this appliance."""
         now = clock.since_boot()
         return now - self._answered > _GAP_SECONDS or now - self._admitted < _ADMITTED_SECONDS
 
@@ -265,11 +264,11 @@ class Replication:
         )
 
     def followed(self) -> bool:
-        """Whether the standby gets the changes now."""
+        """Return whether the standby gets the changes now."""
         return self.sender.lag().connected
 
     def _connected(self) -> bool:
-        """Whether the standby is connected and answers: a dead one is noticed by its missing promises first."""
+        """Return whether the standby is connected and answers: a dead one is noticed by its missing promises first."""
         lease = self._lease.state
         heard = lease.heard if lease is not None else None
         return (

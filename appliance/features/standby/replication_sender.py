@@ -74,7 +74,6 @@ class ReplicationLag(NamedTuple):
 
     @property
     def caught_up(self) -> bool:
-        """Whether the standby is connected and has all changes."""
         return self.connected and not self.changes
 
 

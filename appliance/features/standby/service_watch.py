@@ -37,7 +37,6 @@ class ServiceWatch:
         self._doublings = 0
 
     def linked(self) -> None:
-        """Note that control has a new link, or none."""
         self._serves, self._obstacle = False, ""
 
     def reported(self, now: float, obstacle: str, *, keeps_state: bool) -> None:

@@ -40,7 +40,7 @@ def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Tro
 
 
 def both_active(state: StandbyState) -> bool:
-    """Whether this appliance is active, and the witness names another holder of the lease."""
+    """Return whether this appliance is active, and the witness names another holder of the lease."""
     witness = state.witness
     return state.role == "active" and not is_silent(witness) and witness.holder not in ("", state.name)
 
@@ -50,7 +50,7 @@ def is_silent(witness: WitnessSeen) -> bool:
 
 
 def is_blind(other: OtherAppliance) -> bool:
-    """Whether the other appliance is connected, but the witness does not answer it."""
+    """Return whether the other appliance is connected, but the witness does not answer it."""
     return other.connected and other.witness_seconds is not None and other.witness_seconds >= SILENT_SECONDS
 
 

@@ -303,7 +303,6 @@ class _Pair:
 
 
 def _has(log: TakeoverLog, previous: EpochOf) -> bool:
-    """Whether a log has a takeover, or retention can have removed it."""
     if previous.epoch in log.epochs:
         return True
     return log.result.removed > 0 and (log.first_epoch is None or previous.epoch < log.first_epoch)
@@ -347,7 +346,6 @@ def _contradiction(
 
 
 def _later_epoch(one: _Placed, named: SignedCheckpoint) -> str | None:
-    """Return why a named checkpoint is too late: it seals a takeover of a later epoch."""
     sealed = one.other.before(named.sequence + 1)
     if sealed is None or sealed.detail.epoch <= one.epoch:
         return None

@@ -131,11 +131,9 @@ class TakeoverLog:
         return next((one.sequence - 1 for one in later if one.detail.epoch > epoch), self.result.last)
 
     def last_decision(self, after: int, through: int) -> DecisionPlace | None:
-        """Return the last decision after a place and up to another."""
         return self._decision("DESC", after, through)
 
     def first_decision(self, after: int, through: int) -> DecisionPlace | None:
-        """Return the first decision after a place and up to another."""
         return self._decision("ASC", after, through)
 
     def _decision(self, order: str, after: int, through: int) -> DecisionPlace | None:
@@ -151,7 +149,7 @@ class TakeoverLog:
         return DecisionPlace(*row)
 
     def clock_was_set(self, after: int, through: int) -> bool:
-        """Whether a change of the machine's clock is recorded after a place and up to another."""
+        """Return whether a change of the machine's clock is recorded after a place and up to another."""
         return any(self._first(event, after, through) for event in CLOCK_EVENTS)
 
     def stayed(self, after: int, through: int) -> int | None:

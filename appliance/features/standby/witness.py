@@ -169,7 +169,7 @@ def unseal(purpose: bytes, key: bytes, datagram: bytes) -> Optional[Dict[str, An
 
 
 def is_count(value: object) -> bool:
-    """Whether this is a number that an appliance may send: 0 to `HIGHEST`."""
+    """Return whether this is a number that an appliance may send: 0 to `HIGHEST`."""
     return type(value) is int and 0 <= value <= HIGHEST
 
 
@@ -238,7 +238,7 @@ class LeaseFile:
         return record
 
     def has_room(self) -> bool:
-        """Whether a change needs no free space."""
+        """Return whether a change needs no free space."""
         try:
             return os.stat(self.path).st_size == 2 * _COPY
         except OSError:
@@ -485,7 +485,7 @@ class WitnessGate:
         return seal(ANSWER, name, peer.key, self._answer(name, body))
 
     def _allowed(self, name: str, body: Dict[str, Any]) -> bool:
-        """Whether this operation is allowed: a follower cannot change the lease, so no rule depends on it."""
+        """Return whether this operation is allowed: a follower cannot change the lease, so no rule depends on it."""
         return name in self._appliances or body["do"] == "look"
 
     def _well_formed(self, body: Dict[str, Any]) -> bool:
@@ -835,7 +835,7 @@ class LeaseFirewall:
         self._written = self._present()
 
     def intact(self) -> bool:
-        """Whether the rules are still those that were written; a removed table cannot be listed.
+        """Return whether the rules are still those that were written; a removed table cannot be listed.
 
         Another program may have changed them before they were read for the first time. So the jumps, which must be
         first, and the number of rules are compared with what was written.

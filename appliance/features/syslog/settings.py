@@ -51,7 +51,6 @@ class Syslog(FeatureSection):
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files of the operator that the process reads."""
         return tuple(filter(None, (self.ca, self.certificate, self.key)))
 
     def receivers(self) -> dict[str, tuple[str | None, str | None]]:

@@ -97,11 +97,9 @@ class HostEnrolment(TunnelHosts):
         return self._view.rows()
 
     def served_by(self, pin: str) -> None:
-        """Store the pin by which hosts recognise the api."""
         self._certification.served_by(pin)
 
     async def endpoint(self, _request: host_requests.HostEndpoint) -> answers.Endpoint:
-        """Return the address at which hosts reach the appliance."""
         return await self._find_endpoint()
 
     async def kit(self, request: host_requests.HostKit) -> answers.KitParts:

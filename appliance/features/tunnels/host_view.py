@@ -18,7 +18,7 @@ _NEVER = PortsSeen("unknown", None, [], "")
 
 
 def soon(table: HostTable, row: HostRow, now: float) -> bool:
-    """Whether a certificate ends within 14 days, or within a third of its life if a third is shorter."""
+    """Return whether a certificate ends within 14 days, or within a third of its life if a third is shorter."""
     certificate = table.certificates.get(row.name)
     life = row.expires - certificate.made if certificate is not None else SOON_SECONDS * 3
     return row.expires - now < min(SOON_SECONDS, life / 3)
@@ -117,7 +117,6 @@ class HostView:
         ]
 
     def _known_ports(self, machines: Mapping[str, int]) -> dict[str, PortsSeen]:
-        """Return the last check of ports of each host that may have nodes, by name or address."""
         return {name: self.ports(name) for name in [*(row.name for row in self._table.enrolled()), *machines]}
 
     def _open_ports(self) -> list[str]:

@@ -23,7 +23,6 @@ class KitOptions:
 
     @classmethod
     def of(cls, kept: Mapping[str, str]) -> "KitOptions":
-        """Return the options that were stored with a token."""
         return cls(kept["endpoint"], kept["ports"], tuple(filter(None, kept["open"].split(","))))
 
 

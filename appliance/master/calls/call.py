@@ -219,7 +219,6 @@ def method(
     /,
 ) -> Method[S]: ...
 def method(perform: Callable[..., Awaitable[Value]], /, *parameters: CallParameter[Any]) -> Method[Any]:
-    """Pair a method with the call parameters that it takes after the caller."""
     return Method(perform, parameters)
 
 

@@ -220,7 +220,6 @@ class Execution:
         return self.gate.decide(attempt, self.parameters.mirror.tree)
 
     def _settled(self, attempt: Attempt, probe: Probe | None = None) -> Decision:
-        """Return the decision. In a name conflict, decide by the probe of the node that holds the name."""
         outcome = self._decide(attempt)
         return contested(outcome, probe) if isinstance(outcome, NameConflict) else outcome
 

@@ -76,12 +76,10 @@ class KeyTurn:
 
 
 def touch(keys: Collection[str], others: Collection[str]) -> bool:
-    """Whether a key in one collection equals, or is above, a key in the other."""
     return _meet(_ended(keys), _ended(others))
 
 
 def _ended(keys: Collection[str]) -> tuple[str, ...]:
-    """Append a slash to each key. A key above another key is then its prefix."""
     return tuple({key if key == "/" else f"{key}/" for key in keys})
 
 

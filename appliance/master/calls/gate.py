@@ -108,7 +108,7 @@ class CallGate:
         return None
 
     def is_own_subscriber(self, caller: Caller, topic: str) -> bool:
-        """Whether one of the appliance's own nodes calls a proxy endpoint for a topic to which it is subscribed.
+        """Return whether one of the appliance's own nodes calls a proxy endpoint for a topic to which it is subscribed.
 
         Unlike RVMaster, proxy endpoints have no separate listener for the appliance's own nodes.
         """

@@ -91,7 +91,6 @@ class Multicall:
         return [await self.execution.answer(visit, attempt)] if isinstance(attempt, Attempt) else attempt
 
     async def _understand(self, visit: ServedRequest, part: "Value | Attempt") -> "Value | Attempt":
-        """Return a part as an attempt. If the part is invalid, return its entry in the answer."""
         match part:
             case Attempt():
                 return part

@@ -229,7 +229,7 @@ def _wanted(write: ParameterWrite) -> Wanted:
 
 
 def _is_set(answer: Answer, write: ParameterWrite) -> bool:
-    """Whether the ROS master has stored the value, given its answer to `setParam`.
+    """Return whether the ROS master has stored the value, given its answer to `setParam`.
 
     The ROS master stores the value before it computes the updates for subscribers. If this computation fails, the
     answer is an error although the value is stored. An example is a name such as `a/b` in a dictionary, with a

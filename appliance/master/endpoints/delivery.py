@@ -117,7 +117,6 @@ class Delivery:
 
     @property
     def waiting(self) -> int:
-        """Return the number of waiting calls of all nodes."""
         return sum(len(queue.calls) for queue in self._queues.values())
 
     @property

@@ -69,7 +69,6 @@ class NodeApiClient:
         return client
 
     def _end_round(self) -> None:
-        """Close the connections that were not used since the round before."""
         for client in self._unused.values():
             client.close()
         self._used, self._unused = {}, self._used

@@ -118,7 +118,6 @@ class NodePorts:
         return tuple(sock.getsockname()[1] for sock in opened)
 
     def socket(self, port: int) -> sockets.socket:
-        """Return the listening socket of an opened or adopted port."""
         return self._sockets[f"port:{port}"]
 
     def adopt(self, name: str, sock: sockets.socket) -> None:

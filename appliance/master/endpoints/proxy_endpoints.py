@@ -32,7 +32,6 @@ class ProxyEndpoints:
     servers: dict[str, HttpServer] = field(default_factory=dict, init=False)
 
     def inner_uri(self, incarnation: Incarnation) -> str:
-        """Return the URI by which the ROS master knows the incarnation."""
         return node_uri("127.0.0.1", self.inner_port, f"/{incarnation.key}/")
 
     async def open(self, incarnation: Incarnation) -> None:

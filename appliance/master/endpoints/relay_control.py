@@ -130,7 +130,6 @@ class RelayControl:
         return "away" if away == len(self._posts) else f"{away} of {len(self._posts)} are away"
 
     def port(self, incarnation: Incarnation, kind: Kind, resource: str) -> int:
-        """Return the relay port of a publication or service of an incarnation."""
         return incarnation.relay_ports[self.allocation.of(_WORDS[kind], resource)]
 
     # --- the links ---
@@ -188,7 +187,6 @@ class RelayControl:
         return await self._taps.look(topic, count, seconds, send, latched=latched)
 
     def carries(self, relay: int, kind: str, resource: str) -> bool:
-        """Whether this relay carries a topic or service."""
         return self.allocation.of(kind, resource) == relay
 
     def live_resources(self) -> set[Resource]:
@@ -205,7 +203,6 @@ class RelayControl:
     # --- what is wanted ---
 
     def _place(self, post: RelayOutbox, incarnation: Incarnation) -> None:
-        """Send a relay its publications, services and grants of an incarnation."""
         for registration in incarnation.registrations.values():
             word = _WORDS.get(registration.kind)
             if word is not None and self.carries(post.index, word, registration.resource):
@@ -249,11 +246,9 @@ class RelayControl:
         _revoke(self._post(row.kind, row.resource), row)
 
     def place(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> None:
-        """Have the relay carry a publication or a service."""
         self._place_one(self._post(_WORDS[kind], resource), incarnation, kind, resource, detail)
 
     def withdraw(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
-        """Have the relay stop carrying a publication or a service."""
         _withdraw(self._post(_WORDS[kind], resource), incarnation, kind, resource)
 
     def withdraw_moving(self, moves: Iterable[Move]) -> None:
@@ -361,7 +356,6 @@ class RelayControl:
             await self._find_upstream(post, asked.key, asked.topic)
 
     def _held_back(self, message: messages.LatchRefused | messages.MessagesLimited) -> None:
-        """Record that a relay did not keep or pass on messages."""
         if isinstance(message, messages.MessagesLimited):
             for row in message.rows:
                 self.carried.limited(row, self.policy().limit_rule(row.topic) if row.topic else None)
@@ -394,7 +388,6 @@ def _grant(policy: Policy, row: PermissionRow) -> messages.GrantInstalled:
 
 
 def _names(policy: Policy, host: Address) -> bool:
-    """Whether the policy names a host. Loopback (the appliance itself) counts as named."""
     return host.is_loopback or policy.names(host)
 
 

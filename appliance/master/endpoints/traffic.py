@@ -126,7 +126,7 @@ class RelayTraffic:
         )
 
     def moving(self, key: str, resource: str) -> bool:
-        """Whether messages have passed in the last minute, or may have, because control started later."""
+        """Return whether messages have passed in the last minute, or may have, because control started later."""
         moved = self.traffic.get((key, resource), Traffic()).moved
         return clock.now() - max(moved, self._began) < _MOVING_SECONDS
 

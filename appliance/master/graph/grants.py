@@ -41,7 +41,6 @@ class Grants:
         return [row for rows in self._of_node.values() for row in rows]
 
     def of(self, key: str) -> Collection[PermissionRow]:
-        """Return the grants for the topics and services of an incarnation."""
         return self._of_node.get(key, ())
 
     def give(self, row: PermissionRow) -> Effects:
@@ -65,7 +64,6 @@ class Grants:
         return [*self._drop(row), RevokeGrant(row)]
 
     def forget(self, key: str) -> Effects:
-        """Forget an incarnation permanently, with the grants for its topics and services."""
         return [effect for row in self._of_node.pop(key, ()) for effect in self._drop(row)]
 
     def _add(self, row: PermissionRow) -> None:

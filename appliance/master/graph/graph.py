@@ -208,7 +208,6 @@ class RosGraph:
     # --- grants ---
 
     def topic_granted(self, publisher: Incarnation, topic: str, host: Address, caller_id: str) -> Effects:
-        """Let a subscriber connect to a topic of a publisher."""
         return self.grants.give(PermissionRow(publisher.key, TOPIC, topic, str(host), caller_id))
 
     def service_granted(self, provider: Incarnation, service: str, host: Address, caller_id: str) -> Effects:
@@ -318,7 +317,6 @@ class RosGraph:
         return self._tell_parameters(key, value, caller_id)
 
     def parameter_deleted(self, key: str) -> Effects:
-        """Return the updates for a parameter that the ROS master deleted."""
         return self._tell_parameters(key, {}, None)
 
     def _tell_parameters(self, key: str, value: Value, caller_id: str | None) -> Effects:

@@ -45,5 +45,5 @@ class Mediation:
         )
 
     def hides_publishers(self, topic: str) -> bool:
-        """Whether subscribers of a topic get the publishers' outer URIs instead of the real URIs."""
+        """Return whether subscribers of a topic get the publishers' outer URIs instead of the real URIs."""
         return self.stand_ins or self.carries_topic(topic)

@@ -117,7 +117,6 @@ class Incarnation:
 
     @property
     def ports(self) -> tuple[int, ...]:
-        """Return every port that represents the incarnation."""
         return (self.outer_port, *self.relay_ports)
 
     @property
@@ -140,7 +139,6 @@ class Incarnation:
         return self.outer_uri(told) if hidden or self.own else self.real_uri
 
     def in_order(self) -> list[NodeRegistration]:
-        """Return the registrations in the order in which they were made."""
         return sorted(self.registrations.values(), key=lambda registration: registration.order)
 
     def resources(self, kind: Kind) -> list[str]:
@@ -229,11 +227,9 @@ class Registry:
         return list(self._by_key.values())
 
     def registered(self, kind: Kind, resource: str) -> Iterable[Incarnation]:
-        """Return the live incarnations that registered this resource, in the order of registration."""
         return self._topics.get((kind, resource), {}).values()
 
     def resources(self) -> Iterator[tuple[Kind, str, Iterable[Incarnation]]]:
-        """Yield all resources that live incarnations registered, with these incarnations."""
         return ((kind, resource, holders.values()) for (kind, resource), holders in self._topics.items())
 
     def type_of(self, topic: str) -> str:
@@ -246,7 +242,6 @@ class Registry:
 
     @property
     def tells_parameters(self) -> bool:
-        """Whether live incarnations subscribed to any parameter."""
         return bool(self._subscribed_keys)
 
     def subscribed_below(self, key: str) -> list[str]:
@@ -290,14 +285,12 @@ class Registry:
 
     @property
     def registrations(self) -> int:
-        """Return the number of registrations of all hosts."""
         return self._registrations_of.total()
 
     def registrations_by_host(self) -> Iterable[tuple[Address, int]]:
         return self._registrations_of.items()
 
     def registrations_of(self, host: Address) -> int:
-        """Return the number of registrations of a host, for the limit per host."""
         return self._registrations_of.get(host, 0)
 
     def machines(self) -> dict[str, int]:
@@ -331,7 +324,6 @@ class Registry:
     # --- changing ---
 
     def add(self, incarnation: Incarnation) -> list[Durable]:
-        """Add a new incarnation, which has no registrations yet."""
         self.version += 1
         self._by_key[incarnation.key] = incarnation
         self._known[incarnation.name, incarnation.host, incarnation.api_text] = incarnation

@@ -119,7 +119,7 @@ class Revocation:
         return [*self.grants.take(row), record]
 
     def may_have(self, incarnation: Incarnation, kind: Kind, resource: str) -> bool:
-        """Whether the policy in force grants a node a registration."""
+        """Return whether the policy in force grants a node a registration."""
         return self._decide(incarnation, kind, resource).allowed
 
     def _decide(self, incarnation: Incarnation, kind: Kind, resource: str) -> Decision:

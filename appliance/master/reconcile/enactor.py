@@ -137,7 +137,6 @@ class Enforcement:
         return self._take_back(self.revocation.policy_changed(before, policy))
 
     def expel(self, host: Address, reason: str) -> int:
-        """Revoke all rights of a host. Return their number."""
         return self._take_back(self.revocation.expel(host, reason))
 
     def redecide_for(self, host: Address, caller_id: str) -> None:

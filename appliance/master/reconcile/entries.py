@@ -52,11 +52,9 @@ class MasterRegistrations:
         self.pid: int | None = None
 
     def make(self, node: Incarnation, registration: NodeRegistration) -> None:
-        """Make a registration of a node, after all changes that wait."""
         self._forward(node.host, self.call_to_make(node, registration))
 
     def end(self, node: Incarnation, registration: NodeRegistration) -> None:
-        """End a registration of a node, after all changes that wait."""
         kind, resource = registration.kind, registration.resource
         told = [resource, stand_in(node) if kind is Kind.SERVICE else self._inner_uri(node)]
         if kind is Kind.PARAMETER:  # only this call has the reverse order

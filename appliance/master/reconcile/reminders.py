@@ -109,7 +109,6 @@ class RelayMoves:
         await self._relay.carried_out()
 
     def live_resources(self) -> set[Resource]:
-        """Return the topics and services of live nodes."""
         return self._relay.live_resources()
 
     def withdraw(self, moves: Sequence[Move]) -> None:

@@ -166,7 +166,6 @@ class PacketRule:
 
     @property
     def is_tcp(self) -> bool:
-        """Whether the rule matches a part of the TCP header."""
         return self.tcp_ports is not None or self.from_ports is not None or self.opening or self.accepting
 
     def families(self) -> tuple[Family, ...]:

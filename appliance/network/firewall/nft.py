@@ -244,7 +244,6 @@ def _limit(above: RateLimit) -> Json:
 
 
 def _meter(rule: PacketRule, family: int) -> str:
-    """Return the name of the set of buckets. A host has one bucket for all ports."""
     assert rule.above is not None  # noqa: S101 - the caller asked
     return f"new-ipv{family}-{rule.above.per_second}-{rule.above.burst}"
 
@@ -311,7 +310,7 @@ def _ports(ports: PortRange) -> object:
 
 
 def _translates_source(rule: Json) -> bool:
-    """Whether a rule has `masquerade` or `snat`, in the form of nft or of iptables-nft."""
+    """Return whether a rule has `masquerade` or `snat`, in the form of nft or of iptables-nft."""
     return any(
         "masquerade" in part or "snat" in part or part.get("xt", {}).get("name") in SOURCE_TRANSLATIONS
         for part in rule["expr"]

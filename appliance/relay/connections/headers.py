@@ -22,7 +22,6 @@ _LONGEST = 1024
 
 
 def kept(fields: Mapping[str, str]) -> dict[str, str]:
-    """Return the fields of a peer's header that are kept while it is connected."""
     return _known(fields, _OF_PEER)
 
 
@@ -48,7 +47,7 @@ def size_of(fields: Mapping[str, str]) -> int:
 
 
 def switched_on(fields: Mapping[str, str], name: str) -> bool:
-    """Whether a field is set, in any spelling that the client libraries accept."""
+    """Return whether a field is set, in any spelling that the client libraries accept."""
     return fields.get(name, "").lower() in _TRUE
 
 
@@ -59,7 +58,6 @@ def to_service(fields: Mapping[str, str], caller_id: str) -> dict[str, str]:
 
 
 def to_client(fields: Mapping[str, str], node: str) -> dict[str, str]:
-    """Return the header that a client gets from a service of this node."""
     return {"callerid": node, **_known(fields, _OF_SERVICE)}
 
 

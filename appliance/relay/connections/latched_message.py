@@ -70,7 +70,6 @@ class LatchedMessage:
         self._refuse(size)
 
     def repeat(self) -> None:
-        """Report again which message is not kept."""
         if self._refused_size is not None:
             self._refused(self._refused_size)
 

@@ -69,7 +69,6 @@ class ListeningPorts:
             self.close(key)
 
     def left(self, host: str) -> None:
-        """Count one peer fewer for this host."""
         self.connected.give_back(host)
 
     def _watch(self, key: str, sock: socket.socket) -> None:

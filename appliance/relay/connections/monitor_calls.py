@@ -166,7 +166,6 @@ class ServiceCalls:
             self._failed(call.wanted, reason)
 
     def _failed(self, wanted: Published, reason: str) -> None:
-        """Count a failed call as a fault of its monitor, and report it."""
         interceptor = self._context.interceptor
         for monitor in interceptor.monitors.monitors if interceptor.monitors is not None else ():
             monitor.faults += monitor.name == wanted.monitor

@@ -22,7 +22,6 @@ _RETRY_SECONDS = 1.0
 
 
 def looks_for_names(type_name: str) -> bool:
-    """Whether a publisher of this type waits for a subscriber with a certain name."""
     return type_name.endswith(_GOAL) or type_name == _CANCEL
 
 
@@ -66,7 +65,6 @@ class NamedSubscribers:
         self._announcing: LoopTimer | None = None
 
     def open(self, address: tuple[str, int], accepted: Mapping[str, str]) -> None:
-        """Set the publisher's address, and the type that it has accepted."""
         self._address, self._accepted = address, accepted
 
     def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:

@@ -103,7 +103,6 @@ class OwnService:
             self._loop.after(_SECOND, lambda: self._ask_again(call))
 
     def _ask_again(self, call: _Call) -> None:
-        """Ask control for the clients that called in the second after an answer."""
         asked = call.asked
         if call.waiting and self._calls.get((asked.service, asked.host)) is call:
             self._ask(asked.service, asked.host, asked.caller_id, call.waiting)

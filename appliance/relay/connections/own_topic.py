@@ -23,7 +23,6 @@ class OwnTopicPublisher(Upstream):
             self.recheck()
 
     def release(self) -> None:
-        """Close the topic, as it has no subscriber."""
         self._wanted = False
         if self._current is not None:
             self._current = None

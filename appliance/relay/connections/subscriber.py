@@ -175,7 +175,6 @@ class Subscriber:
 
     @property
     def full(self) -> bool:
-        """Whether the queue has reached its bounds."""
         return self._queue.full
 
     def trim(self) -> int:

@@ -270,11 +270,11 @@ class Interceptor:
         return self._awaited is not None
 
     def intercepts(self, topic: str) -> bool:
-        """Whether messages of a topic go through monitors."""
+        """Return whether messages of a topic go through monitors."""
         return bool(self.blocked) or (self.monitors is not None and self.monitors.wants(topic))
 
     def wants(self, topic: str) -> bool:
-        """Whether a monitor wants a topic's messages even without a subscriber."""
+        """Return whether a monitor wants a topic's messages even without a subscriber."""
         return self.monitors is not None and self.monitors.wants(topic)
 
     def mask(self, topic: str) -> Callable[[str], bool] | None:

@@ -41,7 +41,6 @@ class Loader:
 
     @property
     def busy(self) -> bool:
-        """Whether something is being loaded or waits to be."""
         return self._loading is not None or bool(self._waiting)
 
     def close(self) -> None:

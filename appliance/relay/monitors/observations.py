@@ -163,12 +163,11 @@ class Observations:
         repeated.add(count, first, time, text)
 
     def was_reported(self, kind: str, monitor: str, point: ObservationPoint, distinction: str = "") -> bool:
-        """Whether such an event was already reported in this second, so the next one is only counted."""
+        """Return whether such an event was already reported in this second, so the next one is only counted."""
         return self._key(kind, monitor, point, distinction) in self._told
 
     @property
     def some(self) -> bool:
-        """Whether there was an event in this second."""
         return bool(self._told)
 
     def tick(self) -> None:

@@ -77,19 +77,19 @@ class Observer:
         }
 
     def shows(self, point: ObservationPoint) -> bool:
-        """Whether the next change at a point is reported with the bytes before it."""
+        """Return whether the next change at a point is reported with the bytes before it."""
         return point not in self._shown
 
     def hides_drop(self, monitor: str, point: ObservationPoint) -> bool:
-        """Whether the next drop of a monitor at a point is only counted."""
+        """Return whether the next drop of a monitor at a point is only counted."""
         return self._observations.was_reported("drop", monitor, point)
 
     def hides_verdict(self, verdict: Verdict, point: ObservationPoint) -> bool:
-        """Whether the next such verdict at a point is only counted."""
+        """Return whether the next such verdict at a point is only counted."""
         return self._observations.was_reported("verdict", verdict.monitor, point, named(verdict))
 
     def asks(self, verdict: Verdict, source: int) -> bool:
-        """Whether a verdict is reported in full and needs an explanation; at most `_EXPLAINED` a second do."""
+        """Return whether a verdict is reported in full and needs an explanation; at most `_EXPLAINED` a second do."""
         point = self.senders.point(source) or NOWHERE
         kind = f"{self._prefix}verdict"
         if (
@@ -147,7 +147,6 @@ class Observer:
                 self._judged(judged, _of_publication(point, published.topic), published.data)
 
     def _send(self, outcome: Outcome) -> None:
-        """Publish the messages of an outcome in the order in which they were published."""
         for earlier in outcome.before:
             self._send(earlier)
         for published in outcome.sent():
@@ -248,7 +247,6 @@ class Observer:
         return text
 
     def call_failed(self, monitor: str, service: str, time: int, text: str) -> None:
-        """Report as a fault of a monitor that its call of a service failed."""
         self._observations.note(
             f"{self._prefix}fault", monitor, ObservationPoint("", service), time, text, distinction=text
         )
@@ -269,7 +267,6 @@ class Observer:
 
     @property
     def incomplete(self) -> frozenset[str]:
-        """Return the monitors that missed something."""
         return frozenset(name for name, counters in self._counters.items() if counters.missed)
 
     def tick(self, time: int) -> None:

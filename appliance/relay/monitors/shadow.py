@@ -133,7 +133,6 @@ class ShadowMonitors:
             self._timer = self._loop.after(max(0, due - self._now()) / 1e9, self.have_turn)
 
     def _awake(self) -> list[MonitorSet]:
-        """Return the sets that may have a turn in this second."""
         shadows = self._monitors.shadows if self._monitors is not None and self._spent <= SHARE else ()
         return [shadow for shadow in shadows if shadow not in self._resting]
 
@@ -196,7 +195,7 @@ class ShadowMonitors:
                 self._miss(shadow, NOWHERE, _TOO_LONG)
 
     def _rests(self, shadow: MonitorSet) -> bool:
-        """Whether a set has used more than its share; if so, let it rest until the next second."""
+        """Return whether a set has used more than its share; if so, let it rest until the next second."""
         spent = shadow.late or any(monitor.context.budget < 0 for monitor in shadow.monitors)
         if spent:
             self._resting.add(shadow)

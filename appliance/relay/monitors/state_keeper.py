@@ -330,7 +330,6 @@ def _left(contents: Sequence[bytes], found: RecoveredState) -> Iterator[tuple[St
 
 
 def _sections(entry: _Entry) -> list[tuple[bytes, int]]:
-    """Return the sections of a group: its state with the size of its cells, then the parts of its slices."""
     return [(entry.base, entry.group.size), *((data, 0) for data in entry.parts)]
 
 

@@ -94,7 +94,6 @@ class StateMemory:
         self._sections[section].write_cells(cells)
 
     def has_cells(self, section: int) -> bool:
-        """Whether cells of a section are kept that are newer than its base."""
         return self._sections[section].has_cells
 
     def cells_place(self, section: int) -> CellsPlace:
@@ -113,7 +112,6 @@ class _Section:
         self._size = cells
 
     def begin(self, base: bytes) -> None:
-        """Write the first base while the half is still invalid."""
         self._put(0, base)
         self._memory[self._at] = 0
 

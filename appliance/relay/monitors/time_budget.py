@@ -23,7 +23,6 @@ class TimeBudget:
         self._until = 0
 
     def part(self, now: int) -> float:
-        """Return the fraction of the budget that a message gets now."""
         return _REDUCED if now < self._until else 1.0
 
     def fuel(self, now: int, budget: float) -> int:
@@ -37,5 +36,5 @@ class TimeBudget:
             self._until = now + self._length
 
     def recovered(self, now: int) -> bool:
-        """Whether the time since the end of the last reduction is at least as long as the reduction."""
+        """Return whether the time since the end of the last reduction is at least as long as the reduction."""
         return now >= self._until + self._length

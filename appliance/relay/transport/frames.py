@@ -76,7 +76,6 @@ class Batch:
 
     @property
     def kept(self) -> bool:
-        """Whether the frames are also used elsewhere."""
         return self._kept is not None
 
     def keep(self) -> memoryview:
@@ -214,7 +213,6 @@ class FrameReceiver:
         return torn
 
     def resume(self, torn: bytes) -> None:
-        """Continue the incomplete frame that the pump has received."""
         self._torn = torn
 
     def found(self, size: int, end: int, messages: int) -> Batch:

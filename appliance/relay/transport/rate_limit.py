@@ -152,7 +152,7 @@ class SharedRateLimit:
         return bool(self._shares)
 
     def paid(self, now: float) -> bool:
-        """Whether everything used has been refilled, so that a new limit would not differ."""
+        """Return whether everything used has been refilled, so that a new limit would not differ."""
         self._fill(now)
         return self._messages.full and self._bytes.full
 

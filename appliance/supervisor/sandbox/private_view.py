@@ -130,12 +130,11 @@ def _enter(view: PrivateView, account: Account) -> None:
 
 
 def _closed_above(path: Path) -> Path | None:
-    """Return the topmost folder above a path that other users may not enter."""
     return next((folder for folder in reversed(path.parents) if not _permits(folder, _ENTER)), None)
 
 
 def _is_open(folder: Path) -> bool:
-    """Whether other users may read a folder; of our packages, also every file: a pull may have another umask."""
+    """Return whether other users may read a folder; of our packages, also every file: a pull may have another umask."""
     if folder.name not in _PACKAGES:
         return _permits(folder, _ENTER | _READ)
     return all(
