@@ -60,7 +60,6 @@ class RayCluster:
             return [(number, WorkerDeath(f"its worker in the cluster failed: {_reason(error)}"))]
 
     def close(self) -> None:
-        """Cancel all tasks, and leave the cluster."""
         self._ray.shutdown()
 
 

@@ -204,7 +204,6 @@ def _found(outcome: Outcome) -> Iterator[Found]:
 
 
 def because(verdict: Verdict) -> Iterator[str]:
-    """Yield the messages of the recording that caused a verdict."""
     return lines_of_why(why_of(verdict, place_of).get("why", {}))
 
 

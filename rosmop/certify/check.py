@@ -230,7 +230,6 @@ def _check_future(formula: str, events: Sequence[str], tables: AutomatonTables) 
 
 
 def _check_pattern(formula: str, events: Sequence[str], tables: AutomatonTables) -> int:
-    """Check a pattern. An event that the pattern does not name stands for endless silence."""
     return _check_endless(patterns.meaning(formula, events), events, [*events, _SILENCE], tables)
 
 

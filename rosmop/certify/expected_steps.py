@@ -222,5 +222,4 @@ def begun_in(one: PropertyStep, state: int) -> Any:
 
 
 def _drops(compiled: Compiled, function: str) -> bool:
-    """Whether a function may drop the message, according to its form."""
     return any(isinstance(node, nodes.Drop) for node in nodes.walk(compiled.functions[function]))

@@ -58,7 +58,7 @@ class WordReader:
         return before
 
     def _fits(self, sign: str, at: int) -> bool:
-        """Whether the sign is next. A sign that ends with a letter must be a whole word."""
+        """Return whether the sign is next. A sign that ends with a letter must be a whole word."""
         end = at + len(sign)
         if not self._text.startswith(sign, at):
             return False

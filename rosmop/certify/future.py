@@ -35,11 +35,9 @@ class FutureFollower:
         self._known: dict[Clause, bool] = {}
 
     def start(self, formula: Node) -> State:
-        """Return the obligation before the first event."""
         return self._now(formula)
 
     def step(self, state: State, letter: int) -> State:
-        """Return the remaining obligation after a letter."""
         return self._any([self._after(clause, letter) for clause in state])
 
     def steps(self, state: State, letters: Sequence[int]) -> State:
@@ -50,11 +48,10 @@ class FutureFollower:
         )
 
     def possible(self, state: State) -> bool:
-        """Whether some endless trace meets the obligation."""
+        """Return whether some endless trace meets the obligation."""
         return any(self._possible(clause) for clause in state)
 
     def _among(self, clause: Clause, letters: Sequence[int]) -> list[int]:
-        """Return the letters that no part of the clause rules out alone."""
         masks = [part[1] for part in clause if part[0] == "one of"]
         return [letter for letter in letters if all(mask >> letter & 1 for mask in masks)]  # type: ignore[operator]  # sets of letters
 
@@ -84,7 +81,6 @@ class FutureFollower:
         return self._all([self._at(second, letter), self._any([self._at(first, letter), again])])
 
     def _at(self, formula: Node, letter: int) -> State:
-        """Return the remainder of a formula after a position with the letter."""
         return self.step(self._now(formula), letter)
 
     def _now(self, formula: Node) -> State:
@@ -108,7 +104,6 @@ class FutureFollower:
         return frozenset(together)
 
     def _least(self, clauses: set[Clause]) -> State:
-        """Return the clauses, except each clause that requires more than another."""
         self._work -= len(clauses)
         if self._work < 0:
             raise WorkLimitError
@@ -179,7 +174,7 @@ class FutureFollower:
 
 
 def _fulfils(group: set[Clause], ways: dict[Clause, set[Way]]) -> bool:
-    """Whether a trace can stay in these clauses for ever and fulfil every `until`."""
+    """Return whether a trace can stay in these clauses for ever and fulfil every `until`."""
     inside = [off for clause in group for after, off in ways[clause] if after in group]
     return bool(inside) and not frozenset.intersection(*inside)
 

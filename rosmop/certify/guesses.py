@@ -45,7 +45,6 @@ class PastGuesses:
         self.rules = [rule for node in self._guessed for rule in self._rules(node)]
 
     def kept(self, formula: Node) -> Node:
-        """Return the formula together with all rules."""
         return reduce(lambda left, right: ("and", left, right), self.rules, formula)
 
     def _over(self, node: Node) -> Node:

@@ -96,7 +96,6 @@ def _sweep(module: WasmModule, walk: int) -> bytes:
 
 
 def _leb(value: int) -> bytes:
-    """Encode an unsigned number: seven bits in each byte, the lowest first."""
     groups = [value >> shift & 0x7F for shift in range(0, max(value.bit_length(), 1), 7)]
     return bytes(group | 0x80 for group in groups[:-1]) + bytes(groups[-1:])
 
@@ -119,7 +118,6 @@ def _load_i32(address: int) -> bytes:
 
 
 def _store(kind: bytes, offset: int) -> bytes:
-    """Encode the store of the value on the stack, at the address below it."""
     return (b"\x36" if kind == _I32 else b"\x37") + b"\x00" + _leb(offset)
 
 

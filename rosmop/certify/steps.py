@@ -232,7 +232,7 @@ class _Bench:
         self._count(case, one, expected)
 
     def _waits_no_more(self, number: int, state: Any, case: StepCase) -> bool:
-        """Whether the deadline of a property would have passed before the message."""
+        """Return whether the deadline of a property would have passed before the message."""
         tables = self._topic.properties[number].compiled
         if not isinstance(tables, ClockedProperty) or tables.waits[state[0]] is None:
             return False

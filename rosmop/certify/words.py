@@ -32,7 +32,7 @@ class ExpressionDerivatives:
         self.initial, _ = self._read(expression)
 
     def matches(self, state: int) -> bool:
-        """Whether the trace that led here is in the language."""
+        """Return whether the trace that led here is in the language."""
         return self._matching[state]
 
     def step(self, state: int, event: str) -> int:

@@ -68,7 +68,6 @@ def refusal(source: Type, target: Type) -> str:
 
 
 def number(value: nodes.Expression, target: Type) -> nodes.Expression:
-    """Return a number converted to another numeric type."""
     return value if value.type == target else nodes.Convert(target, value)
 
 

@@ -138,5 +138,4 @@ def _variables(names: SpecificationNames, event: str) -> list[Variable]:
 
 
 def _name(function: str, event: str) -> str:
-    """Return the name of the variable, which no text can contain."""
     return f"{function}({event})"

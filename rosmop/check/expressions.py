@@ -53,7 +53,7 @@ def literal_number(scope: FunctionScope, node: tree.NumberLiteral) -> Value:
 
 
 def _is_beyond_long(node: tree.NumberLiteral) -> bool:
-    """Whether the literal is a decimal integer without suffix that `long` cannot hold."""
+    """Return whether the literal is a decimal integer without suffix that `long` cannot hold."""
     return bool(_DECIMAL.fullmatch(node.text)) and int(node.text) > value_types.LONG.most
 
 

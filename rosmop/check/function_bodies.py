@@ -256,7 +256,6 @@ def _called(node: tree.SyntaxNode) -> Iterable[str]:
 
 
 def _free_names(function: tree.FunctionDefinition) -> set[str]:
-    """Return the names in a function that it does not declare itself."""
     inside = list(tree.walk(function.body))
     own = {inner.name for inner in inside if isinstance(inner, tree.Declarator | tree.RangeForStatement)}
     own |= {parameter.name for parameter in function.parameters}

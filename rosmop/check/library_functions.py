@@ -159,17 +159,14 @@ def functions() -> dict[str, tree.FunctionDefinition]:
 
 
 def is_polygon(kind: Type) -> bool:
-    """Whether the type is a list of numbers."""
     return isinstance(kind, value_types.VectorType) and value_types.is_number(kind.element)
 
 
 def is_names(kind: Type) -> bool:
-    """Whether the type is a list of strings."""
     return isinstance(kind, value_types.VectorType) and isinstance(kind.element, value_types.StringType)
 
 
 def is_quaternion(kind: Type) -> bool:
-    """Whether the type is the message for an orientation."""
     return kind == value_types.RecordType("geometry_msgs/Quaternion")
 
 

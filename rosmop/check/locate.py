@@ -84,7 +84,6 @@ class MessageCursor:
         return self._first(".".join(names) + ".")
 
     def _first(self, prefix: str) -> Spot | None:
-        """Return the start of a nested message, which is the start of its first field."""
         for name, place in self._layout.places.items():
             if name.startswith(prefix):
                 start = self.start_of(place.part)

@@ -23,7 +23,6 @@ MAX_NESTED = 15
 
 
 def charge(scope: FunctionScope, node: tree.SyntaxNode) -> None:
-    """Charge for one iteration (or one call)."""
     scope.add(nodes.Charge(scope.lines.site, weight(node)))
 
 

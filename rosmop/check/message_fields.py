@@ -92,7 +92,6 @@ def read_fields(scope: FunctionScope, bound: list[PatternField]) -> None:
 
 
 def _read_fixed(scope: FunctionScope, fixed: list[PatternField]) -> None:
-    """Write reads of numbers, with one read for all numbers at known distances from each other."""
     groups: dict[str | None, list[PatternField]] = {}
     for field in fixed:
         assert field.spot is not None  # a number always has a position
@@ -150,7 +149,7 @@ def check_overlaps(bound: list[PatternField], written: list[PatternField]) -> No
 
 
 def _overlap(one: tree.Binding, other: tree.Binding) -> bool:
-    """Whether one binding is the same as the other, or a part of it.
+    """Return whether one binding is the same as the other, or a part of it.
 
     An array without an index means all its elements.
     """

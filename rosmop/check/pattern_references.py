@@ -146,7 +146,6 @@ class _Rewriting:
         )
 
     def _violation(self, event: tree.EventDefinition, late: tree.Expression) -> tree.EventDefinition:
-        """Return the event that happens with each message that violates the pattern."""
         trigger, position = event.trigger, self._node.formula_position
         assert isinstance(trigger, tree.MessageTrigger)  # `_event` checks this
         test: tree.Expression = tree.CallExpression(

@@ -34,7 +34,6 @@ def reached(node: tree.Specification, definitions: Definitions) -> frozenset[str
 
 
 def identity(node: tree.Specification) -> bytes:
-    """Return a digest that ignores positions."""
     return sha256(repr(_plain(node)).encode()).digest()
 
 

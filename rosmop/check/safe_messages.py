@@ -72,14 +72,13 @@ def _compiled(
 
 
 def is_stamped(messages: MessageTypes, name: str) -> bool:
-    """Whether messages of a type begin with a `std_msgs/Header`."""
+    """Return whether messages of a type begin with a `std_msgs/Header`."""
     return [field.notation for field in messages.definition(name).fields[:1]] == [_HEADER]
 
 
 def _assign(
     scope: FunctionScope, kind: str, value: list[Any], binding: tree.Binding, *, stamped: bool
 ) -> None:
-    """Assign a constant to a field of a message under construction."""
     path = binding.path
     field = type_of_path(scope.messages, kind, path)
     if binding.constant is None:

@@ -250,7 +250,7 @@ class FunctionScope:
         return (own, None) if own is not None else self.shared.foreign(self.names, name, position)
 
     def changes_anything(self) -> bool:
-        """Whether the statements written so far, or functions they call, assign a variable."""
+        """Return whether the statements written so far, or functions they call, assign a variable."""
         return self.changes or any(self.names.changed_by(called) for called in self.calls)
 
     def unknown(self, name: str, position: Position, what: str = "variable") -> SpecificationError:
@@ -276,7 +276,6 @@ class FunctionScope:
         return self.symbols.fresh(prefix)
 
     def site(self, node: tree.SyntaxNode) -> int:
-        """Return the site of a node: its position, and the variables in it."""
         return self.symbols.site(Site(node.position, tuple(self._variables(node))))
 
     @contextmanager

@@ -93,7 +93,7 @@ def slicing_of(
 
 
 def _enforces(shared: CompilationContext, functions: Sequence[str]) -> bool:
-    """Whether these functions, or the functions that they call, drop, change or publish a message."""
+    """Return whether these functions, or the functions that they call, drop, change or publish a message."""
     waiting, seen = [*functions], {*functions}
     while waiting:
         function = shared.functions.get(waiting.pop())
@@ -124,7 +124,7 @@ def creates(specification: tree.Specification, event: tree.EventDefinition) -> b
 
 
 def acts(function: nodes.Function, shared: CompilationContext) -> bool:
-    """Whether the action of an event does more than change the slice's own variables."""
+    """Return whether the action of an event does more than change the slice's own variables."""
     if not shared.unsliced.isdisjoint(function.shared):
         return True
     return any(

@@ -151,7 +151,6 @@ def lint_statements(specification: tree.Specification) -> Iterator[Diagnostic]:
 
 
 def _assigned(condition: tree.Expression) -> Iterator[Diagnostic]:
-    """Yield warnings about assignments in a condition."""
     if isinstance(condition, tree.Assignment) and condition.operator == "=":
         text = "`=` assigns, and the condition is the value that was assigned; to compare write `==`"
         yield Diagnostic(condition.position, "warning", text)
@@ -163,7 +162,7 @@ def _assigned(condition: tree.Expression) -> Iterator[Diagnostic]:
 
 
 def _acts(expression: tree.Expression) -> bool:
-    """Whether an expression may have an effect; each call may."""
+    """Return whether an expression may have an effect; each call may."""
     acting = (tree.Assignment, tree.IncrementExpression, tree.CallExpression, tree.NewExpression)
     return stream_of(expression) is not None or any(
         isinstance(node, acting) for node in tree.walk(expression)

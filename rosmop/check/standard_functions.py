@@ -48,7 +48,6 @@ class Arguments:
         return Value(result, self.position)
 
     def value(self, kind: value_types.Type, function: str, *arguments: nodes.Expression) -> Value:
-        """Return a call of a function of the form as the value."""
         return self.result(nodes.Call(kind, function, arguments, self.site))
 
 
@@ -78,7 +77,6 @@ def _math(name: str, count: int) -> Function:
 
 
 def _elementary(name: str) -> Function:
-    """Return the compiler of a function that the library has for doubles."""
     function = _math(name, numbers.MATH[name][0])
 
     def of_doubles(call: Arguments) -> Value:
@@ -289,7 +287,6 @@ def _fills_at_most(call: Arguments) -> Value:
 
 
 def _stored(call: Arguments, target: Value, function: str, *arguments: nodes.Expression) -> Value:
-    """Return the target buffer as filled by a function of the form."""
     filled = nodes.Call(value_types.CHARACTERS, function, (target.form, *arguments), call.site)
     return Value(store(call.scope, target, filled), call.position)
 

@@ -43,7 +43,6 @@ def _called_again(event: tree.EventDefinition) -> Iterator[Diagnostic]:
 
 
 def _unlike_a_sender(specification: tree.Specification) -> Iterator[Diagnostic]:
-    """Warn of a sender that is compared with a text that no sender has."""
     own = {function.name for function in specification.functions}
     for node in tree.walk(specification):
         match node:
@@ -90,7 +89,7 @@ def _always_dropped(event: tree.EventDefinition) -> Iterator[Diagnostic]:
 
 
 def _ends(statement: tree.Statement | None) -> bool:
-    """Whether each path through a statement drops the message."""
+    """Return whether each path through a statement drops the message."""
     match statement:
         case tree.ReturnStatement():
             return True
@@ -102,7 +101,6 @@ def _ends(statement: tree.Statement | None) -> bool:
 
 
 def _acts(statement: tree.Statement) -> bool:
-    """Whether a statement drops or replaces the message, on some path."""
     return _ends(statement) or any(
         isinstance(node, tree.DropStatement | tree.StopStatement) for node in tree.walk(statement)
     )

@@ -359,7 +359,6 @@ class TopicCodegen:
         """The first of the local variables of handlers."""
 
     def _reads_in_place(self, event: nodes.Event) -> bool:
-        """Return whether an event reads strings or arrays where they are in the message."""
         body = self._writer.functions[event.function].body
         return any(isinstance(node, nodes.ReadValue) for node in nodes.walk(body))
 

@@ -161,7 +161,6 @@ class ModuleCodegen(MemoryLayout):
         """By function: the places where it leaves the message to the interpreter."""
 
     def leave(self, function: str, error: NotCompiledError) -> None:
-        """Note a place at which a function leaves the message."""
         self.left.setdefault(function, []).append(error)
 
     def event(self, name: str, channel: str = "") -> WasmFunction:
@@ -170,7 +169,7 @@ class ModuleCodegen(MemoryLayout):
         return self.function(function, {"at": I32, "size": I32}, I32, function.context, channel=channel)
 
     def stops(self, event: nodes.Event) -> bool:
-        """Whether the action of an event may send the safe message."""
+        """Return whether the action of an event may send the safe message."""
         return any(
             isinstance(one, nodes.StopMessage) for one in nodes.walk(self.functions[event.function].body)
         )
@@ -374,7 +373,6 @@ class _FunctionCodegen(StringCodegen):
         return self._spend(constant(I64, node.instructions))
 
     def _allocate(self, node: nodes.Allocate) -> bytes:
-        """Charge as the interpreter does, although nothing is allocated here."""
         if node.size is not None:
             return self._allocated(constant(I64, node.size))
         many = self._length() + constant(I64, nodes.CHARGED) + I64_GT_U
@@ -814,12 +812,10 @@ class _FunctionCodegen(StringCodegen):
 
 
 def _has_place(kind: Type) -> bool:
-    """Return whether values of a type are represented by address and length."""
     return isinstance(kind, value_types.StringType | value_types.VectorType)
 
 
 def _part_of(node: nodes.Item) -> nodes.Read:
-    """Return the local variable for a part of a function's result."""
     assert isinstance(node.base, nodes.Read)  # noqa: S101  the form guarantees this
     return nodes.Read(node.type, f"{node.base.name} {node.number}")
 

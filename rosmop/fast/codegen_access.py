@@ -124,7 +124,6 @@ class MessageAccess(ArithmeticCodegen):
         return code + self._after_elements(nodes.AfterElements(node.site, node.end, start, count, size))
 
     def _read_texts(self, node: nodes.ReadValue) -> bytes:
-        """Store the address of each string of an array."""
         if isinstance(node.type, value_types.VectorType) and node.type.length is not None:
             raise NotCompiledError.of(node.type)
         count, left, entry = (

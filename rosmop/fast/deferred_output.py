@@ -86,7 +86,6 @@ class OutputLine(msgspec.Struct, tag=True, array_like=True, dict=True):
 
 
 def is_text(node: nodes.Expression) -> bool:
-    """Return whether a value is a string."""
     return isinstance(node.type, value_types.StringType)
 
 

@@ -17,7 +17,6 @@ from roswire.message_text import MessageDefinition, ServiceDefinition
 
 
 def _parts(kind: Any) -> Any:
-    """Return the types of the arguments of a property's constructor, as a type."""
     hints = get_type_hints(kind.__init__)
     return tuple[tuple(hint for name, hint in hints.items() if name != "return")]  # type: ignore[misc]  # made here
 

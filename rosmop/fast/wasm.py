@@ -81,7 +81,6 @@ def signed(value: int) -> bytes:
 
 
 def row(items: Sequence[bytes]) -> bytes:
-    """Encode a vector: the number of items, and the items."""
     return unsigned(len(items)) + b"".join(items)
 
 
@@ -143,7 +142,6 @@ def constant(machine: int, value: float) -> bytes:
 
 
 def load(machine: int, address: int) -> bytes:
-    """Push the number at a fixed address."""
     return constant(I32, 0) + _LOADS[machine](address)
 
 

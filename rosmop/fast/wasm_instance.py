@@ -159,7 +159,6 @@ class WasmInstance:
         self._functions, self._view, self._store = {}, memoryview(b""), None
 
     def _asked(self) -> tuple[int, Any]:
-        """Return the C name of the memory."""
         if self._store is None or self._memory is None:
             raise WasmError("the instance is closed")
         return self._store.context, ctypes.byref(self._memory, _Export.of.offset)

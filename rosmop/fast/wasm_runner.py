@@ -203,7 +203,6 @@ class ModuleState:
         self._due(anew=True)
 
     def named(self, context: str) -> str:
-        """Return the monitor whose context has this name."""
         return self._contexts[context].monitor
 
     def leave(self) -> None:

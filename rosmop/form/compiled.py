@@ -62,7 +62,6 @@ class Comparison:
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """Return the variables of both sides for both results."""
         return (*self.when_true, *self.when_false)
 
 
@@ -103,7 +102,7 @@ class Given:
     bounds: tuple[int | float, int | float] | None
 
     def holds(self, value: object) -> bool:
-        """Whether a value has the type, and lies within the bounds."""
+        """Return whether a value has the type, and lies within the bounds."""
         if self.bounds is None or isinstance(value, bool):
             return self.bounds is None and isinstance(value, bool)
         fits = isinstance(value, int) or (
@@ -243,7 +242,7 @@ class Compiled:
         )
 
     def is_stamped(self, message_type: str | None) -> bool:
-        """Whether messages of a type begin with a `std_msgs/Header`."""
+        """Return whether messages of a type begin with a `std_msgs/Header`."""
         fields = self.messages.definitions.message(message_type).fields if message_type is not None else ()
         return bool(fields) and fields[0].notation == "std_msgs/Header"
 

@@ -722,7 +722,7 @@ PURE = "lib"
 
 
 def acts(root: Expression) -> bool:
-    """Whether evaluating the expression has an effect."""
+    """Return whether evaluating the expression has an effect."""
     return any(
         isinstance(node, Assign | Log | Throttle)
         or (isinstance(node, Invoke) and not node.function.startswith(PURE))

@@ -53,7 +53,6 @@ class Symbols:
 
     @staticmethod
     def owner(name: str) -> str:
-        """Return the specification that a name was made for."""
         return name.partition(" ")[2]
 
     def site(self, site: Site) -> int:

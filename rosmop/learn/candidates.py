@@ -77,7 +77,6 @@ class Candidate:
 
     @property
     def place(self) -> str:
-        """Return the field in the notation for people."""
         return self.path if self.element is None else f"{self.path}[{self.element}]"
 
 
@@ -152,7 +151,6 @@ class _Proposer:
             yield from self._number(topic, rhythm, place)
 
     def _by_field(self, topic: str, rows: Mapping[str, Statistic]) -> Iterator[tuple[str, Statistic]]:
-        """Yield the rows of a topic's fields, in the order of the definition."""
         return ((path, rows[path]) for path in self._known.fields[topic] if path in rows)
 
     def _support(self, rhythm: TopicRhythm) -> CandidateSupport:
@@ -349,7 +347,6 @@ class _Proposer:
             )  # fmt: skip
 
     def of_orders(self) -> Iterator[Candidate]:
-        """Yield the orders of topics, the strongest first."""
         orders = self._known.orders
         found: list[tuple[float, Candidate]] = []
         done: set[frozenset[str]] = set()

@@ -175,7 +175,6 @@ class _Marked:
 
 
 def _watch(monitors: MonitorSet) -> list["_Watch"]:
-    """Watch every state machine of a set, before it starts."""
     watches = []
     for monitor in monitors.monitors:
         for running in monitor.properties:
@@ -203,7 +202,6 @@ class _Watch(CompiledProperty):
         return _Run(self, self._machine.start(time_ns), next(iter(states)))
 
     def seen(self) -> dict[CoverageItem, int]:
-        """Return how often each state and transition was exercised."""
         counts: Counter[CoverageItem] = Counter()
         states = read_state_machine(self.source, timed=self.timed).states
         for (state, event), count in self.taken.items():
@@ -249,7 +247,6 @@ class _Run:
         return categories
 
     def saved(self) -> tuple[Any, ...]:
-        """Return nothing: replay on recordings saves no state."""
         return ()
 
     def restore(self, saved: tuple[Any, ...]) -> None:

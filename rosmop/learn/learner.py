@@ -131,7 +131,6 @@ class _Learner:
         )
 
     def _facts(self) -> tuple[LearntFacts, LearntFacts]:
-        """Return the facts of the training recordings, and those of all recordings."""
         times = [
             TimeStep(*self._span(place), gaps=math.ceil(MOST_GAPS / len(self._trained)))
             for place in range(len(self._parts))

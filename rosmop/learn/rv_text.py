@@ -49,7 +49,6 @@ def literal(value: object) -> str | None:
 
 
 def quoted(text: str) -> str:
-    """Return the text between the quotes of a string literal."""
     return "".join(_ESCAPES.get(letter, letter) for letter in text)
 
 
@@ -60,7 +59,6 @@ def one_line(text: str) -> str:
 
 
 def formatted(text: str) -> str:
-    """Return text for use in a printf format."""
     return quoted(text).replace("%", "%%")
 
 

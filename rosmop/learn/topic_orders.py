@@ -39,7 +39,6 @@ class TopicPair(msgspec.Struct):
         self.seconds, self.started = 0, False
 
     def merged(self, other: "TopicPair") -> "TopicPair":
-        """Return the order in both, which have ended."""
         return TopicPair(
             self.back.merged(other.back), self.forth.merged(other.forth), self.answered + other.answered,
             self.requires and other.requires, self.turns and other.turns,
@@ -81,7 +80,7 @@ class TopicOrders:
         self.pairs = merged_rows(self.pairs, pairs, TopicPair.merged)
 
     def by_chance(self, bound: float, rate: float, count: int) -> bool:
-        """Whether chance alone would place `count` messages within `bound` seconds of another topic's messages.
+        """Return whether chance alone would place `count` messages within `bound` seconds of another topic's messages.
 
         `rate` is the other topic's rate (1/s).
         """

@@ -77,7 +77,6 @@ class FormulaCell:
 
     @property
     def wanted(self) -> bool:
-        """Whether the value is open and has a user."""
         return self.value is None and bool(self.tells or self.users)
 
     def hear(self, value: bool) -> bool | None:
@@ -110,7 +109,6 @@ def _use(value: Value, user: "FormulaCell | _Operator") -> bool:
 
 
 def _leave(value: Value, user: "FormulaCell | _Operator") -> None:
-    """Remove a user of a value. If no user remains, also remove the value from the users of its operands."""
     waiting = [(value, user)]
     while waiting:
         left, leaver = waiting.pop()
@@ -125,7 +123,6 @@ _ABSORBING = {"and": False, "or": True}
 
 
 def _together(kind: str, operands: tuple[Value, ...]) -> bool:
-    """Return the value for operands that are all known and not absorbing."""
     if kind == "xor":
         return sum(map(bool, map(_known, operands))) % 2 == 1
     return bool(_known(operands[0])) is not (kind == "not")
@@ -158,7 +155,6 @@ class _Operator(ABC):
         self.rows: deque[_Row] = deque()
 
     def ask(self, now: int) -> Value:
-        """Return the operator's value at the current event."""
         self.rows.append(_Row(self.run.place, now, None, None, FormulaCell(self.run.journal)))
         return self.rows[-1].cell or False
 
@@ -174,12 +170,10 @@ class _Operator(ABC):
         del cell
 
     def pass_by(self, time: int) -> None:
-        """Note that no further event comes at or before this time."""
         del time
 
     @property
     def deadline(self) -> int | None:
-        """Return the time of the first bound on which a value depends."""
         return None
 
     def saved(self) -> tuple[Any, ...]:
@@ -235,7 +229,6 @@ class _Rows(_Operator):
         return row
 
     def drop(self) -> _Row:
-        """Remove the oldest row and return it."""
         row = self.rows.popleft()
         for value in (row.left, row.right):
             if value is not None:
@@ -341,7 +334,7 @@ class _OpenUntil(_Rows):
         return True
 
     def _value(self, row: _Row, goods: _Marks, bads: _Marks) -> bool:
-        """Whether some mark of `goods` is within the row's bounds, and not after the first mark of `bads`."""
+        """Return whether some mark of `goods` is within the row's bounds, and not after the first mark of `bads`."""
         good = _first(goods, (row.time + self.low, row.place))
         if good is None or good[0] > row.time + self.high:
             return False
@@ -349,7 +342,6 @@ class _OpenUntil(_Rows):
         return bad is None or good <= bad
 
     def _forget(self) -> None:
-        """Drop the rows before the first row that is still needed."""
         while self.rows and not _wanted(self.rows[0]):
             row = self.drop()
             for value in (row.left, row.right):
@@ -399,7 +391,6 @@ def _last(kinds: _Marks, mark: _Mark) -> _Mark | None:
 
 
 def _behind(mark: _Mark | None, low: int = 0) -> _Mark:
-    """Return the first position for which a mark is too early."""
     return (-FOREVER, 0) if mark is None else (mark[0] - low, mark[1] + 1)
 
 

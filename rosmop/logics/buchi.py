@@ -76,7 +76,6 @@ class Automata:
         return product
 
     def _smallest(self, sets: Iterable[Obligations]) -> Sets:
-        """Return the sets that do not include another of the sets."""
         kept: list[Obligations] = []
         for candidate in sorted(set(sets), key=int.bit_count):
             self._spend(1 + len(kept) // 8)

@@ -51,7 +51,6 @@ class _GrammarReader:
         return Grammar(len(self._source.events), next(iter(self._heads.values())), tuple(self._rules))
 
     def _find_heads(self) -> None:
-        """Find the nonterminals: the names left of an arrow."""
         for index in range(len(self._source.text)):
             token, following = self._tokens.ahead(index), self._tokens.ahead(index + 1)
             if token.kind == "end":

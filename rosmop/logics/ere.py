@@ -63,7 +63,6 @@ class ExpressionTable:
         return number
 
     def symbol(self, letter: int) -> int:
-        """Return the expression for the trace of one event."""
         return self._intern("symbol", (letter,), nullable=False)
 
     def complement(self, inner: int) -> int:
@@ -81,7 +80,6 @@ class ExpressionTable:
         return self._intern("star", (inner,), nullable=True)
 
     def sequence(self, factors: list[int]) -> int:
-        """Return the expression for one trace of each factor, one after the other."""
         flat: list[int] = []
         for factor in factors:
             expression = self._all[factor]

@@ -201,7 +201,6 @@ class FiniteRun(UntimedRun):
 
     @property
     def as_new(self) -> bool:
-        """Whether the run is in the initial state."""
         return self.state == self._automaton.initial
 
     def step(self, event: int, _time_ns: int) -> Categories:
@@ -306,7 +305,6 @@ class ClockedRun:
         return wait.categories
 
     def mark(self) -> tuple[int, int]:
-        """Return the state and the start of its clock."""
         return self.state, self.since
 
     def take_back(self, mark: tuple[int, int]) -> None:
@@ -314,11 +312,9 @@ class ClockedRun:
         self.state, self.since = mark
 
     def saved(self) -> tuple[Any, ...]:
-        """Return the state, the start of its clock, and the time."""
         return self.state, self.since, self.now
 
     def restore(self, saved: tuple[Any, ...]) -> None:
-        """Restore the state, the start of its clock, and the time."""
         self.state, self.since, self.now = saved
 
     def _move(self, move: Move) -> None:

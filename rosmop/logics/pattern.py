@@ -73,7 +73,6 @@ class Pattern:
     enforced: bool = False
 
     def initial(self) -> Mode:
-        """Return the mode of a fresh run."""
         return "quiet" if self.opens is None else "waiting"
 
     def after_event(self, mode: Mode, event: int, *, late: bool) -> Mode:
@@ -97,7 +96,7 @@ class Pattern:
         return "quiet" if second and self.kind == "causes" else mode
 
     def restarts_clock(self, before: Mode, event: int, mode: Mode) -> bool:
-        """Whether the clock restarts.
+        """Return whether the clock restarts.
 
         It runs from the opening of the scope, the oldest unanswered event, or the latest event.
         """
@@ -143,7 +142,6 @@ def verdicts(pattern: Pattern, events: int) -> dict[Mode, Categories]:
 
 
 def _reachable(pattern: Pattern, mode: Mode, events: int) -> set[Mode]:
-    """Return the mode, and all modes that can be reached from it by events and deadlines."""
     lateness = (False,) if pattern.within_ns is None else (False, True)
     found: set[Mode] = set()
     waiting = [mode]

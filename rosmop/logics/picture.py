@@ -80,7 +80,6 @@ def _document(parts: Sequence[str], width: int, height: int) -> str:
 
 
 def _placed(diagram: Diagram, top: int) -> dict[int, _State]:
-    """Return the position of every state."""
     distance = {diagram.initial: 0}
     waiting = deque([diagram.initial])
     while waiting:

@@ -72,7 +72,6 @@ def shortest_trace_to(compiled: CompiledProperty, category: str) -> tuple[str, .
 
 
 def _shortest_traces(graph: VerdictGraph) -> dict[str, tuple[str, ...]]:
-    """Return a shortest trace for each category that a trace can lead to."""
     found: dict[str, tuple[str, ...]] = {}
     traces: dict[int, tuple[str, ...]] = {graph.initial: ()}
     waiting = deque([graph.initial])

@@ -109,7 +109,6 @@ class RewritingRun(UntimedRun):
 
 
 def _matching(rules: Sequence[RewriteRule], string: list[int], place: int) -> tuple[RewriteRule | None, int]:
-    """Return the first rule that matches at a place, and the work that the search took."""
     work = 1
     for rule in rules:
         end = place + len(rule.left)

@@ -271,12 +271,10 @@ def _example(model: Any) -> str:
 
 
 def _same(held: Term, value: Term) -> Term:
-    """Return the condition that a cell holds a value. A boolean may be stored as a number."""
     return held == (as_bits(value) if z3.is_bool(value) and not z3.is_bool(held) else value)
 
 
 def _among(noted: LineTerm, lines: Term) -> Term:
-    """Return the condition that the line has one of its allowed values."""
     held = number_at(lines, noted.offset, noted.allowed[0].size() // 8) if noted.allowed else None
     return either(*(held == one for one in noted.allowed))
 

@@ -87,7 +87,6 @@ def is_signed(kind: Type) -> bool:
 
 
 def width(kind: Type) -> int:
-    """Return the width of the bit vector for a number of this type."""
     return 32 if isinstance(kind, value_types.IntegerType) and kind.bits <= 32 else 64
 
 
@@ -99,7 +98,6 @@ def wrapped(value: Term, kind: value_types.IntegerType) -> Term:
 
 
 def _text(view: _View) -> Term:
-    """Return the address and length of a string of the message."""
     return z3.Concat(z3.Extract(31, 0, view.count), AT + z3.Extract(31, 0, view.start))
 
 
@@ -321,7 +319,6 @@ class FormTerms:
         return offset if at.base is None else state.slots[self._frame, at.base] + offset
 
     def _place(self, at: nodes.Spot, state: State) -> Term:
-        """Return the address of a position that is within the message."""
         offset = integer(at.offset, 32)
         return offset if at.base is None else z3.Extract(31, 0, state.slots[self._frame, at.base]) + offset
 

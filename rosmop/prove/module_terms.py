@@ -287,7 +287,6 @@ class ModuleExecution:
             self._stored.add(place)
 
     def _cell(self, address: Any, offset: int) -> int:
-        """Return a constant address that is not in a string."""
         number = z3.simplify(_bits(address))
         known = z3.is_bv_value(number)
         place = int(number.as_long()) + offset if known else -1
@@ -368,13 +367,11 @@ def each_name(family: str, how: str) -> str:
 
 
 def _same(one: Term, other: Term) -> bool:
-    """Return whether two terms are plainly the same number."""
     rest = z3.simplify(one - other)
     return bool(z3.is_bv_value(rest) and rest.as_long() == 0)
 
 
 def _fits(value: Any, family: str) -> bool:
-    """Return whether a cell holds values of this type."""
     return (
         family == "i32" if isinstance(value, Pointer) or z3.is_bool(value) else value.sort() == _SORTS[family]
     )

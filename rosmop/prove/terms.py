@@ -96,7 +96,6 @@ def choice(test: Term, yes: Term, no: Term) -> Term:
 
 
 def as_bits(truth: Term, bits: int = 32) -> Term:
-    """Return a boolean as a number."""
     return z3.If(truth, integer(1, bits), integer(0, bits))
 
 

@@ -111,7 +111,6 @@ class BoundedReader(Reader):
         return header.get_uint32("conn"), data
 
     def _index(self, info: ChunkInfo) -> list[_Entry]:
-        """Return the index of a chunk, in the order of its connections."""
         assert self.bio is not None  # noqa: S101  the reader is open
         chunk = self.chunks[info.pos]
         self.bio.seek(chunk.datapos + chunk.datasize)

@@ -89,7 +89,6 @@ class OutputBag:
 
 
 def _sender(connection: Connection) -> ConnectionExtRosbag1:
-    """Return the caller id of a recorded publisher, and whether it latches."""
     assert isinstance(connection.ext, ConnectionExtRosbag1)  # noqa: S101  the readers make no other connections
     return connection.ext
 
@@ -142,7 +141,6 @@ def replay(
 
 
 def _steps(step: ReplayStep) -> Iterator[ReplayStep]:
-    """Yield a step, and the steps of messages that monitors published in it."""
     yield step
     for number, judged in step.outcome.judged.items():
         message = step.outcome.published[number]

@@ -327,7 +327,6 @@ class MonitorSet:
         return self.compiled.messages.definitions
 
     def wants(self, topic: str) -> bool:
-        """Return whether an enabled monitor has an event on this topic."""
         return topic in self.steps
 
     def taps(self, topic: str) -> bool:
@@ -420,7 +419,6 @@ class MonitorSet:
         return self._lanes.area
 
     def contexts(self, topic: str) -> tuple[Context, ...]:
-        """Return the contexts of a topic's monitors, with the rest of their budgets."""
         return self._contexts.get(topic, ())
 
     def lane(self, topic: str) -> FastLane | None:
@@ -560,7 +558,7 @@ class MonitorSet:
         return [monitor.name for monitor in found]
 
     def holds_if_lost(self, code: SpecificationCode) -> bool:
-        """Whether a specification holds its topics if its state is lost."""
+        """Return whether a specification holds its topics if its state is lost."""
         return code.hold or (code.name in self._guards.names and not code.begins)
 
     def identity(self, code: SpecificationCode) -> bytes:
@@ -846,7 +844,6 @@ class MonitorSet:
         monitor.faults = before.faults
 
     def _index(self) -> None:
-        """Index the steps by topic, or part of a service."""
         self._silent.clear()
         steps: dict[str, list[Step]] = {}
         standing = {monitor.name: monitor.steps for monitor in self._monitors if monitor.enabled}
@@ -879,7 +876,6 @@ class MonitorSet:
         }
 
     def _taps(self, shadow: "MonitorSet") -> tuple[Step, ...]:
-        """Return a tap for each topic and part of a service with an enabled event in shadow mode."""
         return tuple(
             _Tap(found[0].monitor, found[0].event, 0, "", self._tap(shadow, found[0].event))
             for found in shadow.steps.values()
@@ -897,7 +893,6 @@ class MonitorSet:
 
 
 def _slice_parts(group: MonitorGroup) -> list[tuple[str, SliceParts]]:
-    """Return, by name, the slices of a group's parametric specifications, to be saved in parts."""
     sliced = [(monitor.name, monitor.slices) for monitor in group.monitors]
     return [(name, SliceParts(slices)) for name, slices in sliced if slices is not None]
 

@@ -504,7 +504,6 @@ class MonitorExecution:
         return False
 
     def _note(self, monitor: MonitorInstance) -> None:
-        """Add an event that happened in a slice to the trail."""
         if self._bound is not None and (not monitor.trail or monitor.trail[-1] is not self._bound):
             self._append_to_trail(monitor, self._bound)
 

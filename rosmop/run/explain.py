@@ -118,7 +118,6 @@ class Exits:
         """Do nothing; see `mark`."""
 
     def move(self, owner: object, room: memoryview) -> None:
-        """Move the history into the owner's memory."""
         self.room, self.owner = room[: len(self.room)], owner
 
     def forget(self, run: Any, _time_ns: int) -> None:
@@ -215,7 +214,6 @@ class Steps:
         return self._started, self._steps, len(self._steps), self._before, self._following
 
     def take_back(self, mark: Any) -> None:
-        """Forget the steps since the mark."""
         self._started, self._steps, size, self._before, self._following = mark
         del self._steps[size:]
 
@@ -240,7 +238,6 @@ class Steps:
         return run.expire()
 
     def follow(self, earlier: "Exits | Steps") -> "Exits | Steps":
-        """Continue the history of the same property."""
         return earlier
 
     def _kept(self) -> tuple[Sequence[EventOccurrence], Run | None]:
@@ -318,7 +315,6 @@ class ClockedSteps(Steps):
         return run.expire()
 
     def move(self, owner: object, room: memoryview) -> None:
-        """Move the history into the owner's memory."""
         self.room, self.owner = room[:CLOCKED_ROOM], owner
 
     def follow(self, earlier: Exits | Steps) -> "ClockedSteps":

@@ -79,7 +79,7 @@ def _places(code: SpecificationCode, compiled: Compiled, acts: set[str]) -> set[
 
 
 def _acts(function: nodes.Function) -> bool:
-    """Whether a function drops, changes or publishes a message."""
+    """Return whether a function drops, changes or publishes a message."""
     return any(
         isinstance(node, nodes.Drop | nodes.StopMessage | nodes.Publish)
         or (isinstance(node, nodes.WriteBack) and node.writes)
@@ -88,7 +88,6 @@ def _acts(function: nodes.Function) -> bool:
 
 
 def _changing(compiled: Compiled, starts: set[str]) -> set[str]:
-    """Return the variables that may change after the start."""
     return {
         node.name
         for name, function in compiled.functions.items()

@@ -238,7 +238,6 @@ class _Maker:
         return self._effect(node.value)
 
     def _effect(self, node: nodes.Expression) -> _Run:
-        """Build an expression whose value is not used."""
         if isinstance(node, nodes.Assign):
             return self._store(node)
         if isinstance(node, nodes.Sequence):
@@ -618,7 +617,6 @@ class _Maker:
         return assign
 
     def _marks_field(self, node: object) -> bool:
-        """Return whether a node marks a field of the message as assigned."""
         if not isinstance(node, nodes.Assign) or node.name not in self._flags:
             return False
         value = node.value.value if isinstance(node.value, nodes.Convert) else node.value

@@ -191,7 +191,6 @@ class MonitorInstance:
 
     @property
     def failing(self) -> bool:
-        """Whether the monitor failed to start or has faulted often."""
         return self.broken or self.faults >= FAILING_AFTER
 
     def picture(self) -> str | None:

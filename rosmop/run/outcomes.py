@@ -323,7 +323,6 @@ def why_of(verdict: Verdict, who: Who) -> dict[str, Any]:
 
 
 def moment(time_ns: int) -> str:
-    """Return a time in UTC, with microseconds."""
     return datetime.datetime.fromtimestamp(time_ns / 1e9, datetime.UTC).isoformat(timespec="microseconds")
 
 
@@ -366,7 +365,6 @@ def lines_of_why(why: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _named(event: Mapping[str, Any]) -> str:
-    """Return one event: name, time, sender, and the state after it."""
     index = f" #{event['index']}" if "index" in event else ""
     seq = f" seq {event['seq']}" if "seq" in event else ""
     who = "".join(

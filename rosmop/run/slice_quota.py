@@ -15,7 +15,6 @@ HolderOf = Callable[[int], Holder]
 
 
 def no_holder(_source: int) -> Holder:
-    """Charge no holder: sources are not distinguished."""
     return None
 
 
@@ -32,7 +31,6 @@ class Quota(Generic[Thing]):
         self._of: dict[Holder, OrderedDict[Thing, None]] = {}
 
     def held(self, holder: Holder) -> int:
-        """Return how many things the holder has."""
         return len(self._of.get(holder, ()))
 
     def fits(self, holder: Holder, more: int) -> bool:
@@ -63,5 +61,4 @@ class Quota(Generic[Thing]):
         self.total = 0
 
     def take_over(self, other: "Quota[Thing]") -> None:
-        """Take over the counts of another quota, but keep the limit of this quota."""
         self._of, self.total = other._of, other.total

@@ -95,7 +95,6 @@ class Slice:
 
     @property
     def deadline(self) -> int | None:
-        """Return the first deadline of its properties."""
         times = [time for run in self.runs if (time := run.deadline) is not None]
         return min(times, default=None)
 
@@ -212,7 +211,6 @@ class Slices:
                 part.clear()
 
     def take_over(self, before: "Slices") -> None:
-        """Take over the slices of the same specification before it was loaded again."""
         self._first, self._known = before._first, before._known
         self.quota.take_over(before.quota)
         self._ended.take_over(before._ended)
@@ -292,7 +290,6 @@ class Slices:
         return [*whole, *seeds]
 
     def _agreeing(self, domain: int, key: Key) -> Iterator[Slice]:
-        """Return the slices that agree with the binding of the event."""
         for other, known in self._known.items():
             if other & domain == domain:
                 for known_key in self._with(other, domain, key):
@@ -363,7 +360,6 @@ class Slices:
         return f"its host has {held} of {self.limit} slices, as many as are left for all other hosts"
 
     def _has_room(self, most: int) -> bool:
-        """Return whether the host may have this many more slices, or can forget some of its own."""
         return self.quota.fits(self._holder, most) or (self._forgets and self.quota.held(self._holder) > 0)
 
     def _refuse(self, domain: int, key: Key, why: str) -> None:
@@ -386,7 +382,6 @@ class Slices:
         return slice_.runs
 
     def own(self) -> tuple[Any, ...]:
-        """Return the values of the slices' own variables."""
         return tuple(self._namespace[name] for name in self._own)
 
     def settle(
@@ -458,7 +453,6 @@ class Slices:
             self._tidy()
 
     def _tidy(self) -> None:
-        """Remove the invalid entries of the heap, which are most of its entries."""
         self._deadlines = [one for one in self._deadlines if one[0] == one[2].due and not one[2].gone]
         heapify(self._deadlines)
 
@@ -574,7 +568,6 @@ class Slices:
         self._put(*binding, slice_)
 
     def values(self, slice_: Slice) -> Mapping[int, Any]:
-        """Return the values of parameters, by number."""
         return dict(zip(_members(slice_.domain), slice_.key[1:], strict=True))
 
     def binding(self, slice_: Slice) -> Mapping[str, object]:

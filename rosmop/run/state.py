@@ -221,7 +221,6 @@ _HELD: Mapping[type, type | tuple[type, ...]] = MappingProxyType(
 
 
 def _fits(known: ValueCodec, kind: Type, value: Any) -> bool:
-    """Return whether a value is valid for a variable of a type."""
     if isinstance(kind, value_types.VectorType):
         return (
             isinstance(value, list)

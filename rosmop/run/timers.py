@@ -57,7 +57,6 @@ class Agenda:
         self._monitors = ()
 
     def has_come(self, time_ns: int) -> bool:
-        """Return whether something is due at this time."""
         return self.due is not None and self.due <= time_ns
 
     def schedule(self) -> None:

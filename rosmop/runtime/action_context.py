@@ -107,7 +107,7 @@ class Turn:
             self.until = self.clock() + self.seconds * self.part
 
     def late(self, more: float = 0.0) -> bool:
-        """Whether the time is over, or will be after `more` seconds."""
+        """Return whether the time is over, or will be after `more` seconds."""
         return self.clock is not None and self.clock() + more > self.until
 
     def check(self) -> None:
@@ -224,7 +224,7 @@ class Context:
         self.turn.log.append(line_of(level, text, self.monitor))
 
     def throttle(self, period: float, site: int) -> bool:
-        """Whether output at this site is due: the last one was at least `period` seconds ago."""
+        """Return whether output at this site is due: the last one was at least `period` seconds ago."""
         now = self.turn.now
         last = self.throttled.get(site)
         if last is not None and last <= now < last + period * 1e9:

@@ -12,7 +12,7 @@ _MOST_SECONDS = (1 << 32) - 1
 
 
 def is_safe(safe: SafeMessage, buffer: bytes | bytearray | memoryview) -> bool:
-    """Whether a message equals the safe one, except for `seq` and `stamp` of its header."""
+    """Return whether a message equals the safe one, except for `seq` and `stamp` of its header."""
     first = HEAD if safe.stamped else 0
     return len(buffer) == len(safe.data) and buffer[first:] == safe.data[first:]
 

@@ -55,7 +55,7 @@ def weighed(context: Context, values: Values, measure: Callable[[Values], int], 
 
 
 def same(left: Any, right: Any) -> bool:
-    """Whether two vectors or messages are equal. A NaN equals nothing, not even itself."""
+    """Return whether two vectors or messages are equal. A NaN equals nothing, not even itself."""
     return left == right and _numbers(left)
 
 

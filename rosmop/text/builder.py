@@ -518,7 +518,6 @@ def _string_bytes(inner: str) -> bytes:
 
 
 def _character_value(inner: str) -> int:
-    """Return the value of a character literal as a signed char."""
     value = _string_bytes(inner)
     if len(value) != 1:
         raise _LiteralError("a character outside ASCII is more than one char; write a string")
@@ -526,7 +525,6 @@ def _character_value(inner: str) -> int:
 
 
 def _resource(name: Any, kind: Any) -> tuple[str, str]:
-    """Return the name of a topic or service, and its type."""
     names = [_unquoted(child) if child.type == "STRING" else str(child) for child in (name, kind)]
     return names[0], names[1].replace("::", "/")
 

@@ -19,7 +19,6 @@ class SyntaxNode:
 
 
 def fields_of(node: SyntaxNode) -> list[Any]:
-    """Return the values of all fields of a node, in order."""
     return [getattr(node, name) for name in node.__dataclass_fields__]
 
 

@@ -148,7 +148,6 @@ def _rows(learnt: LearningResult) -> Iterator[dict[str, Any]]:
 
 
 def _write(program: CommandContext, out: Path, learnt: LearningResult, recorded: Definitions) -> None:
-    """Write the specification, and beside it the definitions that are not part of ROS."""
     files = {out: learnt.text}
     for name in _needed(learnt, recorded):
         path = out.parent / BESIDE / f"{name}.msg"

@@ -95,7 +95,6 @@ class ReplayReport:
         say_table(table)
 
     def _show_recordings(self) -> None:
-        """Print the recordings with effects, and those that failed."""
         rows = [row for row in self._recordings if any(row.counts)]
         columns = (Column(head, justify="right") for head in ("messages", *_HEADS, "first at", "last at"))
         table = table_of(Column("recording", overflow="fold"), *columns)

@@ -13,7 +13,6 @@ import typer
 
 
 def printable(text: str) -> str:
-    """Return the text with its control characters escaped."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 

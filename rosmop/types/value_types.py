@@ -53,7 +53,6 @@ class IntegerType(_Kind, frozen=True):
         return (1 << (self.bits - self.signed)) - 1
 
     def holds(self, other: "IntegerType") -> bool:
-        """Whether every value of the other type is also a value of this type."""
         return self.least <= other.least and other.most <= self.most
 
     def __eq__(self, other: object) -> bool:
@@ -154,12 +153,11 @@ NUMBERS = (BoolType, IntegerType, FloatingType)
 
 
 def is_number(kind: Type) -> bool:
-    """Whether C++ calculates with values of this type."""
     return isinstance(kind, NUMBERS)
 
 
 def is_scalar(kind: Type) -> bool:
-    """Whether values of this type never change in place, so they need no copy."""
+    """Return whether values of this type never change in place, so they need no copy."""
     return not isinstance(kind, VectorType | RecordType)
 
 
@@ -185,7 +183,7 @@ def common(left: Type, right: Type) -> Type:
 
 
 def convertible(source: Type, target: Type) -> bool:
-    """Whether a value of one type can be assigned to a variable of another."""
+    """Return whether a value of one type can be assigned to a variable of another."""
     if is_number(source) and is_number(target):
         return True
     if isinstance(target, StringType | CharactersType):

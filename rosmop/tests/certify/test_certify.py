@@ -131,7 +131,7 @@ def tables_of(compiled: CompiledProperty) -> AutomatonTables:
 
 
 def same_verdicts(one: AutomatonTables, other: AutomatonTables) -> bool:
-    """Whether two automata have the same verdicts after every trace, and after the same times."""
+    """Return whether two automata have the same verdicts after every trace, and after the same times."""
     seen = {(one.initial, other.initial)}
     waiting = list(seen)
     for left, right in waiting:
