@@ -126,7 +126,6 @@ class Direct:
     pid: int | None = None
 
     def target(self, publisher: int) -> tuple[int, str]:
-        """Return the publisher's own port and topic."""
         return publisher, "-"
 
     def close(self) -> None:

@@ -148,7 +148,6 @@ def theirs(automaton: str, logic: str, trace: Sequence[str]) -> list[tuple[bool,
 
 
 def _violated(tree: Any, trace: tuple[str, ...]) -> bool:
-    """Whether the formula is false on every continuation, by the definition."""
     endless = [
         ltl.unrolled(one, 6) for one in ltl.lassos(ltl.AB, len(trace) + 1, 3) if one[0][: len(trace)] == trace
     ]

@@ -79,7 +79,6 @@ def visited(text: str, messages: Sequence[bytes]) -> float:
 
 
 def resident() -> float:
-    """Return the memory of this process in megabytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
 
 

@@ -66,7 +66,6 @@ class Successes:
             return next(one for one in self.times if one > moment)
 
     def longest_pause(self) -> float:
-        """Return the longest time between two successes."""
         return max(after - before for before, after in zip(self.times, self.times[1:], strict=False))
 
 

@@ -81,7 +81,6 @@ class Bench:
         return self._messages(path, 200, PACED)[1]
 
     def _messages(self, path: Way, size: int, hertz: float) -> tuple[float, float]:
-        """Return messages a second, and the median of their delays."""
         home = self.site.home
         with (
             RosSession(MASTER, home, self.site.robot) as here,

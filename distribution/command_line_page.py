@@ -90,7 +90,6 @@ def _markdown(text: str) -> str:
 
 
 def _code(paragraph: str) -> str:
-    """Return a paragraph whose lines stay as they are: its commands are code."""
     return f"```text\n{paragraph.removeprefix(chr(8)).strip()}\n```"
 
 

@@ -17,12 +17,10 @@ one quota. The *kept* part is for hosts with a registration only, so the robot's
 
 
 def all_rows() -> tuple[QuotaRow, ...]:
-    """Return the rows of the core, then those of features."""
     return (*QUOTA_ROWS, *(row for feature in FEATURES for row in feature.quotas))
 
 
 def page() -> str:
-    """Return the page, as Markdown."""
     return "\n".join((_HEAD, *_tables()))
 
 
@@ -58,7 +56,6 @@ def _table(title: str, columns: tuple[str, ...], cells: Callable[[QuotaRow], tup
 
 
 def _setting(row: QuotaRow) -> str:
-    """Return the key of a setting as code, followed by its note."""
     key, space, note = row.setting.partition(" ")
     return f"`{key}`{space}{note}" if key else "none"
 

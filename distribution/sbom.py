@@ -37,7 +37,7 @@ class ImageFiles:
         self._links: dict[str, str] = {}
 
     def wants(self, name: str) -> bool:
-        """Whether `add` needs the content of this file."""
+        """Return whether `add` needs the content of this file."""
         name = name.removeprefix("./")
         return any(fnmatchcase(name, pattern) for pattern in _READ)
 

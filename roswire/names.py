@@ -75,7 +75,7 @@ def canonical_tool_id(caller_id: str) -> str:
 
 
 def is_global_name(name: str) -> bool:
-    """Whether `name` is a canonical global name (`/a/b`; not `/`, not `//a`, not `a`)."""
+    """Return whether `name` is a canonical global name (`/a/b`; not `/`, not `//a`, not `a`)."""
     return len(name) <= MAX_NAME_LENGTH and _CANONICAL.match(name) is not None
 
 
@@ -87,7 +87,7 @@ def is_relative_member(name: str) -> bool:
 
 
 def is_valid_type_name(name: str) -> bool:
-    """Whether `name` is a message or service type (`package/Type`) or `*`, any type."""
+    """Return whether `name` is a message or service type (`package/Type`) or `*`, any type."""
     return name == "*" or (len(name) <= MAX_NAME_LENGTH and _TYPE_NAME.match(name) is not None)
 
 

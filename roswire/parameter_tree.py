@@ -15,7 +15,7 @@ def parts_of(key: str) -> tuple[str, ...]:
 
 
 def holds_others(value: Value) -> bool:
-    """Whether a value is a namespace with keys. Its keys also need rights."""
+    """Return whether a value is a namespace with keys. Its keys also need rights."""
     return isinstance(value, dict) and bool(value)
 
 

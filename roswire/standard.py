@@ -115,7 +115,6 @@ def _in_places(text: str, before: dict[str, int]) -> str:
 
 
 def _messages_of_actions() -> dict[str, str]:
-    """Return the messages that genaction makes from each action."""
     files = {}
     for name, parts in _ACTIONS.items():
         short = name.partition("/")[2]

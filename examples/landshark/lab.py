@@ -124,7 +124,6 @@ class Lab:
         interfaces.set_link(self.switch, host.port, up=False)
 
     def plug(self, host: Host) -> None:
-        """Plug the host's cable in again."""
         interfaces.set_link(self.switch, host.port, up=True)
 
     def close(self) -> None:
@@ -146,7 +145,6 @@ def clear_leftovers(prefix: str) -> list[str]:
 
 
 def _clear(gone: Sequence[Namespace]) -> None:
-    """End all processes in these namespaces, then delete the namespaces."""
     end_processes([pid for namespace in gone for pid in namespace.processes()])
     for namespace in gone:
         namespace.delete()

@@ -34,7 +34,6 @@ class Messages:
         return bytes(self.store.serialize_ros1(self._object(long_name(kind), nested), long_name(kind)))
 
     def decode(self, kind: str, data: bytes) -> Any:
-        """Return the message as an object with its fields."""
         return self.store.deserialize_ros1(data, long_name(kind))
 
     def _object(self, kind: str, given: Mapping[str, Any]) -> Any:

@@ -148,7 +148,6 @@ def _end(pose: physics.Pose, colour: str) -> str:
 
 
 def _note(x: float, y: float, row: float, lines: tuple[str, ...]) -> str:
-    """Return a note at the right, with a line to the place that it describes."""
     px, py = _at(x, y)
     left = 705.0
     words = [_text(left + 8, row + 18 * number, line) for number, line in enumerate(lines)]

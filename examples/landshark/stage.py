@@ -81,7 +81,6 @@ class Actor:
 
     @property
     def running(self) -> bool:
-        """Whether the process has not ended."""
         return self.process.poll() is None
 
     def expect(self, event: str, seconds: float = START_SECONDS) -> Event:
@@ -233,7 +232,6 @@ class Stage:
             raise DemoError(f"rosrv protect on the robot failed: {said.strip()}")
 
     def start_operator(self) -> Actor:
-        """Start the operator control unit."""
         return self._start(self.operator_host, "ocu", [NODE_PYTHON, str(self.nodes / "ocu.py")])
 
     def command(self, what: str, *values: str) -> Event:

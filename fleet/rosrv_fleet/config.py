@@ -82,7 +82,7 @@ class RetentionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
         return None if self.index_days is None else clock.utc_now().date() - timedelta(self.index_days)
 
     def keeps(self, day: date) -> bool:
-        """Whether the index keeps a day of arrival (UTC) now."""
+        """Return whether the index keeps a day of arrival (UTC) now."""
         oldest = self.oldest_day()
         return oldest is None or day >= oldest
 

@@ -69,7 +69,6 @@ class Shares:
         return min(most, left + (now - at) * rate)
 
     def _take_of_all(self, now: float) -> bool:
-        """Take one from the share of all addresses that are not proven."""
         at, left = self._all_others
         left = min(_ALL_OTHERS_AT_ONCE, left + (now - at) * _ALL_OTHERS_A_SECOND)
         self._all_others = (now, left - 1.0 if left >= 1.0 else left)
@@ -156,7 +155,7 @@ class ClientConnections:
         return self._requests.take(owner, proven=owner in self._proven)
 
     def is_proven(self, owner: str) -> bool:
-        """Whether a robot or an operator connected from an address (`owner_of`)."""
+        """Return whether a robot or an operator connected from an address (`owner_of`)."""
         return owner in self._proven
 
     def _made_room(self, owner: str, proven: bool) -> bool:

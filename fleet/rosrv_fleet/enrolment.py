@@ -64,7 +64,6 @@ class RobotAppliance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
     @property
     def public_key(self) -> bytes:
-        """Return the raw public key that seals its log."""
         return bytes.fromhex(self.key)
 
     @property
@@ -88,7 +87,6 @@ class Robot(RobotAppliance, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     @property
     def appliances(self) -> dict[str, RobotAppliance]:
-        """Return all appliances by name, with those that were removed."""
         return {self.appliance: self, **self.others}
 
     @property
@@ -100,7 +98,6 @@ class Robot(RobotAppliance, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     @property
     def public_keys(self) -> frozenset[bytes]:
-        """Return the raw public keys that seal its logs."""
         return frozenset(one.public_key for one in self.appliances.values())
 
     def appliance_with(self, der: bytes) -> str:

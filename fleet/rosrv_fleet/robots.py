@@ -246,7 +246,6 @@ class Robots:
 
 
 def _detail(robot: Robot, appliance: str) -> str:
-    """Return the words of an act about an appliance."""
     words = f"certificate {robot.appliances[appliance].fingerprint}"
     return f"{words} appliance {appliance}" if robot.others else words
 

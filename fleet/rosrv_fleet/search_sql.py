@@ -42,7 +42,6 @@ class SearchCursor(msgspec.Struct, frozen=True, array_like=True):
     id: str
 
     def text(self) -> str:
-        """Return the cursor as it is printed."""
         return base64.urlsafe_b64encode(msgspec.json.encode(self)).decode("ascii")
 
 

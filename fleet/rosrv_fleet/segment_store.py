@@ -137,7 +137,7 @@ class SegmentStore:
         return self._folder / "segments" / place.robot / place.log / bucket / name
 
     def has(self, place: SegmentPlace) -> bool:
-        """Whether the segment is stored, and its header can be read. Raises `OSError`."""
+        """Return whether the segment is stored, and its header can be read. Raises `OSError`."""
         return self.path(place).exists() and self._readable(place) is not None
 
     def header(self, place: SegmentPlace) -> SegmentHeader:
@@ -327,7 +327,6 @@ class SegmentStore:
         return len(found)
 
     def indexed(self, place: SegmentPlace) -> None:
-        """Note that the index has a segment, or does not need it."""
         for kind in ("pending", "large", "damaged"):
             self._unmark(kind, place)
 

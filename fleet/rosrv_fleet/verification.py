@@ -135,7 +135,6 @@ def _read(
 
 
 def _note_missing(proof: LogProof, header: SegmentHeader) -> None:
-    """Note the records between the proven ones and the beginning of a segment."""
     begin = header.start[0]
     if header.begin is None and proof.last == 0:
         proof.begins_after = begin

@@ -76,7 +76,6 @@ class RosNode:
 
     @property
     def tcpros(self) -> tuple[str, int]:
-        """Return the address of the topics and services."""
         return self._network.source, self._servers[1].port
 
     async def close(self) -> None:

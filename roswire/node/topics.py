@@ -225,7 +225,6 @@ class NodePublication:
 
     @property
     def subscribers(self) -> list[str]:
-        """Return the names of the connected subscribers."""
         return [one.name for one in self._served]
 
     def publish(self, body: bytes) -> None:

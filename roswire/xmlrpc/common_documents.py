@@ -163,7 +163,6 @@ def _answer(part: re.Match[bytes]) -> Value:
 
 
 def _fits(body: bytes, limits: XmlRpcLimits) -> bool:
-    """Whether a document is so short that nothing in it can exceed the limits."""
     return len(body) <= min(limits.body, limits.string, _SMALLEST * limits.elements) and limits.depth > 3
 
 

@@ -72,7 +72,7 @@ class ScriptHost:
         return found
 
     def _left(self) -> bool:
-        """Whether the ports are free for the next host of this network; a remaining process is terminated."""
+        """Return whether the ports are free for the next host of this network; a remaining process is terminated."""
         programs = self._programs()
         self._looks += 1
         if self._looks == _PATIENT_LOOKS:

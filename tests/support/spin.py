@@ -158,7 +158,7 @@ Step = tuple[str, int, int]
 
 
 def accepts(folder: Path, bounds: Bounded, trace: Sequence[Step]) -> bool:
-    """Whether an execution of the model leaves this trace; all executions are tried."""
+    """Return whether an execution of the model leaves this trace; all executions are tried."""
     steps = [
         f"    kind[{place}] = {what}; first[{place}] = {one}; second[{place}] = {other};\n"
         for place, (what, one, other) in enumerate(trace)

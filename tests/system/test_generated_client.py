@@ -251,7 +251,7 @@ def generate(generator: Path, contract: Any, folder: Path) -> None:
 
 
 def same(read: Any, said: Any) -> bool:
-    """Whether a JSON answer was parsed without loss; timestamps have fewer digits."""
+    """Return whether a JSON answer was parsed without loss; timestamps have fewer digits."""
     if isinstance(read, dict) and isinstance(said, dict):
         return read.keys() == said.keys() and all(same(read[name], said[name]) for name in said)
     if isinstance(read, list) and isinstance(said, list):

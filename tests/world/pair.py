@@ -86,7 +86,7 @@ class PairWorld(World):
         return self.robot.translated(address) if address[0] == APPLIANCE else address
 
     def _reaches(self, source: str, target: str) -> bool:
-        """Whether packets of a host reach another one; those of nodes pass the robot's firewall."""
+        """Return whether packets of a host reach another one; those of nodes pass the robot's firewall."""
         ends = {source, target}
         if frozenset(ends) in self.network.cut:
             return False

@@ -54,7 +54,7 @@ def call(uri, method, *parameters):
 
 
 def granted(answer):
-    """Whether a ROS API reported success."""
+    """Return whether a ROS API reported success."""
     return bool(answer) and answer[0] == 1
 
 
@@ -120,7 +120,6 @@ def watch_the_battery():
 
 
 def spy_on_gps():
-    """Read the robot's position."""
     return subscribe(GPS)
 
 
@@ -139,7 +138,7 @@ def subscribe(topic):
 
 
 def reads(host, port, topic):
-    """Whether a TCPROS port sends a message of the topic to an unknown host."""
+    """Return whether a TCPROS port sends a message of the topic to an unknown host."""
     fields = {"callerid": ME, "topic": topic, "type": "*", "md5sum": "*", "tcp_nodelay": "0"}
     body = b"".join(
         struct.pack("<I", len(text)) + text for text in (f"{k}={v}".encode() for k, v in fields.items())

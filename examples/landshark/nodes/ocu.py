@@ -40,7 +40,6 @@ class Operator:
             rospy.Subscriber(topic, kind, self.look, callback_args=topic)
 
     def look(self, message, topic):
-        """Store the newest message of a topic."""
         with self.changed:
             self.seen[topic] = message
             if topic == "/landshark/odom":
@@ -56,7 +55,7 @@ class Operator:
             return self.changed.wait_for(lambda: rospy.is_shutdown() or condition(self.seen), seconds)
 
     def connected(self):
-        """Whether every control reaches a driver and every display shows something."""
+        """Return whether every control reaches a driver and every display shows something."""
         controls = (self.velocity, self.turret, self.trigger)
         return len(self.seen) == 4 and all(control.get_num_connections() for control in controls)
 

@@ -71,7 +71,6 @@ def pose_of(odometry: Any) -> Pose:
 
 
 def normal_angle(angle: float) -> float:
-    """Return the same direction within -pi to pi."""
     return math.remainder(angle, math.tau)
 
 

@@ -255,7 +255,6 @@ def _files_in(folder: Path) -> dict[str, bytes]:
 
 
 def _copy(source: Path, target: Path, pattern: str, leave: str = "") -> None:
-    """Copy files that are not there yet."""
     for path in sorted(source.glob(pattern)):
         copied = target / path.relative_to(source)
         if copied.exists() or (leave and f".{leave}." in path.name):

@@ -113,7 +113,6 @@ def choice(name: str, label: str, options: Iterable[tuple[str, str]], chosen: st
 
 
 def field(name: str, value: str) -> str:
-    """Return a text field with its name as its label."""
     return f'<label>{name} <input name="{name}" value="{escape(value)}" maxlength="256"></label>'
 
 

@@ -58,7 +58,7 @@ class StoredEvidence(EvidenceContent, frozen=True, kw_only=True):
     by: str
 
     def has(self, record: Mapping[str, Any]) -> bool:
-        """Whether it contains a record of a search."""
+        """Return whether it contains a record of a search."""
         is_same_log = self.robot == record["robot"] and self.log == record["log"]
         return is_same_log and rfc3339(self.since) <= str(record["time"]) < rfc3339(self.until)
 

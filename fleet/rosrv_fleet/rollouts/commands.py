@@ -91,7 +91,6 @@ def _problems(group: dict[str, Any]) -> str:
 
 
 def _time(seconds: float) -> str:
-    """Return a time since the epoch in UTC."""
     return f"{datetime.datetime.fromtimestamp(seconds, datetime.UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 

@@ -99,7 +99,6 @@ class BundleRollout(msgspec.Struct, frozen=True):
 
 
 def ring_of(rollout: BundleRollout, robot: str) -> int:
-    """Return the index of a robot's ring."""
     return rollout.terms.ring_of(robot, rollout.bundle)
 
 
@@ -240,7 +239,6 @@ def unhealthy(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: floa
 
 
 def _members(rollout: BundleRollout, robots: Mapping[str, RobotSeen], index: int) -> list[str]:
-    """Return the robots of a ring that count for the gates."""
     return [robot for robot in rollout.baselines if robot in robots and ring_of(rollout, robot) == index]
 
 

@@ -378,12 +378,10 @@ def _checked(report: RobotReport, now: float) -> RobotSeen:
 
 
 def _in_force_after(rollout: BundleRollout) -> str:
-    """Return the bundle that a group has after its last rollout."""
     return rollout.path if rollout.state == "done" else rollout.before
 
 
 def _stamp(folder: Path) -> _Stamp:
-    """Return a stamp that changes when the published metadata change."""
     found = (
         (path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in (folder / "metadata").iterdir()
     )

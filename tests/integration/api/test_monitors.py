@@ -86,7 +86,7 @@ def _compiler(appliance: Appliance) -> tuple[int, float]:
 
 
 def _compiling(appliance: Appliance, before: tuple[int, float]) -> bool:
-    """Whether the compiler is working: since `before`, it used more processor time than a start takes."""
+    """Return whether the compiler is working: since `before`, it used more processor time than a start takes."""
     pid, seconds = _compiler(appliance)
     return seconds > 2.5 + (before[1] if pid == before[0] else 0)
 

@@ -170,7 +170,7 @@ def differences(answers: Answers) -> list[str]:
 
 
 def same(one: Any, other: Any) -> bool:
-    """Whether both are equal, including types and the order of keys.
+    """Return whether both are equal, including types and the order of keys.
 
     `1` differs from `True` and `1.0`; `nan` equals `nan`.
     """

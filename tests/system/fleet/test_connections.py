@@ -31,7 +31,7 @@ def _connect(site: FleetSite, source: str = "127.0.0.1") -> socket.socket:
 
 
 def _is_closed(connection: socket.socket) -> bool:
-    """Whether the collector has closed a connection; wait up to a second."""
+    """Return whether the collector has closed a connection; wait up to a second."""
     connection.settimeout(1.0)
     try:
         return connection.recv(1) == b""
@@ -42,7 +42,7 @@ def _is_closed(connection: socket.socket) -> bool:
 
 
 def _is_held(connection: ssl.SSLSocket) -> bool:
-    """Whether the collector answers a request, and waits for the end of a second one."""
+    """Return whether the collector answers a request, and waits for the end of a second one."""
     connection.settimeout(LIMIT)
     try:
         connection.sendall(b"GET /v1/bundles/x HTTP/1.1\r\nHost: x\r\n\r\nGET ")

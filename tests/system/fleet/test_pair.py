@@ -121,7 +121,7 @@ def _restart(site: StandbySite, name: str) -> None:
 
 
 def _all_pushed(site: StandbySite, fleet: Fleet, name: str) -> bool:
-    """Whether the collector has all records of an appliance that a checkpoint seals."""
+    """Return whether the collector has all records of an appliance that a checkpoint seals."""
     log = site.appliances[name].state / "control" / "audit.db"
     last = signed_checkpoints(log, 0, 1_000_000)[-1]
     found = {proof["log"]: proof["last"] for proof in fleet.proven()}

@@ -96,7 +96,7 @@ def unharmed(robot: Host, attacker: Host, protected: Host, ports: tuple[int, ...
 
 @pytest.fixture(params=[False, True], ids=["resets", "silent"])
 def silent(request: pytest.FixtureRequest, robot: Host) -> bool:
-    """Whether the robot's own firewall drops unexpected answers: forged connections then stay half-open."""
+    """Return whether the robot's own firewall drops unexpected answers: forged connections then stay half-open."""
     if request.param:
         load(robot.namespace, "nft", _SILENT)
     return bool(request.param)

@@ -28,7 +28,7 @@ def released(tmp_path: Path) -> Path:
 
 
 def checks(folder: Path) -> bool:
-    """Whether the two commands of docs/install.md (openssl and coreutils) accept the release."""
+    """Return whether the two commands of docs/install.md (openssl and coreutils) accept the release."""
     signature = folder.parent / "signature"
     decoded = subprocess.run(
         ["base64", "--decode", "SHA256SUMS.sig"], cwd=folder, capture_output=True, check=False

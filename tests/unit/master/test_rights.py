@@ -196,7 +196,7 @@ POLICIES = st.fixed_dictionaries(
 
 
 def granted_by(decision: Decision) -> bool:
-    """Whether the rules grant the request; audit-only mode allows denied requests."""
+    """Return whether the rules grant the request; audit-only mode allows denied requests."""
     return decision.allowed and not decision.would_deny
 
 

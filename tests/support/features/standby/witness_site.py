@@ -167,7 +167,7 @@ class Site:
         return self.sockets.enter_context(host.run(lambda: socket.create_server((host.address, port))))
 
     def refused(self, host: Host, address: str, port: int) -> bool:
-        """Whether a connection is refused at once. While the rules change, an attempt may get no answer."""
+        """Return whether a connection is refused at once. While the rules change, an attempt may get no answer."""
         begun = time.monotonic()
         try:
             self.connect(host, address, port, LIMIT / 3).close()

@@ -56,7 +56,7 @@ async def listening(limits: ApiLimits) -> AsyncIterator[Connect]:
 
 
 async def served(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
-    """Whether a request is answered; False when the connection is closed instead."""
+    """Return whether a request is answered; False when the connection is closed instead."""
     try:
         writer.write(REQUEST)
         await writer.drain()

@@ -23,7 +23,7 @@ def replica(tmp_path: Path) -> Iterator[Replica]:
 
 
 async def complete(replica: Replica, folder: Path, boot: str, *, followed: bool, seconds: float) -> bool:
-    """Whether the appliance may take over within this time."""
+    """Return whether the appliance may take over within this time."""
     done = asyncio.Event()
     task = asyncio.create_task(ReplicaSync(replica, folder, boot).run(lambda: followed, done.set))
     try:

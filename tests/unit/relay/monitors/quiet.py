@@ -19,7 +19,7 @@ class Timers:
         self._work: list[Callable[[], None]] = []
 
     def over(self) -> bool:
-        """Whether the turn is over: never."""
+        """Return whether the turn is over: never."""
         return False
 
     def beside(self, work: Callable[[], Any], done: Callable[[Any], None]) -> "Timers":
