@@ -78,17 +78,27 @@ class MemoryServer:
         self.network.servers.pop(self.address, None)
 
 
+class _Reader(asyncio.StreamReader):
+    _buffer: bytearray
+
+    def discard(self) -> bool:
+        """Drop the unread bytes; return whether there were any."""
+        unread = bool(self._buffer)
+        self._buffer.clear()
+        return unread
+
+
 @dataclass(eq=False)
 class MemoryWriter:
     """One end of a connection: its reader, and itself as writer and as the reader's transport."""
 
     address: tuple[str, int]
     closed: bool = False
-    reader: asyncio.StreamReader = field(init=False)
+    reader: _Reader = field(init=False)
     peer: "MemoryWriter" = field(init=False)
 
     def __post_init__(self) -> None:
-        self.reader = asyncio.StreamReader(limit=_ROOM)
+        self.reader = _Reader(limit=_ROOM)
         self.reader.set_transport(self)  # type: ignore[arg-type]  # a reader only pauses and resumes it
         self.has_room = asyncio.Event()
         self.has_room.set()
@@ -107,8 +117,8 @@ class MemoryWriter:
         if not self.closed:
             self.closed = True
             self.has_room.set()
-            if self.reader._buffer:  # type: ignore[attr-defined]  # as with TCP, unread bytes reset the connection
-                self.peer.reader._buffer.clear()  # type: ignore[attr-defined]
+            if self.reader.discard():  # as with TCP, unread bytes reset the connection
+                self.peer.reader.discard()
             for end in (self, self.peer):
                 if not end.reader.at_eof():
                     end.reader.feed_eof()
