@@ -105,14 +105,20 @@ class Naive:
 
 def drawn(random: Random) -> Phase:
     due = {
-        (random.choice(ABC), random.choice(ABC)): random.randint(1, 4) for _ in range(random.randint(0, 2))
+        (random.choice(ABC), random.choice(ABC)): random.randint(1, 6) for _ in range(random.randint(0, 3))
     }
-    first, second = random.choice(ABC), random.choice(ABC)
-    forbidden = [
-        Meaning(random.choice(("forbids", "requires")), None, None, first, second, random.randint(0, 3))
-    ]
-    echoes = {random.choice(ABC): random.choice(ABC)} if random.random() < 0.3 else {}
-    return Phase(forbidden[: random.randint(0, 1)], [(*pair, within) for pair, within in due.items()], echoes)
+    forbidden = [drawn_ban(random) for _ in range(random.randint(0, 2))]
+    echoes = {random.choice(ABC): random.choice(ABC) for _ in range(max(0, random.randint(-2, 2)))}
+    return Phase(forbidden, [(*pair, within) for pair, within in due.items()], echoes)
+
+
+def drawn_ban(random: Random) -> Meaning:
+    """Draw what a phase forbids, in any scope; an event is rarely forbidden for ever."""
+    kind = random.choice(("no", "forbids", "requires"))
+    opens, closes = random.choice((None, None, *ABC)), random.choice((None, None, *ABC))
+    within = None if random.random() < 0.3 else random.randint(0, 5)
+    closes = None if closes == opens else closes
+    return Meaning(kind, opens, closes, random.choice(ABC), random.choice(ABC), within)
 
 
 def sent(outcome: Outcome, time: int, event: str) -> Timed:
