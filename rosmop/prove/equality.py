@@ -181,10 +181,10 @@ class Validation:
         possible = {
             text: simple for text, one in wrong.items() if not z3.is_false(simple := z3.simplify(one))
         }
-        if self._asked(abstracted([*known, either(*possible.values())]), begun)[0] == z3.unsat:
-            return None
         for text, condition in possible.items():
             question = [*known, condition]
+            if self._asked(abstracted(question, floats=True), begun)[0] == z3.unsat:
+                continue
             answer, guess = self._asked(abstracted(question), begun)
             if answer != z3.unsat:
                 if guess is not None and _holds(question, guess):

@@ -198,12 +198,14 @@ _COSTLY = frozenset((
     z3.Z3_OP_FPA_TO_SBV, z3.Z3_OP_FPA_TO_IEEE_BV, z3.Z3_OP_BMUL, z3.Z3_OP_BSDIV, z3.Z3_OP_BUDIV, z3.Z3_OP_BSREM,
     z3.Z3_OP_BUREM, z3.Z3_OP_BSDIV_I, z3.Z3_OP_BUDIV_I, z3.Z3_OP_BSREM_I, z3.Z3_OP_BUREM_I,
 ))  # fmt: skip
+_FLOATING = frozenset((z3.Z3_FLOATING_POINT_SORT, z3.Z3_ROUNDING_MODE_SORT))
 
 
-def abstracted(terms: Sequence[Term]) -> list[Term]:
+def abstracted(terms: Sequence[Term], *, floats: bool = False) -> list[Term]:
     """Replace the results of costly operations by variables, with the same variable for equal operands.
 
-    If a formula over these variables cannot hold, the original formula cannot hold.
+    With `floats`, floating-point numbers become values without a meaning, which are only equal or not, and so do the
+    results of all operations on them. If a formula over these variables cannot hold, the original formula cannot hold.
     """
     known: dict[int, Term] = {}
     kept: list[Term] = []  # kept alive as long as their numbers are used
@@ -220,17 +222,26 @@ def abstracted(terms: Sequence[Term]) -> list[Term]:
         if term.get_id() in known:
             continue
         new = [known[part.get_id()] for part in parts]
-        result = (
-            term.decl()(*new)
-            if any(not argument.eq(part) for argument, part in zip(new, parts, strict=True))
-            else term
-        )
-        if term.decl().kind() in _COSTLY and not _is_cheap(term.decl().kind(), new):
-            sorts = [*(argument.sort() for argument in new), result.sort()]
-            result = z3.Function(" ".join(map(str, (term.decl(), *sorts))), *sorts)(*new)
         kept.append(term)
-        known[term.get_id()] = result
+        known[term.get_id()] = _abstracted(term, new, floats=floats)
     return [known[term.get_id()] for term in begin]
+
+
+def _abstracted(term: Term, operands: Sequence[Term], *, floats: bool) -> Term:
+    """Return a term with these operands; its result is a variable if its operation is costly."""
+    kind, parts = term.decl().kind(), term.children()
+    sorts = [part.sort() for part in (*parts, term)]
+    if floats and any(sort.kind() in _FLOATING for sort in sorts):
+        if kind == z3.Z3_OP_ITE:
+            return z3.If(*operands)
+        if kind == z3.Z3_OP_EQ:
+            return operands[0] == operands[1]
+        sorts = [z3.DeclareSort(str(sort)) if sort.kind() in _FLOATING else sort for sort in sorts]
+    elif kind not in _COSTLY or _is_cheap(kind, operands):
+        changed = any(not operand.eq(part) for operand, part in zip(operands, parts, strict=True))
+        return term.decl()(*operands) if changed else term
+    name = " ".join(map(str, (term.decl() if parts else term.sexpr(), *sorts)))  # exact for each number
+    return z3.Function(name, *sorts)(*operands)
 
 
 def _is_cheap(kind: int, operands: Sequence[Term]) -> bool:

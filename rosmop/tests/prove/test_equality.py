@@ -51,6 +51,21 @@ def test_no_shipped_specification_is_left_out() -> None:
     assert {path.stem for path in MONITORS.glob("*.rv")} == set(SHIPPED)
 
 
+PRESETS = {
+    "agree": {"one", "two", "drive"}, "arm": {"battery", "position", "preflight", "drive"}, "estop": {"drive"},
+    "rate": {"drive"}, "sane": {"drive"}, "sensor": {"drive"}, "separation": {"drive"}, "speed": {"drive"},
+    "withhold": {"frame", "turn"}, "deadman": set(), "fence": set(), "answer": set(), "joints": set(),
+}  # fmt: skip
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("path", sorted(MONITORS.glob("guards/*.rv")), ids=lambda path: str(path.stem))
+def test_presets_of_guards(path: Path) -> None:
+    """The page on assurance lists these events as proved."""
+    found = answers(path.read_text())
+    assert {name.partition(".")[2] for name, answer in found.items() if answer == EQUAL} == PRESETS[path.stem]
+
+
 PROVED = {
     "guards, fields that are written, a drop": event(
         "if (x < 3) { return; } if (y > 2.5) { y = -y; } x = n + 7; n++;",
