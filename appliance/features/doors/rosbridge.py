@@ -2,7 +2,7 @@
 
 A frame of the client goes in; requests to the node of the door and frames for the client come out. Rules:
 
-1. The requests of one frame are a sequence: if the session cannot carry one out, it drops later ones on the same topic.
+1. The requests of one frame are carried out in order. After a refused advertisement, its message is dropped.
 2. Every refusal is words: a `status` of the level error with the id of the operation, or a `service_response` with
    `result` false and an object with `message`. Nothing else is sent without a request.
 3. Frames repeat the client's own spelling of a name; requests have the canonical name.

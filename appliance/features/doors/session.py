@@ -32,7 +32,7 @@ from appliance.features.doors.door_node import DoorNode
 from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.lookout import Lookout
 from appliance.features.doors.origins import rejection
-from appliance.features.doors.requests import AdvertiseTopic, DoorRequest, Frame, UnadvertiseTopic
+from appliance.features.doors.requests import AdvertiseTopic, DoorRequest, Frame, PublishMessage, UnadvertiseTopic
 from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerStalledError
 from roswire.errors import RosError
@@ -275,7 +275,7 @@ class DoorSession:
                 self._disconnect(CloseCode.POLICY_VIOLATION, str(error))
 
     async def _carry_out(self, frame: Frame) -> None:
-        """Carry out the requests of a frame; after a refusal, drop later ones on the same topic."""
+        """Carry out the requests of a frame; after a refused advertisement, drop the messages of its topic."""
         self.received += 1
         requests = self._protocol.receive(frame)
         self._wake.set()
@@ -283,16 +283,15 @@ class DoorSession:
         for request in requests:
             if self._over.is_set():
                 return
-            topic = getattr(request, "topic", "")
-            if topic in refused:
+            if isinstance(request, PublishMessage) and request.topic in refused:
                 continue
             try:
                 await self._door.carry_out(request, self)
                 self._note_will(request)
             except RosError as error:
                 self.refusals += 1
-                if topic:
-                    refused.add(topic)
+                if isinstance(request, AdvertiseTopic):
+                    refused.add(request.topic)
                 self._protocol.failed(request, str(error))
                 self._wake.set()
 
