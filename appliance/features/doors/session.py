@@ -32,7 +32,13 @@ from appliance.features.doors.door_node import DoorNode
 from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.lookout import Lookout
 from appliance.features.doors.origins import rejection
-from appliance.features.doors.requests import AdvertiseTopic, DoorRequest, Frame, PublishMessage, UnadvertiseTopic
+from appliance.features.doors.requests import (
+    AdvertiseTopic,
+    DoorRequest,
+    Frame,
+    PublishMessage,
+    UnadvertiseTopic,
+)
 from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerStalledError
 from roswire.errors import RosError
