@@ -80,15 +80,18 @@ def raise_priority(by: int) -> int:
 
 
 def add_niceness(by: int) -> None:
-    """Add to the niceness of this process, and give its session the result; do nothing that is not permitted.
+    """Add to the niceness of this process; do nothing that is not permitted.
 
     Where the kernel shares the processor among sessions (autogroups), the niceness of a process has an effect only
-    inside its session. So call this in a session of this process alone.
+    inside its session. So a session with a process of higher priority gets its niceness: call this in a session of
+    this process alone. One with a lower priority keeps its share, or a busy machine would lock operators out.
     """
     with contextlib.suppress(PermissionError):
         os.nice(by)
-    with contextlib.suppress(OSError):
-        _AUTOGROUP.write_text(str(os.getpriority(os.PRIO_PROCESS, 0)), encoding="ascii")
+    niceness = os.getpriority(os.PRIO_PROCESS, 0)
+    if niceness < 0:
+        with contextlib.suppress(OSError):
+            _AUTOGROUP.write_text(str(niceness), encoding="ascii")
 
 
 def shorten_slice(nanoseconds: int) -> None:

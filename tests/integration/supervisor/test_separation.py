@@ -76,7 +76,7 @@ def test_the_order_of_oom_kills(appliance: Appliance) -> None:
 
 
 def test_the_weights_of_processes(appliance: Appliance) -> None:
-    """No busy program delays a stop, and the api yields to all others; also where sessions share the processor."""
+    """No busy program delays a stop, also where sessions share the processor; the api yields, but never starves."""
     pids = {role: int(row["pid"]) for role, row in appliance.processes().items()}
     nice = {role: os.getpriority(os.PRIO_PROCESS, pid) for role, pid in pids.items()}
     own = os.getpriority(os.PRIO_PROCESS, 0)
@@ -85,7 +85,7 @@ def test_the_weights_of_processes(appliance: Appliance) -> None:
     for role in ("relay", "control", "api"):
         group = Path(f"/proc/{pids[role]}/autogroup")
         if group.exists() and (text := group.read_text()):
-            assert text.endswith(f" nice {nice[role]}\n")
+            assert text.endswith(f" nice {min(0, nice[role])}\n")
 
 
 def test_a_relay_has_short_turns(appliance: Appliance) -> None:
