@@ -50,7 +50,6 @@ class FeatureParts:
         return {name: address for kept in self.kept.values() for name, address in kept.addresses().items()}
 
     def connected(self, door: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
-        """Pass a WebSocket of the api on; return an HTTP status and why it is refused, or an empty text."""
         connected = next(filter(None, (part.connected for part in self._parts)), None)
         return (
             connected(door, ticket, peer, descriptor)
@@ -84,7 +83,6 @@ class FeatureParts:
         return next((part.links[name] for part in self._parts if name in part.links), None)
 
     def longest(self, role: str) -> int:
-        """Return the most bytes of a message of a role."""
         return next((part.longest[role] for part in self._parts if role in part.longest), LONGEST)
 
     def methods(self) -> "tuple[RequestMethod[Any], ...]":
@@ -108,7 +106,6 @@ class FeatureParts:
         return details
 
     async def called(self, call: "OwnServiceCalled") -> "OwnServiceAnswered":
-        """Answer a node's call of one of the appliance's own services."""
         (called,) = (
             answer
             for part in self._parts
@@ -118,19 +115,16 @@ class FeatureParts:
         return await called(call)
 
     def holders(self) -> "dict[str, Address]":
-        """Return the host that holds each group of `[Authority]`."""
         return {group: host for part in self._parts for group, host in part.holders().items()}
 
     def approved(self) -> "frozenset[Approval]":
         return frozenset(approval for part in self._parts for approval in part.approved())
 
     def hold_call(self, request: "Request") -> str:
-        """Hold a call that needs an approval; return the answer to its host."""
         hold = next((part.hold_call for part in self._parts if part.hold_call is not None), None)
         return _NO_APPROVALS if hold is None else hold(request)
 
     async def approve(self, wanted: "ApprovalWanted") -> "ApprovalAnswered":
-        """Decide about one request of a client to a service."""
         approve = next((part.approve for part in self._parts if part.approve is not None), None)
         if approve is not None:
             return await approve(wanted)
@@ -146,5 +140,4 @@ class FeatureParts:
         return next((part.hosts for part in self._parts if part.hosts is not None), self._no_hosts)
 
     def work(self) -> dict[str, Callable[[], Awaitable[None]]]:
-        """Return the work that runs until control ends."""
         return {what: one for part in self._parts for what, one in part.work.items()}

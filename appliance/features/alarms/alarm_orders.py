@@ -19,7 +19,6 @@ from appliance.telemetry.audit_trail import AuditTrail
 
 
 def operate(context: OperatorContext) -> FeaturePart:
-    """Return the part of control."""
     orders = AlarmOrders(context.handled_alarms, context.core.trail, context.status)
     return FeaturePart(
         methods=(

@@ -76,7 +76,6 @@ class ApprovalOrders:
     # --- calls ---
 
     def hold_call(self, request: Request) -> str:
-        """Hold a publication or a write; return the answer to its host."""
         call = HeldCall(request.host, request.category, request.resource)
         return self._held(call, request.caller_id, "", b"")
 
@@ -243,7 +242,6 @@ class ApprovalOrders:
                 await self._stop.after(str(call.host), {call.resource}, f"approval {entry.number} ended")
 
     async def _enforce(self) -> None:
-        """Decide all rights again if the leases differ from those in force."""
         if self._policy().approved != self.approved():
             self._decide_again()
             await self._carried_out()
@@ -259,7 +257,6 @@ class ApprovalOrders:
         return ApprovalCounts(len(waiting), round(oldest, 1), leases, len(self._unanswered))
 
     def limits(self) -> tuple[LimitUse, ...]:
-        """Return how much of the table is used."""
         (host, used), bounds = self._table.most(), APPROVALS.bounds
         whole, name = len(self._table.entries()), "" if host is None else str(host)
         return (LimitUse("approvals", whole, bounds.whole, "", name, used, bounds.host),)

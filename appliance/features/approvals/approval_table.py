@@ -125,7 +125,6 @@ class ApprovalTable:
         )
 
     def refuse(self, entry: ApprovalEntry, who: str) -> ApprovalEntry:
-        """Refuse a call until its entry ends."""
         return self._put(replace(entry, state=ApprovalState.REFUSED, who=who))
 
     def end(self, entry: ApprovalEntry) -> None:

@@ -71,7 +71,6 @@ class GroupHolders:
         return True
 
     def free(self, group: str) -> Holding | None:
-        """End the authority over a group, and return who had it."""
         return self._held.pop(group, None)
 
     def hold(self, group: str, host: Address, now: float) -> None:
@@ -105,7 +104,6 @@ class GroupHolders:
         return f"it was silent for {group.lease:g} s" if left is not None and left <= 0 else ""
 
     def successor(self, group: AuthorityGroup, now: float) -> Address | None:
-        """Return the waiting host that gets the group once it is free."""
         able = (Claim.TAKE, Claim.OVERRIDE)
         return next((host for host in self.waiting(group, now) if self._claim_of(group, host) in able), None)
 

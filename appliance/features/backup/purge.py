@@ -15,9 +15,9 @@ from appliance.supervisor.state_directory import StateDirectory, foreign
 
 
 def purge(state: Path) -> tuple[int, int]:
-    """Remove an unused state directory; return the number of files and the number of overwritten files.
+    """Return the numbers of removed files and of overwritten ones.
 
-    Raises `BackupError` if the directory does not exist or is in use, or if a file cannot be removed.
+    Raises `BackupError` if `state` does not exist or is in use, or if a file cannot be removed.
     """
     state = state.absolute()
     try:
@@ -51,7 +51,6 @@ def purge(state: Path) -> tuple[int, int]:
 
 
 def _write_over(state: Path) -> tuple[int, int]:
-    """Overwrite small files except links; return the numbers of all files and of overwritten files."""
     files = written = 0
     for _folder, _folders, names, at in os.fwalk(state, follow_symlinks=False):
         for name in names:

@@ -54,7 +54,6 @@ _REGISTERED = {
 
 
 async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
-    """Return the part of control."""
     orders = BlockOrders(
         base.blocks,
         base.policies,

@@ -76,7 +76,6 @@ def _scan(frame: bytes) -> None:
 
 
 def _head(frame: bytes, position: int) -> tuple[int, int, int]:
-    """Return the major type and argument of a value, and the position after them."""
     if position >= len(frame):
         raise MessageValueError(f"not CBOR: the frame ends at byte {position}")
     major, short = frame[position] >> 5, frame[position] & 31

@@ -245,7 +245,6 @@ class DoorOrders:
         return {"doors": DoorsState([self._processes.health(row) for row in rows]) if rows else None}
 
     def limits(self) -> tuple[LimitUse, ...]:
-        """Return how many doors exist, and how many connections they have."""
         rows = self._table.live()
         counts = {row.address: self._processes.state(row)[0].connections for row in rows}
         most = max(counts, key=lambda address: counts[address], default="")

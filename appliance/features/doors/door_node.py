@@ -391,7 +391,6 @@ class DoorNode:
     # --- parameters ---
 
     async def _parameters(self, names: Sequence[str]) -> dict[str, Any]:
-        """Return the values of parameters; those that do not exist are left out."""
         if not names:
             listed = await self.node.master("getParamNames")
             names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []

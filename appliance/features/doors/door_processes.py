@@ -104,7 +104,6 @@ class DoorProcesses:
         return self._slots[row.slot or 0].clients
 
     def health(self, row: DoorRow) -> DoorHealth:
-        """Return the counts of a door and its process for metrics and alarms."""
         slot, now = self._slots[row.slot or 0], clock.now()
         counts = slot.counts
         return DoorHealth(

@@ -58,7 +58,6 @@ class DoorTable:
         return [row.port for row in self.live() if row.port is not None]
 
     def addresses(self) -> Mapping[str, Address]:
-        """Return the addresses of `door:NAME` in the policy."""
         return {} if self.problem else {f"{DOOR}{row.name}": address_of(row.address) for row in self.live()}
 
     def of(self, name: str) -> DoorRow:
@@ -125,7 +124,6 @@ class DoorTable:
         self._store.doors.save(row)
 
     def remove(self, name: str) -> DoorRow:
-        """Remove a door; return its last row."""
         row = self.of(name)
         self.save(row._replace(removed=clock.wall(), slot=None))
         return row

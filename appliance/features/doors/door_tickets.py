@@ -50,7 +50,6 @@ class DoorTickets:
         return row, text
 
     def find(self, door: str, text: str) -> TicketRow | None:
-        """Return the valid ticket for this door with this text, or None."""
         row = shown(text, self._rows)
         return None if row is None or row.door != door or self._ends.passed(row.id, row.expires) else row
 
@@ -69,7 +68,6 @@ class DoorTickets:
 
 
 def new_ticket(door: str, seconds: float, who: str) -> tuple[TicketRow, str]:
-    """Return a new ticket: its row, and its text, which is stored nowhere."""
     number, secret, now = secrets.token_hex(6), secrets.token_urlsafe(32), clock.wall()
     return TicketRow(number, door, _hash(secret), now, now + seconds, who), f"{number}.{secret}"
 

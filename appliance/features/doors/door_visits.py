@@ -34,7 +34,6 @@ class DoorVisits:
         self._visits: dict[str, _Visit] = {}
 
     def make(self, door: str, who: str) -> tuple[TicketRow, str]:
-        """Make a ticket; return its row and its text."""
         own = [one for one in self._visits.values() if one.row.who == who and not one.over]
         for visit in own[: max(0, len(own) + 1 - _MOST_OF_PERSON)]:
             visit.over = True
@@ -51,7 +50,6 @@ class DoorVisits:
         self._visits[ticket].until = None
 
     def left(self, door: str, ticket: str) -> None:
-        """Forget a visit whose connection ended, by the report of its door."""
         visit = self._visits.get(ticket)
         if visit is not None and visit.row.door == door:
             del self._visits[ticket]

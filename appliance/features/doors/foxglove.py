@@ -114,7 +114,6 @@ class Foxglove:
     # --- frames of the client ---
 
     def receive(self, frame: Frame) -> list[DoorRequest]:
-        """Return the requests of a frame; replies go to the queue. Raises `ViewerStalledError`."""
         try:
             if isinstance(frame, bytes):
                 return self._binary(frame)
@@ -248,7 +247,7 @@ class Foxglove:
         self._tell("serviceCallFailure", serviceId=service, callId=call, message=text)
 
     def failed(self, request: DoorRequest, reason: str) -> None:
-        """Refuse a request in words, and forget what it began. Raises `ViewerStalledError`."""
+        """Refuse a request in words, and forget what it began."""
         match request:
             case CallOfService():
                 service, call = self._calls.pop(request.call, (0, 0))
@@ -262,14 +261,12 @@ class Foxglove:
         self._refuse(reason)
 
     def answered(self, number: int, values: Raw | bytes) -> None:
-        """Answer a call of the client. Raises `ViewerStalledError`."""
         if number in self._calls:
             service, call = self._calls.pop(number)
             head = _SERVICE_CALL.pack(3, service, call, len(_ENCODINGS[0])) + _ENCODINGS[0].encode("ascii")
             self.queue.reply(head + bytes(values))
 
     def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
-        """Send the values of parameters. Raises `ViewerStalledError`."""
         rows = [{"name": name, "value": value} for name, value in values.items()]
         self._tell("parameterValues", parameters=rows, **({} if reply_to is None else {"id": reply_to}))
 
@@ -343,12 +340,10 @@ class Foxglove:
             self._tell("connectionGraphUpdate", **changed, removedTopics=removed, removedServices=services)
 
     def message(self, message: DoorMessage, now: float) -> None:
-        """Queue a message for each subscription to its topic; `now` is a monotonic time in seconds."""
         for number in self._by_topic.get(message.topic, ()):
             self.queue.put(number, message, len(message.body), now)
 
     def next_frame(self, now: float) -> Frame | None:
-        """Return the next frame for the client; None if nothing may be sent now."""
         taken = self.queue.take(now)
         if taken is None or taken[0] is None:
             return None if taken is None else taken[1]
@@ -356,7 +351,6 @@ class Foxglove:
         return _MESSAGE_DATA.pack(1, number, message.received) + bytes(message.body)
 
     def next_time(self) -> float | None:
-        """Return the time of the next frame that waits; None if none waits."""
         return self.queue.next_time()
 
 

@@ -44,11 +44,9 @@ class KeptDoors:
         self.usable: Callable[[], frozenset[str]]
 
     def bearers(self) -> frozenset[str]:
-        """Return the names of the tokens and sessions that may be used now."""
         return self.usable()
 
     def addresses(self) -> Mapping[str, Address]:
-        """Return the addresses of `door:NAME` in the policy."""
         return self.table.addresses()
 
 
@@ -81,7 +79,6 @@ class LateOrders(Orders):
 
 
 def operate(context: OperatorContext) -> FeaturePart:
-    """Return the part that answers operators' requests."""
     orders = LateOrders(context)
     if "doors" in context.kept:
         _kept(context).usable = context.bearers

@@ -58,7 +58,6 @@ class Lookout:
         return DoorSurroundings(graph, topics, services)
 
     async def _ask(self, graph: VisibleGraph) -> None:
-        """Ask about topics without a known definition, and about services without a known type."""
         unknown = [
             topic for topic in sorted(graph.publishers) if self._text(graph.types.get(topic, "")) is None
         ]

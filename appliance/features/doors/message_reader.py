@@ -162,7 +162,6 @@ def _one(name: str, read: _Read) -> _ReadInto:
 
 
 def _scalars(fields: list[Field]) -> _ReadInto:
-    """Read consecutive numbers at once."""
     whole = struct.Struct("<" + "".join(PRIMITIVES[field.type][0] for field in fields))
     names = [field.name for field in fields]
 

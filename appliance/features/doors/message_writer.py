@@ -195,7 +195,6 @@ class _Writers:
             raise _FieldError(f"The message has more than {self._most_bytes} bytes")
 
     def _zeros(self, field: Field) -> int:
-        """Return the number of bytes of a field that is zero."""
         if field.is_array and field.length is None:
             return 4
         if field.type == "string":

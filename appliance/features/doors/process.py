@@ -46,7 +46,6 @@ _log = structlog.get_logger()
 
 
 def main(lifeline_fd: int, _index: int) -> None:
-    """Serve a door until it is removed, or the supervisor ends the process."""
     uvloop.run(_Process(lifeline_fd).run())
 
 
@@ -306,7 +305,6 @@ class _Process:
 
 
 def _protocol(node: str, queues: list[ViewerQueue[Any]], subprotocol: str | None) -> ClientProtocol:
-    """Return the protocol that a client speaks; its queue is added to `queues`."""
     queue: ViewerQueue[Any] = ViewerQueue()
     queues.append(queue)
     if subprotocol is None:

@@ -54,7 +54,6 @@ class MasterSight:
         self._now = now
 
     async def graph(self) -> VisibleGraph:
-        """Return topics, services and nodes."""
         state = await self._node.master("getSystemState")
         if not isinstance(state, list) or len(state) != 3:
             raise ProtocolError("the master gave no valid answer to getSystemState")

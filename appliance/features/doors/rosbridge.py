@@ -127,7 +127,6 @@ class Rosbridge:
     # --- frames of the client ---
 
     def receive(self, frame: Frame) -> list[DoorRequest]:
-        """Return the requests of a frame; replies go to the queue. Raises `ViewerStalledError`."""
         reply_to: ClientId = None
         try:
             operation = decode_operation(frame_as_json(frame))
@@ -274,7 +273,7 @@ class Rosbridge:
     # --- answers and refusals ---
 
     def failed(self, request: DoorRequest, reason: str) -> None:
-        """Refuse a request in words, and forget what it began. Raises `ViewerStalledError`."""
+        """Refuse a request in words, and forget what it began."""
         match request:
             case CallOfService():
                 call = self._calls.pop(request.call, None)
@@ -303,7 +302,6 @@ class Rosbridge:
         self.queue.reply(json_frame(fields, call.reply_to))
 
     def answered(self, number: int, values: Raw | bytes) -> None:
-        """Answer a call of the client. Raises `ViewerStalledError`."""
         call = self._calls.pop(number, None)
         if call is not None:
             fields = {"op": "service_response", "service": call.service, "values": values, "result": True}
@@ -333,7 +331,6 @@ class Rosbridge:
         return call
 
     def give_up(self, call: str) -> None:
-        """Expect no answer to a call of the client's service."""
         self._asked.pop(call, None)
 
     def status(self, level: str, text: str, reply_to: ClientId = None) -> None:
@@ -344,12 +341,10 @@ class Rosbridge:
     # --- messages of topics ---
 
     def message(self, message: DoorMessage, now: float) -> None:
-        """Queue a message for each subscription to its topic; `now` is a monotonic time in seconds."""
         for spelling in self._spellings.get(message.topic, ()):
             self.queue.put(spelling, message, len(message.body), now)
 
     def next_frame(self, now: float) -> Frame | None:
-        """Return the next frame for the client; None if nothing may be sent now."""
         taken = self.queue.take(now)
         if taken is None or taken[0] is None:
             return None if taken is None else taken[1]
@@ -362,7 +357,6 @@ class Rosbridge:
             return json_frame({"op": "status", "level": "error", "msg": f"{spelling}: {error}"})
 
     def next_time(self) -> float | None:
-        """Return the time of the next frame that waits; None if none waits."""
         return self.queue.next_time()
 
 

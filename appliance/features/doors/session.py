@@ -397,7 +397,6 @@ class DoorSession:
 
 
 def _reason(socket: ServerProtocol) -> str:
-    """Return why the protocol ended, if it was not a normal end."""
     if socket.parser_exc is not None:
         return f": {socket.parser_exc}"
     return f" with the code {socket.close_code}" if socket.close_code is not None else ""

@@ -324,7 +324,6 @@ class _Pipe(io.RawIOBase):
         return len(data)
 
     def take(self) -> bytes:
-        """Return the bytes written since the last call."""
         taken = bytes(self._held)
         self._held.clear()
         return taken

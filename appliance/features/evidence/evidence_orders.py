@@ -18,13 +18,11 @@ class EvidenceOrders:
     """The answers to the requests of an evidence export. Its methods raise `NotSealedError`."""
 
     def __init__(self, log: AuditLog, trail: AuditTrail, robot: str = "") -> None:
-        """Start without an export; `robot` is its name, empty if it has none."""
         self._log = log
         self._trail = trail
         self._robot = {"robot": robot} if robot else {}
 
     async def seal(self, _request: LogSealed) -> Sealed:
-        """Wait until a signed checkpoint seals all records."""
         await self._seal()
         return Sealed()
 

@@ -130,7 +130,6 @@ def _recorded(recording: RecordingSummary | None) -> Iterator[str]:
 
 
 def _who(detail: str) -> str:
-    """Return the name of the token in the details of a record, or an empty string."""
     try:
         found = json.loads(detail).get("who")
     except ValueError:  # the record was damaged

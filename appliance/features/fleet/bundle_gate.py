@@ -202,7 +202,6 @@ class BundleGate:
 
     @property
     def _changed(self) -> bool:
-        """Whether an operator has changed a part of the bundle in force on this robot."""
         record = self._record
         if not record.in_force or record.trial is not None:
             return False

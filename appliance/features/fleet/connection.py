@@ -306,5 +306,4 @@ def robot_context(ca: Path, certificate: Path, key: Path) -> ssl.SSLContext:
 def robot_connection(
     url: str, ca: Path, certificate: Path, key: Path, name: str | None = None
 ) -> CollectorConnection:
-    """Return the connection of a robot with these certificate files (`robot_context`)."""
     return CollectorConnection(url, lambda: robot_context(ca, certificate, key), name)

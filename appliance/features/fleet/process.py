@@ -39,7 +39,6 @@ _LONGEST_ROOT = 1 << 18
 
 
 def main(lifeline_fd: int, config: Path) -> None:
-    """Poll for bundles until the supervisor ends the process."""
     asyncio.run(_Process(load_resolved(config).of(Fleet), lifeline_fd).run())
 
 

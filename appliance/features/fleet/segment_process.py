@@ -12,7 +12,6 @@ from appliance.forwarding.process import ForwardingProcess
 
 
 def main(lifeline_fd: int, config: Path) -> None:
-    """Push segments until the supervisor ends the process."""
     pusher = make_pusher(load_resolved(config), Path.cwd())
     asyncio.run(ForwardingProcess(pusher, lifeline_fd).run())
 

@@ -132,7 +132,6 @@ class Fleet(FeatureSection):
 
     @property
     def destination(self) -> tuple[str, int]:
-        """`collector` as address and port; only where it is given."""
         return split_collector(self.collector or "")
 
     @property

@@ -74,7 +74,6 @@ class SelectedBundle:
 
     @property
     def sha256(self) -> str:
-        """Return the SHA-256 of the archive."""
         return str(self.target.hashes["sha256"])
 
 

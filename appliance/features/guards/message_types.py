@@ -160,7 +160,6 @@ def _header(found: "re.Match[str]", kind: str, row: TypeRow) -> str:
 
 
 def _end_of(text: str, start: int) -> int:
-    """Return the place behind the block that begins before `start`."""
     depth = 1
     for place in range(start, len(text)):
         depth += {"{": 1, "}": -1}.get(text[place], 0)

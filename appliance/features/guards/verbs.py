@@ -268,7 +268,6 @@ def _guard(appliance: Appliance, name: str) -> tuple[Monitors, MonitorState, str
 
 
 def _in_force(row: MonitorState, preset: Preset) -> dict[str, str]:
-    """Return the values in force of what is given to a guard, as text."""
     names = {each.name for each in preset.parameters}
     return {
         one.name: str(one.value).lower() if isinstance(one.value, bool) else f"{one.value!r}"
@@ -331,7 +330,6 @@ def _plan(appliance: Appliance, request: GuardTry) -> None:
 
 
 def _replay(appliance: Appliance, row: MonitorState, text: str, since: str) -> None:
-    """Print what a text would have stopped, from the flight recorder."""
     from appliance.cli.monitor.replay import replay_monitor  # noqa: PLC0415  slow to import
 
     with tempfile.TemporaryDirectory() as folder:

@@ -19,7 +19,6 @@ from appliance.quotas.table import NAMES, RELAY_FRAMES, RELAY_LATCHED, RELAY_QUE
 
 
 async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
-    """Return the part of control."""
     queries = LimitQueries(parts, base.settings, base.listener_limits, base.features.limits)
     return FeaturePart(methods=(RequestMethod(LimitsWanted, queries.use, order=False),))
 
@@ -34,7 +33,6 @@ class LimitQueries:
     features: Callable[[], Iterable[LimitUse]]
 
     async def use(self, _request: LimitsWanted) -> LimitList:
-        """Return the resources that hosts can exhaust, with their present use."""
         return LimitList([*self._registry(), *self._pools(), *self._relays(), *self._stored()])
 
     def _registry(self) -> Iterator[LimitUse]:

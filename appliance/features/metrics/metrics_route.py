@@ -33,7 +33,6 @@ _TEXT = file("text/plain", "Prometheus's text format")
 
 
 def routes(services: Services) -> Routes:
-    """Return the route, which has two paths."""
     router = Routes(tags=["metrics"])
 
     async def metrics(bearer: Viewer) -> Response:

@@ -135,7 +135,6 @@ def _show(found: Granted, record: str) -> None:
 
 
 def _granted(appliance: Appliance, record: str, *, tool: bool) -> Granted:
-    """Compute the change in this program, or over REST in the appliance."""
     if appliance.place is not None:
         return msgspec.convert(_over_rest(appliance, record, "grant", tool=tool), Granted)
     from appliance.features.policy_tools.explanations import granted  # noqa: PLC0415  not for every verb

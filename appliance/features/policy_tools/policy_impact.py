@@ -68,7 +68,6 @@ def _by_dry_run(appliance: Appliance, file: Path) -> PolicyImpact:
 
 
 def _finding(given: dict[str, Any], file: Path) -> PolicyFinding:
-    """Convert a finding of REST, which calls the policy's file `policy`."""
     named = str(file) if given["file"] == "policy" else given["file"]
     return PolicyFinding(
         named, given["line"], given["column"], FindingSeverity(given["severity"]), given["text"]

@@ -39,7 +39,6 @@ _MOST_SHOWN = 1000
 
 
 def routes(services: Services) -> Routes:
-    """Return the routes."""
     router = Routes(prefix="/v1")
     router.include_router(_of_policy(services))
     router.include_router(_of_records(services))

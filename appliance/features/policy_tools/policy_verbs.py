@@ -96,7 +96,6 @@ def _say_finding(finding: PolicyFinding, *, as_json: bool) -> None:
 
 
 def decision_fields(decision: Decision) -> dict[str, object]:
-    """Return a decision's fields as in the audit log."""
     place = asdict(decision.rule) if decision.rule else None
     return {"decision": decision.verdict, "rule": place, "reason": decision.reason}
 

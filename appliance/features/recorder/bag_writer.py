@@ -157,7 +157,6 @@ def read_fields(file: BinaryIO) -> dict[str, bytes]:
 
 
 def fields_of(data: bytes) -> dict[str, bytes]:
-    """Parse the fields in the header of a record or a connection."""
     fields, at = {}, 0
     while at < len(data):
         end = at + 4 + _U32.unpack_from(data, at)[0]
@@ -168,7 +167,6 @@ def fields_of(data: bytes) -> dict[str, bytes]:
 
 
 def _bag_header(index: int, connections: int, chunks: int) -> bytes:
-    """Return the first record, padded to its fixed size."""
     fields = {"op": BAG, "index_pos": _U64.pack(index)}
     fields |= {"conn_count": _U32.pack(connections), "chunk_count": _U32.pack(chunks)}
     padding = _HEAD_SIZE - len(_record(fields, b""))

@@ -63,7 +63,6 @@ def _pieces(opened: ExitStack, reader: BagReader) -> Iterator[bytes]:
 
 
 def _channel(writer: Writer, header: Mapping[str, str], schemas: dict[tuple[str, str], int]) -> int:
-    """Describe a connection; return the number of its channel."""
     name, text = header["type"], header["message_definition"]
     if (name, text) not in schemas:
         schemas[name, text] = writer.register_schema(_text(name), "ros1msg", _text(text).encode())

@@ -28,7 +28,6 @@ _DAY = 86_400.0
 
 
 def main(lifeline_fd: int, config: Path) -> None:
-    """Record until the supervisor ends it."""
     asyncio.run(_Process(load_resolved(config), lifeline_fd).run())
 
 

@@ -122,12 +122,10 @@ class RecordingInProgress:
 
     @property
     def opened(self) -> OpenRecording:
-        """The recording as far as it is known before its end."""
         progress = self.progress
         return OpenRecording(progress.id, progress.began, progress.ends, progress.triggers[0])
 
     def step(self) -> None:
-        """Write the new messages up to the recording's end. Raises `OSError`."""
         progress = self.progress
         for number, reader in enumerate(self._readers):
             for found in reader.read(progress.began, progress.ends):

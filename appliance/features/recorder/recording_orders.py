@@ -71,13 +71,11 @@ class RecordingOrders:
     # --- what operators ask -------------------------------------------------------------------------------
 
     def limits(self) -> tuple[LimitUse, ...]:
-        """Return how much of the disk recordings use; nothing if the recorder is off."""
         if (state := self.state()) is None:
             return ()
         return (LimitUse("bytes of recordings", state.bytes, int(self._rules.disk), "recorder.disk"),)
 
     async def recordings(self, _request: recording_requests.RecordingsWanted) -> Recordings:
-        """Return the kept recordings, oldest first."""
         self._require()
         rules, kept = self._rules, [self._kept[name] for name in sorted(self._kept)]
         in_progress = [
@@ -91,7 +89,6 @@ class RecordingOrders:
         return self._find(request.id)
 
     async def now(self, request: recording_requests.RecordNow, who: str) -> RecordingBegun:
-        """Begin a recording now, without a trigger."""
         self._require()
         before = self._rules.before if request.before is None else request.before
         after = self._rules.after if request.after is None else request.after
@@ -152,7 +149,6 @@ class RecordingOrders:
     async def _given_out(
         self, recording_id: str, event: str, reason: str, who: str, *, reads: bool = False, **detail: Any
     ) -> Recording:
-        """Record who gets the messages of a recording, wait until the record is on disk, and return the recording."""
         self._require()
         recording = self._find(recording_id)
         self._trail.happened(

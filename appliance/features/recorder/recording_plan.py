@@ -54,7 +54,6 @@ class RecordingSpan:
     latest: int
 
     def prolonged(self, now: int) -> int:
-        """Return the end after an act at `now`."""
         return max(self.ends, min(now + self.hold, self.latest))
 
 
@@ -98,7 +97,6 @@ class HourlyLimit:
         return True
 
     def refusal(self, charged_to: str) -> str:
-        """Return why `take` returned False."""
         return (
             f"{charged_to} already started {self._most} recordings of this kind this hour (recorder.per_hour)"
         )
@@ -139,7 +137,6 @@ class RecordingPlan:
         )
 
     def _take(self, what: TriggerKind, charged_to: str, now: int) -> tuple[str, str]:
-        """Return the id of an act's recording, or an empty id and the reason."""
         own = recording_owner(charged_to)
         found = self._open.get(own)
         if found is not None and found[1].began <= now <= found[1].ends:

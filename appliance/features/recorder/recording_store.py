@@ -92,7 +92,6 @@ class RecordingStore:
 
     @property
     def free(self) -> int:
-        """Return the free bytes on the disk."""
         return shutil.disk_usage(self._folder).free
 
     def part(self, recording_id: str) -> Path:
@@ -112,7 +111,6 @@ class RecordingStore:
         shutil.rmtree(rest)
 
     def discard_part(self, recording_id: str) -> None:
-        """Remove an unfinished recording, if there is one."""
         with suppress(OSError):
             self._discard(self.part(recording_id))
 
@@ -235,7 +233,6 @@ class RecordingStore:
         return (self._oldest(own), why) if own and charged_to in KEPT else (None, why)
 
     def _oldest(self, charged_to: Collection[str]) -> Recording:
-        """Return the oldest recording of these hosts, of the kind of trigger that uses the most bytes."""
         kinds = self._sizes(lambda found: _kind(found) if found.charged_to in charged_to else "")
         del kinds[""]
         fullest = max(kinds, key=lambda kind: kinds[kind])

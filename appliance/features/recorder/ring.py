@@ -132,12 +132,10 @@ def rows(memory: memoryview) -> list[tuple[int, BlockRow]]:
 
 
 def birth_at(block: int) -> int:
-    """Return the index of the word with a block's `birth`."""
     return _COUNTERS // 8 + block * _WORDS
 
 
 def used_at(block: int) -> int:
-    """Return the index of the word with a block's `used`."""
     return birth_at(block) + 4
 
 
@@ -282,7 +280,6 @@ class RingWriter:
         return chain.writer
 
     def count(self, counter: int, by: int) -> None:
-        """Add to a counter of data that is not stored (`MISSED`, `REFUSED`)."""
         self.words[counter] = (self.words[counter] + by) % (1 << 64)
 
     def take(self, stream: int, number: int, kind: int, begins: int, chain: _Chain, *, now: int) -> int:

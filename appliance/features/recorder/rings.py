@@ -47,7 +47,6 @@ class RecorderRings:
             self._rings.append((given, writable, readable))
 
     def messages_for(self, role: str, index: int) -> Iterator[tuple[MemoryGiven, int]]:
-        """Yield the messages and descriptors that a process gets at its start."""
         for given, writable, readable in self._rings:
             if role == "recorder":
                 yield MemoryGiven(msgspec.to_builtins(given)), readable

@@ -100,7 +100,6 @@ class _Columns:
 
 
 def _part(number: int, first: int, last: int, time: int) -> int:
-    """Return how many of `number` events between `first` and `last` happened before `time`."""
     return number * min(max(time - first, 0), last - first + 1) // (last - first + 1)
 
 
@@ -248,7 +247,6 @@ def _records(reader: BagReader, since: int = 0) -> Iterator[tuple[_Said, int]]:
 
 
 def _kind(said: _Said | AuditRecord) -> EventKind | None:
-    """Return the kind of event that the timeline shows for a record; None if the record is not shown."""
     kinds = kinds_of(said.event, said.decision, said.severity)
     if kinds:
         return kinds[0]  # type: ignore[return-value]  # a record's kinds of trigger are kinds of event

@@ -22,7 +22,6 @@ _LONGEST_TEXT = 300
 
 
 def kinds_of(event: str, decision: str | None, severity: Severity) -> list[TriggerKind]:
-    """Return the kinds of trigger that apply to a record."""
     kinds: list[TriggerKind] = [_BY_EVENT[event]] if event in _BY_EVENT else []
     if decision == "deny":
         kinds.append("denial")

@@ -51,7 +51,6 @@ def call(uri: str, method: str, *arguments: Any) -> Any:
 
 
 def own_address(master: str) -> str:
-    """Return the address from which this machine reaches the appliance."""
     place = urlsplit(master)
     with socket.create_connection((str(place.hostname), place.port or 80), _SECONDS) as sock:
         return str(sock.getsockname()[0])

@@ -32,7 +32,6 @@ def fail(check: str, text: str, advice: str) -> SelftestFinding:
 
 
 def skip(check: str, text: str, advice: str = "") -> SelftestFinding:
-    """Return a check that could not run on this machine."""
     return SelftestFinding(check, "skip", text, advice)
 
 

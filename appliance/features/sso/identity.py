@@ -52,7 +52,6 @@ def _verified_mail(claims: Mapping[str, Any]) -> str:
 
 
 def _values(claims: Mapping[str, Any], path: str) -> frozenset[str]:
-    """Return the strings of a claim: the claim of this name, or else the one that the dots lead to."""
     found: Any = claims
     if path in claims:
         found = claims[path]

@@ -36,12 +36,10 @@ _MOST_AT_ONCE = 32
 
 
 def main(lifeline_fd: int, config: Path) -> None:
-    """Serve sign-ons until the supervisor ends the process."""
     asyncio.run(_Process(load_resolved(config).of(Sso), lifeline_fd).run())
 
 
 def make_sign_ons(wanted: Sso) -> SignOns:
-    """Return the sign-ons for these settings, which must have an issuer."""
     assert wanted.issuer is not None  # noqa: S101  the role runs only with it
     provider = Provider(wanted.issuer, ProviderConnection(wanted).exchange, wanted.keys_hours * 3600)
     return SignOns(wanted, provider, lambda: _secret(wanted.client_secret_file))

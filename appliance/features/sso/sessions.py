@@ -37,15 +37,12 @@ class SessionTable:
         self._kept: dict[str, _Kept] = {}
 
     def rows(self) -> list[TokenRow]:
-        """Return the sessions that may be used now, in the form of tokens."""
         return [kept.row for kept in self._usable()]
 
     def sessions(self) -> list[Session]:
-        """Return the sessions that may be used now."""
         return [kept.session for kept in self._usable()]
 
     def of(self, session_id: str) -> Session | None:
-        """Return the person of a session, or None if it has ended."""
         return next((one for one in self.sessions() if one.id == session_id), None)
 
     def open(self, identity: SignedInPerson, keys: SessionKeys) -> tuple[Session, list[Session]]:

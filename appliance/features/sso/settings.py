@@ -212,5 +212,4 @@ class Sso(FeatureSection):
         return next((role for role in _RANKING if values.intersection(self.roles.get(role, ()))), None)
 
     def door_groups_of(self, values: frozenset[str]) -> tuple[str, ...]:
-        """Return the groups of doors that these values of `roles_claim` give."""
         return tuple(group for group, wanted in self.doors.items() if values.intersection(wanted))

@@ -46,7 +46,6 @@ class ApplianceTable(Appliances):
 
     @property
     def other(self) -> ApplianceRow | None:
-        """Return the other appliance; None if it has not introduced itself."""
         return next((row for row in self._rows.values() if not self._is_own(row)), None)
 
     async def until_introduced(self) -> None:

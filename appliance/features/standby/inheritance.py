@@ -57,7 +57,6 @@ def _save_copies(store: StateStore, epoch: int, contents: Iterable[tuple[int, by
 
 
 def inherited_state(pair: Pair, store: StateStore) -> tuple[InheritedState, Callable[[], None]]:
-    """Return the state that this appliance's relays start with, and the function to call once they have it."""
     own = _Active(pair.membership.name, pair.epoch)
 
     def taken() -> None:
@@ -113,7 +112,6 @@ class StateCopies:
         self._noted = 0.0
 
     async def run(self) -> None:
-        """Copy changed states until cancelled."""
         while True:
             await asyncio.sleep(await self.copy_once())
 
@@ -160,7 +158,6 @@ class CopyAge:
         self._changed: float | None = None
 
     async def run(self) -> None:
-        """Look for new notes until cancelled."""
         while True:
             self.look(await asyncio.to_thread(self._setting, _COPIES))
             await asyncio.sleep(_LOOK_SECONDS)

@@ -23,10 +23,11 @@ _SHUT = "rosrv-witness-shut.service"
 
 @dataclass(frozen=True, kw_only=True)
 class PairPlan:
-    """The decisions of an operator. `address` and `name` are those of the appliance that runs and has all data.
+    """The decisions of an operator.
 
-    `ports` are translated at the fixed address, such as `11311` and `19001-26000`; `master_port` is one of them.
-    `epoch` is greater than that of any earlier lease. `followers` maps names of further computers to their addresses.
+    `address` and `name` are those of the appliance that has all data. `ports` are translated at the fixed address,
+    such as `11311` and `19001-26000`; `master_port` is one of them. `epoch` exceeds that of any earlier lease.
+    `followers` maps names of further computers to their addresses.
     """
 
     name: str

@@ -143,7 +143,6 @@ class ApplianceLease:
 
     @property
     def valid_until(self) -> float:
-        """Return the time to which this appliance stays active if no further answer arrives."""
         return self._valid_until
 
     @property
@@ -168,7 +167,6 @@ class ApplianceLease:
         return f"the witness could not save the takeover: {self._trouble}" if self._trouble else ""
 
     def is_active(self, now: float) -> bool:
-        """Return whether this appliance may decide, relay and answer."""
         return self.held is not None and self._promised_until <= now < self._valid_until
 
     def may_be_renewed(self, now: float) -> bool:

@@ -38,12 +38,10 @@ class LeaseClient:
             self.send(lease_link.ControlPresent())
 
     def present(self) -> None:
-        """Report that this process stands by or serves."""
         self._present = True
         self.send(lease_link.ControlPresent())
 
     def withdraw(self) -> None:
-        """Report that this process stands by, but could not serve."""
         if self._present:
             self._present = False
             self.send(lease_link.ControlUnready())
@@ -69,7 +67,6 @@ class LeaseClient:
         self._link.send(message)
 
     def active(self) -> bool:
-        """Return whether this appliance may answer now."""
         return self.state is not None and clock.since_boot() < self.state.until
 
     def hears_witness(self) -> bool:

@@ -68,15 +68,12 @@ class Membership(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
             raise ValueError("the key of the witness and the key of the other appliance must differ")
 
     def unsealed(self) -> "Membership":
-        """Return the membership without the tunnels' authority."""
         return msgspec.structs.replace(self, sealed_certificate="", sealed_key="")
 
     def for_lease(self) -> "Membership":
-        """Return the membership with the secrets of the lease only."""
         return msgspec.structs.replace(self, certificate="", key="", other_certificate="")
 
     def for_control(self) -> "Membership":
-        """Return the membership with the secrets of the replication only."""
         return msgspec.structs.replace(self, witness_key="", peer_key="")
 
 

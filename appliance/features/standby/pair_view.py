@@ -16,7 +16,6 @@ class StandbyPairView(PairView):
     """The views of an appliance that can be one of two."""
 
     def request(self) -> "StandbyWanted":
-        """Return the request for the state of both appliances."""
         from appliance.features.standby.standby_requests import StandbyWanted  # noqa: PLC0415  it imports the views
 
         return StandbyWanted()

@@ -33,7 +33,6 @@ class PairedRole(ActiveRole):
 
     @property
     def replication(self) -> Replication:
-        """Return the replication, which exists from `inherit` on."""
         if self._replication is None:
             raise RuntimeError("the replication is used before the state is inherited")
         return self._replication
@@ -43,7 +42,6 @@ class PairedRole(ActiveRole):
         return self.replication.stored
 
     def inherit(self, store: StateStore, age: Callable[[], int]) -> None:
-        """Begin to keep changes for the standby, and move all times in the state to this appliance's clocks."""
         pair, settings = self.pair, self._settings
         store.note_whole_parameters()
         self._replication = Replication(
@@ -80,5 +78,4 @@ class PairedRole(ActiveRole):
         self.replication.admission.on_end_of_gap(ended)
 
     def close(self) -> None:
-        """Keep no further changes for the standby."""
         self.replication.close()

@@ -49,7 +49,6 @@ _log = structlog.get_logger()
 
 
 def main(lifeline_fd: int, membership: Path) -> None:
-    """Keep the lease until the supervisor ends the process."""
     found = load_membership(membership)
     if found is None:
         raise FileNotFoundError(f"{membership} is missing")
@@ -173,14 +172,12 @@ class LeaseProcess:
         self._wake.set()
 
     def witness_sent(self, datagram: bytes, address: str) -> None:
-        """Take an answer of the witness; ignore a datagram of any other host."""
         found = self._witness.read(datagram) if address == self._membership.witness else None
         if found is not None:
             self._answered, self._answer = clock.since_boot(), found[1]
             self._after(self._lease.answered(*found))
 
     def peer_sent(self, datagram: bytes, address: str) -> None:
-        """Take a message of the other appliance; ignore a datagram of any other host."""
         if address == self._membership.other_address:
             message = self._peer.read(datagram)
             if message is not None:

@@ -202,7 +202,6 @@ class Replication:
                 task.cancel()
 
     def begin(self) -> None:
-        """Report that nodes are served from now on."""
         self._lease.present()
         self._absent, self._taken_over = self._taken_over, False
         self.report()
@@ -264,7 +263,6 @@ class Replication:
         )
 
     def followed(self) -> bool:
-        """Return whether the standby gets the changes now."""
         return self.sender.lag().connected
 
     def _connected(self) -> bool:

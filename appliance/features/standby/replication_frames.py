@@ -118,17 +118,14 @@ FromStandby = Stored | Introduction | ObstacleFound | Refused | SwitchoverWanted
 
 
 def reason_of(error: Exception) -> Refused:
-    """Return the message with the reason why this side ends the link."""
     return Refused(str(error)[:_LONGEST_REASON])
 
 
 def refusal_of(reason: str) -> SwitchoverRefused:
-    """Return the message with the reason why the active appliance does not hand over."""
     return SwitchoverRefused(reason[:_LONGEST_REASON])
 
 
 def obstacle_of(reason: str) -> ObstacleFound:
-    """Return the message with the reason why the standby could not serve."""
     return ObstacleFound(reason[:_LONGEST_REASON])
 
 

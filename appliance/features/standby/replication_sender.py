@@ -143,7 +143,6 @@ class ReplicationSender:
                 waiter.set_result(None)
 
     def lag(self) -> ReplicationLag:
-        """Return how far the standby is behind."""
         return ReplicationLag(
             self.link is not None,
             self._database.number - self._acknowledged,

@@ -8,7 +8,6 @@ from appliance.features.view import Samples
 
 
 def samples_of(state: StandbyState) -> dict[str, Samples]:
-    """Return the samples of each metric of a pair."""
     other, answered, active = state.other, state.witness.answered_seconds, state.role == "active"
     return {
         "rosrv_standby_role": [((role,), state.role == role) for role in ("active", "standby")],

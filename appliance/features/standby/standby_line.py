@@ -7,14 +7,12 @@ from appliance.features.standby.standby_summary import is_silent, lag_of, lastin
 
 
 def standby_line(state: StandbyState) -> Text:
-    """Return the state in a line of `rosrv status`."""
     other, witness = lag_in_words(state.other), answer_in_words(state.witness)
     line = f"{state.name} is {state.role}; {state.other.name}: {other}; witness: {witness}"
     return Text(line, style="yellow" if any(standby_troubles(state)) else "")
 
 
 def lag_in_words(other: OtherAppliance) -> str:
-    """Return how well the standby follows this active appliance."""
     if other.connected:
         return "in sync" if other.in_sync else lag_of(other)
     return connection(other)

@@ -40,7 +40,6 @@ class SingleAppliance:
         """Return None."""
 
     async def hand_over(self) -> None:
-        """Raise `HandOverError`."""
         raise HandOverError(_SINGLE)
 
 
@@ -64,7 +63,6 @@ class ActiveAppliance:
         return self._replication.state()
 
     async def hand_over(self) -> None:
-        """Make the standby the active appliance. Raises `HandOverError`."""
         await self._replication.require_ready()
         try:
             await self._leaving()

@@ -61,7 +61,6 @@ def lag_of(other: OtherAppliance) -> str:
 
 
 def lasting(seconds: float) -> str:
-    """Return a duration in one unit."""
     for length, unit in ((86_400, "d"), (3600, "h"), (60, "min")):
         if seconds >= length:
             return f"{int(seconds // length)} {unit}"

@@ -17,7 +17,6 @@ _RED = "bold red"
 
 
 def standby_view(state: StandbyState) -> StatusView:
-    """Return the state as a terminal shows it; its exit status is 1 if something is wrong."""
     troubles = [trouble.text for trouble in standby_troubles(state)]
     fields = {**in_full(state), "troubles": troubles}
     return StatusView(1 if troubles else 0, StandbyScreen(state, troubles), fields)

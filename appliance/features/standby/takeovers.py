@@ -121,7 +121,6 @@ class TakeoverLog:
                 self.unreadable.append(sequence)
 
     def before(self, sequence: int) -> Takeover | None:
-        """Return the last takeover before a record."""
         place = bisect_left(self._places, sequence)
         return self.takeovers[place - 1] if place else None
 
@@ -164,7 +163,6 @@ class TakeoverLog:
         return place  # type: ignore[no-any-return]  # checked above
 
     def hash_at(self, sequence: int) -> str | None:
-        """Return the hash of a record, or None if the log does not have it."""
         row = self._connection.execute("SELECT hash FROM record WHERE sequence = ?", (sequence,)).fetchone()
         return row[0].hex() if row is not None and isinstance(row[0], bytes) else None
 

@@ -317,7 +317,6 @@ class DiskCheck:
         self._failure = ""
 
     def start(self) -> None:
-        """Check until the process ends."""
         threading.Thread(target=self._check_always, daemon=True).start()
 
     def _check_always(self) -> None:
@@ -383,7 +382,6 @@ class Witness:
         self._enforce(holder if self.admitted == holder else "")
 
     def left(self) -> float:
-        """Return the seconds until the lease expires, or 0."""
         return max(0.0, self._expires - self._clock())
 
     def handle(self, name: str, operation: str, epoch: int, other: str) -> str:
@@ -528,17 +526,14 @@ class WitnessGate:
 class WitnessFollower:
     """The rules of a computer that does as the witness does.
 
-    R1 to R4 of the lease are rules of the witness and the appliances; a follower only asks (`look`). It admits an
-    appliance only while the lease of that appliance runs at the witness: for 0.9 of the time that the answer has left,
-    counted from the time the request was *sent*. The rest allows for clocks of different speeds.
+    It admits an appliance only while the appliance's lease runs at the witness: for 0.9 of the time that the answer
+    has left, counted from the time the request was *sent*. The rest allows for clocks of different speeds. The
+    witness grants the lease only after it expired or was released. So whenever the robot admits one appliance, no
+    follower admits the other one, unless that one has given the lease up. Without answers, both are shut out after at
+    most one expiry. Old and repeated answers are ignored.
 
-    The witness grants the lease only after it has expired, or was released by an appliance that had become passive. So
-    whenever the robot admits one appliance, no follower that runs admits the other one, unless that one has given the
-    lease up. Without answers, both are shut out after at most one expiry.
-
-    An answer to an earlier process, an old answer and a repeated one are ignored. `epoch` is the greatest that was
-    saved; a smaller one, of a witness that was restored from an old disk, is not accepted. `clock` also runs while the
-    computer sleeps; `answered` is its time at the last authentic answer. `save` and `admit` are those of the witness.
+    `epoch` is the greatest that was saved; a smaller one, of a witness that was restored from an old disk, is not
+    accepted. `clock` also runs while the computer sleeps; `answered` is its time at the last authentic answer.
     """
 
     def __init__(
@@ -627,7 +622,6 @@ class WitnessFollower:
             self.enforce(wanted)
 
     def enforce_again(self) -> None:
-        """Write the firewall rules again, because another program changed them. Raises `WitnessError`."""
         self.enforce(self._holder if self._clock() < self._until else "")
 
     def enforce(self, name: str) -> None:
@@ -918,7 +912,6 @@ class IdleConnections:
         self._rounds = 0
 
     def connecting(self) -> List[Ends]:
-        """Return the connections to an appliance that wait for its first answer."""
         return sockets_with(self._addresses(""), _socket_tables(), _CONNECTING)
 
     def reset(self, admitted: str, connecting: Iterable[Ends] = ()) -> None:
@@ -1327,7 +1320,6 @@ def _require_place(settings: WitnessSettings, command: str) -> None:
 
 
 def main(arguments: List[str]) -> int:
-    """Run a command; return the exit status."""
     parser = argparse.ArgumentParser(description="The witness of two appliances, on the robot's computer.")
     parser.add_argument("command", choices=("shut", "serve", "follow", "begin", "remove"))
     parser.add_argument("--settings", default=SETTINGS, help="default: %(default)s")

@@ -14,13 +14,11 @@ from appliance.forwarding.process import ForwardingProcess
 
 
 def main(lifeline_fd: int, config: Path) -> None:
-    """Forward the log until the supervisor ends the process."""
     forwarder = make_forwarder(load_resolved(config), Path.cwd() / "position.json")
     asyncio.run(ForwardingProcess(forwarder, lifeline_fd).run())
 
 
 def make_forwarder(settings: Settings, kept: Path) -> LogForwarder:
-    """Return the forwarder for these settings; they must configure a receiver."""
     wanted = settings.of(Syslog)
     longest = LONGEST_DATAGRAM if wanted.destination[0] == "udp" else LONGEST_IN_STREAM
     return LogForwarder(

@@ -63,7 +63,6 @@ def publishers_at(
 
 
 def _registered(past: Iterable[LogEntry]) -> list[PastPublisher]:
-    """Return the publishers after these records, without those that were lost."""
     holders: dict[str, PastPublisher] = {}
     lost: dict[str, PastPublisher] = {}
     for sequence, record in past:

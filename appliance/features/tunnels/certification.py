@@ -75,7 +75,6 @@ class Certification:
         self._served.set()
 
     def revoked(self, name: str) -> None:
-        """Note that a name is revoked, so that its enrolments and renewals in progress fail."""
         self._revocations[name] += 1
 
     @contextlib.contextmanager
@@ -119,7 +118,6 @@ class Certification:
         )
 
     def renewed(self, name: str, before: str, serial: str, expires: float, who: str) -> None:
-        """Record that a host has replaced its certificate."""
         self.trail.happened(
             "host renewed",
             f"{name} has a new certificate; its tunnel reconnects with it",
@@ -131,7 +129,6 @@ class Certification:
         )
 
     def keep(self, name: str, address: str, made: CertificateMade) -> None:
-        """Make this certificate the host's only one, and update charon and the policy."""
         self.table.keep(name, address, made)
         self.tunnels.state_anew()
         self.changed()

@@ -14,14 +14,13 @@ from appliance.store.stored_deadlines import StoredDeadlines
 
 
 def machines(base: Foundation, parts: Parts) -> dict[str, int]:
-    """Return the number of live nodes by address. A door's node runs on the appliance, not on a machine of its own."""
+    """Return the number of live nodes by address; a door's node runs on the appliance, not on a machine of its own."""
     doors = {str(address) for address in base.features.addresses().values()}
     nodes = parts.core.registry.machines()
     return {address: number for address, number in nodes.items() if address not in doors}
 
 
 async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
-    """Return the part that answers operators and hosts."""
     settings, ends = base.settings, StoredDeadlines(base.store)
     certification = Certification(
         base.store,

@@ -89,11 +89,9 @@ class HostEnrolment(TunnelHosts):
         )
 
     def status(self) -> IpsecState:
-        """Return the state of the tunnels for `rosrv status`."""
         return self._view.status(self.ports.in_clear_text())
 
     def rows(self) -> list[Host]:
-        """Return every host, enrolled, awaited or declared."""
         return self._view.rows()
 
     def served_by(self, pin: str) -> None:
@@ -286,7 +284,6 @@ class HostEnrolment(TunnelHosts):
         )
 
     def _keep_text(self) -> None:
-        """Store the file's valid text, so that a start with an invalid file keeps these declarations."""
         text = self._table.declared.text
         if text != self._kept_text:
             self._store.save_setting(DECLARED_HOSTS, text)

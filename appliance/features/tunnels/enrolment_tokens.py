@@ -36,7 +36,6 @@ class EnrolmentTokens:
         self.rows()  # from now on, no step of the clock postpones an end
 
     def rows(self) -> dict[str, EnrolmentTokenRow]:
-        """Return the valid tokens by the names of their hosts."""
         for row in list(self._rows.values()):
             if self._ends.passed(row.id, row.expires):
                 self.forget(row.name)

@@ -33,7 +33,6 @@ class HostView:
         self._tunnels = tunnels
 
     def rows(self) -> list[Host]:
-        """Return every host, enrolled, awaited or declared, by name."""
         awaited = self._awaited.rows()
         names = {*self._table.rows, *self._table.declared.hosts, *awaited}
         return [self._row(name, awaited.get(name)) for name in sorted(names)]
@@ -84,7 +83,6 @@ class HostView:
         return None
 
     def ports(self, name: str) -> PortsSeen:
-        """Return the last check of a machine's ROS ports from outside."""
         row = self._table.ports.get(name)
         if row is None:
             return _NEVER
@@ -165,7 +163,6 @@ class HostView:
 
 
 def span(seconds: float) -> str:
-    """Return a duration in words, in the unit that fits: days, hours, minutes or seconds."""
     if seconds >= 2 * 86_400:
         return f"{int(seconds // 86_400)} days"
     if seconds >= 7200:

@@ -239,7 +239,6 @@ class TunnelProcess:
 
 
 def main(lifeline_fd: int, directory: Path) -> None:
-    """Run this process: `lifeline_fd` is the lifeline's descriptor, `directory` the process's private directory."""
     lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
     try:
         key = _own_key(directory / KEY_FILE)

@@ -25,7 +25,6 @@ class RestAddress:
 
 
 def rest_address(settings: Settings) -> RestAddress:
-    """Return the ports of REST that the configuration implies."""
     if settings.isolation == "none":
         return RestAddress(None, NO_TUNNELS, None)
     if settings.api_address is None:
