@@ -301,7 +301,6 @@ class DataPlane:
             relayed.monitor(None, wanted=wanted)
 
     def _holder(self, host: str) -> str:
-        """Return the host if it is registered; all other hosts count as one holder, the empty string."""
         return host if self._table.is_registered(host) else ""
 
     def _monitors_changed(self, topics: frozenset[str] | None) -> None:

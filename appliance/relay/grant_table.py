@@ -106,7 +106,6 @@ class GrantTable:
             self._restated.add(fact)
 
     def withdraw(self, message: messages.Message) -> None:
-        """Remove a fact; an unknown one is ignored."""
         if isinstance(message, messages.NodeWithdrawn):
             for fact in list(self._by_key.get(message.key, ())):
                 self._forget(fact)
@@ -121,7 +120,6 @@ class GrantTable:
         return QuotaClass.REGISTERED if host in self._hosts else QuotaClass.UNKNOWN
 
     def payer(self, host: str) -> str:
-        """Return the payer of this host's processor time: the host itself, or its class."""
         if host not in self._hosts:
             return UNKNOWN
         return host if host in self._named else ANYBODY
@@ -142,7 +140,6 @@ class GrantTable:
         return ServiceEndpoint(key, service, placed.host, placed.port, key if node is None else node.name)
 
     def grant(self, key: str, topic: str, host: str, caller_id: str) -> messages.GrantInstalled | None:
-        """Return the grant of this subscriber for this topic of that incarnation."""
         grant = self._facts.get(("grant", key, topic, host, caller_id))
         return grant if isinstance(grant, messages.GrantInstalled) else None
 
@@ -150,12 +147,10 @@ class GrantTable:
         return ("client", key, service, host, caller_id) in self._facts
 
     def asks(self, key: str, service: str, host: str, caller_id: str) -> bool:
-        """Return whether control approves each request of this client."""
         granted = self._facts.get(("client", key, service, host, caller_id))
         return not isinstance(granted, messages.ClientGranted) or granted.asks
 
     def client_of(self, key: str, service: str, host: str) -> str | None:
-        """Return a node name under which this host may call this service, or None."""
         return next(iter(self._clients.get(("client", key, service, host), ())), None)
 
     def _name(self, message: Statement) -> None:

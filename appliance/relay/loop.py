@@ -266,11 +266,9 @@ class EventLoop:
             self._floor = max(self._floor, found.spent)
 
     def stop(self) -> None:
-        """End `run` after this turn."""
         self._running = False
 
     def run(self) -> None:
-        """Serve until `stop`."""
         self._running = True
         while self._running:
             self.turn(_LONGEST_WAIT)

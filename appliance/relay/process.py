@@ -32,7 +32,6 @@ _UNTIL_FULL_COLLECTION = 100
 
 
 def main(lifeline_fd: int, index: int, limits: RelayLimits | None = None) -> None:
-    """Run relay `index` until the supervisor ends it; `lifeline_fd` is this process's end of the lifeline."""
     young, middle, _ = gc.get_threshold()
     gc.set_threshold(young, middle, _UNTIL_FULL_COLLECTION)
     RelayProcess(socket.socket(fileno=lifeline_fd), index, limits or RelayLimits()).run()
@@ -54,7 +53,6 @@ class RelayProcess:
         self._earlier: list[memoryview] = []
 
     def run(self) -> None:
-        """Serve until the supervisor stops it."""
         detail = {
             "index": self._index,
             "congestion": congestion_control(),

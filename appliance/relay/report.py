@@ -59,7 +59,6 @@ class Reporter:
         return self._link is not None
 
     def repeat_connections(self) -> None:
-        """Report open connections to a new control, and those that ended while there was no control."""
         ended, self._ended = self._ended, []
         for opened, reason in ended:
             self.send(opened)
@@ -69,12 +68,10 @@ class Reporter:
         self._memory = {}
 
     def send(self, message: Message) -> None:
-        """Send a message to control, if control is connected."""
         if self._link is not None:
             self._link.send(message)
 
     def opened(self, key: str, resource: str, kind: str, host: str, caller_id: str) -> int:
-        """Report a new connection and return its number."""
         self._number += 1
         message = ConnectionOpened(self._number, key, resource, kind, host, caller_id[:_TEXT])
         self._open[self._number] = message
@@ -82,7 +79,6 @@ class Reporter:
         return self._number
 
     def closed(self, number: int, reason: str) -> None:
-        """Report the end of a served connection."""
         opened = self._open.pop(number, None)
         if opened is None:
             return

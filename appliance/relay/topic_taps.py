@@ -31,7 +31,6 @@ class TopicTaps:
         self._left: dict[int, int] = {}
 
     def begin(self, wanted: LookWanted, topics: Iterable[RelayedTopic]) -> None:
-        """Tap a topic at all its publishers; do nothing if `MOST_LOOKS` taps are open."""
         if len(self._open) >= MOST_LOOKS:
             return
         taps = self._open[wanted.number] = []
@@ -47,7 +46,6 @@ class TopicTaps:
         self._left.pop(number, None)
 
     def end_all(self) -> None:
-        """Remove all taps, because there is no control."""
         for number in list(self._open):
             self.end(number)
 

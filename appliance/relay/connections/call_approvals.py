@@ -70,7 +70,6 @@ class CallApprovals:
         waiting(answer.refused)
 
     def attach(self, connected: bool) -> None:
-        """Refuse all requests that wait for a control that has gone."""
         self._connected = connected
         self._sent.clear()
         self._unsent.clear()

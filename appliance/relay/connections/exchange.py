@@ -64,7 +64,6 @@ class ServiceExchange:
 
     @property
     def may_read(self) -> bool:
-        """Whether the client may be read: no request waits, and the service is not busy with one."""
         return not self._busy and self._asking is None and not self._waiting and not self.done
 
     @property

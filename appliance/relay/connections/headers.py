@@ -34,7 +34,6 @@ def canonical(fields: dict[str, str]) -> dict[str, str]:
 
 
 def too_long(fields: Mapping[str, str]) -> str:
-    """Return why a header cannot be kept (a field is longer than any ROS name); empty if it can."""
     for name in _OF_PEER:
         if len(fields.get(name, "")) > _LONGEST:
             return f"its header has a {name} of {len(fields[name])} characters"
@@ -42,7 +41,6 @@ def too_long(fields: Mapping[str, str]) -> str:
 
 
 def size_of(fields: Mapping[str, str]) -> int:
-    """Return approximately how many bytes a header takes."""
     return sum(len(name) + len(value) for name, value in fields.items())
 
 

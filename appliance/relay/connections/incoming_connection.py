@@ -74,7 +74,6 @@ class IncomingConnection:
         self._stream.close()
 
     def make_room(self) -> None:
-        """End the connection in favour of a peer with a higher claim."""
         self._failed(self, "it waited longest when the limit of connections was reached")
 
     def _received(self, data: bytes) -> None:
@@ -123,7 +122,6 @@ class RefusedConnection:
             self._told()
 
     def make_room(self) -> None:
-        """End the connection in favour of a peer with a higher claim."""
         self.close()
 
     def close(self) -> None:

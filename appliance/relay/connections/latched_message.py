@@ -31,7 +31,6 @@ class LatchedMessage:
 
     @property
     def is_lacking(self) -> bool:
-        """Whether monitors have held back messages of a latching publisher, and no message is latched now."""
         return self.is_latching and self.withheld and self.batch is None
 
     @property
@@ -41,7 +40,6 @@ class LatchedMessage:
 
     @property
     def is_refused(self) -> bool:
-        """Whether the publisher's last message is not kept."""
         return self._refused_size is not None
 
     def keep(self, batch: Batch) -> None:
@@ -58,13 +56,11 @@ class LatchedMessage:
             self.batch = batch.keep_last()
 
     def forget(self) -> None:
-        """Drop the message, because its publisher is gone."""
         self._free()
         self._refused_size = None
         self.withheld = False
 
     def give_up(self) -> None:
-        """Drop the message in favour of a host that holds less memory."""
         size = self.size
         self._free()
         self._refuse(size)

@@ -155,7 +155,6 @@ class ServiceCalls:
             self._end(number, "" if replies[0].ok else replies[0].body.decode("utf-8", "replace"))
 
     def _end(self, number: int, reason: str) -> None:
-        """End a call; a reason means that it failed."""
         call = self._calls.pop(number, None)
         if call is None:
             return

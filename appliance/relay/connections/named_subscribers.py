@@ -32,7 +32,6 @@ class ActionServers:
         self._names: dict[str, dict[str, str]] = {}
 
     def add(self, key: str, topic: str, name: str) -> list[str]:
-        """Add a publication; return the topics whose publishers wait for this node."""
         action, _, last = topic.rpartition("/")
         if last != "status":
             return []

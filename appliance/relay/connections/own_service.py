@@ -71,12 +71,10 @@ class OwnService:
             last.waiting.remove(server)
 
     def answered(self, answer: OwnServiceAnswered) -> None:
-        """Give control's answer to the clients that wait for it."""
         for call in [call for call in self._calls.values() if call.asked.number == answer.number]:
             self._settle(call, answer.success, answer.text, repeats=answer.repeats)
 
     def control_gone(self) -> None:
-        """Answer all open calls: control has gone."""
         for call in list(self._calls.values()):
             if not call.until:
                 self._settle(call, False, _AWAY)
@@ -149,7 +147,6 @@ class OwnServer:
             self.answered(encode_header({"error": reason}))
 
     def answered(self, reply: bytes) -> None:
-        """Give the reply to the client in the next turn of the loop."""
         self._timer = self._loop.after(0, lambda: self._received(reply))
 
     def close(self) -> None:

@@ -29,7 +29,6 @@ class OwnTopicPublisher(Upstream):
             self._topic.upstream_closed()
 
     def recheck(self) -> None:
-        """Give subscribers the header of the specifications that are in force now."""
         header = self._header() if self._wanted else None
         if header == self._current:
             return
@@ -40,7 +39,6 @@ class OwnTopicPublisher(Upstream):
             self._topic.upstream_opened(header)
 
     def publish(self, data: bytes) -> None:
-        """Send a monitor's message to the present subscribers."""
         if self._current is not None:
             self._topic.published(Batch(memoryview(encode_frame(data)), 1, 0, owned=True))
 

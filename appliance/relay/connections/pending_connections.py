@@ -48,7 +48,6 @@ class PendingConnections:
         self._waiting.put(guest, host, self._clock())
 
     def leave(self, guest: PendingConnection) -> None:
-        """Remove a connection; ignore an unknown one."""
         self._waiting.remove(guest)
         self._with_long_headers.remove(guest)
         host, held = self._hosts.pop(guest, None), self._long.pop(guest, 0)

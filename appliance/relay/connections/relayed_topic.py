@@ -179,7 +179,6 @@ class RelayedTopic:
             self.upstream.connect()
 
     def leave(self, member: TopicSubscriber) -> None:
-        """Remove a subscriber whose connection is closed."""
         self._waiting.pop(member, None)
         self._served.remove(member)
         self.differs()
@@ -191,7 +190,6 @@ class RelayedTopic:
 
     @property
     def header(self) -> Mapping[str, str] | None:
-        """Return the publisher's header, as subscribers get it; None while it is not known."""
         return self._header
 
     def tap(self, tap: Callable[[Batch], None], *, latched: bool) -> None:
@@ -212,7 +210,6 @@ class RelayedTopic:
         self._spare_unwanted()
 
     def differs(self) -> None:
-        """Make the pump ask again whether the next frames are `simple`."""
         self.plain.change()
 
     def simple(self) -> tuple[list[int], ModuleCall | None] | None:
@@ -236,7 +233,6 @@ class RelayedTopic:
 
     @property
     def keeps_large(self) -> bool:
-        """Whether the rest of a large batch can be kept for each subscriber that does not accept all of it."""
         return not any(member.exhausted for member in self._served)
 
     def limit(self, own: RateAllowance | None, together: RateAllowance | None) -> None:
@@ -303,7 +299,6 @@ class RelayedTopic:
 
     @property
     def lacks_latched(self) -> bool:
-        """Whether monitors have held back messages of a latching publisher, and no message is latched now."""
         return self._latch.is_lacking
 
     def upstream_closed(self) -> None:
@@ -424,14 +419,12 @@ class RelayedTopic:
             self._pause_or_trim()
 
     def relieve(self) -> None:
-        """Resume reading the publisher after a pause."""
         if self._state is TopicState.PAUSED:
             self._state = TopicState.OPEN
             if self.upstream is not None:
                 self.upstream.resume()
 
     def cut_all(self, reason: str) -> None:
-        """Cut every subscriber, because the topic is withdrawn."""
         self._end_stream()
         for member in self.members:
             member.cut(reason)
@@ -457,11 +450,9 @@ class RelayedTopic:
 
     @property
     def latched(self) -> int:
-        """Return the bytes of the latched message."""
         return self._latch.size
 
     def give_up_latched(self) -> None:
-        """Drop the latched message in favour of a host that holds less memory."""
         self._latch.give_up()
 
     def repeat(self) -> None:
@@ -527,7 +518,6 @@ class RelayedTopic:
             self._state, self._header = TopicState.UNKNOWN, None
 
     def announce(self) -> None:
-        """Show the publisher its subscribers, if it looks for their names."""
         if self.upstream is not None and self._header is not None:
             self.upstream.announce(self._names, self._header.get("type", ""))
 

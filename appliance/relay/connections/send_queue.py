@@ -37,12 +37,10 @@ class SendQueue:
 
     @property
     def messages(self) -> int:
-        """Return the number of frames that wait and are not started."""
         return self._messages
 
     @property
     def size(self) -> int:
-        """Return the bytes of these frames."""
         return self._size
 
     @property
@@ -52,7 +50,6 @@ class SendQueue:
 
     @property
     def begun(self) -> int:
-        """Return the unsent bytes of a frame that is sent in part."""
         return 0 if self._started is None else len(self._started)
 
     @property
@@ -146,7 +143,6 @@ class SendQueue:
         return before - self._messages
 
     def clear(self) -> None:
-        """Forget everything; the subscriber is gone."""
         self._share.add(-self._size - (0 if self._started is None else len(self._started)))
         self._started = None
         self._waiting.clear()

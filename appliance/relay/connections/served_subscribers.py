@@ -70,7 +70,6 @@ class ServedSubscribers:
 
     @property
     def masked(self) -> bool:
-        """Return whether messages are withheld from hosts."""
         return self._mask is not None
 
     def withhold(self, mask: Callable[[str], bool] | None) -> None:
@@ -94,13 +93,11 @@ class ServedSubscribers:
         self._members[member] = self._row = None
 
     def remove(self, member: TopicSubscriber) -> None:
-        """Remove a subscriber whose connection is closed."""
         self._members.pop(member, None)
         self._row = None
 
     @property
     def undelivered(self) -> int:
-        """Return the bytes of the batch that some subscribers still have to get."""
         return 0 if self._waits is None else len(self._waits[0].view)
 
     def deliver(self, batch: Batch, member: TopicSubscriber) -> None:
@@ -154,10 +151,8 @@ class ServedSubscribers:
 
     @property
     def has_dropped(self) -> bool:
-        """Whether messages were dropped since `take_dropped`."""
         return bool(self._dropped)
 
     def take_dropped(self) -> int:
-        """Return how many messages were dropped since the last call."""
         dropped, self._dropped = self._dropped, 0
         return dropped

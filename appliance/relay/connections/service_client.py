@@ -136,7 +136,6 @@ class ServiceClient:
         return "service", self.service.key, self.service.service, self.host, self.caller_id
 
     def start(self, rest: bytes) -> None:
-        """Connect to the service; `rest` is the bytes that the client has sent after its header."""
         try:
             self._exchange.from_client(rest)
             self._server = self._reach()
@@ -179,7 +178,6 @@ class ServiceClient:
             self.cut(f"{held} bytes of a message wait, without progress for {seconds:g} s")
 
     def cut(self, reason: str) -> None:
-        """Close both connections; the reason is empty if the client closed the connection."""
         if self._live:
             self._release()
             self._client.close()

@@ -67,7 +67,6 @@ class Subscriber:
         return "topic", self.topic.key, self.topic.topic, self.host, self.caller_id
 
     def greet(self, header: Mapping[str, str]) -> bool:
-        """Answer with the publisher's header, or refuse if the md5sums differ; return whether it is served now."""
         mismatch = describe_mismatch(self.fields, header)
         if mismatch:
             self._live = False
@@ -92,7 +91,7 @@ class Subscriber:
         return True
 
     def deliver(self, batch: Batch) -> int:
-        """Send the frames, or queue the bytes that the socket does not accept; return how many messages are dropped.
+        """Send the frames, or queue the bytes that the socket does not accept.
 
         A large batch is dropped while the host's memory is exhausted, because its unsent rest could not be kept.
         """
@@ -122,7 +121,6 @@ class Subscriber:
         return 0
 
     def accepted(self, batch: Batch, sent: int) -> int:
-        """Like `deliver`, after the pump has sent the first `sent` bytes (negative: the number of an error)."""
         if sent < 0 and -sent not in {errno.EAGAIN, errno.EWOULDBLOCK}:
             self._cut_by(OSError(-sent, os.strerror(-sent)), "cannot be written to")
             return 0
@@ -132,7 +130,6 @@ class Subscriber:
 
     @property
     def descriptor(self) -> int:
-        """The socket to which the next batch is just sent; -1 if it needs other work."""
         return -1 if self._writing or self._flow is not None else self._socket.fileno()
 
     def limit(self, flow: RateAllowance | None) -> None:
@@ -170,7 +167,6 @@ class Subscriber:
 
     @property
     def exhausted(self) -> bool:
-        """Whether no more data should be kept for its host."""
         return self._share.exhausted
 
     @property
@@ -178,7 +174,6 @@ class Subscriber:
         return self._queue.full
 
     def trim(self) -> int:
-        """Drop the oldest messages beyond the bounds; return how many."""
         return self._queue.trim()
 
     def check_stall(self) -> None:
@@ -188,7 +183,6 @@ class Subscriber:
             self.cut("its host has no memory left in the relay, and it does not accept the rest of a message")
 
     def cut(self, reason: str) -> None:
-        """Close the connection; the reason is empty if the subscriber closed it."""
         if self._live:
             self._live = False
             self._loop.discard(self._socket)
@@ -198,7 +192,6 @@ class Subscriber:
             self._ended(self)
 
     def _cut_by(self, error: OSError, what: str) -> None:
-        """Cut the subscriber for an error; a reset counts as its normal end."""
         self.cut(
             "" if isinstance(error, BrokenPipeError | ConnectionResetError) else f"{what}: {error.strerror}"
         )

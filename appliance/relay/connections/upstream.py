@@ -92,7 +92,6 @@ class PublisherConnection(Upstream):
         self._reader: UpstreamReader | None = None
 
     def connect(self) -> None:
-        """Connect, unless a connection exists or is under way."""
         self._wanted = True
         if self._linger is not None:
             self._linger.cancel()
@@ -101,7 +100,6 @@ class PublisherConnection(Upstream):
             self.ask()
 
     def silence(self, *, silent: bool) -> None:
-        """Take no message from the publisher, and close its connection at once; or connect again if it is wanted."""
         before, self._silent = self._silent, silent
         if silent and not before:
             self._drop_connection()
@@ -126,12 +124,10 @@ class PublisherConnection(Upstream):
         self._context.reporter.send(UpstreamWanted(self._topic.key, self._topic.topic))
 
     def ask_again(self) -> None:
-        """Repeat an open question to a new control."""
         if self.state is UpstreamState.ASKED:
             self.ask()
 
     def found(self, host: str, port: int) -> None:
-        """Connect to the address that control has found; ignore an answer that is no longer awaited."""
         if self.state is not UpstreamState.ASKED:
             return
         try:
@@ -148,19 +144,17 @@ class PublisherConnection(Upstream):
         self._enter(UpstreamState.CONNECTING, self._limits.connect_seconds, lambda: self._lose(late))
 
     def refused(self) -> None:
-        """Ask again later, because control has no address."""
         if self.state is UpstreamState.ASKED:
             self._retry()
 
     def close(self) -> None:
-        """Close everything, because the publication is withdrawn."""
         self._wanted = False
         if self._linger is not None:
             self._linger.cancel()
         self._close_unwanted()
 
     def pause(self, seconds: float) -> None:
-        """Stop reading the publisher until `resume`, for at most `seconds`; its data stays in the kernel's buffer."""
+        """Stop reading until `resume`, for at most `seconds`; the data stays in the kernel's buffer."""
         if self._reader is not None:
             self._reader.pause(seconds)
 
@@ -169,12 +163,10 @@ class PublisherConnection(Upstream):
             self._reader.resume()
 
     def check_stall(self) -> None:
-        """Cut a publisher that holds memory for a message and sends nothing of it; called once a second."""
         if self._reader is not None:
             self._reader.check_stall()
 
     def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
-        """Show the names of new subscribers to a publisher whose type needs them."""
         self._named_subscribers.announce(names, type_name)
 
     def request_latched(self) -> None:

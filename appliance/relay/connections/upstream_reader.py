@@ -75,7 +75,6 @@ class UpstreamReader:
         self._take_early()
 
     def pause(self, seconds: float) -> None:
-        """Stop reading until `resume`, for at most `seconds`."""
         if self._pause is None:
             self._loop.unwatch(self._socket.fileno())
             self._pause = self._loop.after(seconds, self._topic.relieve)
@@ -101,7 +100,6 @@ class UpstreamReader:
             self._lost(reason, "limit exceeded")
 
     def disarm(self) -> None:
-        """Take the next frames from the pump, with the incomplete one."""
         torn = self._pumped.disarm()
         if torn:
             self._receiver.resume(torn)
@@ -142,7 +140,6 @@ class UpstreamReader:
         self._arm()
 
     def _received(self, count: int) -> None:
-        """Take received bytes; 0 is the end of the connection, a negative number the number of an error."""
         if count > 0:
             self._take(count)
         elif count:

@@ -77,7 +77,6 @@ class BatchProgress:
         self._batch, self.messages, self.end = batch.head(taken), taken, self.position
 
     def result(self) -> Batch | None:
-        """Return the messages to pass on; None if there are none."""
         if not self.run:
             return self._batch
         left = self.messages - self._gone

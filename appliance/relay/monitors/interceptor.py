@@ -117,7 +117,6 @@ class Interceptor:
         self.shadow = ShadowMonitors(loop, self.now, self._shadow_observer)
 
     def remember(self, keeper: StateKeeper) -> None:
-        """Keep the monitors' state in `keeper`, and start from the state in it; call this before any statement."""
         self._keeper = keeper
         self.offset = keeper.offset
 
@@ -226,7 +225,6 @@ class Interceptor:
             self._give(message.name, message.values)
 
     def switch(self, name: str, enabled: bool) -> None:
-        """Enable or disable a monitor; ignore an unknown name."""
         self.invalidate_prepared()
         self._switches[name] = enabled
         if self.monitors is not None:
@@ -270,7 +268,6 @@ class Interceptor:
         return self._awaited is not None
 
     def intercepts(self, topic: str) -> bool:
-        """Return whether messages of a topic go through monitors."""
         return bool(self.blocked) or (self.monitors is not None and self.monitors.wants(topic))
 
     def wants(self, topic: str) -> bool:
@@ -308,7 +305,6 @@ class Interceptor:
         return "" if only_tried else objection
 
     def header_of(self, topic: str) -> dict[str, str] | None:
-        """Return the connection header, without names, for a topic that monitors publish; None for other topics."""
         if self.monitors is None or topic not in self.monitors.publications:
             return None
         return {**self._claim(self.monitors, self.monitors.publications[topic]), "latching": "0"}
@@ -335,7 +331,6 @@ class Interceptor:
             self.invalidate_prepared()
 
     def cells_place(self, way: str) -> CellsPlace | None:
-        """Return where the pump keeps the state of the monitors on a channel; None if it cannot."""
         return NOT_KEPT if self._keeper is None else self._keeper.cells_place(way)
 
     def _published(self, message: Published) -> None:

@@ -44,7 +44,6 @@ class Loader:
         return self._loading is not None or bool(self._waiting)
 
     def close(self) -> None:
-        """Wait for the end of loading, and discard its result."""
         self._waiting.clear()
         if self._loading is not None:
             self._loading.discard()

@@ -180,7 +180,6 @@ class Observations:
         self.tell_counters()
 
     def repeat(self) -> None:
-        """Send all waiting events, and all counters, to a new control."""
         self._counted = []
         self.flush()
 
@@ -192,7 +191,6 @@ class Observations:
     def _repeated(
         self, kind: str, monitor: str, point: ObservationPoint, distinction: str
     ) -> _Repeated | None:
-        """Return the counted events of a key, or None; a count for several clients of a host names none of them."""
         repeated = self._told.get(self._key(kind, monitor, point, distinction))
         if repeated is not None and repeated.caller_id != point.caller_id:
             repeated.caller_id = ""
@@ -201,7 +199,6 @@ class Observations:
     def _begin(
         self, kind: str, monitor: str, point: ObservationPoint, distinction: str, shared: Mapping[str, Any]
     ) -> _Repeated:
-        """Begin to count the events of a new key, and count it among the distinctions."""
         key = self._key(kind, monitor, point, distinction)
         if key[-1]:
             self._distinct[kind, monitor] = self._distinct.get((kind, monitor), 0) + 1

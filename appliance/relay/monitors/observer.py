@@ -70,18 +70,15 @@ class Observer:
         self._owed: list[FastPathCounts] = []
 
     def keep(self, names: list[str], began: list[str], time: int) -> None:
-        """Set the monitors in force; the counters of monitors that began start from zero."""
         self._sum_up(time)
         self._counters = {
             name: _Counters() if name in began else self._counters.get(name, _Counters()) for name in names
         }
 
     def shows(self, point: ObservationPoint) -> bool:
-        """Return whether the next change at a point is reported with the bytes before it."""
         return point not in self._shown
 
     def hides_drop(self, monitor: str, point: ObservationPoint) -> bool:
-        """Return whether the next drop of a monitor at a point is only counted."""
         return self._observations.was_reported("drop", monitor, point)
 
     def hides_verdict(self, verdict: Verdict, point: ObservationPoint) -> bool:
@@ -101,7 +98,6 @@ class Observer:
         return True
 
     def collect_later(self, counts: FastPathCounts) -> None:
-        """Add counts, to be collected when the second is over."""
         counts.begun = True
         self._owed.append(counts)
 
@@ -270,7 +266,6 @@ class Observer:
         return frozenset(name for name, counters in self._counters.items() if counters.missed)
 
     def tick(self, time: int) -> None:
-        """Send the counts of this second; called once a second."""
         self._sum_up(time)
         self._shown.clear()
         self._explained = 0
@@ -405,7 +400,6 @@ def dropped(body: memoryview, now: int, reason: str) -> Outcome:
 
 
 def refusal(outcome: Outcome, part: str) -> str:
-    """Return the error text for the client of a service."""
     if outcome.reason:
         return outcome.reason
     said = f": {outcome.fatal.text}" if outcome.fatal is not None else _said(outcome)
@@ -438,5 +432,4 @@ def _together(events: Sequence[str]) -> list[str]:
 
 
 def _of_publication(point: ObservationPoint, topic: str) -> ObservationPoint:
-    """Return the point of a publication that a message at `point` caused."""
     return point._replace(key="", resource=topic)

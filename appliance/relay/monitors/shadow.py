@@ -111,7 +111,6 @@ class ShadowMonitors:
             self.schedule()
 
     def tick(self) -> None:
-        """Begin a new second of processor time."""
         self._spent = 0.0
         self._resting.clear()
         self._observer.tick(self._now())
@@ -137,7 +136,6 @@ class ShadowMonitors:
         return [shadow for shadow in shadows if shadow not in self._resting]
 
     def have_turn(self) -> None:
-        """Process waiting messages for one slice of time."""
         self._timer = None
         self._turn(_SLICE)
         self.schedule()

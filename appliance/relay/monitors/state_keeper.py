@@ -169,7 +169,6 @@ class StateKeeper:
         self._lay_out()
 
     def take_nothing(self) -> None:
-        """Keep no state, because there are no monitors."""
         self._entries, self._by_channel = [], {}
         self._lay_out()
 
@@ -187,7 +186,6 @@ class StateKeeper:
         return all(stayed)
 
     def cells_place(self, channel: str) -> CellsPlace | None:
-        """Return where the cells of the monitors on a topic are kept; None if their state must be kept from Python."""
         entry = self._by_channel.get(channel)
         if entry is None or entry.refused:
             return NOT_KEPT

@@ -90,7 +90,6 @@ class StateMemory:
         return self._sections[section].write_base(base)
 
     def write_cells(self, section: int, cells: bytes) -> None:
-        """Keep the cells of a section if they have changed; they are newer than its base."""
         self._sections[section].write_cells(cells)
 
     def has_cells(self, section: int) -> bool:

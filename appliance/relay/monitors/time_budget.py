@@ -36,5 +36,4 @@ class TimeBudget:
             self._until = now + self._length
 
     def recovered(self, now: int) -> bool:
-        """Return whether the time since the end of the last reduction is at least as long as the reduction."""
         return now >= self._until + self._length

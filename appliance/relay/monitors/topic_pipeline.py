@@ -103,7 +103,6 @@ class TopicPipeline:
             self._interceptor.invalidate_prepared()
 
     def _failed(self, error: Exception, lane: FastLane, now: int) -> None:
-        """Report a defect of the fast path, and leave this topic to the engine from now on."""
         self._interceptor.observer.defect(error, self.point, now)
         self._defect = lane
         self._preparation = _UNPREPARED

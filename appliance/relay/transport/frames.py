@@ -126,7 +126,6 @@ class Batch:
         return self.last
 
     def keep_last(self) -> "Batch":
-        """Return the last frame as a batch with its own memory, which monitors may change."""
         if self._owned and self.messages == 1:
             self.keep()
             return self
@@ -265,7 +264,6 @@ class FrameReceiver:
         self._idle = True
 
     def abandon(self) -> None:
-        """Free everything: the connection is gone."""
         self._count(0)
         self._share.add(-self._aside)
         self._unwalked, self._aside = None, 0

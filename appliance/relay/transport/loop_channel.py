@@ -40,7 +40,6 @@ class LoopLink:
         loop.watch(channel.fileno(), READ, self._ready)
 
     def send(self, message: Message) -> None:
-        """Send the message now, or when the other end reads; do nothing after the link has ended."""
         if not self._live:
             return
         try:
@@ -113,7 +112,6 @@ class LoopLink:
         self._slice = self._loop.after(0, self._carry_out) if more else None
 
     def _finish(self) -> None:
-        """Carry out all messages that need not wait; then report the end of a link that has ended."""
         while self._arrived and not self._waits:
             self._carry_out()
         if self._end_of_link is not None and not self._arrived:

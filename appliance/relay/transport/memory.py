@@ -31,7 +31,6 @@ class HostMemory:
 
     @property
     def used(self) -> int:
-        """Return the number of bytes that this host holds."""
         return self._pool.held(self._host)
 
     def add(self, size: int) -> None:
@@ -81,7 +80,6 @@ class RelayMemory:
 
     @classmethod
     def of(cls, limits: RelayLimits, quota_class: Callable[[str], QuotaClass]) -> "RelayMemory":
-        """Return the pools of one relay; `memory_bytes` is divided in the proportions of `quotas/table.py`."""
         rows = (RELAY_FRAMES, RELAY_QUEUES, RELAY_LATCHED)
         together = sum(row.bounds.whole for row in rows)
 
@@ -94,7 +92,6 @@ class RelayMemory:
         return cls(frames, queues, latched, pool_of(RELAY_HEADERS, limits.header_memory_bytes))
 
     def held(self) -> dict[str, int]:
-        """Return the bytes in each pool."""
         return {
             "frames": self.frames.total,
             "queues": self.queues.total,

@@ -134,14 +134,12 @@ class SharedRateLimit:
         return share
 
     def room(self, name: str, batch: Batch, most: int, now: float) -> int:
-        """Return how many of the first `most` messages in this holder's batch may pass."""
         self._fill(now)
         if self._limit.messages:
             most = min(most, max(0, ceil(self._messages.left(name))))
         return batch.within(self._bytes.left(name), most) if self._limit.bytes else most
 
     def take(self, name: str, batch: Batch) -> None:
-        """Charge this holder for a batch that has passed."""
         if self._limit.messages:
             self._messages.take(name, batch.messages)
         if self._limit.bytes:
@@ -181,7 +179,6 @@ class RateAllowance:
         self._name = name
 
     def room(self, batch: Batch, most: int, now: float) -> int:
-        """Return how many of the first `most` messages of a batch may pass."""
         return self._flow.room(self._name, batch, most, now)
 
     def take(self, batch: Batch) -> None:
@@ -241,7 +238,6 @@ class PublicationRateLimit:
         self.limits = False
 
     def set(self, own: RateAllowance | None, together: RateAllowance | None) -> None:
-        """Set the limit of the publication's host, and the limit of its topic."""
         self._own = own
         self._together = together
         self.limits = self._own is not None or together is not None

@@ -31,7 +31,6 @@ def tune(sock: socket.socket) -> None:
 
 
 def congestion_control() -> str:
-    """Return the congestion control of the relay's sockets."""
     with socket.socket() as sock:
         tune(sock)
         return sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, 16).rstrip(b"\0").decode()
@@ -89,7 +88,6 @@ class BufferedSocket:
 
     @property
     def backlog(self) -> int:
-        """Return the number of bytes that the kernel has not accepted yet."""
         return len(self._outgoing)
 
     def send(self, data: bytes) -> None:
