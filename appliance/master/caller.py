@@ -39,7 +39,6 @@ class Caller(NamedTuple):
 
     @property
     def asker(self) -> Asker:
-        """Return the caller in the form that the audit log records."""
         return Asker(
             self.peer.text, self.caller_id, self.arrived, None if self.target is None else self.target.name
         )

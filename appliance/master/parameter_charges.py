@@ -209,7 +209,6 @@ def measure(value: Value) -> tuple[int, int]:
 
 
 def _own_weight(value: Value, below: list[Value]) -> int:
-    """Return the weight of a value without its members. Append the members to `below`."""
     if isinstance(value, str):
         return _TEXT + text_weight(value)
     if isinstance(value, bytes):
@@ -226,5 +225,4 @@ def _own_weight(value: Value, below: list[Value]) -> int:
 
 
 def member_weight(name: str, value: Value) -> int:
-    """Return the approximate bytes that a member of a namespace takes, with its name."""
     return NAME_WEIGHT + text_weight(name) + measure(value)[0]

@@ -64,7 +64,6 @@ class ParameterMirror:
 
     @property
     def bytes_limit(self) -> int:
-        """Return the limit in bytes for all parameters together."""
         return self.charges.pool.bounds.whole
 
     def check(self, key: str, depth: int) -> None:
@@ -93,7 +92,6 @@ class ParameterMirror:
         return Reservation(pool, former, 0, weight)
 
     def replace(self, tree: Tree) -> None:
-        """Replace the mirror by the ROS master's tree."""
         self.tree = tree
         self._recount(final=True)
         self.unnoted = True

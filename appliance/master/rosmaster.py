@@ -98,11 +98,11 @@ class RosMaster:
         return await self._call(lambda: self.call_now(method, *params))
 
     async def call_in_order(self, calls: Sequence[Wanted]) -> list[Answer | CallFailedError]:
-        """Make several calls in order, like `call`. Return the outcome of each call."""
+        """Make several calls in order, like `call`; return the outcome of each."""
         return await self._call(lambda: self._in_order(calls))
 
     async def call_once(self, calls: Sequence[Wanted]) -> list[Answer | CallFailedError]:
-        """Make several calls in order through the open door, and never repeat them. Return the outcome of each call.
+        """Make several calls in order through the open door, and never repeat them.
 
         If they fail, shut the door until the next round of the reconcile loop, and raise `CallFailedError`.
         """
@@ -133,7 +133,6 @@ class RosMaster:
                     return await self._pass(make)
 
     async def opened(self) -> None:
-        """Wait until the door is open."""
         while not self._open.is_set():  # the door may be shut again before this task runs
             await self._open.wait()
 
@@ -179,7 +178,6 @@ class RosMaster:
         self.doubtful.set()
 
     def shut(self) -> None:
-        """Shut the door, because the ROS master is away or not yet restored. Calls wait from now on."""
         self._open.clear()
         self._away = True
 

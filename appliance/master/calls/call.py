@@ -309,7 +309,6 @@ class Attempt:
 
     @property
     def api(self) -> ApiUri | None:
-        """Return the caller's own URI, if the call has one."""
         return None if self.call.api is None else cast(ApiUri, self.arguments[self.call.api])
 
     @property
@@ -341,7 +340,6 @@ Table = Mapping[str, ServedCall]
 
 
 def served(calls: Iterable[RosCall[S]], part: S) -> dict[str, ServedCall]:
-    """Return a table of these calls by name; the methods of `part` carry them out."""
     return {call.name: ServedCall(call, part) for call in calls}
 
 

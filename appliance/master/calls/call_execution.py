@@ -88,7 +88,6 @@ class Execution:
     async def understand(
         self, visit: ServedRequest, method: str, params: Sequence[Value]
     ) -> Attempt | Answer:
-        """Return the undecided call with canonical arguments. If the call is invalid, return the answer to it."""
         if method not in visit.table:
             return self._unknown(visit.caller, method, params)
         call = visit.table[method].call

@@ -59,7 +59,6 @@ class KeyTurn:
         self._end()
 
     def done(self) -> asyncio.Event:
-        """Return an event that is set when this call has ended."""
         if self._done is None:
             self._done = asyncio.Event()
             if self not in self._turns:

@@ -100,7 +100,6 @@ class CallGate:
         return _no(f"{held} {holder.host}; {other}", told=f"{held} a node of another host; {other}")
 
     def _taken(self, attempt: Attempt) -> Decision | None:
-        """Deny a registration of the appliance's own service, because the last provider gets a service."""
         if attempt.call.kind is Kind.SERVICE:
             for provider in self._registry.registered(Kind.SERVICE, attempt.resource):
                 if provider.of_monitors:

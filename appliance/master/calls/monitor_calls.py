@@ -56,7 +56,6 @@ class MonitorCalls:
         return [1, "RV State", cast(Value, self.rv_state())]
 
     def rv_state(self) -> list[object]:
-        """Return the value of `getRVState`."""
         rows: list[list[object]] = []
         for monitor, topics in self.monitors.checked.topics.items():
             for topic in sorted(topics):

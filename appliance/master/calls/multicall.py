@@ -62,7 +62,6 @@ class Multicall:
         return results
 
     async def _why_no_more(self, visit: ServedRequest, room: int) -> str:
-        """Return why no further parts are carried out, or an empty string."""
         if room <= 0:
             return f"the answers to a multicall have more than {self.parameters.mirror.bytes_limit} bytes"
         return await self.trail.still_owing(visit.caller.peer.text)

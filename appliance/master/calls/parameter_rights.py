@@ -46,7 +46,6 @@ class ParameterRights:
         return decision.allowed
 
     def to_find(self, caller: Caller, key: str) -> Decision:
-        """Decide whether a caller may learn that a parameter exists."""
         request = Request(caller.peer.host, caller.caller_id, Category.READ, key)
         return decide_right(self.policy(), right_to_find(request))
 

@@ -17,8 +17,6 @@ class HostSigns:
 
 
 def host_signs(registry: Registry, carried: RelayTraffic) -> HostSigns:
-    """Return the signs of hosts, by their registrations and the reports of relays."""
-
     def live(host: Address) -> bool:
         return any(node.host == host for node in registry.live())
 

@@ -62,7 +62,6 @@ class NodePorts:
         self.taken = self._counted()
 
     def policy_changed(self, ports: range) -> None:
-        """Take new ports from this range, keep the ports in use, and charge them to the new policy's networks."""
         if ports != self._range:
             self._range = ports
             used = {socket.getsockname()[1] for socket in self._sockets.values()}
@@ -121,7 +120,6 @@ class NodePorts:
         return self._sockets[f"port:{port}"]
 
     def adopt(self, name: str, sock: sockets.socket) -> None:
-        """Use a kept socket after a restart of control."""
         self._sockets[name] = sock
         port = sock.getsockname()[1]
         if port in self.unused:

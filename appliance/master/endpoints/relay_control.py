@@ -68,7 +68,6 @@ class RelayOutbox(Link):
         return [self._orders[-1]]
 
     def carried_out(self) -> None:
-        """Handle the relay's answer to the oldest question: it has carried out its orders."""
         if not (done := self._orders.popleft()).done():
             done.set_result(None)
 
@@ -156,7 +155,6 @@ class RelayControl:
         return self._posts[relay].send(message)
 
     def publish(self, message: messages.OwnPublished) -> None:
-        """Send a message of the appliance's own publisher to the present subscribers."""
         self._post(TOPIC, message.topic).send(message)
 
     async def carried_out(self) -> None:
@@ -233,7 +231,6 @@ class RelayControl:
             post.send(placed, soon=True)
 
     def place_grant(self, row: PermissionRow) -> None:
-        """Have the relay admit a subscriber or client."""
         post = self._post(row.kind, row.resource)
         if row.kind == TOPIC:
             post.send(_grant(self.policy(), row))
@@ -278,14 +275,12 @@ class RelayControl:
         return [row for row in rows if (row.kind, row.resource) == (move.kind, move.name)]
 
     def withdraw_node(self, incarnation: Incarnation) -> None:
-        """Have all relays stop carrying an incarnation."""
         for post in self._posts:
             if incarnation.key in post.placed:
                 post.placed.discard(incarnation.key)
                 post.send(messages.NodeWithdrawn(incarnation.key))
 
     def place_node(self, incarnation: Incarnation) -> None:
-        """Have the relays carry all topics and services of an incarnation, with their grants."""
         for post in self._posts:
             self._place(post, incarnation)
 

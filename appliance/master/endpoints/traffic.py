@@ -131,7 +131,6 @@ class RelayTraffic:
         return clock.now() - max(moved, self._began) < _MOVING_SECONDS
 
     def lost(self, relay: int) -> None:
-        """Forget the connections and memory of a relay that is gone."""
         self.memory.pop(relay, None)
         for number in [connection for connection in self.connections if connection[0] == relay]:
             del self.connections[number]
@@ -274,7 +273,6 @@ class RelayTraffic:
         )
 
     def publication_refused(self, message: messages.PublicationRefused) -> None:
-        """Record that a relay refuses to carry a publisher."""
         self._trail.happened(
             "publication refused",
             message.reason,

@@ -30,7 +30,6 @@ class NodeCall:
 
     @property
     def weight(self) -> int:
-        """Return the approximate size of the waiting call in bytes."""
         if self.size:
             return self.size
         texts = [

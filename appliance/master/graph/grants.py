@@ -56,7 +56,7 @@ class Grants:
         return [*effects, PlaceGrant(row)]
 
     def take(self, row: PermissionRow) -> Effects:
-        """Revoke a grant if it exists. Its connection is cut."""
+        """Revoke a grant if it exists; its connection is cut."""
         rows = self._of_node.get(row.key, set())
         if row not in rows:
             return []

@@ -139,7 +139,7 @@ class RosGraph:
         return effects
 
     def replaced(self, incarnation: Incarnation, by: Incarnation) -> Effects:
-        """Replace an incarnation whose name another incarnation took. Shut it down with the ROS master's text."""
+        """Shut down an incarnation whose name another incarnation took, with the ROS master's text."""
         lost = list(incarnation.registrations.values())
         reason = f"[{incarnation.name}] Reason: new node registered with same name"
         other = by.host != incarnation.host

@@ -45,5 +45,4 @@ class Mediation:
         )
 
     def hides_publishers(self, topic: str) -> bool:
-        """Return whether subscribers of a topic get the publishers' outer URIs instead of the real URIs."""
         return self.stand_ins or self.carries_topic(topic)

@@ -206,7 +206,6 @@ class Registry:
         return self._by_key.get(key)
 
     def find(self, name: str, host: Address, api_text: str) -> Incarnation | None:
-        """Return the incarnation that registered as `name` from `host` with this API URI."""
         return self._known.get((name, host, api_text))
 
     def holder(self, name: str) -> Incarnation | None:
@@ -215,7 +214,6 @@ class Registry:
         return incarnation if incarnation is not None and incarnation.registrations else None
 
     def occupant(self, name: str) -> Incarnation | None:
-        """Return the live incarnation that holds a name, or that would hold it with its withdrawn registrations."""
         incarnation = self._live.get(name)
         there = incarnation is not None and (incarnation.registrations or incarnation.shelf)
         return incarnation if there else None
@@ -252,7 +250,6 @@ class Registry:
         return [found for found in below if found != "/"]
 
     def nodes_of(self, host: Address) -> int:
-        """Return the number of known incarnations of a host, for the limit per host."""
         return self._nodes_of.get(host, 0)
 
     def room_for(self, name: str, host: Address, api_text: str) -> Incarnation | None:
@@ -331,7 +328,6 @@ class Registry:
         return [SaveNode(incarnation)]
 
     def restore(self, incarnation: Incarnation) -> None:
-        """Add an incarnation that was read from the store, with its registrations."""
         self.version += 1
         self._by_key[incarnation.key] = incarnation
         self._known[incarnation.name, incarnation.host, incarnation.api_text] = incarnation
@@ -368,13 +364,11 @@ class Registry:
         return [SaveRegistration(incarnation.key, registration, shelved=True)]
 
     def unshelve(self, incarnation: Incarnation, kind: Kind, resource: str) -> list[Durable]:
-        """Forget a registration that the policy withdrew, if there is one."""
         if incarnation.shelf.pop((kind, resource), None) is None:
             return []
         return [EraseRegistration(incarnation.key, kind, resource, shelved=True)]
 
     def unregister(self, incarnation: Incarnation, kind: Kind, resource: str) -> list[Durable]:
-        """Remove a registration, if it exists."""
         if incarnation.registrations.pop((kind, resource), None) is None:
             return []
         self.version += 1
@@ -392,13 +386,11 @@ class Registry:
         return kept + self._retire(incarnation, Life.REPLACED, when)
 
     def overshadow(self, incarnation: Incarnation, when: float) -> list[Durable]:
-        """Suspend the registrations of a node that does not answer, until it returns."""
         for kind, resource in incarnation.registrations:
             self._unindex(incarnation, kind, resource)
         return self._retire(incarnation, Life.SHADOW, when)
 
     def revive(self, incarnation: Incarnation, when: float) -> list[Durable]:
-        """Make a shadow live again, because its node answers and its name is free."""
         self.version += 1
         incarnation.life, incarnation.changed = Life.LIVE, when
         self._live[incarnation.name] = incarnation
@@ -407,7 +399,6 @@ class Registry:
         return [SaveNode(incarnation)]
 
     def forget(self, incarnation: Incarnation) -> list[Durable]:
-        """Forget an incarnation permanently. Its ports may be reused."""
         self.version += 1
         for kind, resource in incarnation.registrations:
             self._unindex(incarnation, kind, resource)

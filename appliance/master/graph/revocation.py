@@ -39,7 +39,6 @@ class Revocation:
     tree: Callable[[], Tree]
 
     def live(self) -> list[LiveRight]:
-        """Return the registrations and grants of all nodes except the appliance's own nodes."""
         return [
             *(
                 self._registered(incarnation, registration.kind, registration.resource)
@@ -50,7 +49,7 @@ class Revocation:
         ]
 
     def policy_changed(self, before: Policy, now: Policy) -> Effects:
-        """Return all effects of a new policy. The policy must already be in force."""
+        """Return all effects of a new policy, which is already in force."""
         return [UsePorts(now.ports), *self.redecide(), *self.graph.limits_changed(before, now)]
 
     def redecide(self) -> Effects:

@@ -140,11 +140,9 @@ class Enforcement:
         return self._take_back(self.revocation.expel(host, reason))
 
     def redecide_for(self, host: Address, caller_id: str) -> None:
-        """Revoke the rights of a caller that the policy in force does not allow."""
         self.enactor.carry_out(self.revocation.redecide_for(host, caller_id))
 
     async def carried_out(self) -> None:
-        """Wait until the relays have carried out all orders."""
         await self.enactor.relay.carried_out()
 
     def _take_back(self, effects: Effects) -> int:

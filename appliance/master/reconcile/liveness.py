@@ -103,11 +103,9 @@ class Watchlist:
         self._missed[node.key] = MissedUpdates(set(node.resources(Kind.SUBSCRIPTION)))
 
     async def filled(self) -> None:
-        """Wait until there is a node to check."""
         await self._filled.wait()
 
     def take(self) -> list[Incarnation]:
-        """Return the nodes to check, and clear the list."""
         self._filled.clear()
         nodes, self._nodes = self._nodes, {}
         return list(nodes.values())
@@ -128,7 +126,6 @@ class Watchlist:
         return missed
 
     def keep_only(self, keys: Collection[str]) -> None:
-        """Forget the missed updates of all nodes, except the nodes with these keys."""
         self._missed = {key: missed for key, missed in self._missed.items() if key in keys}
 
 
@@ -208,7 +205,6 @@ class Liveness:
             task.add_done_callback(lambda _done: self._checks.pop(incarnation.key, None))
 
     async def probe(self, incarnation: Incarnation) -> Probe:
-        """Call a node now to find out whether it is there."""
         now = clock.now()
         since = self._answered.setdefault(incarnation.key, now)
         patience = max(0.0, self.settings.silent - (now - since)) + self.settings.interval
@@ -225,7 +221,6 @@ class Liveness:
         return Probe(incarnation, presence, patience)
 
     def revive(self, incarnation: Incarnation) -> None:
-        """Restore a shadow with all its registrations, because its node registers again."""
         self._answered[incarnation.key] = clock.now()
         self._processes.pop(incarnation.key, None)
         self._bring_back(incarnation)

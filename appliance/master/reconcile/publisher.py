@@ -56,7 +56,6 @@ class OwnPublisher:
         self._woken.set()
 
     def wake(self) -> None:
-        """Update the registrations, because `wanted()` may have changed."""
         self._woken.set()
 
     async def run(self, ready: asyncio.Event) -> None:

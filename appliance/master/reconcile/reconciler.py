@@ -72,7 +72,7 @@ class Reconciler:
                 pass
 
     async def round(self) -> None:
-        """Compare the ROS master with the registry once, and remove all differences."""
+        """Remove all differences between the ROS master and the registry."""
         async with self.rosmaster.alone():
             pid = (await self.rosmaster.call_now("getPid", NAME))[2]
             if pid == self.entries.pid:

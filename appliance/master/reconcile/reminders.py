@@ -49,13 +49,11 @@ class Reminders:
         self._absences: dict[tuple[str, str], _Absence] = {}
 
     async def run(self) -> None:
-        """Remind all subscribers that stay absent, until cancelled."""
         while True:
             await asyncio.sleep(_LASTING_SECONDS)
             self.remind_lasting()
 
     def remind_lasting(self) -> None:
-        """Remind each subscriber whose absence has lasted."""
         before, self._absences, now = self._absences, {}, clock.now()
         for subscriber, topic, publishers in list(self._graph.absent(self._registry.live())):
             absence = before.get((subscriber.key, topic)) or _Absence(
@@ -101,11 +99,9 @@ class RelayMoves:
         self._reminders = reminders
 
     def send(self, message: Message, relay: int) -> bool:
-        """Send a message to a relay. Return False if the relay is not connected."""
         return self._relay.send(message, relay)
 
     async def carried_out(self) -> None:
-        """Wait until every relay has carried out its orders."""
         await self._relay.carried_out()
 
     def live_resources(self) -> set[Resource]:
