@@ -35,7 +35,6 @@ The appliance's own interface for scripts and other programs. Every call but the
 
 
 def build_app(services: Services) -> FastAPI:
-    """Return the application; the caller wraps it in `RequestGate`."""
     app = FastAPI(
         title="ROSRV appliance",
         version=appliance.__version__,

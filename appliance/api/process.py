@@ -47,7 +47,6 @@ _SWITCH_SECONDS = 0.0005  # a thread that judges a large text lets the loop run 
 
 
 def main(lifeline_fd: int, config: Path) -> None:
-    """Serve REST until the supervisor ends it."""
     sys.setswitchinterval(_SWITCH_SECONDS)
     uvloop.run(_Api(load_resolved(config), lifeline_fd).run())
 

@@ -64,7 +64,6 @@ def _group_of(verbs: Verbs, further: Callable[[], Verbs]) -> type[TyperGroup]:
             return {name: own.get(name) or _command_of(verb, name, dict) for name, verb in table.items()}
 
         def get_params(self, ctx: Any) -> list[Any]:
-            """Return the options of the group itself."""
             return _without_type_of_flags(super().get_params(ctx))
 
         def get_command(self, ctx: Any, cmd_name: str) -> Any:

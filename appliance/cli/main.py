@@ -95,14 +95,12 @@ VERBS: Verbs = {
 
 
 def feature_verbs() -> Verbs:
-    """Return the verbs of all features."""
     from appliance.features.table import FEATURES  # noqa: PLC0415  most verbs of the core do not need it
 
     return functools.reduce(joined, (feature.verbs for feature in FEATURES))
 
 
 def all_verbs() -> Verbs:
-    """Return the verbs of the core and of all features, in the order of the help."""
     return joined(VERBS, feature_verbs())
 
 

@@ -295,7 +295,6 @@ def doubted_clock(clock: ClockState) -> str | None:
 
 
 def shortened(lines: Sequence[str], most: int) -> list[str]:
-    """Return at most `most` lines; if lines are left out, the last line has their number."""
     if len(lines) <= most:
         return list(lines)
     return [*lines[: most - 1], f"and {len(lines) - most + 1} more: rosrv status --json"]

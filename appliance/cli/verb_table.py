@@ -21,7 +21,6 @@ class Verb:
 
     @property
     def path(self) -> str:
-        """Return the function's place with the whole name of its module."""
         return self.place if self.place.startswith("appliance.") else f"appliance.cli.{self.place}"
 
     @property

@@ -51,7 +51,6 @@ _WARNINGS = 100  # the most warnings of the policy in `Ready`
 
 
 def main(lifeline_fd: int, config_path: Path) -> None:
-    """Run control until the supervisor stops it."""
     settings = load_resolved(config_path)
     # Limit how long the event loop waits for a thread (audit log, store, large values) that runs Python code.
     sys.setswitchinterval(_SWITCH_SECONDS)

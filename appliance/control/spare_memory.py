@@ -15,7 +15,6 @@ MUCH = 32 << 20
 
 
 def resident() -> int:
-    """Return the resident memory of this process in bytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 

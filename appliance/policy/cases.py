@@ -62,7 +62,6 @@ class CaseResult:
 
     @property
     def finding(self) -> PolicyFinding:
-        """Return the finding for a check that failed."""
         text = f"expected {self.expected}: {self.decision.reason}"
         return PolicyFinding(self.file, self.line, self.column, FindingSeverity.ERROR, text)
 

@@ -40,7 +40,6 @@ class HostNames:
 
     @classmethod
     def of(cls, text: str, enrolled: Mapping[str, Address], robot: Iterable[Network]) -> "HostNames":
-        """Return the names in the text of a valid policy."""
         rows = {
             entry.key.text: [word.text for word in entry.values]
             for section in read(text, Findings("policy"))

@@ -51,7 +51,6 @@ class PolicyContext:
         )
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields as a mapping, to send them to another process."""
         return {
             "hosts": {name: str(address) for name, address in self.hosts.items()},
             "robot": [str(place) for place in self.robot],

@@ -33,7 +33,6 @@ class Key:
 
     @property
     def literal(self) -> str:
-        """Return the text up to the first star."""
         return self.text.partition("*")[0]
 
     @property

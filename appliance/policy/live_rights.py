@@ -33,7 +33,6 @@ class LiveRight(NamedTuple):
         return cls(**{**fields, "host": ipaddress.ip_address(fields["host"])})
 
     def fields(self) -> dict[str, Any]:
-        """Return the fields as a mapping, to send them to another process."""
         return {**self._asdict(), "host": str(self.host)}
 
     def requests(self) -> list[Request]:

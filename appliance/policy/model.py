@@ -88,7 +88,6 @@ class Request:
     resource: str
 
     def fields(self) -> dict[str, str]:
-        """Return the fields as the audit log writes them."""
         return {
             "host": str(self.host),
             "caller_id": self.caller_id,

@@ -93,7 +93,6 @@ class KeyTree(Generic[Value]):
         return inherited[1] if inherited is not None else None
 
     def _walk(self, name: str) -> tuple[tuple[Key, Value] | None, list[_Node[Value]]]:
-        """Return the most specific `/**` key that covers everything below `name`, and the nodes at `name`."""
         reached = [self._root]
         subtrees = [self._root.subtree]
         for level in levels(name):

@@ -57,7 +57,6 @@ class CompiledRule:
 
     @property
     def hosts(self) -> frozenset[Atom]:
-        """Return the atoms of all hosts that the rule names, with those that need an approval."""
         return self.atoms | self.asked
 
     def asks(self, atoms: frozenset[Atom]) -> bool:
@@ -267,7 +266,6 @@ class Policy:
         return self.hosts.narrowest(address)
 
     def alike(self, address: Address) -> str:
-        """Return `named_as` as text, a key for fast look-ups."""
         return self.hosts.alike(address)
 
     def counted_as(self, address: Address) -> str:

@@ -26,7 +26,6 @@ def lint(
     hosts: HostSets,
     findings: Findings,
 ) -> None:
-    """Add all warnings about a policy without errors to `findings`."""
     _shadowed_defaults(tables, findings)
     _dead_rules(tables, hosts, findings)
     _nodes_that_cannot_start(tables, present, written, findings)

@@ -100,7 +100,6 @@ def right_to_find(request: Request) -> Right:
 
 
 def needs_node(request: Request) -> bool:
-    """Return whether the action makes a node part of the graph, so that `[Nodes]` also decides."""
     if request.category is Category.COMMAND:
         return policy_call(request.resource).node
     return request.category in _NODE_CATEGORIES

@@ -26,7 +26,6 @@ class RuleCompiler:
         self._findings = findings
 
     def add_section(self, decider: Decider, section: SectionText) -> None:
-        """Add every line of one section."""
         first_lines: dict[tuple[Category, str], int] = {}
         for entry in section.entries:
             if self._findings.full:
@@ -78,7 +77,6 @@ class RuleCompiler:
         return plain, tuple(word for word in asking if word.text != ASK)
 
     def _fits(self, category: Category, key: Key, name: Word) -> bool:
-        """Whether a pattern can be added: it ties with no earlier pattern, and there are not too many patterns."""
         self._inner_stars += key.inner_star
         if self._inner_stars > MAXIMUM_INNER_STARS:
             text = f"more than {MAXIMUM_INNER_STARS} keys have a star before the end, such as /*/state: use fewer"
@@ -103,7 +101,6 @@ class RuleCompiler:
             table.tree.add(rule.key, rule)
 
     def _category_and_name(self, decider: Decider, entry: Entry) -> tuple[Category, Word] | None:
-        """Return the category and name of a line; the lines of `[Parameters]` begin with the category."""
         if len(decider.categories) == 1:
             return decider.categories[0], entry.key
         verb, _, name = entry.key.text.partition(" ")

@@ -66,7 +66,6 @@ class UnreachableError(Exception):
 
 
 def main() -> None:
-    """Start the role that the command-line arguments name, in this process."""
     role, text = sys.argv[1:3]
     plan = msgspec.json.decode(text, type=LaunchPlan)
     setproctitle.setproctitle(f"rosrv: {title_of(role, plan.index)}")

@@ -413,7 +413,6 @@ class NetnsIsolation(ContainerIsolation):
 
     @contextlib.contextmanager
     def inside(self) -> Iterator[None]:
-        """Move the calling thread into the namespace."""
         with self._namespace.entered():
             yield
 
@@ -432,7 +431,6 @@ class NetnsIsolation(ContainerIsolation):
             self._isolation.forward_also(self._own_ports)
 
     def build(self) -> None:
-        """Make the namespace, its link to the host's networks, and the firewall. Raises `StartError`."""
         try:
             self._isolation.up()
         except NetworkError as error:

@@ -129,7 +129,6 @@ class IsolationWatchdog:
         return messages.EndpointFound(found.address, found.reason)
 
     async def run(self) -> None:
-        """Check every minute."""
         while True:
             await asyncio.sleep(self._every)
             await self.look()
@@ -144,7 +143,6 @@ class IsolationWatchdog:
 
 
 def _words(error: Exception) -> str:
-    """Return an error's text for operators; log an unexpected exception with its traceback."""
     if isinstance(error, NetworkError | ValueError):
         return str(error)
     log.error("fault while checking the environment", exc_info=error)
@@ -152,7 +150,6 @@ def _words(error: Exception) -> str:
 
 
 async def in_thread(function: Callable[[], T]) -> T:
-    """Call `function` in a daemon thread of its own; return its result or raise its exception."""
     loop = asyncio.get_running_loop()
     outcome: asyncio.Future[T] = loop.create_future()
 

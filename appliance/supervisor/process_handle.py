@@ -149,7 +149,6 @@ class ProcessHandle:
 
     @property
     def sandbox_state(self) -> tuple[str, list[str]]:
-        """Return the sandbox in words, and the limits that this kernel lacks."""
         if self.sandbox is None:
             return "", []
         calls = {"listed": "listed calls", "usual": "usual calls"}.get(self.sandbox.calls)
@@ -170,7 +169,6 @@ class ProcessHandle:
             self._reports.violated(self, f"does not read its liveness pipe: {error}")
 
     def ping(self) -> None:
-        """Ping the process, which must answer."""
         self._asked += 1
         self.send(Ping(self._asked))
 

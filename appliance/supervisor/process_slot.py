@@ -37,7 +37,6 @@ class ProcessSlot:
 
     @property
     def is_free(self) -> bool:
-        """Whether no process runs and no start is due."""
         return self.process is None and self.due is None
 
     @property

@@ -15,7 +15,6 @@ class _Section(msgspec.Struct):
 
 
 def main(lifeline_fd: int, index: int, config: Path) -> None:
-    """Run relay `index` until the supervisor ends it."""
     relay(lifeline_fd, index, limits_of(config))
 
 

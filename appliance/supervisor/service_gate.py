@@ -37,7 +37,6 @@ class ServiceGate:
 
     @property
     def active(self) -> bool:
-        """Whether this appliance may serve."""
         return self.epoch is not None and not self.suspended
 
     def heard(self, message: Any) -> None:

@@ -37,7 +37,6 @@ class ServiceManager:
         self._say(f"{_MORE}STATUS={status}")
 
     def ready(self, status: str) -> None:
-        """Report that the appliance serves; `systemctl status` shows `status`."""
         self._starting = False
         self._say(f"READY=1\nSTATUS={status}")
 

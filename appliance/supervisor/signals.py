@@ -27,7 +27,6 @@ def held() -> Iterator[None]:
 
 @contextmanager
 def heard() -> Iterator[None]:
-    """Deliver pending and new signals to the handlers during the block."""
     before = signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
     try:
         yield

@@ -149,7 +149,6 @@ class StateDirectory:
         return listener
 
     def close(self) -> None:
-        """Remove the files of a running appliance, and release the lock."""
         (self.path / ADMIN_SOCKET).unlink(missing_ok=True)
         for name in (self.config.name, *self._written):
             self.config.with_name(name).unlink(missing_ok=True)

@@ -440,7 +440,6 @@ class Supervisor:
         self._tell_control(messages.Activated(epoch))
 
     def _passivate(self) -> None:
-        """End everything that serves the robot; each process starts again, passive."""
         log.warning("this appliance is not active any more; its processes start again, passive")
         self._tell("api", messages.ServicePaused(""))
         self._answer_for_control(self._gate.ended_text)
@@ -473,7 +472,6 @@ class Supervisor:
         return True
 
     def _resume(self) -> None:
-        """Let everything go on that `_suspend` stopped."""
         seconds = clock.now() - self._suspended_at
         self._tell("api", messages.ServicePaused(""))
         self._leave_answers()

@@ -175,7 +175,6 @@ def _collect(entries: Iterable[Traversable], prefix: str) -> dict[str, _File]:
 
 
 def _stating(page: str, said: dict[str, str]) -> str:
-    """Return the page with the site's settings in its `meta` elements."""
     for name, text in said.items():
         empty = f'<meta name="rosrv:{name}" content="'
         before, found, after = page.partition(empty)

@@ -143,7 +143,6 @@ class TokenAuthenticator:
         _require_patience(self._unknown, host)
 
     def noted(self, host: str, *, valid: bool) -> None:
-        """Note a right or wrong secret of a peer that is not a token, such as a ticket."""
         if valid:
             self._remember(peer_key(host))
         else:

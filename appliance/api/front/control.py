@@ -92,7 +92,6 @@ class ControlLink:
         self._tell_pin()
 
     def state_served(self, pin: str, certificate: str) -> None:
-        """Send the pin of this server's key, and the hash of its certificate, to this control and to later ones."""
         self._served = RestServed(pin, certificate)
         self._tell_pin()
 

@@ -98,7 +98,6 @@ class SampleHistory:
         return self.seen
 
     async def run(self) -> None:
-        """Sample until cancelled."""
         while True:
             self._sooner.clear()
             await self.look()
@@ -140,7 +139,6 @@ async def measures_of(control: ControlLink) -> Measures:
 
 
 def sample_of(body: Measures, now: float) -> Sample:
-    """Return a sample of control's answer to `MetricsWanted`."""
     decided = {"allow": 0, "deny": 0, "would deny": 0}
     for _category, outcome, count in body.decisions:
         decided[outcome] = decided.get(outcome, 0) + count

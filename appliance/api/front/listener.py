@@ -263,7 +263,6 @@ class Listener:
     async def _open(
         self, connection: _Connection, sock: socket.socket, context: ssl.SSLContext | None
     ) -> None:
-        """Hand the connection to its protocol; with TLS, after the handshake."""
         # The front's deadline also limits the handshake.
         timeouts = {} if context is None else {"ssl_shutdown_timeout": _END_SECONDS}
         try:

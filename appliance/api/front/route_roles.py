@@ -102,5 +102,4 @@ def problem_of(trouble: Trouble, detail: str) -> ProblemError:
 
 
 def only_standby(detail: str, active: str) -> ProblemError:
-    """Return the problem for a request to a standby; `active` is the address of the active appliance."""
     return ProblemError(503, "standby", detail, retry_after=_STANDBY_SECONDS, active=active)

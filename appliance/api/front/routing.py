@@ -39,7 +39,6 @@ def tagged(body: A) -> Tagged[A]:
 
 
 def answer(body: Any, status: int = 200, tag: int | str | None = None) -> Response:
-    """Return a JSON response with a struct."""
     headers = None if tag is None else {"ETag": etag(tag)}
     return Response(msgspec.json.encode(in_full(body)), status, headers, _JSON)
 
@@ -70,7 +69,6 @@ def content(kind: Any) -> dict[str, Any]:
 
 
 def file(media_type: str, description: str, *, binary: bool = False) -> Responses:
-    """Describe an answer that is not JSON, for `responses=` of a route."""
     schema = {"type": "string"} | ({"format": "binary"} if binary else {})
     return {200: {"description": description, "content": {media_type: {"schema": schema}}}}
 
@@ -184,7 +182,6 @@ def _not_json(text: str, error: Exception) -> ProblemError:
 
 
 def body(kind: type, *, text: str | None = None) -> Any:
-    """Return the annotation of a handler's parameter for a body of this kind; with `text`, also for a plain text."""
     return Depends(_Body(kind, text))
 
 

@@ -38,5 +38,4 @@ class Services:
 
     @property
     def audit_log(self) -> Path:
-        """Return the path of the audit log, which is read-only here."""
         return self.settings.state / "control" / "audit.db"

@@ -62,7 +62,6 @@ class WebSocketPassage(asyncio.Protocol):
             (self._door.pause_reading if held else self._door.resume_reading)()
 
     def refuse(self, status: str, reason: str) -> None:
-        """Answer the client's handshake with an error."""
         body = f"{reason}\n".encode()
         head = f"HTTP/1.1 {status}\r\nContent-Type: text/plain; charset=utf-8\r\nConnection: close\r\n"
         self.client.write(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body)

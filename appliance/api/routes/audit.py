@@ -166,7 +166,6 @@ class LogReader:
         return shown
 
     async def in_thread(self, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
-        """Call a function as `read` does, without waiting for a turn."""
         try:
             return await asyncio.to_thread(function, *arguments, **named)
         except FilterError as error:

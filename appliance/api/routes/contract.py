@@ -36,7 +36,6 @@ WORDS: dict[str, str] = json.loads(files(__package__).joinpath("field_words.json
 
 
 def contract_of(app: FastAPI) -> dict[str, Any]:
-    """Return the OpenAPI document, which is made only once."""
     if app.openapi_schema is None:
         app.openapi_schema = _made(app)
     return app.openapi_schema

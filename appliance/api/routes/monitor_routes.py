@@ -58,7 +58,6 @@ class _Looking:
 
 
 def unknown_monitor(name: str, loaded: Monitors) -> ProblemError:
-    """Return the problem of an unknown monitor, which lists the known ones."""
     known = ", ".join(monitor.name for monitor in loaded.monitors) or "none is loaded"
     return ProblemError(404, "unknown", f"no monitor is named {name}; there are: {known}")
 

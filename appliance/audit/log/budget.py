@@ -28,7 +28,6 @@ _LONGEST_PAUSE_SECONDS = 1.0
 
 
 def weight(record: AuditRecord) -> int:
-    """Return the approximate size of a record on disk."""
     size = len(record.caller_id or "") + len(record.resource or "") + len(record.reason)
     for value in record.detail.values():
         size += len(value if type(value) is str else str(value))

@@ -112,7 +112,6 @@ class RecordFolder:
         return known if same else ""  # overflow kinds and kinds of unknown hosts are collective
 
     def _coming_beside(self, record: AuditRecord) -> int:
-        """Return the number of new, not yet offered kinds in the quota that a denial is charged to."""
         host, quota_class = _holder(record)
         unknown = quota_class is QuotaClass.UNKNOWN
         waiting = list(self._coming.values())  # another thread removes from `_coming`
@@ -180,7 +179,6 @@ class RecordFolder:
                 self._forget(key)
 
     def expire(self, now: float) -> Iterator[AuditRecord]:
-        """Yield the summaries that are due; forget kinds without repetition."""
         # Due times are in order of insertion, so a kind that stays is moved to the end.
         while self._due:
             key = next(iter(self._due))
@@ -198,7 +196,6 @@ class RecordFolder:
         return next(iter(self._due.values()), None)
 
     def finish(self) -> Iterator[AuditRecord]:
-        """Yield all summaries, and forget all kinds."""
         for key in tuple(self._kinds):
             yield from self._summary(key)
             self._forget(key)
@@ -222,7 +219,6 @@ class RecordFolder:
 
 
 def _holder(record: AuditRecord) -> _Holder:
-    """Return the holder to whose quota a kind is charged; records without a host count as those of a named host."""
     return record.host, QuotaClass.UNKNOWN if record.unknown else QuotaClass.NAMED
 
 

@@ -173,7 +173,6 @@ class Housekeeping:
             self._signatures.ask(self.writer)
 
     def keep_signature(self, number: int, signature: bytes, public_key: bytes) -> None:
-        """Store a valid signature; record an invalid one."""
         if self.writer is None:
             return
         refusal = self._signatures.keep(self.writer, number, signature, public_key)

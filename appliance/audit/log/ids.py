@@ -36,7 +36,6 @@ class IdSource:
         return max(0.0, (self._last - self._clock()) / 1e9)
 
     def raise_floor(self, after: str) -> None:
-        """Make the next ids greater than `after`."""
         if after:
             with self._lock:
                 self._last = max(self._last, int(after[:_TIME_DIGITS], 16))

@@ -185,7 +185,6 @@ class AuditLog:
 
     @property
     def failed(self) -> str | None:
-        """Return why the log cannot be written now, or None."""
         return self._failed
 
     @property
@@ -195,7 +194,6 @@ class AuditLog:
 
     @property
     def lag(self) -> Lag:
-        """Return how far writing to the disk is behind."""
         waiting = len(self._queue) + len(self._held)
         return Lag(waiting, now() - self._caught_up if waiting else 0.0)
 
@@ -218,7 +216,6 @@ class AuditLog:
         self._put(partial(self.housekeeping.remover.refused, number, reason, early=early))
 
     def request_signatures(self) -> None:
-        """Request all missing signatures, because the signer is in service (again)."""
         self._put(partial(self.housekeeping.attempt, self.housekeeping.ask_signatures))
         self._put(self.housekeeping.remover.ask_again)
 

@@ -187,7 +187,6 @@ class ChainWriter:
         return [msgspec.json.decode(state, type=FoldState) for (state,) in rows]
 
     def close_folds(self, summaries: Sequence[AuditRecord]) -> None:
-        """Replace the counts of `open_folds` by their summaries."""
         keys = [key for (key,) in self._connection.execute("SELECT key FROM open_fold")]
         self.append(summaries, [(key, None) for key in keys])
 
@@ -309,7 +308,6 @@ class ChainWriter:
             raise
 
     def close(self) -> None:
-        """Close the database and release the lock."""
         try:
             self._connection.close()
         finally:

@@ -115,7 +115,6 @@ def _plain_words(reason: str) -> str:
 
 
 def storable(record: AuditRecord) -> AuditRecord:
-    """Return the record, converted if its key and state would not be storable."""
     rule = record.rule
     texts = [record.host, record.caller_id, record.category, record.resource, record.reason, record.event]
     texts += [str(record.detail[name]) for name in ABOUT if name in record.detail]
@@ -154,6 +153,5 @@ def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = Fa
 
 
 def repetitions(detail: dict[str, Any]) -> int:
-    """Return `count` of a record's detail if it is a number of repetitions, else 1."""
     count = detail.get("count")
     return count if type(count) is int and count > 0 else 1

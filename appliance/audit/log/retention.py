@@ -38,7 +38,6 @@ class Retention:
             raise ValueError("retention needs more than 0 days and at least 1 MiB")
 
     def excess(self, size: int) -> str | None:
-        """Return why a log of `size` bytes is too large, or None."""
         too_large = self.size is not None and size > self.size
         return f"the log was larger than {self.size} bytes" if too_large else None
 

@@ -63,7 +63,6 @@ class SignedCheckpoint(msgspec.Struct, frozen=True, omit_defaults=True):
         ).text()
 
     def as_json(self) -> str:
-        """Return one line of NDJSON, without the newline."""
         return msgspec.json.encode(self).decode("ascii")
 
 

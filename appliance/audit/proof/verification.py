@@ -256,7 +256,6 @@ class _Verifier:
         self._findings.append(LogFinding(FindingKind.STRUCTURE, 0, 0, f"database: {message}"))
 
     def _last_removal(self) -> _Removal | None:
-        """Return the last removal by retention; the walk verifies its record."""
         query = "SELECT detail FROM record WHERE event = 'records removed' ORDER BY sequence DESC LIMIT 1"
         try:
             row = self._connection.execute(query).fetchone()

@@ -132,7 +132,6 @@ def checked_pattern(name: str, value: str) -> str:
 
 
 def text_condition(text: str) -> Condition:
-    """Return the condition that searches a text in each row."""
     escaped = checked_pattern("text", text).replace("\\", "\\\\").replace("%", "\\%").replace("_", "\\_")
     return Condition(f"({TEXT_OF_RECORD}) LIKE ? ESCAPE '\\'", (f"%{escaped}%",))
 

@@ -90,7 +90,6 @@ def export(path: Path, wanted: Filter, page: int = 1000) -> Iterator[LogEntry]:
 
 
 def last_sequence(path: Path) -> int:
-    """Return the sequence of the last record; 0 if there is none."""
     return _reading(path, _last_sequence)
 
 
@@ -126,11 +125,9 @@ class Follower:
 
     @property
     def position(self) -> int:
-        """Return the sequence after which the next poll begins."""
         return self._after
 
     def poll(self, limit: int = 1000) -> list[LogEntry]:
-        """Return the next records, at most `limit`."""
         head = _reading(self._path, _last_sequence)
         if head <= self._after:
             self._after = min(self._after, head)

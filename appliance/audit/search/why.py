@@ -29,7 +29,6 @@ def lines_of(
 
 
 def _counted(detail: Mapping[str, Any], host_in_words: Callable[[str], str]) -> Iterator[str]:
-    """Yield the monitor, number, time and reasons of counted repetitions."""
     if "count" not in detail:
         return
     if "monitor" in detail:

@@ -43,11 +43,9 @@ class Errors(ContextDecorator):
 
 
 def note(text: str) -> None:
-    """Write a line to standard error."""
     sys.stderr.write(f"rosrv: {text}\n")
 
 
 def fail(text: str, status: int) -> NoReturn:
-    """Print an error and exit with `status`."""
     note(printable(text))
     raise typer.Exit(status)

@@ -46,7 +46,6 @@ def print_entries(entries: list[LogEntry], host_in_words: HostInWords, *, each: 
 
 
 def line(entry: LogEntry, host_in_words: HostInWords) -> str:
-    """Return a record as one line: time, sequence, decision, event, host, caller, resource, author, reason."""
     record = entry.record
     parts = [
         rfc3339(record.time),
@@ -139,7 +138,6 @@ def write(text: str) -> None:
 
 
 def _has_room(rows: list[tuple[Text, ...]], width: int) -> bool:
-    """Return whether a table of this width has room for the reasons beside the longest names."""
     columns = list(zip(map(Text, _COLUMNS), *rows, strict=True))[:-1]
     names: int = sum(max(cell.cell_len for cell in column) + _GAP for column in columns)
     return names + _LEAST_WHY <= width

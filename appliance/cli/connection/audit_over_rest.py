@@ -35,7 +35,6 @@ class RestLog:
         self._client = client
 
     def search(self, wanted: Filter, cursor: str | None, limit: int, *, newest_first: bool) -> SearchPage:
-        """Return at most `limit` records from `cursor` on."""
         entries: list[LogEntry] = []
         order = "newest" if newest_first else "oldest"
         while True:
@@ -51,13 +50,11 @@ class RestLog:
                 return SearchPage(entries, cursor)
 
     def denials(self, wanted: Filter, limit: int) -> DenialSummary:
-        """Return the denials that match, by host."""
         parameters = {**_parameters(wanted), "limit": limit}
         with self._refusals():
             return msgspec.convert(self._get("/summary", parameters), DenialSummary)
 
     def show(self, record_id: str, neighbours: int) -> RecordInContext | None:
-        """Return one record with its neighbours; None if the log has no such record."""
         if not ID.fullmatch(record_id):
             return None
         try:
@@ -69,14 +66,12 @@ class RestLog:
             return None
 
     def export(self, wanted: Filter) -> Iterator[LogEntry]:
-        """Yield all records that match, the oldest first."""
         with self._lines("/export", _parameters(wanted), _SILENCE_SECONDS) as lines:
             for line in lines:
                 if line:
                     yield entry_of(json.loads(line))
 
     def evidence(self, wanted: Filter) -> Iterator[tuple[int, str]]:
-        """Yield the sequence and the NDJSON line of all matching records, oldest first."""
         with self._lines("/export", _parameters(wanted), _SILENCE_SECONDS) as lines:
             for line in lines:
                 if line:
@@ -108,7 +103,6 @@ class RestLog:
     def verify(
         self, key: bytes | None, copies: Sequence[SignedCheckpoint] | None, progress: Progress
     ) -> Verification:
-        """Return the appliance's own verification of its log."""
         del progress  # REST does not report it
         if key is not None or copies is not None:
             raise FilterError(
@@ -118,13 +112,11 @@ class RestLog:
             return msgspec.convert(self._get("/verify", {}, _VERIFY_SECONDS), Verification)
 
     def checkpoints(self, after: int) -> list[SignedCheckpoint]:
-        """Return signed checkpoints after a number, in order."""
         with self._refusals():
             found = self._get("/checkpoints", {"after": after})["checkpoints"]
             return msgspec.convert(found, list[SignedCheckpoint])
 
     def last(self) -> int:
-        """Return the sequence of the last record; 0 for an empty log."""
         with self._refusals():
             found = self._get("", {"limit": 1})["records"]
             return int(found[0]["sequence"]) if found else 0

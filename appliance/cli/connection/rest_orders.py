@@ -73,12 +73,10 @@ _UNASKED = "this cannot be asked over REST; run it with --state"
 
 
 def _line(finding: dict[str, Any]) -> str:
-    """Return a finding as one line, in the format of the admin socket."""
     return "{file}:{line}:{column}: {severity}: {text}".format_map(finding)
 
 
 def _registrations(graph: Graph) -> Registrations:
-    """Return the live registrations that the graph shows."""
     return Registrations(
         [
             Registration(node.host, node.name, call, resource)

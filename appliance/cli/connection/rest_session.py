@@ -63,7 +63,6 @@ class RestClient:
         )
 
     def close(self) -> None:
-        """Close the connections that are kept for the next request."""
         self._client.close()
 
     def call(

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 
 def named_by(way: "AdminSocket | RestWay") -> HostInWords:
-    """Return the function that shows a host as text for people."""
     if isinstance(way, AdminSocket):
         return _named_by_socket(way.state)
     return _named_by_rest(way)
@@ -100,12 +99,10 @@ class Appliance(typer.Context):
 
     @property
     def said(self) -> bool:
-        """Whether the command line or the environment names the appliance."""
         return self._target.said
 
     @property
     def place(self) -> str | None:
-        """Return the URL of REST; None over the socket."""
         return self._target.place
 
     @property
@@ -114,7 +111,6 @@ class Appliance(typer.Context):
 
     @property
     def rest(self) -> "RestClient":
-        """Return the REST client of an appliance with a `place`."""
         assert not isinstance(self.way, AdminSocket)  # noqa: S101  it has no place
         return self.way.client
 
@@ -182,7 +178,6 @@ class _ApplianceCommand(GroupedCommand):
 
 
 def speaks(verb: Callable[Concatenate[Appliance, _P], None]) -> GroupedVerb:
-    """Add --json and the options that choose an appliance to a verb."""
     return GroupedVerb(verb, _ApplianceCommand)
 
 

@@ -345,7 +345,6 @@ def _state(row: MonitorState) -> str:
 
 
 def say_replaced(body: Replacement) -> None:
-    """Print the result of a change of the specifications."""
     for warning in body.warnings:
         say(warning, "yellow")
     parts = [
@@ -364,7 +363,6 @@ def say_replaced(body: Replacement) -> None:
 
 
 def _say_idle(appliance: Appliance, files: Collection[str]) -> None:
-    """List the loaded monitors that do not act, and the command that enables them."""
     rows = [row for row in appliance.ask_or_exit(admin.MonitorsWanted()).monitors if row.file in files]
     for word, verb, names in (
         ("disabled", "enable", [row.name for row in rows if not row.enabled and not row.shadow]),

@@ -58,7 +58,6 @@ def reload(appliance: Appliance, confirm_within: ConfirmWithin = None) -> None:
 
 
 def say_loaded(body: Loaded) -> None:
-    """Print the result of a change of the policy."""
     for warning in body.warnings:
         say(warning, "yellow")
     say(

@@ -42,7 +42,6 @@ class BlockTable:
         self._now, self._wall, self._seen = self._age(), clock.wall(), clock.since_boot_ns()
 
     def state(self) -> BlocksState:
-        """Return the number of blocks and the earliest end."""
         ends = [self.until(row) for row in self._rows.values()]
         return BlocksState(len(ends), min((end for end in ends if end is not None), default=None))
 

@@ -154,7 +154,6 @@ class ListenerLimits:
 
 
 def value_limits(settings: Settings) -> XmlRpcLimits:
-    """Return the configured bounds of XML-RPC values."""
     limits = settings.limits
     return XmlRpcLimits(
         body=int(limits.body_bytes),

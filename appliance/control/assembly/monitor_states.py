@@ -12,7 +12,6 @@ from appliance.specifications.specification_manager import SpecificationManager
 
 
 def monitors_of(monitors: SpecificationManager, rv_state: list[object], *, texts: bool) -> answers.Monitors:
-    """Return all monitors with state and counters. With `texts`, also return the specifications."""
     return answers.Monitors(
         revision=monitors.revision,
         tag=monitors.tag,
@@ -32,7 +31,6 @@ def monitors_of(monitors: SpecificationManager, rv_state: list[object], *, texts
 
 
 def monitors_status(monitors: SpecificationManager) -> MonitorsState:
-    """Return the summary for `rosrv status`."""
     rows = states_of(monitors)
     return MonitorsState(
         revision=monitors.revision,
@@ -53,7 +51,6 @@ def monitors_status(monitors: SpecificationManager) -> MonitorsState:
 
 
 def states_of(monitors: SpecificationManager) -> list[answers.MonitorState]:
-    """Return all monitors, in the order in which they receive messages."""
     return [_state(monitors, name) for name in monitors.names()]
 
 

@@ -59,7 +59,6 @@ class SignerRequests:
         self._loop.call_soon_threadsafe(self.link.send, message)
 
     def attach(self, channel: Channel) -> None:
-        """Attach the link of a started signer, and request missing signatures."""
         self.link.attach(channel)
         self._audit().request_signatures()
 

@@ -40,7 +40,6 @@ class HandledAlarms:
         return msgspec.structs.replace(status, handled_alarms=list(kept.values()))
 
     def put(self, row: HandledAlarm) -> None:
-        """Store an acknowledgement or a silence, in place of an earlier one of the alarm."""
         self._keep({**self._rows, row.kind: row})
 
     def end(self, kind: str) -> bool:

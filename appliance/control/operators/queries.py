@@ -99,7 +99,6 @@ class Queries:
         return msgspec.structs.replace(found, in_use=used)
 
     async def graph(self, _request: admin.GraphWanted) -> Graph:
-        """Return nodes, topics and services with their traffic."""
         return graph_of(self.parts)
 
     async def monitors(self, request: admin.MonitorsWanted) -> Monitors:

@@ -17,7 +17,6 @@ def request_methods(
     monitors: SpecificationManager,
     tokens: TokenOrders,
 ) -> tuple[RequestMethod[Any], ...]:
-    """Return the methods of these parts: one for each request of the core."""
     return (
         RequestMethod(admin.StatusWanted, queries.status, order=False),
         RequestMethod(admin.InventoryWanted, queries.inventory, order=False),

@@ -31,7 +31,6 @@ class _Age(msgspec.Struct):
 
 
 def off_now(monitors: SpecificationManager, policies: Policies) -> Iterator[SwitchedOff]:
-    """Yield all switched-off protection, with the present time as its start."""
     now = clock.wall()
     for name, to in monitors.switches.switched_off().items():
         if to is False:
@@ -74,7 +73,6 @@ class SwitchedOffWatch:
         ]
 
     async def watch(self) -> None:
-        """Check every minute."""
         while True:
             before = clock.now()
             await asyncio.sleep(_LOOK_SECONDS)

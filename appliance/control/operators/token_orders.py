@@ -60,7 +60,6 @@ class TokenOrders:
         self._changed = changed
 
     async def listed(self, _request: admin.TokenList) -> answers.Tokens:
-        """Return all tokens, including ended ones, oldest first."""
         return answers.Tokens([self._shown(row) for row in self._rows.values()], self._uses_since)
 
     def usable(self) -> list[TokenKept]:
@@ -102,7 +101,6 @@ class TokenOrders:
         return (await self.add(admin.TokenAdd(FIRST_NAME, "admin", DEFAULT_SECONDS))).token
 
     def first_token_shown(self) -> None:
-        """Store that the first token was shown to the person who started the appliance."""
         if self._untold:
             self._untold = False
             self._store.save_setting(_UNTOLD, "")
@@ -143,8 +141,7 @@ class TokenOrders:
     async def rotate(self, request: admin.TokenRotate, who: str = "") -> answers.RotatedToken:
         """Replace the valid tokens of a name by a new one of the same role. Only this answer contains its text.
 
-        The new token and the ends of the earlier ones are stored at once. If they cannot be stored, the earlier ones
-        stay valid. Raises `TokenRefusedError` and `StoreError`.
+        Raises `TokenRefusedError` and `StoreError`.
         """
         name, now = request.name, clock.wall()
         earlier = self._require_named(name)
@@ -240,6 +237,5 @@ def _fields(row: TokenRow) -> tuple[str, str, answers.TokenRole, float, float, f
 
 
 def kept_by_api(row: TokenRow) -> TokenKept:
-    """Return the data by which the api recognises a token."""
     reading = row.keys.reading if row.keys is not None else b""
     return TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires, reading)

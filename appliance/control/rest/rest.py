@@ -87,7 +87,6 @@ class RestLink:
         self._served, self._certified = served, certified
 
     def attach(self, channel: Channel) -> None:
-        """Serve a new api process, and send the usable tokens to it."""
         self._link.attach(channel)
         self._worker = None
         self._waiting.clear()

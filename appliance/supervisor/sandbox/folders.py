@@ -28,7 +28,6 @@ def with_system_files(sandbox: SandboxPlan, home: str, run: str) -> SandboxPlan:
 
 
 def executables_of(program: Path) -> tuple[str, ...]:
-    """Return the files that the kernel executes for a program: the program, links resolved, and the dynamic linker."""
     loaders = (loader for folder, name in _LOADERS for loader in Path(folder).glob(name))
     return (str(program.resolve()), *(str(loader.resolve()) for loader in loaders))
 
