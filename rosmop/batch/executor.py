@@ -49,7 +49,6 @@ class ThisProcess:
         self._waiting: deque[tuple[int, bytes]] = deque()
 
     def submit(self, number: int, job: bytes) -> None:
-        """Keep a job for `finished`."""
         self._waiting.append((number, job))
 
     def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:

@@ -134,7 +134,6 @@ class TemporaryStore:
         return self.size - len(data), len(data)
 
     def read(self, place: tuple[int, int]) -> bytes:
-        """Return what `append` wrote."""
         with self._errors():
             return os.pread(self._file.fileno(), place[1], place[0])
 

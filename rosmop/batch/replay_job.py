@@ -208,5 +208,4 @@ def because(verdict: Verdict) -> Iterator[str]:
 
 
 def place_of(source: int) -> dict[str, int]:
-    """Return data about the message with a number from 1."""
     return {"index": source - 1}

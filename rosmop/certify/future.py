@@ -41,14 +41,12 @@ class FutureFollower:
         return self._any([self._after(clause, letter) for clause in state])
 
     def steps(self, state: State, letters: Sequence[int]) -> State:
-        """Return the remaining obligation after any one of these letters."""
         self._work -= len(letters)
         return self._any(
             [self._after(clause, letter) for clause in state for letter in self._among(clause, letters)]
         )
 
     def possible(self, state: State) -> bool:
-        """Return whether some endless trace meets the obligation."""
         return any(self._possible(clause) for clause in state)
 
     def _among(self, clause: Clause, letters: Sequence[int]) -> list[int]:

@@ -69,5 +69,4 @@ class StateMachineFollower:
         return self._timeouts.get(state)
 
     def verdicts(self, state: str) -> tuple[str, ...]:
-        """Return the state, and its aliases in the order of the text."""
         return (state, *(alias for alias, members in self._aliases.items() if state in members))

@@ -123,7 +123,6 @@ def path(value: Value) -> tuple[object, ...]:
 
 
 def root(value: Value) -> Variable | None:
-    """Return the variable that a place is part of."""
     place = value.place
     while place is not None:
         if isinstance(place, VariableLvalue):

@@ -36,21 +36,18 @@ def moved(operator: str, left: Value, right: Value, position: Position) -> Value
 
 
 def begin_or_end(base: Value, name: str, position: Position) -> Value:
-    """Compile `v.begin()` or `v.end()`."""
     begin = nodes.Literal(value_types.INDEX, 0)
     place = begin if name == "begin" else nodes.Call(value_types.INDEX, "l_len", (base.form,))
     return Value(place, position, vector=base)
 
 
 def erase(scope: FunctionScope, base: Value, cursors: Sequence[Value], at: tuple[Position, int]) -> Value:
-    """Compile `v.erase(place)` or `v.erase(first, last)`."""
     first, last = _index(base, cursors[0]), nodes.Literal(value_types.VOID, None)
     arguments = (base.form, first, _index(base, cursors[1]) if len(cursors) > 1 else last)
     return _changed(scope, base, nodes.Call(value_types.VOID, "k_erase", arguments, at[1]), at[0])
 
 
 def insert(scope: FunctionScope, base: Value, arguments: Sequence[Value], at: tuple[Position, int]) -> Value:
-    """Compile `v.insert(place, value)`."""
     kind = _vector(base, at[0])
     value = convert(scope, arguments[1], kind.element, at[1])
     width = nodes.Literal(value_types.ULONG, scope.values.width(kind.element))

@@ -49,7 +49,6 @@ def first_facts(names: SpecificationNames) -> Iterator[nodes.Assign]:
 
 
 def note_facts(scope: FunctionScope, event: str) -> bool:
-    """Write the assignments when an event happens; return whether there are any."""
     found = _variables(scope.names, event)
     for variable in found:
         scope.written.add(variable.code)

@@ -40,7 +40,6 @@ def value_of(scope: FunctionScope, node: tree.Expression) -> Value:
 
 
 def literal_number(scope: FunctionScope, node: tree.NumberLiteral) -> Value:
-    """Compile a number literal, with the type that C++ gives it."""
     found = _NUMBER.match(node.text)
     if found is None or len(node.text) > _MAX_DIGITS or found[1].count(".") > 1:
         raise SpecificationError.at(node.position, f"{shown(node.text)} is not a number")

@@ -182,7 +182,6 @@ def _first_value(
 def declare_functions(
     shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
 ) -> None:
-    """Give the helper functions of a specification their names and types."""
     for node in specification.functions:
         try:
             names.functions[node.name] = _signature(shared, names, node)

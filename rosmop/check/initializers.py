@@ -10,7 +10,6 @@ from rosmop.types.value_types import Type
 
 
 def converted(scope: FunctionScope, node: tree.Expression, target: Type) -> nodes.Expression:
-    """Compile an expression as a value of the target type; `{…}` makes a vector."""
     if isinstance(node, tree.InitializerList):
         return elements(scope, node, target)
     return convert(scope, scope.value_of(node), target, scope.site(node))

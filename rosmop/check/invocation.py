@@ -54,7 +54,6 @@ class MemberCall:
         return convert(self.scope, value, value_types.STRING)
 
     def called(self, kind: value_types.Type, function: str, *arguments: nodes.Expression) -> nodes.Call:
-        """Return a call of a function of the form with the base and these arguments."""
         return nodes.Call(kind, function, (self.base.form, *arguments), self.site)
 
     def value(self, kind: value_types.Type, function: str, *arguments: nodes.Expression) -> Value:

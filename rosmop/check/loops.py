@@ -54,7 +54,6 @@ def write_while(scope: FunctionScope, node: tree.WhileStatement, write: Write) -
 
 
 def write_for(scope: FunctionScope, node: tree.ForStatement, write: Write) -> None:
-    """Write `for (start; condition; step)`."""
     with scope.block():
         if node.start is not None:
             write(scope, node.start)
@@ -72,7 +71,6 @@ def write_for(scope: FunctionScope, node: tree.ForStatement, write: Write) -> No
 
 
 def write_range_for(scope: FunctionScope, node: tree.RangeForStatement, write: Write) -> None:
-    """Write `for (type name : values)`."""
     values = scope.value_of(node.values)
     by_value = not node.type.reference or node.type.constant
     if not by_value:

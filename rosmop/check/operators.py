@@ -39,7 +39,6 @@ class Operands:
 
 
 def binary(operator: str, operands: Operands) -> Value:
-    """Compile `left operator right`."""
     left, right = operands.left.type, operands.right.type
     if operator in ("&&", "||"):
         word = "and" if operator == "&&" else "or"
@@ -169,7 +168,6 @@ def _sum(operator: str, left: Type, right: Type) -> Type | None:
 
 
 def unary(operator: str, operand: Value, position: Position, site: int) -> Value:
-    """Compile `!x`, `-x`, `+x` or `~x`."""
     if operator == "!":
         return Value(nodes.Not(condition(operand)), position)
     if operator == "-" and operand.type == value_types.DURATION:

@@ -242,8 +242,6 @@ def _mapped(node: Any, change: Any) -> Any:
 
 
 def _moved(node: Any, position: Position) -> Any:
-    """Return a part of a generated tree with this position, and with names that no text can contain."""
-
     def moved(one: tree.SyntaxNode) -> tree.SyntaxNode:
         one = replace(one, position=position)
         if isinstance(one, tree.Name):

@@ -72,7 +72,6 @@ def _compiled(
 
 
 def is_stamped(messages: MessageTypes, name: str) -> bool:
-    """Return whether messages of a type begin with a `std_msgs/Header`."""
     return [field.notation for field in messages.definition(name).fields[:1]] == [_HEADER]
 
 

@@ -208,7 +208,6 @@ class FunctionScope:
 
     @contextmanager
     def around(self, loop: LoopScope) -> Iterator[None]:
-        """Restore the names that the loop sees."""
         inner, self._blocks = self._blocks, loop.blocks
         try:
             yield
@@ -216,7 +215,6 @@ class FunctionScope:
             self._blocks = inner
 
     def declare(self, variable: Variable) -> None:
-        """Declare a name in the innermost block."""
         block = self._blocks[-1]
         if variable.name in block:
             raise SpecificationError.at(
@@ -250,7 +248,6 @@ class FunctionScope:
         return (own, None) if own is not None else self.shared.foreign(self.names, name, position)
 
     def changes_anything(self) -> bool:
-        """Return whether the statements written so far, or functions they call, assign a variable."""
         return self.changes or any(self.names.changed_by(called) for called in self.calls)
 
     def unknown(self, name: str, position: Position, what: str = "variable") -> SpecificationError:
@@ -315,7 +312,6 @@ class FunctionScope:
     def function(
         self, name: str, parameters: tuple[str, ...], *, happens: int | None = None, same_as: str = ""
     ) -> nodes.Function:
-        """Return the function as written so far."""
         shared = tuple(sorted(self.written))
         return nodes.Function(
             name, self.context, parameters, tuple(self.lines.found), shared, happens, same_as

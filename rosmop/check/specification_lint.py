@@ -41,7 +41,6 @@ def lint_size(size: int, position: Position) -> Iterator[Diagnostic]:
 
 
 def lint_property(compiled: CompiledProperty, node: tree.Property) -> list[Diagnostic]:
-    """Return warnings about a property, each at its handler or formula."""
     handlers = {handler.category: handler.position for handler in node.handlers}
     findings = []
     if not handlers:

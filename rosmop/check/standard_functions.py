@@ -105,7 +105,6 @@ def _math_of_floats(name: str, count: int) -> Function:
 
 
 def _rounded(name: str) -> Function:
-    """Return the compiler of a function such as `lround`."""
     function = _math(name, 1)
 
     def to_integer(call: Arguments) -> Value:

@@ -144,6 +144,5 @@ class SetPart:
 
     @classmethod
     def empty(cls) -> "SetPart":
-        """Return the part without specifications."""
         nothing = Compiled((), (), {}, (), {}, MessageTypes(Definitions({})), ())
         return cls(nothing, CompiledModule(b"", 0, 0, 0, {}, (), {}, (), 0, {}))

@@ -249,7 +249,6 @@ class ArithmeticCodegen(FunctionBuilder):
         return code + self._get(name, I64)
 
     def _with_part(self, node: nodes.Call) -> bytes:
-        """Replace the seconds, or the nanoseconds, of a time."""
         moment, part, new = node.arguments
         assert isinstance(part, nodes.Literal)  # noqa: S101  the name of a part
         value = self._value(new)

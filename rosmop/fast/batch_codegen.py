@@ -378,7 +378,6 @@ class TopicCodegen:
         )
 
     def handlers(self) -> list[WasmFunction]:
-        """Return the handlers that are compiled, in the order of verdicts."""
         return [written for _, written in self._handlers.values() if written is not None]
 
     def _drops(self, number: int) -> bool:

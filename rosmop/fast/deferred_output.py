@@ -63,7 +63,6 @@ class OutputLine(msgspec.Struct, tag=True, array_like=True, dict=True):
         return line_of(self.node.level, text, monitor)
 
     def _made(self, node: nodes.Expression) -> _Make:
-        """Return a function that formats a part of the text from the values."""
         if isinstance(node, nodes.Literal):
             constant = node.value
             self.longest += len(constant) if isinstance(constant, bytes) else 0

@@ -60,7 +60,6 @@ def machine_type(kind: Type) -> int:
 
 
 def is_signed(kind: Type) -> bool:
-    """Return whether numbers of the type may be negative."""
     return not isinstance(kind, value_types.IntegerType) or kind.signed
 
 

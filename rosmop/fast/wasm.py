@@ -128,7 +128,6 @@ _STORES = {I32: i32_store, I64: i64_store, F32: f32_store, F64: f64_store}
 
 
 def if_result(machine: int) -> bytes:
-    """Begin an `if` that leaves a value of this type on the stack."""
     return IF + bytes((machine,))
 
 

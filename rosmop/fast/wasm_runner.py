@@ -194,7 +194,6 @@ class ModuleState:
 
     @property
     def options(self) -> int:
-        """Return the address of the packed options of the next batch."""
         return self._source
 
     def hasten(self) -> None:
@@ -235,7 +234,6 @@ class ModuleState:
 
 
 def packed(prepared: BatchOptions) -> bytes:
-    """Return the options as the module reads them."""
     sender = prepared.source << 32
     return _PREPARED.pack(sender, prepared.told, prepared.enabled, prepared.counted)
 
@@ -314,17 +312,14 @@ class WasmLane:
         self._settle = home.machine.function(feed.settle) if feed.settle else None
 
     def writers(self, who: int) -> tuple[str, ...]:
-        """See `FastLane`."""
         return tuple(name for number, (name,) in enumerate(self.events) if who >> number & 1)
 
     def happened(self) -> Sequence[int]:
-        """See `FastLane`."""
         counts: Sequence[int] = self._counts.unpack_from(self._memory, self._feed.counters)
         self._counts.pack_into(self._memory, self._feed.counters, *self._none)
         return counts
 
     def ready(self) -> bool:
-        """See `FastLane`."""
         for monitor in self._monitors:
             if monitor.enabled and (monitor.held or not monitor.seen or self._topic in monitor.starting):
                 return False
@@ -339,7 +334,6 @@ class WasmLane:
         source: int = 0,
         changed: dict[int, int] | None = None,
     ) -> BatchOptions:
-        """See `FastLane`."""
         bits = sum(1 << number for number, silent in enumerate(told) if silent) - (LOUD if loud else 0)
         enabled = sum(1 << number for number, monitor in enumerate(self._monitors) if monitor.enabled)
         only = sum(1 << number for number, silent in enumerate(counted) if silent)
@@ -355,7 +349,6 @@ class WasmLane:
         prepared: BatchOptions,
         answer: int | Exception | None = None,
     ) -> BatchResult | None:
-        """See `FastLane`."""
         if view.obj is not self._owner:
             return self._process_elsewhere(view, position, run, pieces, time_ns, prepared)
         if self._home.prepared is not prepared:
@@ -401,7 +394,6 @@ class WasmLane:
             answer = None
 
     def native(self) -> NativeCall | None:
-        """See `FastLane`."""
         cells = self._home.parts
         if cells is None:
             return None
@@ -434,7 +426,6 @@ class WasmLane:
         prepared: BatchOptions,
         fuel: int = MESSAGE_FUEL,
     ) -> BatchResult:
-        """See `FastLane`."""
         following = position + 4 + _LENGTH.unpack_from(view, position)[0]
         if self._home.prepared is not prepared:
             self._home.prepare(prepared)
@@ -446,7 +437,6 @@ class WasmLane:
     def process_message(
         self, message: Buffer, time_ns: int, prepared: BatchOptions, fuel: int = MESSAGE_FUEL
     ) -> Outcome | None:
-        """See `FastLane`."""
         end = self._frames + 4 + len(message)
         if end > self._frames + AREA:
             return None

@@ -242,7 +242,6 @@ class Compiled:
         )
 
     def is_stamped(self, message_type: str | None) -> bool:
-        """Return whether messages of a type begin with a `std_msgs/Header`."""
         fields = self.messages.definitions.message(message_type).fields if message_type is not None else ()
         return bool(fields) and fields[0].notation == "std_msgs/Header"
 

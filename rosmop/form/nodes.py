@@ -686,7 +686,6 @@ class Component(FormNode, frozen=True):
 
 
 def walk(root: object) -> Iterator[msgspec.Struct]:
-    """Yield a part of the form and everything in it."""
     waiting = [root]
     while waiting:
         node = waiting.pop()
@@ -702,13 +701,11 @@ _SITE = "site"
 
 
 def sites_of(root: object) -> set[int]:
-    """Return the numbers of the sites in a part of the form."""
     found = (msgspec.structs.asdict(node).get(_SITE, -1) for node in walk(root))
     return {site for site in found if site != -1}
 
 
 def moved(root: Any, sites: Mapping[int, int]) -> Any:
-    """Return a part of the form with its sites renumbered."""
     if isinstance(root, tuple):
         return tuple(moved(part, sites) for part in root)
     if not isinstance(root, FormNode):

@@ -240,7 +240,6 @@ class _Run:
         return categories
 
     def expire(self) -> Categories:
-        """Let the deadline pass, and count it if the machine moved."""
         categories = self._run.expire()
         self._watch.taken[self._state, TIMEOUT] += 1
         self._state = categories[1] if len(categories) > 1 else self._state

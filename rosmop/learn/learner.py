@@ -172,7 +172,6 @@ class _Learner:
     def _span(
         self, place: int, topics: Mapping[str, object] | None = None
     ) -> tuple[int, int, int, int, int, dict[str, str]]:
-        """Return the fields of a step for a part, with these topics or all."""
         part = self._parts[place]
         chosen = {topic: self._types[topic] for topic in self._fields if topics is None or topic in topics}
         return part.number, part.began, part.ended, place * self._each, self._each, chosen
@@ -195,7 +194,6 @@ class _Learner:
         return trained, trained.merged(held_out)
 
     def _alarms(self, candidates: Sequence[Candidate], known: LearntFacts) -> AlarmFacts:
-        """Return the number of warnings of each candidate, by its place, on the held-out recordings."""
         rows = list(specifications(candidates, known))
         numbers = {candidate.key: number for number, candidate in enumerate(candidates)}
         says = {

@@ -22,7 +22,6 @@ def merged_rows(
     other: Mapping[_Key, Statistic],
     merge: Callable[[Statistic, Statistic], Statistic],
 ) -> dict[_Key, Statistic]:
-    """Return the rows of both tables; rows of the same key are merged."""
     rows = {**one, **other}
     for key in one.keys() & other.keys():
         rows[key] = merge(one[key], other[key])

@@ -83,7 +83,6 @@ class TopicContent(msgspec.Struct):
     """Whether some message had an earlier stamp than the previous message."""
 
     def merged(self, other: "TopicContent") -> "TopicContent":
-        """Return the statistics of both, which have ended."""
         result = TopicContent(
             merged_rows(self.numbers, other.numbers, Series.merged),
             merged_rows(self.elements, other.elements, _merged_elements),

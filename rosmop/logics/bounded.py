@@ -667,7 +667,6 @@ class BoundedRun:
         self.journal.clear()
 
     def saved(self) -> tuple[Any, ...]:
-        """Return the values that change, except those of the operators."""
         return self._at_once, self.place, self._now, self._told, self._about
 
     def restore(self, saved: tuple[Any, ...]) -> None:

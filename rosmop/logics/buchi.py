@@ -89,7 +89,6 @@ class Automata:
             raise TooLargeError
 
     def _move(self, node: int, letter: int) -> Sets:
-        """Return the possible obligations after a letter at which ``node`` must hold."""
         known = self._moves.get((node, letter))
         if known is None:
             known = self._moves[node, letter] = self._find_move(node, letter)

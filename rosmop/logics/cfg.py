@@ -39,7 +39,6 @@ class GrammarProperty(CompiledProperty):
         self.recogniser = EarleyRecogniser(grammar)
 
     def start(self, _time_ns: int) -> Run:
-        """Return a fresh run; the time does not matter."""
         return GrammarRun(self.recogniser)
 
 

@@ -72,7 +72,6 @@ class ExpressionTable:
         return self._intern("not", (inner,), nullable=not expression.nullable)
 
     def star(self, inner: int) -> int:
-        """Return the expression for any number of traces, one after the other."""
         if inner in (self.empty, self.epsilon):
             return self.epsilon
         if inner == self.anything or self._all[inner].kind == "star":

@@ -60,7 +60,6 @@ class Syntax:
     """Spellings of other logics, and what to write instead."""
 
     def signs(self) -> list[str]:
-        """Return the spellings that are not words."""
         spellings = [*BOOLEAN_SIGNS, "[", "]", ",", *self.unary, *self.refused]
         for level in self.levels:
             spellings += level.operators
@@ -82,7 +81,6 @@ def nodes(formula: Formula) -> Iterator[Formula]:
 
 
 def event_names(formula: Formula) -> list[str]:
-    """Return the events that a formula names, each once, in order."""
     return list(dict.fromkeys(node.name for node in nodes(formula) if node.operator == "event"))
 
 

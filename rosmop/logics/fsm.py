@@ -33,7 +33,6 @@ class StateMachineText:
 
     @property
     def order(self) -> list[str]:
-        """Return the names of the states, ``fail`` last."""
         return [*self.states, FAIL]
 
     def verdict(self, state: str) -> tuple[str, ...]:
@@ -41,7 +40,6 @@ class StateMachineText:
         return (state, *(alias for alias, members in self.aliases.items() if state in members))
 
     def categories(self) -> list[str]:
-        """Return all names that may have handlers."""
         return [*self.states, *self.aliases, FAIL]
 
 

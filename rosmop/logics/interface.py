@@ -159,7 +159,6 @@ class FiniteProperty(CompiledProperty):
         self.automaton = automaton
 
     def start(self, _time_ns: int) -> Run:
-        """Return a fresh run; the time does not matter."""
         return FiniteRun(self.automaton)
 
     def categories_after(self, event: int) -> frozenset[str]:
@@ -204,7 +203,6 @@ class FiniteRun(UntimedRun):
         return self.state == self._automaton.initial
 
     def step(self, event: int, _time_ns: int) -> Categories:
-        """Take the event; the time does not matter."""
         self.state = self._automaton.table[self.state][event]
         return self._automaton.verdicts[self.state]
 
@@ -271,7 +269,6 @@ class ClockedRun:
 
     @property
     def deadline(self) -> int | None:
-        """Return the time at which the wait of the state ends."""
         wait = self._tables.waits[self.state]
         return None if wait is None else self.since + wait.after
 
@@ -308,7 +305,6 @@ class ClockedRun:
         return self.state, self.since
 
     def take_back(self, mark: tuple[int, int]) -> None:
-        """Restore the marked state and clock, but keep the time."""
         self.state, self.since = mark
 
     def saved(self) -> tuple[Any, ...]:

@@ -80,7 +80,6 @@ def _shown(character: str) -> str:
 
 
 def describe(token: FormulaToken) -> str:
-    """Return the name of a token for messages."""
     if token.kind == "end":
         return "the end of the formula"
     shown = token.text if len(token.text) <= 40 else token.text[:37] + "…"
@@ -88,7 +87,6 @@ def describe(token: FormulaToken) -> str:
 
 
 def suggestion(name: str, known: Sequence[str]) -> str:
-    """Return a suggestion to append to an error."""
     near = get_close_matches(name[:100], known, n=1)
     if near:
         return f"; did you mean `{near[0]}`?"

@@ -57,7 +57,6 @@ class FormulaNodes:
         return parts.pop() if len(parts) == 1 else self._intern(kind, tuple(sorted(parts)))
 
     def next(self, operand: int) -> int:
-        """Return the node that holds if ``operand`` holds at the next position."""
         return operand if self._mask(operand) in (0, self.everything) else self._intern("next", (operand,))
 
     def until(self, left: int, right: int) -> int:

@@ -438,7 +438,6 @@ class PastRun(UntimedRun):
         return list(map(copy.copy, self.values))
 
     def take_back(self, mark: list[Any]) -> None:
-        """Restore the marked values, but keep the time."""
         self.values = mark
 
     def saved(self) -> tuple[Any, ...]:

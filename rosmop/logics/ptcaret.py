@@ -78,7 +78,6 @@ class CaretProperty(CompiledProperty):
         self.begin, self.end = places
 
     def start(self, _time_ns: int) -> Run:
-        """Return a run without open calls; the time does not matter."""
         return CaretRun(self)
 
 

@@ -52,7 +52,6 @@ class RewritingProperty(CompiledProperty):
             self.by_first[rule.left[0]] = (*self.by_first.get(rule.left[0], ()), rule)
 
     def start(self, _time_ns: int) -> Run:
-        """Return a run with an empty string; the time does not matter."""
         return RewritingRun(self)
 
     def categories_after(self, _event: int) -> frozenset[str]:

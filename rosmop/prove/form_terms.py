@@ -82,7 +82,6 @@ class UnknownError(Exception):
 
 
 def is_signed(kind: Type) -> bool:
-    """Return whether numbers of the type may be negative."""
     return not isinstance(kind, value_types.IntegerType) or kind.signed
 
 
@@ -167,7 +166,6 @@ class FormTerms:
     # Ends
 
     def _leave_to_python(self, state: State, condition: Term) -> None:
-        """Leave the message to Python because of a fault, or of a node that is not compiled."""
         self._left.append(both(state.alive, condition))
         state.require(opposite(condition))
 
@@ -286,7 +284,6 @@ class FormTerms:
         self._put_out(node, words, cost, state)
 
     def _put_out(self, node: nodes.Log, parts: Sequence[Term], cost: Term, state: State) -> None:
-        """Store a line: its number in the module, the frame, and its parts."""
         numbers = [
             integer(number, 32)
             for number, line in enumerate(self._lines)

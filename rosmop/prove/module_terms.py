@@ -351,7 +351,6 @@ def _loaded(value: Term, family: str, how: str) -> Term:
 
 
 def _stored(value: Any, size: int) -> Term:
-    """Return a number of the machine, or an address in the message, as bytes."""
     if isinstance(value, Pointer):
         if value.place != "message":
             raise DiffersError("it logs an address outside the message")

@@ -50,7 +50,6 @@ class _BoundedFile(BufferedReader):
         return super().read(size)
 
     def readline(self, _size: int | None = -1, /) -> bytes:
-        """Read the line with the format of a bag, at most `_LONGEST_LINE` bytes."""
         return super().readline(_LONGEST_LINE)
 
 

@@ -264,19 +264,16 @@ class MonitorSet:
 
     @property
     def monitors(self) -> tuple[MonitorInstance, ...]:
-        """Return the running specifications in order, with their state in Python."""
         for monitor in self._monitors:
             monitor.move_to_python()
         return self._monitors
 
     @property
     def shadowed(self) -> tuple[MonitorInstance, ...]:
-        """Return the specifications in shadow mode, with their state in Python."""
         return tuple(monitor for shadow in self.shadows for monitor in shadow.monitors)
 
     @property
     def topics(self) -> Mapping[str, str]:
-        """Return the topics with events, and their message types."""
         return MappingProxyType(
             {
                 step.event.topic: step.event.type
@@ -288,7 +285,6 @@ class MonitorSet:
 
     @property
     def services(self) -> Mapping[str, str]:
-        """Return the services with events, and their types."""
         return MappingProxyType(
             {
                 step.event.topic: step.event.service_type
@@ -300,7 +296,6 @@ class MonitorSet:
 
     @property
     def publications(self) -> Mapping[str, str]:
-        """Return the topics that specifications publish (or would, in shadow mode), and their message types."""
         sets = (self, *self.shadows)
         return MappingProxyType(
             {
@@ -311,7 +306,6 @@ class MonitorSet:
         )
 
     def published_by(self, file: str) -> frozenset[str]:
-        """Return the topics that the specifications of a file publish."""
         return frozenset(
             publication.topic
             for publication in self.compiled.publications
@@ -319,7 +313,6 @@ class MonitorSet:
         )
 
     def md5sum(self, message_type: str) -> str:
-        """Return the md5sum of a message type by the definitions of this set."""
         return self.compiled.messages.definitions.md5sum(message_type)
 
     @property
@@ -410,7 +403,6 @@ class MonitorSet:
 
     @staticmethod
     def channel_of(service: str, part: str) -> str:
-        """Return what replaces a topic (of `lane`, `process_fast`) for the `request` or `response` of a service."""
         return channel_of(service, part)
 
     @property
@@ -753,7 +745,6 @@ class MonitorSet:
     def process_service(
         self, service: str, part: str, buffer: Buffer, time_ns: int, sender: MessageSender = NOBODY
     ) -> Outcome:
-        """Process the `request` or `response` (the `part`) of a service."""
         return self.process(channel_of(service, part), buffer, time_ns, sender)
 
     @property

@@ -250,7 +250,6 @@ class MonitorExecution:
         go_on()
 
     def warn(self, monitor: MonitorInstance, text: str) -> None:
-        """Add a line to the monitor's log, for the next `collect`."""
         self._turn.log.append(LogLine("WARN", text, monitor.name))
 
     def collect(self, outcome: Outcome) -> None:

@@ -291,7 +291,6 @@ class ClockedSteps(Steps):
         super().__init__(compiled, time_ns)
 
     def begin(self, time_ns: int) -> None:
-        """Forget everything: the run has restarted."""
         self._started = time_ns
         _COUNT.pack_into(self.room, 0, 0)
 
@@ -306,7 +305,6 @@ class ClockedSteps(Steps):
         return run.step(event, time_ns)
 
     def forget(self, run: Run, time_ns: int) -> None:
-        """Forget everything: the run continues a run of another process."""
         del run
         self.begin(time_ns)
 

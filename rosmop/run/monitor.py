@@ -200,11 +200,9 @@ class MonitorInstance:
         return svg_of([code.property for code in self.code.properties])
 
     def hold(self, why: str = "") -> None:
-        """Drop messages of its topics until `resume`."""
         self.held, self.why_held = True, why
 
     def resume(self) -> None:
-        """Let messages of its topics pass again."""
         self.held, self.why_held = False, ""
 
     def sending(self, *, passes: bool) -> list[SafeSender]:
@@ -222,7 +220,6 @@ class MonitorInstance:
         self.starting = {*self.safes}
 
     def touch(self) -> None:
-        """Note that the state of its group is about to change."""
         if self.group is not None:
             self.group.changed = True
 

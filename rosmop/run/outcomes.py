@@ -107,7 +107,6 @@ class Fault:
 
 
 def named(verdict: Verdict) -> str:
-    """Return monitor, property, binding and category of a verdict as text."""
     name = f"property {verdict.property + 1} of {verdict.monitor} ({verdict.logic}){bound(verdict)}"
     return f"{name}: {verdict.category}"
 
@@ -240,7 +239,6 @@ class Margin(NamedTuple):
 
 
 def of_drop(outcome: Outcome, who: Who) -> dict[str, Any]:
-    """Return the causes of the drop of the message, with the position of the statement."""
     return {
         **({"at": [str(outcome.dropped_at)]} if outcome.dropped_at is not None else {}),
         **({"values": dict(outcome.fatal.values)} if outcome.fatal is not None else {}),

@@ -174,7 +174,6 @@ class Slices:
 
     @property
     def live(self) -> int:
-        """Return the number of slices, including those that lack a parameter."""
         return self.quota.total
 
     def _look_at(self, properties: Sequence[PropertyCode]) -> None:

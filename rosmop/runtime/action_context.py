@@ -102,7 +102,6 @@ class Turn:
         self.clock, self.seconds = clock, seconds
 
     def begin(self) -> None:
-        """Start to measure the processor time of a message, a tick or a deadline."""
         if self.clock is not None:
             self.until = self.clock() + self.seconds * self.part
 
@@ -233,7 +232,6 @@ class Context:
         return True
 
     def publish(self, topic: str, kind: str, data: bytes, site: int, *, is_call: bool = False) -> None:
-        """Add a message to publish, or a service to call."""
         self.spend(OUTPUT_COST, site)
         self.allocate(len(data), site)
         self._pending += len(data)

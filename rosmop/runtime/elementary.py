@@ -16,14 +16,12 @@ _WHOLE = 1.5 * 2.0**52  # adding and subtracting it rounds to a whole number
 
 
 def sin(x: float) -> float:
-    """Return C's `sin`."""
     if fabs(x) <= LARGEST:
         return _turned(x, 0.0)
     return math.sin(x) if math.isfinite(x) else math.nan
 
 
 def cos(x: float) -> float:
-    """Return C's `cos`."""
     if fabs(x) <= LARGEST:
         return _turned(x, 1.0)
     return math.cos(x) if math.isfinite(x) else math.nan
@@ -69,7 +67,6 @@ def _turned(x: float, quarters: float) -> float:
 
 
 def atan2(y: float, x: float) -> float:
-    """Return C's `atan2`."""
     height, width = fabs(y), fabs(x)
     if not (height <= inf and width <= inf):
         return x + y
@@ -101,7 +98,6 @@ def _arctangent(x: float) -> float:
 
 
 def hypot(x: float, y: float) -> float:
-    """Return C's `hypot`."""
     a, b = fabs(x), fabs(y)
     if inf in {a, b}:
         return inf

@@ -99,7 +99,6 @@ def _log(function: Callable[[float], float]) -> Callable[[float], float]:
 
 
 def power(base: float, exponent: float) -> float:
-    """Return C's `pow`."""
     try:
         return math.pow(base, exponent)
     except ValueError:
@@ -126,17 +125,14 @@ def round_half_even(value: float) -> float:
 
 
 def floor(value: float) -> float:
-    """Return C's `floor`."""
     return math.copysign(float(math.floor(value)), value) if math.isfinite(value) else value
 
 
 def ceil(value: float) -> float:
-    """Return C's `ceil`."""
     return math.copysign(float(math.ceil(value)), value) if math.isfinite(value) else value
 
 
 def trunc(value: float) -> float:
-    """Return C's `trunc`."""
     return math.copysign(float(math.trunc(value)), value) if math.isfinite(value) else value
 
 
@@ -156,7 +152,6 @@ def fma(left: float, right: float, added: float) -> float:
 
 
 def signbit(value: float) -> bool:
-    """Return C's `signbit`, also for -0.0."""
     return math.copysign(1.0, value) < 0
 
 

@@ -64,7 +64,6 @@ class ValueCodec:
         return self._made[make, kind]
 
     def fields(self, kind: value_types.RecordType) -> list[Type]:
-        """Return the types of a message's fields, in order."""
         return [slot.type for slot in self._messages.slots(kind.name).values()]
 
     # Sizes

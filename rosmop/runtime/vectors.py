@@ -35,13 +35,11 @@ def put_slot(record: Values, slot: int, value: Any) -> Any:
 
 
 def append(context: Context, values: Values, value: Any, width: int, site: int) -> None:
-    """Append a value: `values.push_back(value)`."""
     context.allocate(width, site)
     values.append(value)
 
 
 def append_text(context: Context, values: Values, value: bytes, width: int, site: int) -> None:
-    """Append a string: `values.push_back(text)`."""
     context.allocate(width + len(value), site)
     values.append(value)
 
@@ -64,7 +62,6 @@ def _numbers(value: Any) -> bool:
 
 
 def pop(values: Values, site: int) -> None:
-    """Remove the last element: `values.pop_back()`."""
     if not values:
         raise FaultError(site, "pop_back of an empty vector")
     values.pop()

@@ -117,7 +117,6 @@ def put_text(value: bytes, out: bytearray) -> None:
 
 
 def put_numbers(values: list[Any], code: str, out: bytearray) -> None:
-    """Append values of one `struct` code."""
     out += struct.pack(f"<{len(values)}{code}", *values)
 
 

@@ -87,7 +87,6 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
         return Position(self._file, meta.line, meta.column)
 
     def refuse(self, place: Meta | Token, text: str) -> None:
-        """Add an error to `findings`."""
         self.findings.append(Diagnostic(self.at(place), "error", text))
 
     # Files and specifications
@@ -501,7 +500,6 @@ def _unquoted(token: Token) -> str:
 
 
 def check(builder: TreeBuilder) -> None:
-    """Raise the findings of the builder, if there are any."""
     if builder.findings:
         raise SpecificationError(builder.findings)
 

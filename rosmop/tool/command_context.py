@@ -42,7 +42,6 @@ class CommandContext:
             return text.read()
 
     def warn(self, text: str) -> None:
-        """Write a message to standard error."""
         typer.echo(f"{self.name}: {printable(text)}", err=True)
 
     def usage_error(self, text: str) -> typer.Exit:

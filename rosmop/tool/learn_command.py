@@ -31,7 +31,6 @@ def learn_monitors(
     hold_out: float,
     as_json: bool,
 ) -> int:
-    """Propose specifications from the recordings, print or write them, and return the exit status."""
     if out is not None and out.exists():
         raise program.usage_error(f"{out} already exists")
     if len({os.path.realpath(bag) for bag in options.bags}) < len(options.bags):
