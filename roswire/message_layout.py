@@ -130,7 +130,6 @@ class LayoutBuilder:
                 self._add_part(replace(part, path=f"{path}.{part.path}"))
 
     def finish(self) -> MessageLayout:
-        """Return the layout of all added fields."""
         self._close()
         places: dict[str, FieldLocation] = {}
         for index, part in enumerate(self._parts):

@@ -63,7 +63,6 @@ def now() -> float:
 
 
 def now_ns() -> int:
-    """Return the monotonic time in nanoseconds."""
     return _source.get().now_ns()
 
 
@@ -78,7 +77,6 @@ def wall_ns() -> int:
 
 
 def utc_now() -> datetime:
-    """Return the system time as a date in UTC."""
     return datetime.fromtimestamp(wall(), UTC)
 
 

@@ -54,12 +54,10 @@ class EngineThread:
             self._wake.set()
 
     def hurry(self) -> None:
-        """Call a turn at once."""
         self._hurry.set()
         self._wake.set()
 
     def end(self, seconds: float | None) -> bool:
-        """Call the last turns at once; return whether the thread ended within `seconds` (None: no limit)."""
         self.hurry()
         self._thread.join(seconds)
         return not self._thread.is_alive()
@@ -97,6 +95,5 @@ class InCaller:
             self.due = self._turn(time)
 
     def end(self, _seconds: float | None) -> bool:
-        """Call the last turns; return whether the engine ended."""
         self.hurry()
         return self.due is None

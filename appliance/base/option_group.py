@@ -25,7 +25,6 @@ class OptionGroup(Generic[T]):
 
     @property
     def options(self) -> Sequence[Any]:
-        """Return the options, for a `GroupedCommand`."""
         return tuple(self._command.params)
 
     def value(self, given: Mapping[str, Any]) -> T:
@@ -49,7 +48,6 @@ class GroupedCommand(TyperCommand):
         self._own = [one.name for one in params]
 
     def invoke(self, ctx: Any) -> Any:
-        """Call the verb's function."""
         assert self.callback is not None  # noqa: S101  typer gives each verb one
         return ctx.invoke(self.callback, **{name: ctx.params[name] for name in self._own})
 

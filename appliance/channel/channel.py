@@ -115,7 +115,6 @@ class Channel:
         self._watch_writable()
 
     def _next(self) -> tuple[bytes, list[int]]:
-        """Return the next bytes to write, with their descriptors. Join frames without descriptors."""
         frames, size = [], 0
         while self._outgoing and not self._outgoing[0][1] and size < _TOGETHER:
             frames.append(self._outgoing.popleft()[0])

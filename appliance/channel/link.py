@@ -34,7 +34,6 @@ class Link:
 
     @property
     def unanswered(self) -> int:
-        """Return the number of questions that wait for answers."""
         return len(self._asked)
 
     def attach(self, channel: Channel) -> None:

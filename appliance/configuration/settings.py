@@ -472,7 +472,6 @@ class Settings:
 
     @property
     def listen_address(self) -> tuple[str, int]:
-        """`listen` as host and port."""
         return split_address(self.listen)
 
     @property
@@ -482,7 +481,6 @@ class Settings:
 
     @property
     def own_services(self) -> list[str]:
-        """Return the names of the services that features offer to nodes."""
         return [f"{self.publish_as}/{name}" for kind in SECTIONS for name in self.of(kind).services()]
 
 

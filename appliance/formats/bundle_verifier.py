@@ -415,7 +415,6 @@ class Verifier:
         return right and checkpoint["key"] == self.raw_key
 
     def has_signed(self, data: bytes, signed: bytes) -> bool:
-        """Return whether the key made this signature."""
         text, signature = (self.key.with_name(name) for name in ("text", "signature"))
         text.write_bytes(data)
         signature.write_bytes(signed)
@@ -425,14 +424,12 @@ class Verifier:
 
 
 def kept_copies(path: Path) -> dict[int, dict[str, Any]]:
-    """Return the checkpoints that were kept elsewhere, by number."""
     with regular(path) as file:
         lines = iter(lambda: file.readline(MOST), b"")
         return {copy["number"]: copy for copy in map(json.loads, lines)}
 
 
 def main(arguments: list[str]) -> int:
-    """Print the findings; return the exit status."""
     parser = argparse.ArgumentParser(description="Verify an evidence bundle of a ROSRV appliance.")
     parser.add_argument(
         "bundle", nargs="?", type=Path, default=Path(__file__).parent, help="ZIP file or folder"

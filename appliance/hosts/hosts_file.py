@@ -100,7 +100,6 @@ class DeclaredHosts:
         return IN_BUNDLE if self.bundled else str(self.path)
 
     def wants(self, name: str) -> bool:
-        """Return whether a host's tunnel may be open."""
         host = self.hosts.get(name)
         return host is None or host.wanted
 

@@ -47,7 +47,6 @@ class StoredAuthority:
     async def issue(
         self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> CertificateMade:
-        """Return a certificate in this name for the key of a signing request; see `Authority.issue`."""
         await self.require_key()
         return await self._signer.issue(request, name, days, proof=proof, former=former)
 
@@ -57,7 +56,6 @@ class StoredAuthority:
             raise AuthorityError(obstacle)
 
     async def revocations(self, revoked: list[tuple[str, float]]) -> bytes:
-        """Return the signed list (PEM) of these serial numbers and times."""
         await self.certificate()
         return await self._signer.revocations(revoked)
 

@@ -134,7 +134,6 @@ class Tunnels:
             _log.error("enrolled hosts cannot connect", reason=str(error))
 
     def answered(self, message: messages.TunnelsEnclosed) -> None:
-        """Take the supervisor's answer to `open`."""
         self._enclosed = message
         self._answered.set()
 

@@ -112,7 +112,6 @@ class Signer:
         self._public_key = key.public_key().public_bytes_raw()
 
     async def run(self) -> None:
-        """Serve until `Stop` arrives or the supervisor is gone."""
         self._child.attach(messages.Ready(detail={"public_key": self._public_key.hex()}))
         await self._child.ended.wait()
         self._child.close()
@@ -168,7 +167,6 @@ class Signer:
 
 
 def main(lifeline_fd: int, config: Path, passphrase: int | None) -> None:
-    """Run the signer; `lifeline_fd` and `passphrase` are the descriptors of the lifeline and the passphrase file."""
     settings = msgspec.json.decode(config.read_bytes(), type=_Settings)
     kept = RetentionLimits(settings.audit.retention_days, settings.audit.retention_bytes)
     serve(lifeline_fd, Path(settings.state, "signer"), settings.ipsec.ca, passphrase, kept)
@@ -181,7 +179,6 @@ def serve(
     passphrase: int | None = None,
     kept: RetentionLimits = RetentionLimits(),  # noqa: B008  frozen
 ) -> None:
-    """Run the signer with its directory, the kind of the authority's key, and the limits of the log."""
     lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
     try:
         os.umask(0o077)

@@ -81,7 +81,6 @@ def delete_link(namespace: Namespace, name: str) -> None:
 
 
 def add_address(namespace: Namespace, name: str, address: str) -> None:
-    """Give the interface `name` an address with its prefix length."""
     interface = ipaddress.ip_interface(address)
     flags = _IFA_F_NODAD if interface.version == 6 else 0
     _netlink(

@@ -56,7 +56,6 @@ class Acceptor:
         self._loop.add_reader(sock, self._readable)
 
     def close(self) -> None:
-        """Stop accepting, and close the listening socket."""
         if self._pause is not None:
             self._pause.cancel()
         self._loop.remove_reader(self._sock)

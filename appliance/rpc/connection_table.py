@@ -145,7 +145,6 @@ class ConnectionTable(Generic[Holder]):
         return self._take(self.held, host, size)
 
     def release(self, host: Holder, size: int) -> None:
-        """Release bytes that were held for a host."""
         self.held.give_back(host, size)
 
     async def sweep(self) -> None:

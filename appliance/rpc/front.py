@@ -158,7 +158,6 @@ class Front(asyncio.BaseProtocol, ABC):
 
     @property
     def holding(self) -> int:
-        """Return the bytes that the connection holds, and releases when it ends."""
         return 0
 
     def leave(self) -> None:

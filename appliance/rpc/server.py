@@ -138,7 +138,6 @@ class HttpServer:
             self._acceptors.append(Acceptor(self._queues.second, self.time, self._accepted, paced=True))
 
     def close(self) -> None:
-        """Stop accepting, cut all connections, and close the listening socket."""
         self._closed = True
         for acceptor in self._acceptors:
             acceptor.close()

@@ -60,7 +60,6 @@ class SpecificationCompiler:
             self._wanted()
 
     def attach(self, channel: Channel) -> None:
-        """Use the compiler process that has started."""
         self._link.attach(channel)
         self._called = False
         self._there.set()

@@ -41,7 +41,6 @@ class MonitorRecords:
     at: Counter[tuple[str, str]] = field(default_factory=Counter, init=False)
 
     def reported(self, events: list[MonitorEvent], lost: int) -> None:
-        """Record a batch of a relay's events."""
         for event in events:
             for monitor in _monitors(event):
                 self.counts[event.kind, monitor] += event.count or 1

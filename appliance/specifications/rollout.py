@@ -389,7 +389,6 @@ class Rollout:
     # --- messages of the relays ---
 
     def received(self, message: messages.Message, relay: int) -> None:
-        """Process a message of a relay about its monitors."""
         match message:
             case messages.SpecificationsTaken():
                 self._taken(relay, message)

@@ -659,7 +659,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     # --- the relay's messages ---
 
     def received(self, message: messages.Message, relay: int = 0) -> None:
-        """Process a message of a relay about monitors."""
         if isinstance(message, messages.MonitorsReported):
             self.records.reported(message.events, message.lost)
         else:

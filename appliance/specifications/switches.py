@@ -30,7 +30,6 @@ class Switches:
         self.said = json.loads(text)
 
     def enabled(self, name: str) -> bool:
-        """Return whether a monitor is enabled, so that its actions take effect."""
         return self.states.get(name) is True
 
     def in_shadow(self, name: str) -> bool:

@@ -62,7 +62,6 @@ class ChangeFeed:
 
     @property
     def size(self) -> int:
-        """Return the bytes of the changes that are kept."""
         return self._size
 
     def _shrink(self) -> None:

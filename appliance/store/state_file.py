@@ -272,7 +272,6 @@ class StateStore:
     # --- revisions of the policy and of the specifications ---
 
     def save_revision(self, row: RevisionRow) -> None:
-        """Store a policy that comes into force."""
         # Store the signature first: a start in between would reject a revision without its signature.
         self.database.put("policy_signature", row.revision, row.signature)
         self.database.put("policy_revision", *row[:-1])

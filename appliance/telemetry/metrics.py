@@ -25,7 +25,6 @@ class LastMinute:
         self._seconds: deque[tuple[int, Counter[str]]] = deque(maxlen=_SECONDS)
 
     def add(self, name: str, number: int = 1) -> None:
-        """Count events that happen now."""
         second = int(self._clock())
         if not self._seconds or self._seconds[-1][0] != second:
             self._seconds.append((second, Counter()))

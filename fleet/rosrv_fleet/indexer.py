@@ -172,7 +172,6 @@ _database: IndexDatabase | None = None  # of this worker: a connection for all i
 
 
 def _index_one(config: FleetConfig, place: SegmentPlace, keys: Collection[bytes]) -> None:
-    """Index a segment, in a worker. Raises what `index` raises."""
     global _database  # noqa: PLW0603  a worker has nothing else that lives as long
     if _database is None:
         _database = IndexDatabase(

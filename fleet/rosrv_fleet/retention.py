@@ -60,7 +60,6 @@ class Pruner:
             self._ending.wait(_EVERY_SECONDS)
 
     def stop(self) -> None:
-        """End `run`."""
         self._ending.set()
 
     def step(self) -> None:

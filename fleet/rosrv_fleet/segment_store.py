@@ -111,7 +111,6 @@ class SegmentStore:
             make_folder(folder / name)
 
     def _lock(self, robot: str) -> threading.Lock:
-        """Return the lock of a robot's files."""
         return self._locks.setdefault(robot, threading.Lock())
 
     def remove_unfinished(self) -> None:

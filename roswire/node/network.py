@@ -78,11 +78,9 @@ class SourceNetwork:
         self.source = source
 
     async def connect(self, host: str, port: int) -> tuple[asyncio.StreamReader, ByteWriter]:
-        """Return a new connection. Raises `OSError`."""
         return await asyncio.open_connection(host, port, local_addr=(self.source, 0), limit=BUFFER_BYTES)
 
     async def serve(self, serve: Serve) -> ListeningServer:
-        """Call `serve` for each connection to a free port. Raises `OSError`."""
         server = await asyncio.start_server(serve, self.source, 0, limit=BUFFER_BYTES)
         return _AsyncioServer(server)
 

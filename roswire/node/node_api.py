@@ -49,7 +49,6 @@ class NodeApi:
         }
 
     async def answer(self, call: MethodCall) -> Value:
-        """Return the answer to a call: status, text and value."""
         answer: Value
         match call.method, call.params:
             case "publisherUpdate", (str(), str(topic), list(uris)):

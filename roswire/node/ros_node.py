@@ -156,7 +156,6 @@ class RosNode:
         subscriber.update([uri for uri in uris if isinstance(uri, str) and uri != self._uri])
 
     async def unsubscribe(self, topic: str) -> None:
-        """End a subscription, if there is one."""
         async with self._lock("subscriber", topic):
             if topic in self.subscribers:
                 await self._forget("unregisterSubscriber", topic, self._uri)
@@ -194,7 +193,6 @@ class RosNode:
         await self.master("registerPublisher", topic, self.publishers[topic].type.name, self._uri)
 
     async def unadvertise(self, topic: str) -> None:
-        """End a publication, if there is one."""
         async with self._lock("publisher", topic):
             if topic in self.publishers:
                 await self._forget("unregisterPublisher", topic, self._uri)
@@ -218,7 +216,6 @@ class RosNode:
             return server
 
     async def withdraw(self, service: str) -> None:
-        """Offer a service no longer, if it is offered."""
         async with self._lock("service", service):
             if service in self.services:
                 await self._forget("unregisterService", service, service_uri(*self.tcpros))

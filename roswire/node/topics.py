@@ -104,7 +104,6 @@ class NodeSubscription:
             pause = min(2 * pause, _LONGEST_PAUSE)
 
     async def _receive(self, uri: str) -> None:
-        """Receive messages until the connection ends."""
         async with self._connection_to(uri) as (reader, header):
             self.connected[uri] = header
             self._connection.set()

@@ -73,7 +73,6 @@ class Firewall:
         self._backend, self._rules = None, ()
 
     def report(self) -> FirewallReport:
-        """Report which rules are in force, with their counters."""
         backend, not_used = self._backend, tuple(self._not_used)
         if backend is None:
             return FirewallReport(None, statuses(self._rules, ()), not_used)

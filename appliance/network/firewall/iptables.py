@@ -73,7 +73,6 @@ class IptablesBackend:
 
     @property
     def families(self) -> tuple[Family, ...]:
-        """Return the families that the kernel has: without IPv6 if it is disabled."""
         return self._namespace.run(_families)
 
     def install(self, rules: tuple[PacketRule, ...]) -> None:
@@ -89,7 +88,6 @@ class IptablesBackend:
         _in_used_tables(self._namespace, "filter", lambda table: table.replace([]))
 
     def counters(self) -> tuple[RuleCounter, ...]:
-        """Read the rules of the appliance's chains back from the kernel."""
         found: list[RuleCounter] = []
         self._in_tables(lambda table: found.extend(table.counters()))
         return tuple(found)

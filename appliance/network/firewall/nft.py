@@ -59,7 +59,6 @@ class NftBackend:
         self._nft(["-f", "-"], json.dumps({"nftables": _delete_table()}))
 
     def counters(self) -> tuple[RuleCounter, ...]:
-        """Read the rules of the table back from the kernel."""
         tables = self._list("table", "list", "tables")
         if (_FAMILY, TABLE) not in [(table.get("family"), table.get("name")) for table in tables]:
             return ()

@@ -185,7 +185,6 @@ class BundleRepository:
         self.snapshot()
 
     def renew_root(self) -> None:
-        """Sign the root again with a new expiry date."""
         root = self._open("root", Root)
         self._save_root(root, root)
 
@@ -210,7 +209,6 @@ class BundleRepository:
     # --- signing ---
 
     def snapshot(self) -> None:
-        """Sign a snapshot of the newest metadata."""
         try:
             snapshot = self._open("snapshot", Snapshot)
         except RepositoryError:

@@ -46,7 +46,6 @@ _MOST_HISTORY = 20
 
 
 def groups_page(service: BundleService) -> str:
-    """Return the page's body with one row for each group."""
     groups = sorted({*service.rollouts, *service.robots})
     trouble = alert(service.trouble) if service.trouble else ""
     if not service.advancing:

@@ -230,7 +230,6 @@ class BundleService:
         return await self._change(group, back, number)
 
     def counts(self, group: RobotGroup) -> list[dict[str, object]]:
-        """Return the rings of a group's last rollout with their robots."""
         stored = self.rollouts.get(group)
         return [] if stored is None else machine.counts(stored.rollout, self._heard(group), self._clock())
 

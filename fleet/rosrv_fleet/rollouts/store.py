@@ -74,7 +74,6 @@ class RolloutStore:
     # --- rollouts ---
 
     def latest(self) -> dict[RobotGroup, StoredRollout]:
-        """Return the last rollout of every group."""
         query = """
             SELECT DISTINCT ON (site, robot_group) id, site, robot_group, document::text FROM rollout
             ORDER BY site, robot_group, id DESC
@@ -123,7 +122,6 @@ class RolloutStore:
             return cursor.rowcount == 1
 
     def history(self, group: RobotGroup, limit: int) -> list[StoredRollout]:
-        """Return the last rollouts of a group, the newest first."""
         query = """
             SELECT id, document::text FROM rollout WHERE site = %s AND robot_group = %s ORDER BY id DESC LIMIT %s
         """
@@ -137,7 +135,6 @@ class RolloutStore:
     # --- the timestamp ---
 
     def timestamp(self) -> bytes | None:
-        """Return the last timestamp, if there is one."""
         with self._database.writing() as connection:
             cursor = connection.execute("SELECT document FROM bundle_timestamp")
             row = cursor.fetchone()
