@@ -29,9 +29,11 @@ ROOT = HERE.parents[1]
 BUILD = ROOT / "build" / "tests"
 
 
-# rospy ends in its signal handler. A signal in the middle of `publish` waits for a lock that `publish` holds, or for a
-# thread that waits for that lock.
-_IN_ITS_OWN_WAY = re.compile(r"Current thread.*in signal_shutdown.*in _ros_signal.*in publish", re.DOTALL)
+# rospy ends in its signal handler. A signal in the middle of `publish`, or of its own end, waits for a lock that a
+# lower frame of the thread holds, or for a thread that waits for that lock.
+_IN_ITS_OWN_WAY = re.compile(
+    r"Current thread.*in signal_shutdown.*in _ros_signal.*in (publish|_ros_atexit)", re.DOTALL
+)
 
 
 class RosSession:

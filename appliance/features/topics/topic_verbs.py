@@ -62,6 +62,10 @@ def echo(
 
 @speaks
 def info(appliance: Appliance, topic: _Topic) -> None:
+    """Show the publishers, subscribers and rates of a topic.
+
+    Example: rosrv topic info /scan
+    """
     body = appliance.ask_or_exit(admin.GraphWanted())
     found = next((row for row in body.topics if row.name == topic), None)
     if found is None:
