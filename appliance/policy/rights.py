@@ -108,7 +108,7 @@ def needs_node(request: Request) -> bool:
 def decide(policy: Policy, rights: Iterable[Right]) -> Decision:
     """Return one decision on all rights: the first of the lowest rank, so a denial before a missing approval.
 
-    A missing approval goes before one that lasts, because each right that asks needs its own.
+    Each right that asks needs its own approval, so one that lacks it is decisive even if another has it.
     """
     first, *others = rights
     verdict = decide_right(policy, first)

@@ -182,7 +182,7 @@ class DriveOrders:
     ) -> None:
         """Cut the holder off on all relays, then let the next host hold the group. This is one audit record.
 
-        Without `to`, the next host is the first one that waits, if all relays are ready; the group is freed anyway.
+        The group is freed in any case. Without `to`, the first host that waits holds it next, if all relays are ready.
         `stop`: the guards of the group stop the robot in between.
         """
         if to is not None and not self._relays_ready():

@@ -11,7 +11,7 @@ from appliance.policy.model import Category
 
 
 class RuleText(msgspec.Struct, frozen=True):
-    """Where a rule stands."""
+    """The place of a rule in a file."""
 
     section: str
     key: str

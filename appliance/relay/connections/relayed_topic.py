@@ -432,8 +432,7 @@ class RelayedTopic:
     def tidy(self) -> None:
         """Free temporary data, and trim queues to their bounds; called once a second.
 
-        Also pass on a latched message that a rate limit delayed, as soon as the limit permits it, and one that was
-        withheld.
+        Then pass on a latched message that was withheld, or that a rate limit delayed, if it may pass now.
         """
         now = self._clock()
         waiting = self.flow.later(now)
