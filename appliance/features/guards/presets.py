@@ -5,7 +5,7 @@ A guard is an ordinary specification. Its first line names the preset, its versi
 
 import functools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from ipaddress import ip_network
 from pathlib import Path
@@ -235,14 +235,19 @@ def described(text: str) -> str:
 
 def topics_in(text: str) -> dict[str, str]:
     """Return the topics that a guard was made for, by the names that its preset has for them."""
-    topics = described(text).partition(": ")[2].split(", ")
-    return {one.split("=", 1)[0]: one.split("=", 1)[1].split(" ")[0] for one in topics}
+    return {name: topic for name, topic, _kind in _made_for(text)}
 
 
 def types_in(text: str) -> dict[str, str]:
     """Return the message types that a guard was made for, by the names of its topics."""
-    topics = described(text).partition(": ")[2].split(", ")
-    return {one.split("=", 1)[0]: one.rsplit(" ", 1)[1] for one in topics if " " in one}
+    return {name: kind for name, _topic, kind in _made_for(text) if kind}
+
+
+def _made_for(text: str) -> Iterator[tuple[str, str, str]]:
+    for one in described(text).partition(": ")[2].split(", "):
+        name, _, rest = one.partition("=")
+        topic, _, kind = rest.partition(" ")
+        yield name, topic, kind
 
 
 def loaded_values(text: str) -> dict[str, str]:
