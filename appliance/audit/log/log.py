@@ -42,7 +42,7 @@ from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import AUDIT_RESERVE
 
 Durability = Literal["strict", "batched"]
-_GATHER_SECONDS = 0.04  # records are promised on disk within 50 ms
+_GATHER_SECONDS = 0.02
 _RETRY_SECONDS = 0.5
 _LARGEST_BATCH = 2048
 _IDLE_SECONDS = 1.0
@@ -81,7 +81,7 @@ class _LossCounter:
 class AuditLog:
     """The log at `path`, open for writing; `drive` makes the driver that calls its turns, in one thread.
 
-    `durability`: `strict` writes at once (group commit), `batched` after 40 ms; both fsync. A checkpoint is made every
+    `durability`: `strict` writes at once (group commit), `batched` after 20 ms; both fsync. A checkpoint is made every
     `checkpoint_every` records or `checkpoint_seconds`. A turn of the log then calls `signer(number, text)`, and the
     owner answers with `signed` or `refused`. Likewise, `removals(number, checkpoint, newest)` requests the signature of
     a removal; the answer is `removal_approved` or `removal_refused`. `held_by` is called with the ids of processes that

@@ -65,7 +65,7 @@ def test_records_reach_the_disk_without_a_wait(path: Path, durability: Durabilit
     assert log.close() is None
 
 
-@pytest.mark.parametrize(("durability", "gather"), [("strict", 0.0), ("batched", 0.04)])
+@pytest.mark.parametrize(("durability", "gather"), [("strict", 0.0), ("batched", 0.02)])
 def test_only_a_batched_log_gathers_records(path: Path, durability: Durability, gather: float) -> None:
     asked: list[float] = []
 
