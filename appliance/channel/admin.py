@@ -1,8 +1,9 @@
 """The requests of operators' tools to the running appliance. Each request names the struct of its answer.
 
-It is in the state directory; only its owner and root may use it. It accepts all requests except
-`ChallengeWanted`.
+The admin socket carries one JSON document per line in each direction, and one request per connection at a time. It is
+in the state directory; only its owner and root may use it. It accepts all requests except `ChallengeWanted`.
 
+Over REST, the api process passes on all requests with `@rest`. It gets the same JSON document back.
 `channel/operations.py` has both unions, with the requests of features.
 
 `@rest` defines a request's row in the table of operations (`channel/rest_operation.py`): method, path, role, ETag. The

@@ -7,7 +7,8 @@ descriptors are queued in order and assigned to frames in this order.
 The channel has no event loop. Its owner waits on `fileno()`, calls `receive()` when it is readable, and `flush()` when
 it is writable. So the same class works with asyncio (`attach`) and with the relay's epoll loop.
 
-If the peer does not read, `send` raises `ChannelFullError` beyond `limit` bytes of backlog.
+If the peer does not read, `send` raises `ChannelFullError` beyond `limit` bytes of backlog. Both ends belong to the
+appliance, so this is a defect and not high load.
 """
 
 import os

@@ -3,6 +3,9 @@
 Clients may trust exactly this certificate, so it is replaced only when it ends, or when the configuration gives the
 appliance another name. The name of the machine is in it, but another one does not replace it: by default, a container
 has its id as name, and each recreation makes another id.
+
+The authority for hosts in tunnels does not sign the certificate, because REST also runs without tunnels. Copy
+`certificate.pem` to clients by hand, or let them pin the key's fingerprint, as the kits of hosts do.
 """
 
 import base64

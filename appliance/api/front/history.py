@@ -1,7 +1,7 @@
 """Keep samples of the last hour: counters that only grow, from which clients compute rates.
 
-While a client follows, control is queried every `BUSY_SECONDS`; otherwise every `IDLE_SECONDS`. One query
-serves all clients, so more clients cost RVMaster nothing.
+While a client follows, control is queried every `BUSY_SECONDS`; otherwise every `IDLE_SECONDS`. One query serves all
+clients, so more clients cost RVMaster nothing. The age and the number of samples are limited.
 """
 
 import asyncio

@@ -1,6 +1,7 @@
 """Accept connections of REST with `rpc/front`, which RVMaster also uses; uvicorn serves them.
 
-Invariants besides those of `rpc/front`:
+uvicorn's configuration, a public interface, makes each connection's protocol for HTTP and ASGI. This protocol gets the
+bytes that the front accepts. Invariants besides those of `rpc/front`:
 
 1. A connection is entered in the connection table before anything (such as TLS) is set up for it. If the table is full,
    the connection is closed at once.

@@ -1,8 +1,8 @@
 """Limit long answers, which are streams and exports, by quotas.
 
-A long answer counts for its token and for its peer, and each has a quota. So neither a viewer's token with
-many connections nor a machine with many tokens can take the places of others, in particular of operators and
-admins.
+A long answer counts for its token and for its peer, and each has a quota. So neither a viewer's token with many
+connections nor a machine with many tokens can take the places of others, in particular of operators and admins. When
+the response ends, for any reason, its place is free again. `Work` does the same for answers that need much time.
 """
 
 import asyncio

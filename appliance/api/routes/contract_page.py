@@ -1,6 +1,6 @@
 """The contract as a page for people: each call with its parameters, bodies, answers and examples. Pure.
 
-The page is one HTML file without scripts.
+The page is one HTML file without scripts. All its texts come from the program, and are escaped.
 """
 
 import json

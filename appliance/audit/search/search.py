@@ -1,6 +1,7 @@
 """Read the log: search with paging, show a record with its neighbours, follow, export.
 
-Reading works whether or not the appliance runs, and never blocks the writer.
+Reading works whether or not the appliance runs, and never blocks the writer. Texts are searched in the full-text index,
+and in the records that are not indexed yet.
 """
 
 import functools

@@ -1,4 +1,7 @@
-"""The link control <-> api. The api passes on each client's request and credentials; control verifies them."""
+"""The link control <-> api. The api passes on each client's request and credentials; control verifies them.
+
+The api's requests are the union `RestRequest`. No request in it can make a token.
+"""
 
 import math
 from typing import Annotated, ClassVar

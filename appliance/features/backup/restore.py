@@ -1,5 +1,7 @@
 """Restore a state directory from a backup.
 
+Invariants:
+
 1. Existing files are not overwritten, and writing starts only after the whole archive was checked (`archive.py`).
 2. An incomplete restore never becomes an appliance's state: its files are removed. After a kill or a power cut, a mark
    remains, and `rosrv up` rejects the directory. The mark is removed once everything is on the disk.

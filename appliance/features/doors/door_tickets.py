@@ -1,7 +1,8 @@
 """The tickets with which people's viewers open a door. A viewer can carry nothing but a URL.
 
-A ticket is `ID.SECRET`: 48 bits that name it in records, and 256 random bits. A ticket ends by
-`StoredDeadlines`, as tokens do: neither a step of the clock nor a restart gives it more time.
+A ticket is `ID.SECRET`: 48 bits that name it in records, and 256 random bits. The secret is stored as its hash only:
+256 bits cannot be guessed, so a fast hash is enough. A ticket ends by `StoredDeadlines`, as tokens do: neither a step
+of the clock nor a restart gives it more time.
 """
 
 import hashlib

@@ -1,8 +1,8 @@
 """Look at the surroundings of a door: topics and services that its identity may see, with definitions and types.
 
-Viewers list topics before they subscribe, and need the definitions first. A definition that the door does not
-know comes with the header of a publisher, so the door subscribes to the topic for a moment. A topic that the
-policy denies stays without a definition.
+Viewers list topics before they subscribe, and need the definitions first. A definition that the door does not know
+comes with the header of a publisher, so the door subscribes to the topic for a moment. A topic that the policy denies
+stays without a definition. The result, or the denial, is kept until the publishers or the providers change.
 """
 
 import asyncio

@@ -1,4 +1,7 @@
-"""The requests of operators' tools about guards."""
+"""The requests of operators' tools about guards.
+
+A guard is a monitor, so the operations of monitors bring it into force, confirm, disable, resume and remove it.
+"""
 
 from typing import Annotated
 

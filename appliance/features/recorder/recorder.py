@@ -1,6 +1,6 @@
 """Follow the audit log, and make a recording of the relays' memory when a record is a trigger.
 
-`step` does all work that is due and returns the messages for control.
+`step` does all work that is due and returns the messages for control. This module never waits and uses no socket.
 
 Invariants:
 
