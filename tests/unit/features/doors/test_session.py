@@ -97,6 +97,25 @@ async def test_a_will_is_published_within_seconds_after_the_network_is_cut() -> 
         assert heard == [string("stop")]
 
 
+async def test_a_publication_without_a_grant_is_refused_until_it_is_granted_again() -> None:
+    async with door_world() as world:
+        robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
+        client.send({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String"})
+        publish = {"op": "publish", "topic": "/cmd", "msg": {"data": "go"}}
+        await asyncio.sleep(11)
+        world.master.denials["registerPublisher"] = "the approval is over"
+        client.send(publish)
+        assert "the approval is over" in (await client.next())["msg"]
+        del world.master.denials["registerPublisher"]
+        await asyncio.sleep(2)
+        client.send(publish | {"msg": {"data": "again"}})
+        heard: list[bytes] = []
+        await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
+        await asyncio.sleep(1)
+        assert heard == [string("again")]
+        assert client.frames.empty()
+
+
 async def test_wills_and_arguments_of_waiting_calls_are_bounded() -> None:
     """Each counts with its bytes, not with its whole frame."""
     async with door_world() as world:
