@@ -292,8 +292,11 @@ class World:
         self.loop.outside.start(self._learn())
 
     async def _learn(self) -> None:
+        possible = self.possible
         answer = await self.order(admin.PolicyWanted())
-        if answer is None or self.ordering:
+        if (
+            answer is None or self.ordering or self.possible != possible
+        ):  # the answer may be older than a reload
             return
         found = {name for name, policy in POLICIES.items() if policy.text == answer.text}
         if not found & self.possible:
