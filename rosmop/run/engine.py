@@ -541,13 +541,16 @@ class MonitorSet:
         monitor.hold(why)
         self._agenda.schedule()
 
-    def stop(self, topic: str) -> list[str]:
-        """Send the safe messages on a topic until a message comes on it; return the monitors that have one."""
-        found = [monitor for monitor in self._monitors if monitor.enabled and topic in monitor.safes]
-        for monitor in found:
-            monitor.starting.add(topic)
+    def guards(self, topic: str) -> list[str]:
+        """Return the names of the enabled monitors that have a safe message for a topic."""
+        return [monitor.name for monitor in self._monitors if monitor.enabled and topic in monitor.safes]
+
+    def stop(self, topic: str) -> None:
+        """Send the safe messages on a topic until a message comes on it."""
+        for monitor in self._monitors:
+            if monitor.enabled and topic in monitor.safes:
+                monitor.starting.add(topic)
         self._agenda.schedule()
-        return [monitor.name for monitor in found]
 
     def holds_if_lost(self, code: SpecificationCode) -> bool:
         """Return whether a specification holds its topics if its state is lost."""

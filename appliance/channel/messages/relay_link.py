@@ -376,14 +376,18 @@ class MonitorResumed(Message):
 
 
 class StopWanted(Message):
-    """Control has the monitors of a topic send their safe messages until a message comes on it."""
+    """Control has the monitors of a topic send their safe messages until a message comes on it.
+
+    Without `begin`, control only asks which monitors have one.
+    """
 
     number: int
     topic: str
+    begin: bool
 
 
 class StopBegun(Message):
-    """The answer to the `StopWanted` with this number: the names of the monitors that send a safe message."""
+    """The answer to the `StopWanted` with this number: the names of the monitors that have a safe message."""
 
     number: int
     monitors: list[str]

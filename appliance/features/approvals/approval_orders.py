@@ -6,7 +6,7 @@ after a restart of control, and after a takeover, nothing is approved.
 """
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import replace
 from functools import partial
 
@@ -46,7 +46,10 @@ class ApprovalOrders:
     """The held calls, the approvals and the orders. Orders raise `SenselessError` and `UnknownThingError`.
 
     `first` is the number of the first held call. `decide_again()` brings the present `approved` into force, and
-    `carried_out()` waits until the relays have carried out their orders.
+    `carried_out(topics)` waits until the relays of topics have carried out their orders. `guards(topic)` returns the
+    monitors with a safe message for a topic, or None if its relay does not answer.
+
+    An order or an end takes effect before it waits for anything, so a relay that hangs delays no other order or end.
     """
 
     def __init__(
@@ -58,7 +61,8 @@ class ApprovalOrders:
         *,
         first: int,
         decide_again: Callable[[], int],
-        carried_out: Callable[[], Awaitable[None]],
+        carried_out: Callable[[Iterable[str]], Awaitable[None]],
+        guards: Callable[[str], Awaitable[list[str] | None]],
     ) -> None:
         self._policy = policy
         self._trail = trail
@@ -66,11 +70,13 @@ class ApprovalOrders:
         self._stop = stop
         self._decide_again = decide_again
         self._carried_out = carried_out
+        self._guards = guards
         self._table = ApprovalTable(first)
-        self._turn = asyncio.Lock()
         self._unanswered: list[float] = []
         self._moved: dict[int, float] = {}  # of leases: the last message, also after its publisher ended
-        self._still: dict[int, float] = {}  # of leases: the last message before a silence that needs no stop
+        self._still: dict[
+            int, float
+        ] = {}  # of leases: the last message before a silence about which guards were asked
         self.approved = self._table.approved
 
     # --- calls ---
@@ -130,62 +136,72 @@ class ApprovalOrders:
 
     async def approve(self, request: requests.ApproveCall, who: str) -> requests.Approval:
         """Approve a held call once, or give a lease; a lease may be given again to extend or shorten it."""
-        async with self._turn:
-            entry = self._entry(request.number)
-            seconds = request.seconds
-            if seconds is None and entry.lease and entry.call.category is Category.CALL:
-                raise SenselessError(
-                    f"approval {entry.number} is a lease: give its new time with --for, or --refuse it"
-                )
-            if seconds is None and entry.call.category is not Category.CALL:
-                seconds = LEASE_SECONDS  # a publisher registers once, so only a lease bounds its messages
-            if seconds is not None and not requests.SHORTEST_LEASE <= seconds <= requests.LONGEST_LEASE:
-                raise SenselessError(
-                    f"{seconds:g} s is not a lease: give {requests.SHORTEST_LEASE:g}s to {requests.LONGEST_LEASE:g}s"
-                )
-            if self._ended(entry):
-                raise SenselessError(
-                    f"the policy no longer asks about {entry.call.resource}: approve nothing"
-                )
-            take_effect()
-            entry = self._table.approve(entry, seconds, who, clock.now())
-            self._unanswered.clear()
-            what = "once" if seconds is None else f"for {seconds:g} s"
-            self._record("approval given", entry, f"{who} gave approval {entry.number}, {what}", who=who)
-            await self._enforce()
-            return _shown(entry)
+        entry = self._entry(request.number)
+        seconds = request.seconds
+        if seconds is None and entry.lease and entry.call.category is Category.CALL:
+            raise SenselessError(
+                f"approval {entry.number} is a lease: give its new time with --for, or --refuse it"
+            )
+        if seconds is None and entry.call.category is not Category.CALL:
+            seconds = LEASE_SECONDS  # a publisher registers once, so only a lease bounds its messages
+        if seconds is not None and not requests.SHORTEST_LEASE <= seconds <= requests.LONGEST_LEASE:
+            raise SenselessError(
+                f"{seconds:g} s is not a lease: give {requests.SHORTEST_LEASE:g}s to {requests.LONGEST_LEASE:g}s"
+            )
+        if self._ended(entry):
+            raise SenselessError(f"the policy no longer asks about {entry.call.resource}: approve nothing")
+        take_effect()
+        entry = self._table.approve(entry, seconds, who, clock.now())
+        self._unanswered.clear()
+        what = "once" if seconds is None else f"for {seconds:g} s"
+        self._record("approval given", entry, f"{who} gave approval {entry.number}, {what}", who=who)
+        if self._enforce():
+            await self._carried_out({entry.call.resource})
+        return _shown(entry)
 
     async def refuse(self, request: requests.RefuseCall, who: str) -> requests.Approval:
         """Refuse a held call, so that repetitions are not held again; or end an approval."""
-        async with self._turn:
-            entry = self._entry(request.number)
-            take_effect()
-            if entry.state is ApprovalState.APPROVED:
-                await self._end(entry, f"{who} ended it", who)
-                return _shown(replace(entry, state=ApprovalState.REFUSED, until=clock.now(), who=who))
-            entry = self._table.refuse(entry, who)
-            self._record("approval refused", entry, f"{who} refused approval {entry.number}", who=who)
-            return _shown(entry)
+        entry = self._entry(request.number)
+        take_effect()
+        if entry.state is ApprovalState.APPROVED:
+            self._end(entry, f"{who} ended it", who)
+            self._enforce()
+            await self._stop_motion(entry)
+            return _shown(replace(entry, state=ApprovalState.REFUSED, until=clock.now(), who=who))
+        entry = self._table.refuse(entry, who)
+        self._record("approval refused", entry, f"{who} refused approval {entry.number}", who=who)
+        return _shown(entry)
 
     # --- the end of a time ---
 
     async def watch(self) -> None:
         """End what is over; runs until cancelled."""
-        while True:
-            await self.check()
-            await asyncio.sleep(CHECK_SECONDS)
+        async with asyncio.TaskGroup() as checks:
+            while True:
+                checks.create_task(self.check())
+                await asyncio.sleep(CHECK_SECONDS)
 
     async def check(self) -> None:
-        """End the calls and approvals that are over now, and leases of hosts that stopped publishing a motion."""
+        """End the calls and approvals that are over now, and leases of hosts that stopped publishing a motion.
+
+        All of them end before this waits for the stops of the robot.
+        """
+        ended, still = [], []
         for entry in self._table.entries():
-            async with self._turn:
-                reason = self._table.entry(entry.number) is entry and (
-                    self._ended(entry) or await self._silent(entry)
-                )
-                if reason:
-                    if entry.state is ApprovalState.WAITS and entry.until <= clock.now():
-                        self._unanswered.append(clock.now())
-                    await self._end(entry, reason)
+            silence, in_group = (
+                self._silence(entry),
+                self._policy().commanded(entry.call.resource) is not None,
+            )
+            if reason := self._ended(entry) or (silence if in_group else ""):
+                if entry.state is ApprovalState.WAITS and entry.until <= clock.now():
+                    self._unanswered.append(clock.now())
+                self._end(entry, reason)
+                ended.append(entry)
+            elif silence and self._still.get(entry.number) != self._moved[entry.number]:
+                self._still[entry.number] = self._moved[entry.number]
+                still.append(entry)
+        self._enforce()
+        await asyncio.gather(*map(self._stop_motion, ended), *map(self._end_if_guarded, still))
 
     def _ended(self, entry: ApprovalEntry) -> str:
         """Return why an entry ends now; empty: it goes on."""
@@ -201,21 +217,26 @@ class ApprovalOrders:
         # A parameter may be held because of a rule for what is below it.
         return "" if any(asking) else "the policy no longer asks"
 
-    async def _silent(self, entry: ApprovalEntry) -> str:
-        """Return why silence ends a lease on a motion now; empty: it goes on.
+    def _silence(self, entry: ApprovalEntry) -> str:
+        """Return why a lease on a topic ends now if the topic is a motion; empty: its host is not silent.
 
-        A topic is a motion if it is in a group of `[Authority]`, or if an enabled guard has a safe message for it. The
-        answer to the latter is the stop itself, so the guards are asked once in each silence.
+        A topic is a motion if it is in a group of `[Authority]`, or if an enabled guard has a safe message for it.
         """
-        moved, topic = self._last_message(entry), entry.call.resource
-        group = self._policy().commanded(topic)
+        moved, group = self._last_message(entry), self._policy().commanded(entry.call.resource)
         seconds = SILENT_SECONDS if group is None else group.lease
-        if moved <= entry.since or clock.now() - moved < seconds or self._still.get(entry.number) == moved:
-            return ""
-        if group is None and not await self._stop.stop(topic):
-            self._still[entry.number] = moved
-            return ""
-        return f"its host was silent for {seconds:g} s"
+        silent = moved > entry.since and clock.now() - moved >= seconds
+        return f"its host was silent for {seconds:g} s" if silent else ""
+
+    async def _end_if_guarded(self, entry: ApprovalEntry) -> None:
+        """End a lease of a silent host if a guard has a safe message for its topic. Ask once in each silence."""
+        guards = await self._guards(entry.call.resource)
+        present = self._table.entry(entry.number)
+        if guards is None:
+            self._still.pop(entry.number, None)  # the relay did not answer, so ask again
+        elif guards and present is not None and (reason := self._silence(present)):
+            self._end(present, reason)
+            self._enforce()
+            await self._stop_motion(present)
 
     def _last_message(self, entry: ApprovalEntry) -> float:
         """Return the time of the last message under a lease on a topic; 0: none."""
@@ -225,26 +246,31 @@ class ApprovalOrders:
         self._moved[entry.number] = max(moved, self._moved.get(entry.number, 0.0))
         return self._moved[entry.number]
 
-    async def _end(self, entry: ApprovalEntry, reason: str, who: str = "") -> None:
-        """End an entry. The end of a lease cuts its host off on all relays; then the guards stop the robot.
-
-        They also stop it if no message was reported, because a report may be missing: relays report once a second, and
-        the traffic of a node that has ended is forgotten.
-        """
+    def _end(self, entry: ApprovalEntry, reason: str, who: str = "") -> None:
         self._table.end(entry)
         self._moved.pop(entry.number, None)
         self._still.pop(entry.number, None)
         self._record("approval ended", entry, f"approval {entry.number} ended: {reason}", who=who)
-        if entry.lease:
-            await self._enforce()
-            call = entry.call
-            if call.category is Category.PUBLISH and self._policy().may_command(call.resource, call.host):
-                await self._stop.after(str(call.host), {call.resource}, f"approval {entry.number} ended")
 
-    async def _enforce(self) -> None:
-        if self._policy().approved != self.approved():
+    def _enforce(self) -> bool:
+        """Decide all rights again if the leases differ from those in force; return whether they did."""
+        differ = self._policy().approved != self.approved()
+        if differ:
             self._decide_again()
-            await self._carried_out()
+        return differ
+
+    async def _stop_motion(self, entry: ApprovalEntry) -> None:
+        """Have the guards stop the robot after the end of a lease on a topic, once its relay cut the host off.
+
+        They also stop it if no message was reported, because a report may be missing: relays report once a second, and
+        the traffic of a node that has ended is forgotten.
+        """
+        call = entry.call
+        if not entry.lease or call.category is not Category.PUBLISH:
+            return
+        await self._carried_out({call.resource})
+        if self._policy().may_command(call.resource, call.host):
+            await self._stop.after(str(call.host), {call.resource}, f"approval {entry.number} ended")
 
     # --- inside ---
 

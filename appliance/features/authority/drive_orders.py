@@ -6,7 +6,8 @@ control, and after a takeover, each group is free.
 """
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
+from weakref import WeakValueDictionary
 
 from appliance.base import clock
 from appliance.base.withdrawal import take_effect
@@ -28,8 +29,10 @@ CHECK_SECONDS = 0.25
 class DriveOrders:
     """The orders about groups. Their methods raise `SenselessError`, `UnavailableError` and `UnknownThingError`.
 
-    `decide_again()` brings the present `holders` into force, and `carried_out()` waits until the relays have carried
-    out their orders. `relays_ready()` returns whether all relays are connected.
+    `decide_again()` brings the present `holders` into force. `carried_out(topics)` waits until the relays of these
+    topics have carried out their orders; None: all relays. `relays_ready()` returns whether all relays are connected.
+
+    Each group has its own turn. So a relay that hangs delays the next holder of a group, and no other group.
     """
 
     def __init__(
@@ -40,7 +43,7 @@ class DriveOrders:
         stop: MotionStop,
         *,
         decide_again: Callable[[], int],
-        carried_out: Callable[[], Awaitable[None]],
+        carried_out: Callable[[Iterable[str] | None], Awaitable[None]],
         relays_ready: Callable[[], bool],
     ) -> None:
         self._policy = policy
@@ -51,7 +54,7 @@ class DriveOrders:
         self._carried_out = carried_out
         self._relays_ready = relays_ready
         self._groups = GroupHolders(self._claim)
-        self._turn = asyncio.Lock()
+        self._turns: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
 
     def holders(self) -> dict[str, Address]:
         return {name: holding.host for name, holding in self._groups.holdings().items()}
@@ -65,7 +68,7 @@ class DriveOrders:
     async def take(self, request: requests.DriveTake, who: str) -> requests.GroupState:
         """Give a group to a host that may take it now."""
         group, host = self._group(request.group), self._host(request.host)
-        async with self._turn:
+        async with self._turn(group):
             await self._taken(group, host, who)
         return self._state(group)
 
@@ -77,7 +80,7 @@ class DriveOrders:
             raise SenselessError(
                 f"{to} has no claim to {group.name}: add it to ask {group.name} in [Authority]"
             )
-        async with self._turn:
+        async with self._turn(group):
             if self._groups.holder(group.name) is None and to is None:
                 raise SenselessError(f"no host holds {group.name}: `rosrv drive status` lists all groups")
             await self._hand_over(group, to, f"given by {who}", who)
@@ -86,7 +89,7 @@ class DriveOrders:
     async def ask(self, request: requests.DriveAsk, who: str) -> requests.GroupState:
         """Let a host wait for a group; if the group is free and the host may take it, it gets it at once."""
         group, host = self._group(request.group), self._host(request.host)
-        async with self._turn:
+        async with self._turn(group):
             await self._asked(group, host, who)
         return self._state(group)
 
@@ -100,7 +103,7 @@ class DriveOrders:
             if claim is None:
                 continue
             try:
-                async with self._turn:
+                async with self._turn(group):
                     if claim is Claim.ASK:
                         await self._asked(group, host, call.caller_id)
                         refused.append(f"{group.name}: asked for it")
@@ -118,7 +121,7 @@ class DriveOrders:
         """End the authority of the caller's host over all groups."""
         host, done = address_of(call.host), []
         for group in self._policy().authority.values():
-            async with self._turn:
+            async with self._turn(group):
                 holding = self._groups.holder(group.name)
                 if holding is not None and holding.host == host:
                     await self._hand_over(group, None, f"given by {call.caller_id}", call.caller_id)
@@ -130,28 +133,39 @@ class DriveOrders:
 
     async def watch(self) -> None:
         """End the authority of silent and absent holders; runs until cancelled."""
-        while True:
-            await self.check()
-            await asyncio.sleep(CHECK_SECONDS)
+        async with asyncio.TaskGroup() as checks:
+            while True:
+                checks.create_task(self.check())
+                await asyncio.sleep(CHECK_SECONDS)
 
     async def check(self) -> None:
-        """End the authority that is over now, and give each group to the host that waits for it."""
+        """End the authority that is over now, and give each group to the host that waits for it.
+
+        Every authority ends before this waits for a relay.
+        """
         groups = self._policy().authority
-        async with self._turn:
-            for name, gone in self._groups.forget_others(frozenset(groups)).items():
-                self._decide_again()
-                self._record(name, gone, None, "the policy no longer has the group", "")
-        for group in groups.values():
-            async with self._turn:
-                held = self._groups.holder(group.name)
-                if held is None:
-                    if self._next(group) is not None:
-                        await self._hand_over(group, None, "it waited for the group", "")
-                    continue
-                live, moved = self._signs.live(held.host), self._signs.moved(held.host, group.names)
-                loss = self._groups.loss(group, clock.now(), moved=moved, live=live)
-                if loss:
-                    await self._hand_over(group, None, loss, "", stop=True)
+        if gone := self._groups.forget_others(frozenset(groups)):
+            self._decide_again()
+        for name, holding in gone.items():
+            self._record(name, holding, None, "the policy no longer has the group", "")
+        await asyncio.gather(*map(self._check_group, groups.values()))
+
+    async def _check_group(self, group: AuthorityGroup) -> None:
+        turn = self._turn(group)
+        if turn.locked():
+            return  # a hand-over is under way
+        async with turn:
+            held = self._groups.holder(group.name)
+            if held is None:
+                if self._next(group) is not None:
+                    await self._hand_over(group, None, "it waited for the group", "")
+                return
+            live, moved = self._signs.live(held.host), self._signs.moved(held.host, group.names)
+            if loss := self._groups.loss(group, clock.now(), moved=moved, live=live):
+                await self._hand_over(group, None, loss, "", stop=True)
+
+    def _turn(self, group: AuthorityGroup) -> asyncio.Lock:
+        return self._turns.setdefault(group.name, asyncio.Lock())
 
     # --- inside; the caller has the turn ---
 
@@ -192,15 +206,16 @@ class DriveOrders:
         try:
             if before is not None:
                 self._decide_again()
-                await self._carried_out()
                 if stop:
+                    await self._carried_out(group.names)
                     await self._stop.after(str(before.host), group.names, f"{group.name}: {reason}")
+                await self._carried_out(None)  # all: a topic of the group may have moved between relays
             heir = to or self._next(group)
             # A relay whose link was lost in the meantime may still let the earlier holder through.
             if heir is not None and self._relays_ready() and self._claim(group, heir) is not None:
                 self._groups.hold(group.name, heir, clock.now())
                 self._decide_again()
-                await self._carried_out()
+                await self._carried_out(None)
         finally:
             now = self._groups.holder(group.name)
             if (before, now) != (None, None):

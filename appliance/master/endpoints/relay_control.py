@@ -157,23 +157,35 @@ class RelayControl:
     def publish(self, message: messages.OwnPublished) -> None:
         self._post(TOPIC, message.topic).send(message)
 
-    async def carried_out(self) -> None:
-        """Wait until every relay has carried out its orders. A relay that starts in the meantime begins with them."""
-        if waiting := [order for post in self._posts for order in post.orders()]:
+    async def carried_out(self, topics: Iterable[str] | None = None) -> None:
+        """Wait until the relays have carried out their orders: all relays, or those that carry these topics.
+
+        The wait ends with the link to a relay. So it is bounded for a relay that hangs: the supervisor kills the relay
+        after `ANSWER_SECONDS` without an answer, and the next one begins with these orders.
+        """
+        posts = self._posts if topics is None else {self._post(TOPIC, topic) for topic in topics}
+        if waiting := [order for post in posts for order in post.orders()]:
             await asyncio.wait(waiting)
 
     async def stop(self, topic: str) -> list[str]:
         """Have monitors of a topic send their safe messages; return the names of those that have one."""
+        return await self._ask_guards(topic, begin=True) or []
+
+    async def guards(self, topic: str) -> list[str] | None:
+        """Return the names of monitors with a safe message for a topic; None if its relay does not answer."""
+        return await self._ask_guards(topic, begin=False)
+
+    async def _ask_guards(self, topic: str, *, begin: bool) -> list[str] | None:
         self._stop = number = self._stop + 1
         begun: asyncio.Future[list[str]] = asyncio.get_running_loop().create_future()
         self._stops[number] = begun
         try:
-            if not self._post(TOPIC, topic).send(messages.StopWanted(number, topic)):
-                return []
+            if not self._post(TOPIC, topic).send(messages.StopWanted(number, topic, begin)):
+                return None
             async with asyncio.timeout(_STOP_SECONDS):
                 return await begun
         except TimeoutError:
-            return []
+            return None
         finally:
             del self._stops[number]
 

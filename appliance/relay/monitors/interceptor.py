@@ -220,7 +220,7 @@ class Interceptor:
         if isinstance(message, MonitorSwitched):
             self.switch(message.name, message.enabled)
         elif isinstance(message, StopWanted):
-            self._reporter.send(StopBegun(message.number, self._stop(message.topic)))
+            self._reporter.send(StopBegun(message.number, self._guards(message.topic, begin=message.begin)))
         else:
             self._give(message.name, message.values)
 
@@ -253,11 +253,15 @@ class Interceptor:
         self.keep_all()
         return self.monitors.topics_of(held)
 
-    def _stop(self, topic: str) -> list[str]:
-        """Have the monitors of a topic send their safe messages; return their names."""
-        self.invalidate_prepared()
-        names = [] if self.monitors is None else self.monitors.stop(topic)
-        self.schedule()
+    def _guards(self, topic: str, *, begin: bool) -> list[str]:
+        """Return the monitors with a safe message for a topic; with `begin`, have them send it."""
+        if self.monitors is None:
+            return []
+        names = self.monitors.guards(topic)
+        if begin and names:
+            self.invalidate_prepared()
+            self.monitors.stop(topic)
+            self.schedule()
         return names
 
     # --- queries when something changes ---

@@ -1,6 +1,8 @@
+import asyncio
 import hashlib
 import random
 import re
+from collections.abc import Iterable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -51,15 +53,18 @@ class Site:
         self.moved = 0.0
         self.guarded: list[str] = []
         self.asked: list[str] = []
+        self.hanging: set[str] = set()  # topics of a relay that does not answer
+        self.replaced = asyncio.Event()  # that relay
         self.obstacle, self.strict = None, False
         self.orders = ApprovalOrders(
             lambda: self.policy,
             cast(Any, self),
             HostSigns(lambda _host: True, lambda _host, _names: self.moved),
-            cast(Any, SimpleNamespace(after=self.stop, stop=self.guards)),
+            cast(Any, SimpleNamespace(after=self.stop)),
             first=17,
             decide_again=self.decide_again,
             carried_out=self.carried_out,
+            guards=self.guards,
         )
         self.decide_again()
 
@@ -67,8 +72,10 @@ class Site:
         self.policy = replace(self.text, approved=self.orders.approved())
         return 0
 
-    async def carried_out(self) -> None:
+    async def carried_out(self, topics: Iterable[str]) -> None:
         assert self.policy.approved == self.orders.approved()
+        if self.hanging.intersection(topics):
+            await self.replaced.wait()
 
     async def stop(self, host: str, topics: set[str], _why: str) -> None:
         """The guards stop what a host published; its messages already no longer pass."""
@@ -77,8 +84,10 @@ class Site:
         )
         self.stops.append((host, topics))
 
-    async def guards(self, topic: str) -> list[str]:
+    async def guards(self, topic: str) -> list[str] | None:
         self.asked.append(topic)
+        if topic in self.hanging:
+            return None
         return ["deadman"] if topic in self.guarded else []
 
     def happened(self, event: str, reason: str, **detail: Any) -> None:
@@ -203,6 +212,34 @@ async def test_a_lease_on_a_motion_ends_by_silence_and_the_guards_stop_the_robot
     site.moved = 0.0  # its publisher ended
     await site.pass_time(60)
     assert site.stops[2:] == [(str(AGENT), {"/other"})], "its guards stop it too, if there are any"
+
+
+async def test_a_relay_that_hangs_delays_the_end_of_no_other_lease(site: Site) -> None:
+    site.guarded, site.hanging = ["/arm", "/b"], {"/a", "/arm"}
+    approved = [asyncio.ensure_future(approve(site, topic, 2.0)) for topic in ("/a", "/b")]
+    approved.append(asyncio.ensure_future(approve(site, "/arm", 60.0)))
+    await asyncio.sleep(0)
+    assert [site.publish(topic) for topic in ("/a", "/b", "/arm")] == ["", "", ""]
+    site.time.advance(2)
+    checks = [asyncio.ensure_future(site.orders.check())]
+    await asyncio.sleep(0.01)
+    assert site.publish("/a") and site.publish("/b")
+    assert site.stops == [(str(AGENT), {"/b"})], "without the answer of the relay that carries /a"
+    site.moved = clock.now()
+    for _ in range(2):  # its guards did not answer, so they are asked again
+        site.time.advance(5)
+        checks.append(asyncio.ensure_future(site.orders.check()))
+        await asyncio.sleep(0.01)
+    assert site.publish("/arm") == "" and site.asked == ["/arm", "/arm"]
+    site.hanging.clear()
+    site.replaced.set()
+    await asyncio.gather(*approved, *checks, site.orders.check())
+    assert site.publish("/arm")
+    assert site.stops[1:] == [(str(AGENT), {"/a"}), (str(AGENT), {"/arm"})]
+
+
+async def approve(site: Site, topic: str, seconds: float) -> None:
+    await site.orders.approve(ApproveCall(number_in(site.publish(topic)), seconds), "ann")
 
 
 async def test_a_lease_that_is_extended_still_ends_by_silence(site: Site) -> None:

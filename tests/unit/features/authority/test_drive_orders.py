@@ -50,6 +50,7 @@ class Site:
         self.applied: list[Address | None] = [None, None]
         self.ordered: list[list[Address | None]] = [[], []]
         self.ready = True
+        self.hanging: set[str] = set()  # topics of a relay that does not answer
         self.orders = DriveOrders(
             lambda: self.policy,
             cast(Any, self),
@@ -74,8 +75,10 @@ class Site:
             queue.append(self.orders.holders().get("base"))
         return 0
 
-    async def carried_out(self) -> None:
+    async def carried_out(self, topics: Iterable[str] | None) -> None:
         """Let the relays apply their orders in any order, and check after each that at most one host is let through."""
+        while self.hanging and (topics is None or self.hanging.intersection(topics)):
+            await asyncio.sleep(0)
         while any(self.ordered):
             await asyncio.sleep(0)
             relay = self.chance.choice([number for number in (0, 1) if self.ordered[number]])
@@ -194,6 +197,24 @@ async def test_a_holder_loses_a_group(site: Site) -> None:
     ]  # fmt: skip
     stops = [one["reason"] for one in site.records if one["event"] == "motion stopped"]
     assert stops == [f"base: {reason}" for reason in reasons[:3]], "its messages pass without a group"
+
+
+async def test_a_relay_that_hangs_delays_the_end_of_no_other_group(site: Site) -> None:
+    arm = TEXT.replace("[Authority]", "").replace("base", "arm").replace("/cmd_vel", "/arm")
+    site.policy = compile_policy(TEXT + arm, file="site.ini")
+    for group in ("base", "arm"):
+        await site.orders.take(DriveTake(group, PILOT), "op")
+    site.hanging = {"/cmd_vel"}
+    site.time.advance(LEASE)
+    check = asyncio.ensure_future(site.orders.check())
+    for _ in range(9):
+        await asyncio.sleep(0)
+    assert site.orders.holders() == {}
+    assert [one["topics"] for one in site.records if one["event"] == "motion stopped"] == [["/arm"]]
+    await site.orders.check()  # both hand-overs are under way
+    site.hanging.clear()
+    await check
+    assert site.records[-1]["event"] == "authority handed over"
 
 
 async def test_nothing_is_handed_over_while_a_relay_starts(site: Site) -> None:

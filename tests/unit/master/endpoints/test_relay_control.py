@@ -198,6 +198,22 @@ async def test_an_order_is_done_when_every_relay_confirms_it(world: World) -> No
     await relay.carried_out()
 
 
+async def test_a_relay_that_hangs_delays_only_what_it_carries(world: World) -> None:
+    relay, (first, second) = world.relay, world.links
+    world.put(a=0, b=1)
+    every, other = (asyncio.ensure_future(relay.carried_out(topics)) for topics in (None, ["/b"]))
+    asked = asyncio.ensure_future(relay.guards("/a"))
+    await asyncio.sleep(0)
+    for _ in range(2):
+        second.say(messages.OrdersCarriedOut(), ())
+    await other
+    assert first.heard()[-1] == messages.StopWanted(1, "/a", begin=False)
+    assert await asked is None, "not that there is no guard"
+    assert not every.done()
+    first.end()  # the supervisor replaced it
+    await every
+
+
 async def test_each_relay_receives_its_topics(world: World) -> None:
     relay, node, (first, second) = world.relay, world.node, world.links
     placed = messages.NodePlaced("key", "/node", "10.0.0.5")

@@ -12,6 +12,7 @@ from appliance.channel.messages import (
     MonitorGiven,
     MonitorResumed,
     MonitorsCounted,
+    MonitorsReported,
     MonitorSwitched,
     NodePlaced,
     PublicationPlaced,
@@ -19,6 +20,8 @@ from appliance.channel.messages import (
     SpecificationsRefused,
     SpecificationsTaken,
     StateGiven,
+    StopBegun,
+    StopWanted,
 )
 from appliance.relay.connections.relayed_topic import RelayedTopic
 from appliance.relay.monitors.observation_points import ObservationPoint
@@ -534,6 +537,26 @@ def test_given_constants_are_set_between_two_messages_and_on_a_new_relay(world: 
     world.until(lambda: world.taken(SpecificationsTaken, 1))
     publisher.send(string("x"))
     world.gets(subscriber, string("6"))
+
+
+def test_a_guard_sends_its_safe_message_when_it_is_ordered_and_not_when_it_is_asked(world: Monitored) -> None:
+    world.load(
+        GUARD.strip().replace("int seen", 'safe std_msgs/String {data:"stop"} on /chatter every 1s; int seen')
+    )
+    publisher, subscriber = world.typed()
+    publisher.send(string("one"))
+    world.gets(subscriber, string("two"))
+    world.state(StopWanted(1, "/chatter", begin=False))
+    world.state(StopWanted(2, "/other", begin=True))
+    publisher.send(string("one"))
+    world.gets(subscriber, string("two"))
+    answers = [one.monitors for one in world.told if isinstance(one, StopBegun)]
+    assert answers == [["guard"], []]
+    assert {one.kind for told in world.told if isinstance(told, MonitorsReported) for one in told.events} <= {
+        "change"
+    }
+    world.state(StopWanted(3, "/chatter", begin=True))
+    assert string("stop").endswith(world.event("publish", monitor="guard").after)
 
 
 def test_a_safe_message_is_sent_while_a_monitor_holds_its_topic(world: Monitored) -> None:
