@@ -22,9 +22,9 @@ from appliance.features.approvals.approval_table import (
     ApprovalEntry,
     ApprovalState,
     ApprovalTable,
+    ChargedHost,
     HeldCall,
 )
-from appliance.features.approvals.quotas import APPROVALS
 from appliance.features.approvals.view import ApprovalCounts
 from appliance.master.calls.call import denial_text
 from appliance.master.endpoints.host_signs import HostSigns
@@ -117,10 +117,17 @@ class ApprovalOrders:
         now = clock.now()
         entry = self._table.find(call)
         if entry is None:
-            entry = self._table.hold(call, now, caller_id=caller_id, type_=type_, arguments=arguments)
-            if entry is None:
-                most = APPROVALS.bounds.host
-                return f"not held: {most} calls of a host may wait for an approval; ask the operator about those first"
+            held = self._table.hold(
+                call,
+                ChargedHost.of(self._policy(), call.host),
+                now,
+                caller_id=caller_id,
+                type_=type_,
+                arguments=arguments,
+            )
+            if isinstance(held, str):
+                return f"not held: {held}; ask the operator about those first"
+            entry = held
             self._record("approval wanted", entry, f"waits for approval {entry.number}")
         left = max(1, round(entry.until - now))
         if entry.state is ApprovalState.REFUSED:
@@ -283,9 +290,9 @@ class ApprovalOrders:
         return ApprovalCounts(len(waiting), round(oldest, 1), leases, len(self._unanswered))
 
     def limits(self) -> tuple[LimitUse, ...]:
-        (host, used), bounds = self._table.most(), APPROVALS.bounds
-        whole, name = len(self._table.entries()), "" if host is None else str(host)
-        return (LimitUse("approvals", whole, bounds.whole, "", name, used, bounds.host),)
+        pool = self._table.pool
+        host, used = max(pool.holders(), key=lambda held: held[1], default=("", 0))
+        return (LimitUse("approvals", pool.total, pool.bounds.whole, "", str(host), used, pool.bounds.host),)
 
     def _entry(self, number: int) -> ApprovalEntry:
         entry = self._table.entry(number)

@@ -5,17 +5,17 @@ Invariants:
 1. A call has one number while it waits, however often its host repeats it.
 2. An approval of one call is used once, by the same host, for the same service with the same arguments.
 3. A lease ends at its time, whatever happens.
-4. A host has at most `bounds.host` entries, and all hosts have at most `bounds.whole`.
+4. The entries are counted in a `Pool`, each for the host that was charged when the call came.
 """
 
-from collections import Counter
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
 
 from appliance.features.approvals.quotas import APPROVALS
 from appliance.policy.model import Address, Category
-from appliance.policy.policy import Approval
+from appliance.policy.policy import Approval, Policy
+from appliance.quotas.pool import Pool, QuotaClass
 
 WAIT_SECONDS = 120.0
 """How long a call waits for an answer, and how long an approval of one call waits to be used."""
@@ -42,6 +42,20 @@ class HeldCall(NamedTuple):
         return self.host, self.category, self.resource
 
 
+class ChargedHost(NamedTuple):
+    """The unit of the quota: the network by which the policy names a host, or the host's address."""
+
+    network: str
+    named: bool
+
+    @classmethod
+    def of(cls, policy: Policy, host: Address) -> "ChargedHost":
+        return cls(policy.alike(host).removesuffix("/32").removesuffix("/128"), policy.names(host))
+
+    def __str__(self) -> str:
+        return self.network
+
+
 @dataclass(frozen=True, slots=True)
 class ApprovalEntry:
     """A call, and what operators said about it. `arguments` are its first bytes, `type` its service type.
@@ -52,6 +66,7 @@ class ApprovalEntry:
 
     number: int
     call: HeldCall
+    charged: ChargedHost
     caller_id: str
     type: str
     arguments: bytes
@@ -73,7 +88,11 @@ class ApprovalTable:
         self._next = first
         self._entries: dict[int, ApprovalEntry] = {}
         self._by_call: dict[HeldCall, int] = {}
-        self._of_host: Counter[Address] = Counter()
+        self.pool: Pool[ChargedHost] = Pool(
+            "waiting calls and approvals",
+            APPROVALS.bounds,
+            lambda charged: QuotaClass.NAMED if charged.named else QuotaClass.UNKNOWN,
+        )
 
     def entries(self) -> list[ApprovalEntry]:
         return list(self._entries.values())
@@ -88,19 +107,21 @@ class ApprovalTable:
                 return self._entries[number]
         return None
 
-    def most(self) -> tuple[Address | None, int]:
-        return next(iter(self._of_host.most_common(1)), (None, 0))
-
     def hold(
-        self, call: HeldCall, now: float, *, caller_id: str, type_: str, arguments: bytes
-    ) -> ApprovalEntry | None:
-        """Let a call wait. Return its new entry, or None if its host, or all hosts together, have too many."""
-        bounds = APPROVALS.bounds
-        if self._of_host[call.host] >= bounds.host or len(self._entries) >= bounds.whole:
-            return None
-        entry = ApprovalEntry(self._next, call, caller_id, type_, arguments, now, now + WAIT_SECONDS)
+        self,
+        call: HeldCall,
+        charged: ChargedHost,
+        now: float,
+        *,
+        caller_id: str,
+        type_: str,
+        arguments: bytes,
+    ) -> ApprovalEntry | str:
+        """Let a call wait. Return its new entry, or why its host may have no more."""
+        if refusal := self.pool.take(charged):
+            return refusal
+        entry = ApprovalEntry(self._next, call, charged, caller_id, type_, arguments, now, now + WAIT_SECONDS)
         self._next += 1
-        self._of_host[call.host] += 1
         self._put(entry)
         return entry
 
@@ -130,9 +151,7 @@ class ApprovalTable:
     def end(self, entry: ApprovalEntry) -> None:
         if self._entries.pop(entry.number, None) is not None:
             self._by_call.pop(entry.call, None)
-            self._of_host[entry.call.host] -= 1
-            if not self._of_host[entry.call.host]:
-                del self._of_host[entry.call.host]
+            self.pool.give_back(entry.charged)
 
     def approved(self) -> frozenset[Approval]:
         """Return the leases on topics and parameters. Calls of services are decided one by one."""

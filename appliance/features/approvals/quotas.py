@@ -5,12 +5,16 @@ from appliance.quotas.table import QuotaRow
 
 APPROVALS = QuotaRow(
     thing="calls that wait for an approval, and approvals",
-    bounds=Bounds(whole=256, host=8, unknown=0, kept=0),
+    bounds=Bounds(whole=256, host=8, unknown=64, kept=0),
     at_limit="the call is refused without a number: operators decide about the host's other calls first",
     between="a host has at most 8 of them, whatever it calls",
-    counting="repetitions of a call are one; each ends after two minutes, or with its lease",
+    counting="hosts that the policy names as one network count as one; unknown: only `*` names the host; repetitions of"
+    " a call are one; each ends after two minutes, or with its lease",
     alarm="`approval-unanswered`, `rosrv limits`",
-    shown_by=("unit/features/approvals/test_approval_orders.py::test_a_host_has_a_quota_of_waiting_calls",),
+    shown_by=(
+        "unit/features/approvals/test_approval_orders.py::test_a_host_has_a_quota_of_waiting_calls",
+        "unit/features/approvals/test_approval_orders.py::test_many_addresses_leave_another_host_its_calls",
+    ),
 )
 
 ROWS = (APPROVALS,)

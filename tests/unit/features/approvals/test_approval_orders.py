@@ -327,13 +327,31 @@ async def test_a_host_has_a_quota_of_waiting_calls(site: Site) -> None:
     for body in range(20):
         await site.call(bytes([body]))
     assert len(await site.held()) == 8
-    assert "8 calls of a host may wait" in await site.call(b"more")
+    assert "the quota of one host is 8; ask the operator about those first" in await site.call(b"more")
     assert number_in(await site.call(b"1", OTHER))
     [use] = site.orders.limits()
     assert (use.used, use.host, use.host_used) == (9, str(AGENT), 8)
     await site.pass_time(WAIT_SECONDS)
     assert await site.held() == []
     assert number_in(await site.call(b"more"))
+
+
+async def test_many_addresses_leave_another_host_its_calls(site: Site) -> None:
+    text = TEXT.replace("[Clients]\n", "[Clients]\n/net = ask 10.1.0.0/16\n/every = ask *\n")
+    site.text = compile_policy(text, file="site.ini")
+    site.decide_again()
+    for service, most in (("/net", 8), ("/every", 64)):
+        before = len(await site.held())
+        for number in range(32):
+            host = address_of(f"10.{1 if service == '/net' else 2}.0.{number + 1}")
+            for body in (b"1", b"2", b"3"):
+                refusal = await site.call(body, host, service)
+        assert len(await site.held()) - before == most
+        assert refusal.startswith("not held")
+    site.text = compile_policy(TEXT, file="site.ini")  # the policy no longer has the network
+    assert number_in(await site.call(b"1"))
+    await site.pass_time(WAIT_SECONDS)
+    assert site.orders.limits()[0].used == 0
 
 
 async def test_no_call_passes_without_an_approval_of_its_own(site: Site) -> None:
