@@ -17,8 +17,6 @@ Complete = Callable[[typer.Context, str], list[str]]
 
 
 def _names(request: AdminRequest[A], of: Callable[[A], Iterable[str]]) -> Complete:
-    """Return a function that completes the names in the answer to a request."""
-
     def complete(context: typer.Context, incomplete: str) -> list[str]:
         state = context.params.get("state") or "/var/lib/rosrv"
         try:

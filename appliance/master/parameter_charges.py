@@ -135,7 +135,10 @@ class ParameterCharges:
     def _recount(
         self, place: _Place, value: Value, weight: int, parts: tuple[str, ...], *, final: bool
     ) -> int:
-        """Weigh the places at this key and below again. Return their sum. `weight` is the weight of the key."""
+        """Weigh the places at this key and below again; return their sum.
+
+        `weight` is the weight of the key.
+        """
         owned = 0
         for name, below in list(place.below.items()):
             there = isinstance(value, dict) and name in value

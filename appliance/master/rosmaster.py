@@ -38,10 +38,7 @@ _T = TypeVar("_T")
 
 
 def limits_of_answers(limits: XmlRpcLimits, parameters: int) -> XmlRpcLimits:
-    """Return the limits of answers. An answer may be a parameter tree of `parameters` bytes.
-
-    The tree consists of values that `limits` allow.
-    """
+    """Return the limits of answers, which may be a parameter tree of `parameters` bytes whose values `limits` allow."""
     return replace(
         limits,
         body=4 * parameters + limits.body,
@@ -94,7 +91,10 @@ class RosMaster:
         return not self._away
 
     async def call(self, method: str, *params: Value) -> Answer:
-        """Make a call for a node. Wait while the door is shut. Raises `CallFailedError` if the door stays shut."""
+        """Make a call for a node once the door is open.
+
+        Raises `CallFailedError` if it stays shut.
+        """
         return await self._call(lambda: self.call_now(method, *params))
 
     async def call_in_order(self, calls: Sequence[Wanted]) -> list[Answer | CallFailedError]:
@@ -146,7 +146,7 @@ class RosMaster:
             raise CallFailedError(f"the ROS master did not come back within {self._hold:g} s") from None
 
     async def _pass(self, make: Callable[[], Awaitable[_T]]) -> _T:
-        """Make a call through the open door. Shut the door if the ROS master refuses or breaks the connection."""
+        """Make a call through the open door; shut it if the ROS master refuses or breaks the connection."""
         self._enter()
         try:
             return await make()
@@ -183,7 +183,7 @@ class RosMaster:
 
     @contextlib.asynccontextmanager
     async def alone(self) -> AsyncIterator[None]:
-        """Shut the door, and wait until calls under way have ended. Open the door again unless the block fails."""
+        """Shut the door, and wait until calls under way have ended; open it again unless the block fails."""
         async with self._alone:
             self._open.clear()
             await self._empty.wait()

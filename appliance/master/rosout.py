@@ -67,7 +67,7 @@ def header(definitions: Definitions) -> OwnHeaderStated:
 
 
 def _words(event: MonitorEvent) -> tuple[int, str]:
-    """Return the level and the text of a report. Level 0 means that the report is not for `/rosout`."""
+    """Return the level and the text of a report; level 0: it is not for `/rosout`."""
     text, level, category = event.text, event.detail.get("level"), event.detail.get("category")
     if event.count:
         text = f"{event.count} more in the same second" + (f": {text}" if text else "")

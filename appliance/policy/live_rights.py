@@ -81,7 +81,6 @@ def deprived(policy: Policy, things: Iterable[LiveRight]) -> dict[Address, set[s
 
 
 def endings(policy: Policy, things: Iterable[LiveRight]) -> list[Ending]:
-    """Return the live rights that the policy would end, without repetitions."""
     decided = ((live, may_keep(policy, live)) for live in things)
     found = (
         Ending(str(live.host), live.caller_id, policy_call(live.call).gives, live.resource, decision.reason)

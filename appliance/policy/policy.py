@@ -191,7 +191,6 @@ class Policy:
         return None
 
     def limit_rule(self, topic: str) -> LimitRule | None:
-        """Return the line of `[Limits]` for a topic, or None."""
         return self.limits.find(topic)
 
     def limit(self, part: LimitScope, topic: str, host: Address | None = None) -> Rate:

@@ -169,7 +169,6 @@ class Front(asyncio.BaseProtocol, ABC):
         self.abort()
 
     def abort(self) -> None:
-        """Cut the connection now, and leave the connection table."""
         self.leave()
         if self._socket is None:
             self.transport.abort()

@@ -219,7 +219,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     @property
     def tag(self) -> str:
-        """Return the tag of the present state; a request repeats it as `expected`."""
         return f"{self.revision}.{self._acts}"
 
     @property

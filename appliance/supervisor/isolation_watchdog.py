@@ -112,7 +112,6 @@ class IsolationWatchdog:
             log.error("tunnel state may remain", error=_words(error))
 
     async def route_to(self, host: str) -> str | None:
-        """Return the machine's address by which `host` reaches the appliance; None: the address that `host` used."""
         try:
             async with self._few_at_a_time:
                 return await in_thread(lambda: self.isolation.route_to(host))

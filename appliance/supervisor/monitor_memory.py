@@ -72,7 +72,6 @@ class MonitorMemory:
                 os.ftruncate(self._own[-1], SIZE)
 
     def messages_for(self, role: str, index: int) -> Iterator[tuple[StateGiven, int]]:
-        """Yield the messages and descriptors that a starting process gets."""
         if role != "relay":
             return
         ended = self._ended

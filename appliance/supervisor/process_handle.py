@@ -191,7 +191,6 @@ class ProcessHandle:
 
     @property
     def stalled_seconds(self) -> float:
-        """Return the seconds since the process last progressed or waited for a processor or a disk."""
         return self._progress.stalled_seconds()
 
     def kill(self, number: signal.Signals = signal.SIGKILL) -> None:

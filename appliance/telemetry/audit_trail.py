@@ -55,11 +55,9 @@ class AuditTrail:
         return None
 
     def shut_out(self, host: str) -> str:
-        """Return why a nearly full disk blocks this host; empty if it does not."""
         return self._log.budget.shut_out(host)
 
     def owing(self, host: str) -> str:
-        """Return why this host must wait before its next record; empty if it may proceed."""
         return self._log.budget.owing(host)
 
     async def still_owing(self, host: str) -> str:

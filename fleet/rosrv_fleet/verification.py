@@ -44,7 +44,6 @@ class LogProof(msgspec.Struct, kw_only=True):
 
 
 def prove(store: SegmentStore, robot: Robot, segment_bytes: int) -> list[LogProof]:
-    """Verify all stored segments of a robot; one result for each log."""
     return [_prove_log(store, robot, log, segment_bytes) for log in store.logs(robot.name)]
 
 

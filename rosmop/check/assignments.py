@@ -58,7 +58,6 @@ def store(scope: FunctionScope, target: Value, value: nodes.Expression) -> nodes
 
 
 def write_store(scope: FunctionScope, target: Value, value: nodes.Expression) -> None:
-    """Write the statements that assign `value` to `target`."""
     place = require_place(target, "an assignment")
     flag = mark(scope, target)
     scope.evaluate(_store(scope, place, value))

@@ -299,7 +299,6 @@ def compile_function(shared: CompilationContext, names: SpecificationNames, func
 def compile_handler(
     shared: CompilationContext, names: SpecificationNames, handler: tree.Handler, drop_refused: str | None
 ) -> str:
-    """Write the function of a handler; returns its name."""
     scope = FunctionScope(shared, names, "handler")
     scope.drop_refused = drop_refused
     write(scope, handler.body)

@@ -57,7 +57,6 @@ class MemberCall:
         return nodes.Call(kind, function, (self.base.form, *arguments), self.site)
 
     def value(self, kind: value_types.Type, function: str, *arguments: nodes.Expression) -> Value:
-        """Return the call made by `called` as a value."""
         return Value(self.called(kind, function, *arguments), self.position)
 
     def changes(self, value: nodes.Expression) -> Value:
@@ -67,7 +66,6 @@ class MemberCall:
         return Value(nodes.Discard(stored), self.position)
 
     def changes_in_place(self, function: str, *arguments: nodes.Expression) -> Value:
-        """Return a call of a function of the form that changes the vector in place."""
         require_place(self.base, f"`{self.name}`")
         if isinstance(self.base.type, value_types.VectorType) and self.base.type.length is not None:
             raise SpecificationError.at(

@@ -133,7 +133,6 @@ class ModuleState:
         self._unprepare()
 
     def prepare(self, prepared: BatchOptions) -> None:
-        """Move the state into the module, and set the options of the next batch."""
         if not self._inside:
             self._enter()
         self.prepared = prepared
@@ -170,11 +169,6 @@ class ModuleState:
         self._inside = True
 
     def cells(self) -> bytes | None:
-        """Return the state in the module's memory, if it consists only of numbers.
-
-        The result is empty if the state has been in Python since the last save. It is None if the state must be saved
-        from Python.
-        """
         if not self._inside and not self.left:
             return b""
         if self.left or not self.size:
@@ -211,7 +205,6 @@ class ModuleState:
             self._unprepare()
 
     def is_true(self, name: str) -> bool:
-        """Return the value of a `bool`."""
         if self._inside and name in self._addresses:
             return self._memory[self._addresses[name]] != 0
         return bool(self._values[name])

@@ -379,13 +379,11 @@ class _OpenUntil(_Rows):
 
 
 def _first(kinds: _Marks, mark: _Mark) -> _Mark | None:
-    """Return the first of these marks that is not before `mark`."""
     found = ((marks, bisect_left(marks, mark)) for marks in kinds)
     return min((marks[index] for marks, index in found if index < len(marks)), default=None)
 
 
 def _last(kinds: _Marks, mark: _Mark) -> _Mark | None:
-    """Return the last of these marks that is before `mark`."""
     found = ((marks, bisect_left(marks, mark)) for marks in kinds)
     return max((marks[index - 1] for marks, index in found if index), default=None)
 

@@ -248,7 +248,6 @@ class ClockedProperty(CompiledProperty):
     waits: Sequence[Wait | None]
 
     def start(self, time_ns: int) -> Run:
-        """Return a run whose clock begins at ``time_ns``."""
         return ClockedRun(self, time_ns)
 
 

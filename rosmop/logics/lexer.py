@@ -110,7 +110,6 @@ class TokenReader:
         return self._tokens[self._next]
 
     def ahead(self, count: int) -> FormulaToken:
-        """Return the token ``count`` tokens after the next one."""
         return self._tokens[min(self._next + count, len(self._tokens) - 1)]
 
     def take(self) -> FormulaToken:

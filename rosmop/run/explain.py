@@ -316,7 +316,6 @@ class ClockedSteps(Steps):
         self.room, self.owner = room[:CLOCKED_ROOM], owner
 
     def follow(self, earlier: Exits | Steps) -> "ClockedSteps":
-        """Continue the history of the same property."""
         assert isinstance(earlier, ClockedSteps)  # noqa: S101  it has the same tables
         self._started = earlier._started
         self.room[:] = bytes(earlier.room)

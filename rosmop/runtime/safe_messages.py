@@ -18,7 +18,6 @@ def is_safe(safe: SafeMessage, buffer: bytes | bytearray | memoryview) -> bool:
 
 
 def sent(safe: SafeMessage, time_ns: int) -> bytes:
-    """Return the bytes of the safe message, with this time in its header."""
     if not safe.stamped:
         return safe.data
     seconds, nanoseconds = divmod(max(0, time_ns), 1_000_000_000)

@@ -33,7 +33,6 @@ def text(buffer: Buffer, start: int) -> tuple[bytes, int]:
 
 
 def text_end(buffer: Buffer, start: int) -> int:
-    """Return the end of the string at `start`."""
     return int(start + 4 + _LENGTH.unpack_from(buffer, start)[0])
 
 

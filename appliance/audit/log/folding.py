@@ -192,7 +192,6 @@ class RecordFolder:
                 self._forget(key)
 
     def next_due(self) -> float | None:
-        """Return when `expire` is due next."""
         return next(iter(self._due.values()), None)
 
     def finish(self) -> Iterator[AuditRecord]:

@@ -129,7 +129,6 @@ def storable(record: AuditRecord) -> AuditRecord:
 
 
 def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = False) -> AuditRecord:
-    """Return the summary of the repetitions counted in `state`."""
     detail: dict[str, Any] = {
         "count": state.count, "of": state.event, "scope": state.scope, "recorded_id": state.recorded_id,
         "first_id": state.first_id, "last_id": state.last_id,

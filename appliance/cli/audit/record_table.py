@@ -86,7 +86,6 @@ def print_shown(shown: RecordInContext, host_in_words: HostInWords) -> None:
 
 
 def print_verification(result: Verification) -> None:
-    """Print the result of a verification, with one line for each finding."""
     for finding in result.findings:
         write(f"{finding.kind.value.upper()}: {printable(finding.message)}")
     write(f"{result.records} records ({result.first} to {result.last}), log {printable(result.log)}")

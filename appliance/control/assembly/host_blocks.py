@@ -64,7 +64,6 @@ class BlockTable:
         return row
 
     def take(self, address: Address) -> HostBlockRow | None:
-        """Remove the block of a host; return None if it is not blocked."""
         row = self._rows.get(address)
         if row is not None:
             self._store.hosts.forget_block(row.address)

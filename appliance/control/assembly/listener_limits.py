@@ -110,7 +110,6 @@ class ListenerLimits:
             server.close()
 
     def refuse(self, peer: Peer) -> Refusal | None:
-        """Return the refusal for a peer, or None if the peer is served."""
         if self._unhidden:
             fault = build_fault(1, f"the appliance does not serve nodes: {self._unhidden}")
             return lambda _beginning: fault

@@ -68,7 +68,6 @@ class TokenOrders:
         return [kept_by_api(row) for row in ({row.id: row for row in self._session_rows()} | tokens).values()]
 
     def usable_row(self, token_id: str) -> TokenRow | None:
-        """Return the token or session with this id, if it is usable now."""
         row = self._rows.get(token_id)
         if row is not None and row.usable(self._ends):
             return row

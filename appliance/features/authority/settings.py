@@ -19,5 +19,4 @@ class AuthoritySettings(FeatureSection):
     )
 
     def services(self) -> tuple[str, ...]:
-        """Return the names of the services that nodes may call, without the appliance's own name."""
         return (TAKE, GIVE) if self.nodes_may_call else ()

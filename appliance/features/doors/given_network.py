@@ -27,7 +27,6 @@ class GivenNetwork:
         return await asyncio.open_connection(sock=connection, limit=BUFFER_BYTES)
 
     async def serve(self, serve: Serve) -> ListeningServer:
-        """Call `serve` for each connection to a free port. Raises `OSError`."""
         listener = await self._socket(0)
         return _Server(await asyncio.start_server(serve, sock=listener, limit=BUFFER_BYTES))
 

@@ -80,7 +80,6 @@ class SegmentPusher:
     _failures: int = 0
 
     def step(self) -> float:
-        """Push the next segment; return the seconds to wait before the next call."""
         try:
             more = self._push_next() if self._has_log() else self._state_presence(PushPosition(_NO_LOG))
         except (CollectorError, LogUnreadableError, OSError, ValueError) as error:

@@ -168,7 +168,6 @@ class RecordingPlan:
                 self.opened(making.trigger.charged_to, making.id, making.began, making.ends)
 
     def end_of(self, recording_id: str) -> int | None:
-        """Return when an open recording ends; None if the recording is not open."""
         return next((open_span.ends for name, open_span in self._open.values() if name == recording_id), None)
 
     def opened(self, charged_to: str, recording_id: str, began: int, ends: int) -> None:

@@ -71,7 +71,6 @@ class PairedRole(ActiveRole):
         self.pair.tunnels.hand_to(tunnels)
 
     def in_doubt(self) -> bool:
-        """Return whether computers of the robot may refuse the connections of this appliance now."""
         return self.replication.admission.in_doubt()
 
     def on_end_of_gap(self, ended: Callable[[], None]) -> None:

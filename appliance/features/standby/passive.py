@@ -163,7 +163,6 @@ class PassiveControl:
             self._lease.withdraw()
 
     def state(self) -> StandbyState:
-        """Return the state of both appliances, as this one sees it."""
         lease = self._lease.state
         other = OtherAppliance(
             name=self._membership.other,

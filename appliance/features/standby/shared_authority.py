@@ -29,7 +29,6 @@ class SharedAuthority(StoredAuthority):
 
     @property
     def waits(self) -> str:
-        """Return what cannot be done without the authority's key, and until when tunnels open; empty: nothing."""
         if not self._obstacle or self._row is None or not self._row.revocations:
             return self._obstacle
         end = datetime.datetime.fromtimestamp(self._row.signed + LIST_DAYS * 86_400, datetime.UTC)
@@ -43,7 +42,6 @@ class SharedAuthority(StoredAuthority):
         return True
 
     async def obstacle(self) -> str:
-        """Return why this appliance cannot issue certificates; empty if it can."""
         stated, used = await self._signer.stated(), await self.certificate()
         trouble = f" ({stated.trouble})" if stated.trouble else ""
         self._obstacle = "" if stated.certificate == used else _WAITS + trouble

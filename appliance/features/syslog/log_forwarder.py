@@ -83,7 +83,6 @@ class LogForwarder:
     _failures: int = 0
 
     def step(self) -> float:
-        """Send the next batch; return the seconds to wait before the next call."""
         try:
             position = self._position or self._begin()
             more = self._forward(position)

@@ -240,7 +240,6 @@ class HostEnrolment(TunnelHosts):
 
     @property
     def bundled(self) -> str:
-        """Return the bundle's text that is in use instead of hosts.yaml; empty if there is none."""
         return self._table.declared.bundled
 
     async def _declare(self, read: Callable[[], None], who: str) -> answers.Reloaded:

@@ -151,9 +151,9 @@ class Execution:
 
     @contextlib.asynccontextmanager
     async def _turn(self, attempts: Sequence[Attempt]) -> AsyncIterator[bool]:
-        """Wait until no other call writes the parameters of these calls. Yield whether other code may have run.
+        """Wait until no other call writes the parameters of these calls; yield whether other code may have run.
 
-        A subscription also takes a turn. So its node gets the value in the answer, and then every later write.
+        A subscription also takes a turn, so its node gets the value in the answer, and then every later write.
         """
         keys = [attempt.resource for attempt in attempts if attempt.call.kind is Kind.PARAMETER]
         host, values = attempts[0].caller.peer.host, [attempt.value for attempt in attempts]
@@ -239,7 +239,7 @@ class Execution:
         return None if decision.allowed else [0, self._denial_text(decision, record), call.denial]
 
     async def _obstacle(self) -> str | None:
-        """Wait until the records are on disk. Return the text of a denial if that is impossible, otherwise None."""
+        """Wait until the records are on disk; return the text of a denial if that is impossible, otherwise None."""
         if await self.trail.durable() is None:
             return None
         return f"denied: {NOT_RECORDED}"

@@ -34,7 +34,7 @@ class KeyTurns:
 
 
 class KeyTurn:
-    """The turn of a call, an async context manager. It is entered when earlier overlapping calls are done."""
+    """The turn of a call, an async context manager that is entered when earlier overlapping calls are done."""
 
     __slots__ = ("_done", "_keys", "_turns")
 
@@ -44,7 +44,7 @@ class KeyTurn:
         self._done: asyncio.Event | None = None  # made when another call waits for this call
 
     async def __aenter__(self) -> bool:
-        """Wait for the turn. Return whether there was another call to wait for."""
+        """Wait for the turn; return whether there was another call to wait for."""
         before = [turn for turn in self._turns if self._touches(turn)]
         self._turns[self] = None
         try:

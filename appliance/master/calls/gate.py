@@ -178,7 +178,7 @@ def _unreachable(caller: Caller, api: ApiUri) -> Decision | None:
 
 
 def contested(contest: NameConflict, probe: Probe | None) -> Decision:
-    """Decide a name conflict by the probe of the holder. Deny the call if the probe is missing or outdated."""
+    """Decide a name conflict by the probe of the holder; deny the call if the probe is missing or outdated."""
     holder = contest.holder
     if probe is not None and probe.holder is holder:
         if probe.presence is Presence.GONE:

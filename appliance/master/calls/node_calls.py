@@ -67,7 +67,7 @@ class NodeCalls:
         return [1, f"ready on {address}:{port}", ["TCPROS", address, port]]
 
     async def _negotiated_directly(self, target: Incarnation, topic: str, caller: Caller) -> Answer:
-        """Return the node's own TCPROS port, at its peer address. The host in the node's answer is ignored."""
+        """Return the node's own TCPROS port, at its peer address; the host in the node's answer is ignored."""
         try:
             answer = await self.nodes.call(target, "requestTopic", caller.caller_id, topic, [["TCPROS"]])
             port = tcpros_port(answer)

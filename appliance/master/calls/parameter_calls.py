@@ -147,9 +147,9 @@ class ParameterCalls:
         return outcome
 
     async def write(self, writes: Sequence[ParameterWrite]) -> list[Answer | Exception]:
-        """Carry out several writes in order, in few requests. Return the outcome of each write.
+        """Carry out several writes in order, in few requests; return their outcomes.
 
-        Each value is checked as if it were sent after the earlier values. A failed write does not affect other writes.
+        Each value is checked as if it were sent after the earlier values. A failed write does not affect others.
         """
         outcomes: list[Answer | Exception] = []
         waiting: list[tuple[ParameterWrite, Reservation | None]] = []
@@ -184,7 +184,7 @@ class ParameterCalls:
     async def _send(
         self, waiting: list[tuple[ParameterWrite, Reservation | None]]
     ) -> list[Answer | Exception]:
-        """Send the writes. Update mirror, charges and subscribers for each write that the ROS master accepted."""
+        """Send the writes; update mirror, charges and subscribers for those that the ROS master accepted."""
         try:
             outcomes = await self._make([_wanted(write) for write, _reserved in waiting])
         finally:
@@ -231,9 +231,9 @@ def _wanted(write: ParameterWrite) -> Wanted:
 def _is_set(answer: Answer, write: ParameterWrite) -> bool:
     """Return whether the ROS master has stored the value, given its answer to `setParam`.
 
-    The ROS master stores the value before it computes the updates for subscribers. If this computation fails, the
-    answer is an error although the value is stored. An example is a name such as `a/b` in a dictionary, with a
-    subscriber to that key. The ROS master rejects only a root that is not a namespace.
+    It stores the value before it computes the updates for subscribers, so an error of these (a name such as `a/b` in
+    a dictionary, with a subscriber to that key) comes although the value is stored. It rejects only a root that is
+    not a namespace.
     """
     return answer[0] == 1 or write.key != "/" or isinstance(write.value, dict)
 

@@ -22,8 +22,7 @@ from appliance.master.reconcile.enactor import Enactor
 class RegistrationCalls:
     """Change the graph by the calls of nodes, and answer them.
 
-    A call waits at its beginning, if the changes before it wait for the ROS master. Then it changes the graph and is
-    answered without another wait.
+    A call waits only at its beginning, while the changes before it wait for the ROS master.
     """
 
     registry: Registry

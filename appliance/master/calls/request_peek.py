@@ -36,7 +36,7 @@ class PeekedRequest(NamedTuple):
 
 
 def asked_for(peer: Peer, beginning: bytes) -> PeekedRequest:
-    """Parse the beginning of a peer's request. The resource is empty if the request cannot be parsed."""
+    """Parse the beginning of a peer's request; the resource is empty if it cannot be parsed."""
     try:
         call = parse_call(beginning, _LIMITS)
     except PeerError:

@@ -84,9 +84,9 @@ class NodePorts:
             self.taken.charge(named)
 
     def open(self, host: Address) -> tuple[int, ...]:
-        """Open listening sockets for a node of this host. Raises `NoPortError`.
+        """Open listening sockets for a node of this host; return the outer port, and one port for each relay.
 
-        Return the ports: the outer port, and one port for each relay.
+        Raises `NoPortError`.
         """
         named = self._named_as(host)
         held, left = self.taken.held(named), len(self.unused)
@@ -126,9 +126,9 @@ class NodePorts:
             self.unused.remove(port)
 
     def reopen(self, incarnation: Incarnation) -> bool:
-        """Open the same ports again, after a restart of the appliance. Return False if a port cannot be opened.
+        """Open the same ports again, after a restart of the appliance; adapt them to the number of relays.
 
-        If the number of relays has changed, adapt the number of ports. Raises `NoPortError`.
+        Return False if a port cannot be opened. Raises `NoPortError`.
         """
         opened: list[sockets.socket] = []
         for port in incarnation.ports[: self._each]:

@@ -35,7 +35,7 @@ class ProxyEndpoints:
         return node_uri("127.0.0.1", self.inner_port, f"/{incarnation.key}/")
 
     async def open(self, incarnation: Incarnation) -> None:
-        """Serve the proxy endpoint of an incarnation. If this fails, close its ports and raise `NoPortError`."""
+        """Serve the proxy endpoint of an incarnation; if this fails, close its ports and raise `NoPortError`."""
         try:
             sock = self.places.socket(incarnation.outer_port).dup()
         except OSError as error:
@@ -57,14 +57,14 @@ class ProxyEndpoints:
         return [SaveNode(incarnation)] if incarnation.ports != ports else []
 
     def close(self, incarnation: Incarnation) -> None:
-        """Close the proxy endpoint and all ports of an incarnation, if they are open. The ports may be reused."""
+        """Close the proxy endpoint and all ports of an incarnation, if open; the ports may be reused."""
         server = self.servers.pop(incarnation.key, None)
         if server is not None:
             server.close()
             self.places.close(incarnation)
 
     def close_all(self) -> None:
-        """Stop serving. The ports stay open for the next control process."""
+        """Stop serving; the ports stay open for the next control process."""
         for server in self.servers.values():
             server.close()
 

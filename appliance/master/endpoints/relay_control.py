@@ -51,7 +51,7 @@ class RelayOutbox(Link):
         self._orders: deque[asyncio.Future[None]] = deque()
 
     def close(self) -> None:
-        """Close the link. Nothing waits any longer for the relay's orders."""
+        """Close the link; nothing waits any longer for the relay's orders."""
         super().close()
         self.placed.clear()
         while self._orders:
@@ -151,7 +151,7 @@ class RelayControl:
         self.monitors().relay_lost(index)
 
     def send(self, message: messages.Message, relay: int) -> bool:
-        """Send a message to a relay. Return False if the relay is not connected."""
+        """Send a message to a relay; return False if it is not connected."""
         return self._posts[relay].send(message)
 
     def publish(self, message: messages.OwnPublished) -> None:
@@ -200,7 +200,6 @@ class RelayControl:
         return self.allocation.of(kind, resource) == relay
 
     def live_resources(self) -> set[Resource]:
-        """Return the topics and services of live nodes."""
         return {
             (_WORDS[registration.kind], registration.resource)
             for _incarnation, registration in self.registry.in_order()

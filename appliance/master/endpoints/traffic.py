@@ -142,7 +142,7 @@ class RelayTraffic:
             self.past.setdefault(name, Traffic()).include(self.traffic.pop(carried))
 
     def reported(self, rows: list[TopicTraffic], over: float = 1.0) -> None:
-        """Add a relay's counters. Counters of a forgotten node are ignored."""
+        """Add a relay's counters, except those of a forgotten node."""
         now = clock.now()
         for row in rows:
             if self._registry.by_key(row.key) is not None:

@@ -25,7 +25,7 @@ class Grants:
         self._count = 0
 
     def restore(self, rows: Iterable[PermissionRow]) -> Effects:
-        """Restore stored grants. Erase grants of an earlier version that were for all names of a host.
+        """Restore stored grants, but erase those of an earlier version that were for all names of a host.
 
         The clients of erased grants look up the service again.
         """
@@ -44,7 +44,7 @@ class Grants:
         return self._of_node.get(key, ())
 
     def give(self, row: PermissionRow) -> Effects:
-        """Give a grant. It becomes the newest grant of its host, even if it existed before."""
+        """Give a grant, which becomes the newest of its host even if it existed before."""
         effects: Effects = []
         if row not in self._of_node.get(row.key, ()):
             effects.append(SaveGrant(row))

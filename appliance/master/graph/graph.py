@@ -218,7 +218,7 @@ class RosGraph:
     def _give_up(self, subscriber: Incarnation, topic: str) -> Effects:
         """Remove the grants of a subscriber that gave up a topic, for all publishers of the topic.
 
-        Grants are for a name and a host. So if a later subscriber has the same name and host, it keeps the grants.
+        Grants are for a name and a host, so a later subscriber with the same two keeps them.
         """
         other = self.registry.holder(subscriber.name)
         if (
@@ -313,7 +313,7 @@ class RosGraph:
         return [_emptied(subscriber, topic)] if (Kind.SUBSCRIPTION, topic) in subscriber.shelf else []
 
     def parameter_set(self, key: str, value: Value, caller_id: str) -> Effects:
-        """Return the updates for a value that the ROS master accepted. The caller gets none for exactly this key."""
+        """Return the updates for a value that the ROS master accepted; the caller gets none for exactly this key."""
         return self._tell_parameters(key, value, caller_id)
 
     def parameter_deleted(self, key: str) -> Effects:
@@ -362,8 +362,8 @@ class RosGraph:
     ) -> Iterator[tuple[Incarnation, str, list[Incarnation]]]:
         """Yield each relayed topic of these subscribers with the publishers that the subscriber is not connected to.
 
-        Whether there is a grant does not matter. If a grant was withdrawn unnoticed, the subscriber asks again only
-        after it drops the publisher. So the result depends only on data that survive a restart.
+        Grants do not matter: if one was withdrawn unnoticed, the subscriber asks again only after it drops the
+        publisher. So the result depends only on data that survive a restart.
         """
         used = self.grants.used()
         for subscriber in subscribers:
@@ -408,7 +408,7 @@ def revocation(
 ) -> WriteRecord:
     """Return the audit record of a withdrawal.
 
-    `call` is the call that the policy no longer allows. It is empty if the policy is not the reason.
+    `call` is the call that the policy no longer allows; empty if the policy is not the reason.
     """
     about = {"call": call, "needs": decision.needs}
     return WriteRecord(

@@ -272,9 +272,8 @@ class Registry:
         return idle or min(gone, key=lambda incarnation: incarnation.changed, default=None)
 
     def evictable_for(self, host: Address) -> Incarnation | None:
-        """Return the incarnation to evict for a new incarnation of this host.
-
-        This is an incarnation of the same host, or otherwise an evictable incarnation of another host.
+        """Return the incarnation to evict for a new one of this host: one of the same host, or an evictable one of
+        another host.
         """
         return self._evictable_of(host) or next(
             (incarnation for incarnation in self._by_key.values() if incarnation.evictable), None

@@ -177,7 +177,7 @@ def _kept_kind(kind: Kind, shelved: bool) -> str:
 
 
 def restore(registry: Registry, store: StateStore) -> int:
-    """Fill `registry` from the store. Return the number of incarnations."""
+    """Fill `registry` from the store; return the number of incarnations."""
     incarnations, registrations = store.load_registry()
     by_key = {
         row.key: Incarnation(

@@ -71,7 +71,7 @@ class MasterRegistrations:
                 await self._has_room.wait()
 
     def start_round(self) -> list[tuple[Incarnation, NodeRegistration]]:
-        """Return the registrations that the ROS master must have, in order. Drop the changes that led to them."""
+        """Return the registrations that the ROS master must have, in order; drop the changes that led to them."""
         self._waiting.clear()
         self._waiting_of.clear()
         self._has_room.set()

@@ -85,7 +85,7 @@ class Watchlist:
         self._filled.set()
 
     def could_not_tell(self, node: Incarnation, call: NodeCall, why: str) -> None:
-        """Note that a call did not reach a node, and check the node. Once it answers, it gets the present state."""
+        """Note that a call did not reach a node; the node is checked, and gets the present state once it answers."""
         _log.info("a call to a node failed", node=node.name, call=call.method, why=why)
         missed = self._missed.setdefault(node.key, MissedUpdates())
         if call.method == "publisherUpdate":
@@ -94,7 +94,7 @@ class Watchlist:
         self.look_at(node)
 
     def cut_off(self, subscriber: Incarnation, topic: str) -> None:
-        """Note that a subscriber lost its connection. Once it answers, it gets the list of publishers again."""
+        """Note that a subscriber lost its connection; once it answers, it gets the list of publishers again."""
         self._missed.setdefault(subscriber.key, MissedUpdates()).topics.add(topic)
         self.look_at(subscriber)
 
@@ -117,7 +117,7 @@ class Watchlist:
     def to_make_up(self, node: Incarnation) -> MissedUpdates | None:
         """Return and clear the missed updates of a node.
 
-        Return None if the node missed no update, or if its updates were repeated in the last `_MADE_UP_SECONDS`.
+        None: it missed none, or they were repeated in the last `_MADE_UP_SECONDS`.
         """
         missed, now = self._missed.get(node.key), clock.now()
         if missed is None or (missed.made_up is not None and now - missed.made_up < _MADE_UP_SECONDS):
@@ -156,7 +156,7 @@ class Liveness:
         self._turns = Turns(PROBES.bounds, quota_class)
 
     async def run(self) -> None:
-        """Check all incarnations every `interval` seconds, and nodes on the watchlist at once. Run until cancelled."""
+        """Check all incarnations every `interval` seconds, and nodes on the watchlist at once, until cancelled."""
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._look_at_all())
             tasks.create_task(self._look_at_lost())
@@ -194,10 +194,9 @@ class Liveness:
             self.look_at(incarnation)
 
     def look_at(self, incarnation: Incarnation) -> None:
-        """Start a check of a node, unless a check is under way.
+        """Start a check of a node, unless one is under way.
 
-        The publisher for monitors is not checked, because it is control itself. Also, the firewall lets only the ROS
-        master call this publisher.
+        The publisher for monitors is not checked, because it is control itself, and only the ROS master may call it.
         """
         if incarnation.key not in self._checks and not incarnation.of_monitors:
             task = asyncio.get_running_loop().create_task(self.look(incarnation))
@@ -256,7 +255,7 @@ class Liveness:
             asyncio.get_running_loop().call_later(RECENTLY_LOST_SECONDS, self.look_at, incarnation)
 
     def _make_up(self, incarnation: Incarnation) -> None:
-        """Send a node the updates that it missed. It drops the publishers first to which it is not connected."""
+        """Send a node the updates that it missed; first it drops the publishers to which it is not connected."""
         missed = self.watchlist.to_make_up(incarnation)
         if missed is None:
             return
@@ -282,10 +281,11 @@ class Liveness:
         return False, ""
 
     async def _call(self, incarnation: Incarnation) -> None:
-        """Call a node. Raises `CallFailedError`. Raises `RefusedError` also if another process has the node's port.
+        """Call a node.
 
-        A node that registers again at the same address may be a new process. So after each registration, the first
-        process that answers becomes the expected process.
+        Raises `CallFailedError`, and `RefusedError` also if another process has the node's port. A node that
+        registers again at the same address may be a new process, so after each registration, the first process that
+        answers becomes the expected one.
         """
         answer = await self.nodes.call(incarnation, "getPid", RELAY_NAME)
         match answer:

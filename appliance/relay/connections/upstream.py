@@ -170,7 +170,6 @@ class PublisherConnection(Upstream):
         self._named_subscribers.announce(names, type_name)
 
     def request_latched(self) -> None:
-        """Reconnect, so that a latching publisher sends its message again."""
         if self._reader is not None and self._wanted:
             self._drop_connection()
             self.ask()
