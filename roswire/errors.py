@@ -47,5 +47,4 @@ class DefinitionError(PeerError):
 
 
 def quoted(text: str) -> str:
-    """Return the part of a rejected name or URI that the error message repeats."""
     return ascii(text if len(text) <= 80 else text[:80] + "...")

@@ -143,7 +143,6 @@ def read_bytes(data: bytes) -> str:
 
 
 def _more(count: int) -> str:
-    """Return the note on omitted elements, bytes or characters."""
     return f"{CUT} {count} more" if count > 0 else ""
 
 

@@ -45,7 +45,6 @@ def encode_frame(body: bytes | bytearray | memoryview) -> bytes:
 
 
 def encode_service_reply(body: bytes | bytearray | memoryview) -> bytes:
-    """Encode the reply to a service call that succeeded; `body` is the serialised response."""
     return b"\x01" + encode_frame(body)
 
 

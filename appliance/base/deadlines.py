@@ -30,7 +30,6 @@ class Deadlines:
             self._limits[name] = min(now + seconds, self._limits.get(name, math.inf))
 
     def retain(self, names: Collection[str]) -> None:
-        """Forget all ends but those of these names."""
         self._deadlines = {name: known for name, known in self._deadlines.items() if name in names}
 
     def left(self) -> dict[str, float]:

@@ -67,7 +67,6 @@ class Channel:
 
     @property
     def pending(self) -> bool:
-        """Whether `flush` has more data to write."""
         return bool(self._outgoing)
 
     def send(self, message: Message, descriptors: tuple[int, ...] = (), *, soon: bool = False) -> None:

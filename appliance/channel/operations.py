@@ -23,5 +23,4 @@ else:
 
 
 def request_named(verb: str) -> type[AdminRequest[Any]] | None:
-    """Return the request with this `verb`, or None if no feature of this appliance has it."""
     return next((request for request in REQUESTS if request.__struct_config__.tag == verb), None)

@@ -103,7 +103,6 @@ def _written(value: Any) -> str:
 
 
 def _named(template: list[str], parts: list[str]) -> dict[str, str] | None:
-    """Return the parameters in the path, or None if the path belongs to another operation."""
     if len(template) != len(parts):
         return None
     both = list(zip(template, parts, strict=True))

@@ -54,12 +54,10 @@ def _group_of(verbs: Verbs, further: Callable[[], Verbs]) -> type[TyperGroup]:
 
         @functools.cached_property
         def own_commands(self) -> dict[str, Any]:
-            """The commands of `verbs`."""
             return {name: _command_of(verb, name, further) for name, verb in verbs.items()}
 
         @functools.cached_property
         def all_commands(self) -> dict[str, Any]:
-            """The commands of `verbs` and `further`, in the order of the help."""
             own, table = self.own_commands, joined(verbs, further())
             return {name: own.get(name) or _command_of(verb, name, dict) for name, verb in table.items()}
 

@@ -57,7 +57,6 @@ def write_told(path: Path, data: bytes | mmap) -> None:
 
 
 def say_json(fields: msgspec.Struct | Mapping[str, Any] | tuple[Any, ...]) -> None:
-    """Write an object to standard output as one line of JSON."""
     terminal.say_json(in_full(fields))
 
 

@@ -38,7 +38,6 @@ log = structlog.get_logger()
 
 
 def _isolations(incomplete: str) -> list[tuple[str, str]]:
-    """Complete the kinds of isolation, each with its description."""
     return [(name, text) for name, text in _ISOLATIONS.items() if name.startswith(incomplete)]
 
 

@@ -86,7 +86,6 @@ def _line_of(mistake: Mistake) -> int:
 
 
 def json_schema() -> dict[str, Any]:
-    """Return the JSON schema of `appliance.yaml`."""
     return _reader().json_schema()
 
 
@@ -274,7 +273,6 @@ class _Gathered:
 
 
 def _about(path: KeyPath, place: str) -> str:
-    """Return the key of a mistake as a prefix; empty if the location is the key's own flag."""
     return "" if not path or (place.startswith("--") and len(path) == 1) else f"{_dotted(path)}: "
 
 

@@ -89,7 +89,6 @@ class FeatureParts:
         return tuple(method for part in self._parts for method in part.methods)
 
     def state(self) -> dict[str, Any]:
-        """Return the present states of all features by their fields in the status; `with_states` defines the fields."""
         return {field: state for part in self._parts for field, state in part.status_fields().items()}
 
     def limits(self) -> "tuple[LimitUse, ...]":

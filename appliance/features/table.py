@@ -68,7 +68,6 @@ def memories(sections: Sections, relays: int) -> tuple[SharedMemory, ...]:
 
 
 def recorded_messages() -> Any:
-    """Return the function that gives the recorded messages of a period, or None if no feature records."""
     return next((pkgutil.resolve_name(one.recorded) for one in FEATURES if one.recorded is not None), None)
 
 

@@ -40,7 +40,6 @@ def with_states(kind: type[msgspec.Struct], part: str) -> Any:
 
 
 def states_in(states: Mapping[str, Any], part: str) -> dict[str, Any]:
-    """Return the fields of a part of the status that features add."""
     return {view.field: states.get(view.field) for view in STATES if view.part == part}
 
 

@@ -85,7 +85,6 @@ class HostTable:
         return [row for row in self.rows.values() if row.revoked is None]
 
     def admitted(self) -> list[HostRow]:
-        """Return the enrolled hosts, except hosts whose tunnel hosts.yaml closes."""
         return [row for row in self.enrolled() if self.declared.wants(row.name)]
 
     def addresses(self) -> dict[str, Address]:

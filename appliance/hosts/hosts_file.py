@@ -96,7 +96,6 @@ class DeclaredHosts:
 
     @property
     def source(self) -> str:
-        """Return the name of the text in use, for messages."""
         return IN_BUNDLE if self.bundled else str(self.path)
 
     def wants(self, name: str) -> bool:

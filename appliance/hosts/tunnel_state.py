@@ -102,7 +102,6 @@ class Tunnels:
 
     @property
     def enclosed(self) -> bool:
-        """Whether the firewall accepts the pool's addresses through IPsec only."""
         return self.esp is not None
 
     @property
@@ -116,12 +115,10 @@ class Tunnels:
 
     @property
     def waits(self) -> str:
-        """Return what waits for the key of the hosts' authority; empty if it is here."""
         return self._authority.waits
 
     @property
     def addresses(self) -> dict[str, Address]:
-        """Return the addresses that `host:NAME` means in the policy now."""
         return self._table.addresses() if self.enclosed else {}
 
     async def start(self) -> None:

@@ -93,7 +93,6 @@ class CheckpointMemory:
         return int.from_bytes(path.read_bytes(), "big") if path.exists() else None
 
     def remember_removed(self, log: str, sequence: int) -> None:
-        """Store that the removal of the records up to `sequence` was approved."""
         write_whole(self._path(log, "removed"), sequence.to_bytes(_NUMBER, "big"), 0o600)
 
     def _may_be_removed(self, wanted: Checkpoint) -> None:

@@ -169,7 +169,6 @@ class ParameterCharges:
 
 
 def _region(path: list[_Place], parts: Sequence[str]) -> _Place:
-    """Return the nearest place above a key, or the root for the root."""
     for place in reversed(path[: len(parts)]):
         if place.owner is not None:
             return place

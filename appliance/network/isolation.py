@@ -78,7 +78,6 @@ class IsolationSettings:
 
     @property
     def link(self) -> str:
-        """Return the interface name of the host's end of the veth pair."""
         return f"veth-{self.name}"[: interfaces.IFNAMSIZ]
 
 
@@ -134,7 +133,6 @@ class _IpForwarding:
                 self._host.sysctl(_GLOBAL[family], "1")
 
     def restore(self, record: dict[str, str]) -> None:
-        """Restore recorded settings; skip interfaces that no longer exist."""
         for key, value in record.items():
             if self._host.run((Path("/proc/sys") / key).exists) and self._host.sysctl(key) != value:
                 self._host.sysctl(key, value)
@@ -189,7 +187,6 @@ class Isolation:
             self._lock = None
 
     def host_address_for(self, peer: str) -> str:
-        """Return the address by which `peer` reaches the host, for nodes on that peer."""
         return interfaces.source_address_for(self._host, peer)
 
     def endpoint(self) -> PublicAddress:
@@ -456,7 +453,6 @@ _Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
 
 def _choose(pool: _Network, length: int, taken: list[_Network]) -> LinkAddresses:
-    """Return the ends of the pool's first subnet that overlaps no network in `taken`."""
     candidates: Iterator[_Network] = iter(pool.subnets(new_prefix=length))
     for candidate in itertools.islice(candidates, _CANDIDATES):
         if not any(candidate.version == other.version and candidate.overlaps(other) for other in taken):

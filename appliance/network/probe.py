@@ -77,7 +77,6 @@ class ProbeResult:
 
     @property
     def listening_outside(self) -> tuple[str, ...]:
-        """Return the addresses in `listening` that are not loopback addresses."""
         return tuple(text for text in self.listening if not ipaddress.ip_address(text).is_loopback)
 
     def describe(self) -> str:

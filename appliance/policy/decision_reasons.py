@@ -62,12 +62,10 @@ class DecisionExplanation:
 
     @property
     def node(self) -> "DecisionExplanation | None":
-        """Return the explanation of the `[Nodes]` right, or None if the request does not need it."""
         return self._also(Category.NODE)
 
     @property
     def command(self) -> "DecisionExplanation | None":
-        """Return the explanation of the `[Commands]` right, or None if the request does not need it."""
         return self._also(Category.COMMAND)
 
     def _also(self, category: Category) -> "DecisionExplanation | None":

@@ -70,7 +70,6 @@ class Key:
 
 
 def _compatible(one: Step, other: Step) -> bool:
-    """Return whether these levels of two keys can match the same level of a name."""
     (text, star), (other_text, other_star) = one, other
     fits = star and other_text.startswith(text)
     return fits or (other_star and text.startswith(other_text)) or text == other_text

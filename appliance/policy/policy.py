@@ -67,7 +67,6 @@ class CompiledRule:
         return not self.atoms.isdisjoint(atoms)
 
     def granted_through(self, atoms: frozenset[Atom]) -> tuple[str, ...]:
-        """Return the words of the value that include a host with these atoms."""
         return tuple(word for word, atom in self.words if atom in atoms)
 
 
@@ -236,7 +235,6 @@ class Policy:
         return Decision(False, None, f"{host} is {block}", told=f"{host} is blocked by an operator")
 
     def commanded(self, name: str) -> AuthorityGroup | None:
-        """Return the group of `[Authority]` with this topic or service, or None."""
         return self._commanded.get(name)
 
     def may_command(self, name: str, host: Address) -> bool:
@@ -261,7 +259,6 @@ class Policy:
         return rule is not None and bool(rule.asked)
 
     def named_as(self, address: Address) -> Network:
-        """Return the smallest network of the policy that contains the address, or the address itself as a network."""
         return self.hosts.narrowest(address)
 
     def alike(self, address: Address) -> str:
@@ -283,11 +280,9 @@ class Policy:
         return self.tables[category].audit_only
 
     def atoms_of(self, address: Address) -> frozenset[Atom]:
-        """Return the networks and groups of this policy that contain an address (for `explain`)."""
         return self.hosts.atoms_of(address)
 
     def rules(self, category: Category) -> tuple[CompiledRule, ...]:
-        """Return the rules of a category in the order of the file, `default` included."""
         return tuple(self.tables[category].rules)
 
     def _decide(self, request: Request) -> Decision:

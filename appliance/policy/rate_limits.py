@@ -54,7 +54,6 @@ class Rate:
         return ", ".join(parts) or "no limit"
 
     def strictest(self, other: "Rate") -> "Rate":
-        """Return the lower limit of messages and the lower limit of bytes."""
         return Rate(_lower(self.messages, other.messages), _lower(self.bytes, other.bytes))
 
 

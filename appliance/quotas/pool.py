@@ -149,7 +149,6 @@ class Pool(Generic[Holder]):
         return sum(self._by_class)
 
     def holders(self) -> Iterator[tuple[Holder, int]]:
-        """Yield every host that has holdings, and the amount."""
         return ((host, amount) for host, (_, amount) in self._held.items())
 
     def _look_up(self, host: Holder) -> tuple[QuotaClass, int]:
@@ -162,7 +161,6 @@ class Pool(Generic[Holder]):
         return quota_class, amount
 
     def _set(self, host: Holder, quota_class: QuotaClass, before: int, amount: int) -> None:
-        """Change the holdings of a host from `before` to `amount`, both under this quota class."""
         self._by_class[quota_class] += amount - before
         if amount:
             self._held[host] = quota_class, amount

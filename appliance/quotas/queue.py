@@ -20,7 +20,6 @@ class Queue(Generic[Holder, Member]):
         self._line_of: dict[Member, OrderedDict[Member, tuple[Holder, float]]] = {}
 
     def put(self, member: Member, host: Holder, since: float) -> None:
-        """Append a member that has waited since `since`."""
         self._file(member, host, since, self._quota_class(host))
 
     def remove(self, member: Member) -> bool:

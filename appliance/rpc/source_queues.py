@@ -49,7 +49,6 @@ class NamedFirst:
         self._program = b""
 
     def __call__(self) -> bytes:
-        """Return the program for the policy in force."""
         policy = self._policy()
         if policy is not self._of:
             blocked = [address for address in policy.blocks if policy.hosts.names(address)]

@@ -121,7 +121,6 @@ class Rollout:
 
     @property
     def refused(self) -> list[str]:
-        """Return why relays refuse the specifications in force; empty if no relay does."""
         return [finding for findings in self._refusals.values() for finding in findings]
 
     @property
@@ -199,11 +198,9 @@ class Rollout:
         return self.allocation.of_file(self._now.checked.monitors[monitor])
 
     def tell(self, monitor: str, message: messages.Message) -> bool:
-        """Send a message to the relay of a monitor; return False if that relay is not connected."""
         return self.relays.send(message, self.relay_of(monitor))
 
     async def carried_out(self) -> None:
-        """Wait until the relays have carried out their orders, which then apply to all later messages."""
         await self.relays.carried_out()
 
     def resumed(self, monitor: str) -> None:
@@ -214,7 +211,6 @@ class Rollout:
     # --- a change ---
 
     def began(self, names: Iterable[str]) -> list[str]:
-        """Return which of these monitors began again at the last change, including moved monitors."""
         return [name for name in names if name in self._began]
 
     async def take(self, coming: Revision) -> list[str]:

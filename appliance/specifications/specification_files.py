@@ -110,7 +110,6 @@ class Sources(msgspec.Struct, frozen=True):
         )
 
     def named(self) -> dict[str, str]:
-        """Return all texts by their names below the folder; names of definitions begin with `msg/`."""
         return self.files | {f"msg/{name}": text for name, text in self.definitions.items()}
 
 

@@ -26,7 +26,6 @@ class Switches:
         self.states: dict[str, Switch] = {}
 
     def restore(self, text: str) -> None:
-        """Take the operators' switches from the setting `SWITCHES`."""
         self.said = json.loads(text)
 
     def enabled(self, name: str) -> bool:
@@ -53,7 +52,6 @@ class Switches:
         return states
 
     def shadows_of(self, checked: CheckedSpecifications) -> frozenset[str]:
-        """Return those of these monitors that are in shadow mode."""
         return frozenset(name for name, state in self.states_of(checked).items() if state == SHADOW)
 
     def _own(self, name: str) -> Switch:

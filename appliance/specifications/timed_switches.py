@@ -112,7 +112,6 @@ class TimedSwitches:
             self._save()
 
     def keep(self, states: Mapping[str, Switch]) -> None:
-        """Forget monitors that are gone, or no longer have the limited switch."""
         self.end([name for name, one in self._kept.items() if states.get(name) != one.of])
 
     def _save(self) -> None:

@@ -78,5 +78,4 @@ def hash_secret(secret: str, salt: bytes) -> bytes:
 
 
 def is_secret(secret: str, salt: bytes, kept: bytes) -> bool:
-    """Return whether `kept` was made from this secret."""
     return hmac.compare_digest(hash_secret(secret, salt), kept)

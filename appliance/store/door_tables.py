@@ -53,7 +53,6 @@ class DoorTables:
         self._database.put("door", *row)
 
     def doors(self) -> list[DoorRow]:
-        """Return all doors that were ever added, the oldest first."""
         return [DoorRow(*row) for row in self._database.query("SELECT * FROM door ORDER BY added, name")]
 
     def save_tickets(self, *rows: TicketRow) -> None:

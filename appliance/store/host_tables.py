@@ -151,7 +151,6 @@ class HostTables:
         self._database.put("host", *row)
 
     def hosts(self) -> list[HostRow]:
-        """Return all hosts that were ever enrolled, sorted by name."""
         return [HostRow(*row) for row in self._database.query("SELECT * FROM host ORDER BY name")]
 
     def save_certificate(self, row: CertificateRow) -> None:
@@ -173,7 +172,6 @@ class HostTables:
         return [PortsRow(name, state, json.loads(opened), *told) for name, state, opened, *told in rows]
 
     def save_awaited(self, row: EnrolmentTokenRow) -> None:
-        """Store a one-time token, replacing an earlier token for the same name."""
         self._database.put("enrolment_token", *row[:-2], json.dumps(row.kit), row.who)
 
     def forget_awaited(self, name: str) -> None:

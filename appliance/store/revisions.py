@@ -90,7 +90,6 @@ class Revisions(ABC, Generic[R]):
 
     @property
     def revision(self) -> int:
-        """Return the number of the revision in force; 0 for none."""
         return self.in_force.revision
 
     @property

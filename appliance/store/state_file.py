@@ -212,7 +212,6 @@ class StateStore:
 
     @property
     def tree_is_due(self) -> bool:
-        """Whether the tree should be stored after a change that was noted."""
         return self._largest_change is not None or len(self._noted) > _MOST_NOTED
 
     def note_parameter(self, key: str, value: Any) -> None:
@@ -328,7 +327,6 @@ class StateStore:
         self.database.put("token_use", token, used)
 
     def token_uses(self) -> dict[str, float]:
-        """Return the last use of each token that was ever used, by id."""
         return dict(self.database.query("SELECT id, used FROM token_use"))
 
     def save_time_left(self, left: Mapping[str, float]) -> None:

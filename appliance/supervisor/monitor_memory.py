@@ -123,7 +123,6 @@ def _is_complete(life: Path) -> bool:
 
 
 def _this_boot() -> str:
-    """Return the id of this boot; a random id if the kernel has none."""
     try:
         return _BOOT.read_text("ascii").strip()
     except OSError:

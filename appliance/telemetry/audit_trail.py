@@ -171,7 +171,6 @@ class AuditTrail:
         )
 
     def _marked(self, host: str | None, decision: str | None, detail: dict[str, Any]) -> bool:
-        """Return whether an unknown host is denied; if so, set the mark in `detail`."""
         if host is None or decision != "deny" or self._log.budget.quota_class(host) is not QuotaClass.UNKNOWN:
             return False
         detail["unknown_host"] = True

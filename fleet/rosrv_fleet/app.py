@@ -51,7 +51,6 @@ ROUTERS: tuple[Callable[[Collector], APIRouter], ...] = (
 
 
 async def _damaged(_request: Request, error: Exception) -> Response:
-    """Answer 503 if a file of the data folder is damaged."""
     _log.error("a request failed", reason=str(error))
     return JSONResponse({"detail": "a file of the collector is damaged; see its log"}, 503)
 

@@ -155,7 +155,6 @@ class ClientConnections:
         return self._requests.take(owner, proven=owner in self._proven)
 
     def is_proven(self, owner: str) -> bool:
-        """Return whether a robot or an operator connected from an address (`owner_of`)."""
         return owner in self._proven
 
     def _made_room(self, owner: str, proven: bool) -> bool:

@@ -70,7 +70,6 @@ def answer_to(
 
 
 def _detail(answer: httpx.Response) -> str:
-    """Return the reason in an answer with an error status, or the beginning of its body."""
     try:
         detail = answer.json()["detail"]
     except (ValueError, TypeError, KeyError):

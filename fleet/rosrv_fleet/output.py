@@ -12,7 +12,6 @@ from appliance.audit.log.record_format import printable
 
 
 def say(line: str) -> None:
-    """Write one line; control characters are escaped."""
     typer.echo(printable(line))
 
 

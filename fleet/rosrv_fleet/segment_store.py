@@ -95,7 +95,6 @@ class SegmentPlace(NamedTuple):
 
     @property
     def mark(self) -> str:
-        """Return the name of its markers in the robot's folders."""
         return f"{self.log}~{self.number:0{_DIGITS}}~{self.name}"
 
 

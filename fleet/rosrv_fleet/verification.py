@@ -106,7 +106,6 @@ def _proof_after(
 
 
 def _begin_after(note: RemovalNote, proof: LogProof) -> None:
-    """Begin the proof after the segments that the collector's retention removed."""
     proof.removed = proof.last = max(header.end.sequence for header in note.ends)
     day = datetime.fromtimestamp(note.time // 10**9, UTC).date().isoformat()
     proof.removal = (

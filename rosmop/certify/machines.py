@@ -61,7 +61,6 @@ class StateMachineFollower:
         return members
 
     def step(self, state: str, event: str) -> str:
-        """Return the state after an event; `fail` if no transition is written."""
         return self._moves.get(state, {}).get(event, self._default.get(state, FAIL))
 
     def timeout(self, state: str) -> tuple[int, str] | None:

@@ -163,7 +163,6 @@ def _types(section: bytes) -> Iterator[bytes]:
 
 
 def _chosen(section: bytes) -> Iterator[bytes]:
-    """Yield the number of each function's type."""
     count, at = _read_leb(section, 0)
     for _ in range(count):
         begin = at
@@ -180,7 +179,6 @@ def _bodies(section: bytes) -> Iterator[bytes]:
 
 
 def _read_exports(section: bytes) -> Iterator[tuple[bytes, str, int]]:
-    """Yield the bytes, the name and the number of each export."""
     count, at = _read_leb(section, 0)
     for _ in range(count):
         size, begin = _read_leb(section, at)

@@ -54,7 +54,6 @@ class Value:
 
     @property
     def pure(self) -> bool:
-        """Whether evaluating the expression has no effect."""
         return not acts(self.form)
 
     @property

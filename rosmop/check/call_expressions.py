@@ -229,7 +229,6 @@ def _log(
 
 
 def _line(scope: FunctionScope, node: tree.CallExpression) -> Value:
-    """Compile `puts(text)`, which has no format."""
     if len(node.arguments) != 1:
         raise SpecificationError.at(node.position, f"`puts` takes 1 argument(s), not {len(node.arguments)}")
     text = convert(scope, scope.value_of(node.arguments[0]), value_types.STRING)

@@ -269,7 +269,6 @@ class FunctionScope:
     # Statements
 
     def temporary(self, prefix: str = "t") -> str:
-        """Return a new name for an intermediate value."""
         return self.symbols.fresh(prefix)
 
     def site(self, node: tree.SyntaxNode) -> int:

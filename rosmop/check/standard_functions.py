@@ -159,7 +159,6 @@ def _question(name: str) -> Function:
 
 
 def _finite(call: Arguments) -> Value:
-    """Compile `isfinite` of a number, or of all numbers in a message or vector."""
     call.count(1)
     if isinstance(call.values[0].type, value_types.RecordType | value_types.VectorType):
         return call.result(library_functions.all_finite(call.scope, call.values[0]))

@@ -73,7 +73,6 @@ def _declare(scope: FunctionScope, node: tree.Declaration) -> None:
 
 
 def _is_copy(scope: FunctionScope, declarator: tree.Declarator, kind: value_types.Type) -> bool:
-    """Return whether a `char *` is initialised with another `char *`."""
     if kind != value_types.CHARACTERS or declarator.is_array or not isinstance(declarator.value, tree.Name):
         return False
     return isinstance(scope.value_of(declarator.value).type, value_types.CharactersType)

@@ -84,7 +84,6 @@ class Cells:
 
     @property
     def kept(self) -> Sequence[int]:
-        """Return the addresses of the variables that are strings or arrays."""
         return [at for at, kind in self.variables.values() if kept_size(kind)]
 
 

@@ -96,7 +96,6 @@ def part_of(compiled: Compiled, names: Collection[str], shadows: Collection[str]
 
 
 def fast_path_of(compiled: Compiled) -> WasmFastPath:
-    """Return the fast path of all specifications of a set, for `MonitorSet`."""
     return WasmFastPath(_translated(written_of(compiled)))
 
 

@@ -785,7 +785,6 @@ class _FunctionCodegen(StringCodegen):
         return code
 
     def _put_span(self, name: str) -> bytes:
-        """Pop an address and length (32 bits each) into local variables."""
         code = self._set("span", I64) + self._get("span", I64) + I32_WRAP_I64 + self._set(f"place of {name}")
         return (
             code + self._get("span", I64) + constant(I64, 32) + I64_SHR_U + self._set(f"count of {name}", I64)

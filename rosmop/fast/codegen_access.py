@@ -62,7 +62,6 @@ class MessageAccess(ArithmeticCodegen):
         return offset if at.base is None else self._get(at.base, I64) + offset + I64_ADD
 
     def _length(self) -> bytes:
-        """Push the size of the whole message, in 64 bits."""
         return self._get("size") + I64_EXTEND_I32_U + load(I64, REST) + I64_ADD
 
     def _within(self, at: nodes.Spot, size: int) -> bytes:
@@ -71,7 +70,6 @@ class MessageAccess(ArithmeticCodegen):
         return self._when(short, self._elsewhere)
 
     def _length_at(self, at: nodes.Spot) -> bytes:
-        """Load the 32 bits at a position within the message, as 64 bits."""
         base = self._get("at") + (
             b"" if at.base is None else self._get(at.base, I64) + I32_WRAP_I64 + I32_ADD
         )

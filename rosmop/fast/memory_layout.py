@@ -27,7 +27,6 @@ class NotCompiledError(Exception):
 
     @classmethod
     def of(cls, kind: Type) -> "NotCompiledError":
-        """Return the error for a value of a type that is made, kept, compared or changed."""
         return cls(f"makes, keeps, compares or changes a value of type {kind}")
 
     def place(self, site: int) -> None:

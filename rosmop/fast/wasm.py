@@ -173,10 +173,8 @@ _CALCULATIONS = {
 
 
 def compare(machine: int, operator: str, *, signed: bool = True) -> bytes:
-    """Choose the comparison of two numbers of this type."""
     return _COMPARISONS[machine, signed][operator]
 
 
 def calculate(machine: int, operator: str, *, signed: bool = True) -> bytes:
-    """Choose the calculation with two numbers of this type."""
     return _CALCULATIONS[machine, signed][operator]

@@ -474,7 +474,6 @@ class Spot(FormNode, frozen=True):
     offset: int
 
     def plus(self, more: int) -> "Spot":
-        """Return the position `more` bytes further."""
         return Spot(self.base, self.offset + more)
 
 

@@ -68,7 +68,6 @@ class Candidate:
 
     @property
     def key(self) -> tuple[str, str, str, int | None]:
-        """Return the subject of the candidate, without its bound."""
         return self.topic, self.kind, self.path, self.element
 
     @property

@@ -27,7 +27,6 @@ def specifications(
 
 
 def _new_name(text: str, taken: set[str]) -> str:
-    """Return a name made of the text, with a number if the name is taken."""
     name = identifier(text)
     name = f"{name}_topic" if name in WORDS else name
     free = name if name not in taken else next(f"{name}_{n}" for n in count(2) if f"{name}_{n}" not in taken)

@@ -43,7 +43,6 @@ class HighestValues(msgspec.Struct):
 
     @property
     def top(self) -> float:
-        """Return the highest number of all windows; minus infinity if there is none."""
         return max(self.of.values(), default=-math.inf)
 
 
@@ -74,7 +73,6 @@ class ValueSeries(msgspec.Struct):
 
     @property
     def ordered(self) -> list[Any]:
-        """Return the values in an order that does not depend on the recordings."""
         return sorted(self.windows, key=lambda value: (isinstance(value, bytes), value))
 
     def _limit(self) -> None:

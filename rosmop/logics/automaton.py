@@ -134,7 +134,6 @@ def _smaller_halves(
 
 
 def _split(blocks: list[set[int]], block_of: list[int], cut: int, members: list[int]) -> None:
-    """Move ``members`` out of block ``cut`` into a new last block."""
     number = len(blocks)
     blocks[cut].difference_update(members)
     blocks.append(set(members))

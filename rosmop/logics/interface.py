@@ -120,7 +120,6 @@ class CompiledProperty(ABC):
     """The function of the specification that publishes the due message at a deadline (`enforced by`)."""
 
     def __new__(cls, *made_of: Any) -> Self:
-        """Store the arguments of the constructor in `made_of`."""
         made = super().__new__(cls)
         made.made_of = made_of
         return made

@@ -59,12 +59,10 @@ class PastInstruction:
 
     @property
     def bounded(self) -> bool:
-        """Whether the value depends on the time of events."""
         return self.low > 0 or self.high is not None
 
     @property
     def plain(self) -> str:
-        """Return the operator without ``abstract``."""
         return self.operator.removeprefix("abstract ")
 
 
@@ -151,7 +149,6 @@ class FoldedProgram:
 
     @property
     def kept(self) -> slice:
-        """Return the places of the values kept for the next step."""
         return slice(2, 2 + len(self.bounds))
 
     def start(self) -> list[Any]:

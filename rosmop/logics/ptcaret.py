@@ -112,7 +112,6 @@ class CaretRun(UntimedRun):
         return TOLD[holds]
 
     def saved(self) -> tuple[Any, ...]:
-        """Return the values of the open calls, and the present values."""
         return self._stack, self._values
 
     def restore(self, saved: tuple[Any, ...]) -> None:

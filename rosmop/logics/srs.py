@@ -55,7 +55,6 @@ class RewritingProperty(CompiledProperty):
         return RewritingRun(self)
 
     def categories_after(self, _event: int) -> frozenset[str]:
-        """Return the verdicts of all rules; any event can lead to them."""
         return frozenset(rule.verdict for rule in self.rules if rule.verdict)
 
 

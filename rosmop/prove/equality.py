@@ -235,7 +235,6 @@ class Validation:
         return StartTerms(message, size, now, variables, budgets, throttles), cells, known
 
     def _ends(self, meant: FormResult) -> Iterator[tuple[int, Term]]:
-        """Yield the required final value of each cell."""
         for component in self._module.cells:
             for name, (address, _) in component.variables.items():
                 if name in meant.variables:

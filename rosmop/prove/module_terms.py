@@ -186,7 +186,6 @@ class ModuleExecution:
                 stack.append(_calculated(family, rest, instruction.operands, stack))
 
     def _divides(self, name: str, state: State, stack: Sequence[Any]) -> None:
-        """Trap if the divisor is zero or the quotient overflows."""
         left, right = _bits(stack[-2]), _bits(stack[-1])
         traps = right == 0
         if name == "div_s":
@@ -316,7 +315,6 @@ class ModuleExecution:
         state.slots[_MESSAGE] = with_number(message, position, z3.Extract(8 * size - 1, 0, _bits(value)))
 
     def _note(self, pointer: Pointer, offset: int, size: int, value: Any, state: State) -> None:
-        """Write a part of the next entry of the log."""
         begin = state.slots["cell", UNDO].offset
         part = z3.simplify(pointer.offset + offset - begin)
         if not z3.is_bv_value(part) or (part.as_long(), size) not in ((0, 4), (4, 4), (8, 8)):
@@ -343,7 +341,6 @@ class ModuleExecution:
 
 
 def _loaded(value: Term, family: str, how: str) -> Term:
-    """Return bytes as a number of the machine."""
     if family in ("f32", "f64"):
         return z3.fpBVToFP(value, _SORTS[family])
     missing = int(family[1:]) - value.size()
@@ -361,7 +358,6 @@ def _stored(value: Any, size: int) -> Term:
 
 
 def each_name(family: str, how: str) -> str:
-    """Return the number of bits that are read or written as a text, such as `32 bits`."""
     return f"{how.strip('_us') or family[1:]} bits"
 
 

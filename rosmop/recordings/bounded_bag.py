@@ -69,7 +69,6 @@ class BoundedReader(Reader):
 
     @property
     def message_count(self) -> int:
-        """Return the number of messages that the headers of the chunks name."""
         return sum(sum(info.connection_counts.values()) for info in self.chunk_infos)
 
     def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:

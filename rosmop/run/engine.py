@@ -109,12 +109,10 @@ class KeptGroup:
 
     @property
     def layout(self) -> bytes:
-        """Return the layout of the cells (`CellNames` as MessagePack)."""
         return msgspec.msgpack.encode(None if self._group.home is None else self._group.home.names)
 
     @property
     def size(self) -> int:
-        """Return the size of the cells in bytes; 0 without cells."""
         return 0 if self._group.home is None else self._group.home.size
 
     def cells(self) -> bytes | None:
@@ -323,11 +321,9 @@ class MonitorSet:
         return topic in self.steps
 
     def taps(self, topic: str) -> bool:
-        """Return whether messages on this topic may be copied into `tapped`."""
         return topic in self._tapped_ways
 
     def may_withhold(self, topic: str) -> bool:
-        """Return whether an enabled monitor in force may withhold messages of a topic from hosts."""
         return topic in self._withheld
 
     def withheld_from(self, topic: str) -> tuple[str, ...]:
@@ -357,7 +353,6 @@ class MonitorSet:
         return next((step.event.type for step in steps if shadowed or not isinstance(step, _Tap)), None)
 
     def stamped(self, topic: str) -> bool:
-        """Return whether messages of a topic begin with a `std_msgs/Header`, by the type in this set."""
         return self.compiled.is_stamped(self.type_of(topic, shadowed=True))
 
     def service_type_of(self, service: str, *, shadowed: bool = False) -> str | None:
@@ -382,7 +377,6 @@ class MonitorSet:
 
     @property
     def late(self) -> bool:
-        """Whether the last message, tick or deadline used up its time."""
         return self.interpreter.turn.late()
 
     def name_senders(self, names: Callable[[int], tuple[str, str]]) -> None:
@@ -904,7 +898,6 @@ def _groups(compiled: Compiled, monitors: Sequence[MonitorInstance]) -> Iterator
 
 
 def _redefined(before: Definitions, after: Definitions) -> frozenset[str]:
-    """Return the message types that both sets have with different definitions."""
     if before is after:
         return frozenset()
     both = set(before.message_types) & set(after.message_types)

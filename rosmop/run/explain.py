@@ -380,7 +380,6 @@ class _Trial:
         return self._category in (told if self._ended is None else self._expire(run, self._ended + 1))
 
     def _expire(self, run: Run, time_ns: int) -> Categories:
-        """Expire the deadlines before a time; return the categories of the last one."""
         told: Categories = ()
         while (deadline := run.deadline) is not None and deadline < time_ns:
             categories = run.expire()

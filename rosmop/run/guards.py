@@ -79,7 +79,6 @@ def _places(code: SpecificationCode, compiled: Compiled, acts: set[str]) -> set[
 
 
 def _acts(function: nodes.Function) -> bool:
-    """Return whether a function drops, changes or publishes a message."""
     return any(
         isinstance(node, nodes.Drop | nodes.StopMessage | nodes.Publish)
         or (isinstance(node, nodes.WriteBack) and node.writes)

@@ -110,7 +110,6 @@ class Interpreter:
         self._site = -1
 
     def had_happened(self, error: Exception) -> bool:
-        """Return whether the event had happened before the error stopped the function."""
         return error is self.failed.error and self.failed.happened
 
     def let_go(self) -> None:

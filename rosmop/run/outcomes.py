@@ -290,9 +290,6 @@ def of_verdict(outcome: Outcome, verdict: Verdict, who: Who) -> dict[str, Any]:
 
 
 def _led(outcome: Outcome, who: Who, handled: Verdict | None = None) -> dict[str, Any]:
-    """Return the events (or the timer), the conditions with the compared values, and the verdict whose handler
-    acted.
-    """
     return {
         "events": list(outcome.events),
         **({"timer": outcome.timer} if outcome.timer is not None else {}),

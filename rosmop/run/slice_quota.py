@@ -53,7 +53,6 @@ class Quota(Generic[Thing]):
         return next(iter(self._of[holder]))
 
     def all(self) -> Iterator[tuple[Holder, Thing]]:
-        """Yield all things with their holders; the things of each holder are sorted, oldest first."""
         return ((holder, thing) for holder, things in self._of.items() for thing in things)
 
     def clear(self) -> None:

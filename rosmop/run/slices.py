@@ -245,7 +245,6 @@ class Slices:
         return None
 
     def at(self, key: Key) -> Slice | None:
-        """Return the slice of all parameters with this key, if there is one."""
         return self._whole.get(key)
 
     def quiet(self, event: int, slice_: Slice) -> Sequence[int] | None:
@@ -302,7 +301,6 @@ class Slices:
         return slice_
 
     def _with(self, domain: int, part: int, key: Key) -> Sequence[Key]:
-        """Return the keys of this domain in which the parameters in `part` have these values."""
         known = self._known[domain]
         if part == domain:
             return (key,) if key in known.slices else ()
@@ -570,7 +568,6 @@ class Slices:
         return dict(zip(_members(slice_.domain), slice_.key[1:], strict=True))
 
     def binding(self, slice_: Slice) -> Mapping[str, object]:
-        """Return the values of parameters, as they are reported."""
         return self._shown(slice_.domain, slice_.key)
 
     def _shown(self, domain: int, key: Key) -> Mapping[str, object]:

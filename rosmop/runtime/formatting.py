@@ -7,7 +7,6 @@ _LONG = 1024  # bytes; shorter text is not charged in advance
 
 
 def to_text_integer(value: int) -> bytes:
-    """Return the text of an integer as printed by `std::to_string` and by `<<`."""
     return b"%d" % value
 
 
@@ -31,7 +30,6 @@ def to_text_precise(value: float, precision: int, site: int) -> bytes:
 
 
 def to_text_character(value: int) -> bytes:
-    """Return the text of `std::cout << character`."""
     return bytes((value & 0xFF,))
 
 

@@ -106,7 +106,6 @@ def charged(context: Context, text: bytes, site: int) -> bytes:
 
 
 def compare(left: bytes, right: bytes) -> int:
-    """Return `left.compare(right)`, which is also `strcmp`."""
     return (left > right) - (left < right)
 
 
@@ -162,7 +161,6 @@ def filled_at_most(context: Context, buffer: bytes, text: bytes, count: int, sit
 
 
 def printed(context: Context, buffer: bytes, text: bytes, limit: int, site: int) -> bytes:
-    """Return a `char` buffer after `snprintf(buffer, limit, "%s", text)`."""
     return filled(context, buffer, text[: limit - 1], site) if limit else buffer
 
 

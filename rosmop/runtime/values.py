@@ -119,7 +119,6 @@ class ValueCodec:
     # Zeros and copies
 
     def maker(self, kind: Type) -> Callable[[], Any]:
-        """Return a function that makes a zero value (None for void)."""
         return self._once(ValueCodec._maker, kind)
 
     def _maker(self, kind: Type) -> Callable[[], Any]:

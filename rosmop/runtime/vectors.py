@@ -91,17 +91,14 @@ def recast_each(context: Context, values: Values, convert: Callable[[Values], Va
 
 
 def signed(values: Values) -> Values:
-    """Return `uint8_t` or `bool` values as `int8_t`."""
     return memoryview(bytes(values)).cast("b").tolist()
 
 
 def unsigned(values: Values) -> Values:
-    """Return `int8_t` or `bool` values as `uint8_t`."""
     return [value & 0xFF for value in values]
 
 
 def truths(values: Values) -> Values:
-    """Return bytes as `bool`."""
     return list(map(bool, values))
 
 

@@ -178,7 +178,6 @@ class WireMessage:
 
     @property
     def overwritten(self) -> Sequence[tuple[int, bytes]]:
-        """Return the positions of changed bytes, and the bytes that they replaced, in order."""
         return self.written or ()
 
     def patch(self, start: int, new: bytes, by: int = 1) -> None:

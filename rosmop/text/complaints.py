@@ -234,7 +234,6 @@ def _open_braces(text: str, offset: int) -> list[int]:
 
 
 def _code(text: str, offset: int) -> str:
-    """Return the text before `offset` without the comments and blanks at its end."""
     ends = (piece.end() for piece in _PIECE.finditer(text, 0, offset) if not piece["gap"])
     return text[: max(ends, default=0)]
 

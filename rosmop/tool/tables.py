@@ -12,7 +12,6 @@ _WIDE = 200  # columns, if the output is not a terminal
 
 
 def table_of(*heads: str | Column) -> Table:
-    """Return an empty table with these column heads."""
     return Table(*heads, box=None, padding=(0, 2, 0, 0), header_style="dim")
 
 

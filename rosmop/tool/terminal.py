@@ -17,7 +17,6 @@ def printable(text: str) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """Return `1 error`, `2 errors`."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
@@ -40,5 +39,4 @@ def say(line: str, style: str = "") -> None:
 
 
 def say_json(fields: Any) -> None:
-    """Write one object on one line to standard output."""
     sys.stdout.write(json.dumps(msgspec.to_builtins(fields)) + "\n")

@@ -9,7 +9,6 @@ _JSON = "application/json"
 
 
 def etag(tag: int | str) -> str:
-    """Return the ETag for a revision number, or for an answer's own tag."""
     return f'"{tag}"'
 
 

@@ -97,7 +97,6 @@ class _Connection(Front, asyncio.Protocol):
             self._uvicorn.data_received(data)
 
     def _passed_on(self) -> bool:
-        """Pass the connection on if its request opens a WebSocket; return whether it does."""
         if self._websocket is None:
             return False
         self._listener.pass_on(self._websocket, bytes(self._head))
@@ -200,7 +199,6 @@ class Listener:
         self._time = ProcessorTime(partial(_class_of, quota_class))
 
     def opens_websocket(self, target: bytes) -> bool:
-        """Return whether a request that wants an upgrade opens the WebSocket of a door."""
         return self._websockets is not None and target.startswith(PREFIX)
 
     def pass_on(self, passage: WebSocketPassage, head: bytes) -> None:

@@ -50,7 +50,6 @@ class Buckets:
         return 0.0 if left >= 1 else (1 - left) / self._per_second
 
     def touched(self, host: str, now: float) -> bool:
-        """Return whether the peer's bucket has not refilled completely."""
         return self._left(host, now) < self._burst
 
     def _left(self, host: str, now: float) -> float:

@@ -62,7 +62,6 @@ _HEADERS = {
 
 
 def is_console(path: str) -> bool:
-    """Return whether a path is one of the console's files, which are served without a token."""
     return path in ("/", "/console") or path.startswith("/console/")
 
 
@@ -208,7 +207,6 @@ class _Answer:
         self._ended = message["type"] == "http.response.body" and not message.get("more_body", False)
 
     async def fail(self, problem: ProblemError, receive: Receive) -> None:
-        """Answer with a problem; abort an answer that has already begun."""
         if self._ended:
             return
         if self._begun:

@@ -47,7 +47,6 @@ Admin = Annotated[Bearer, requires("admin")]
 
 
 def reads_contents(bearer: Bearer) -> bool:
-    """Return whether a bearer may read message contents in records of monitors; only viewers may not."""
     return bearer.role != "viewer"
 
 

@@ -34,7 +34,6 @@ class Tagged(NamedTuple, Generic[A]):
 
 
 def tagged(body: A) -> Tagged[A]:
-    """Return an answer with its own tag; without a tag, with its revision."""
     return Tagged(body, getattr(body, "tag", None) or body.revision)  # type: ignore[attr-defined]  # each versioned answer has a revision
 
 
@@ -151,7 +150,6 @@ def _all_wrong(given: Any, kind: Any) -> list[BadInput]:
 
 
 def _bad(error: msgspec.ValidationError, where: str = "body", kind: Any = None) -> BadInput:
-    """Return the error of one part of a body of this kind, with the part's place."""
     text, at, place = str(error).rpartition(" - at `")
     if not at:
         text, place = place, ""

@@ -54,7 +54,6 @@ def link(previous: bytes, content: bytes) -> bytes:
 
 
 def record_hash(previous: bytes, columns: tuple[object, ...]) -> bytes:
-    """Return the hash of a record (values of `StoredColumns`) that follows the hash `previous`."""
     return link(previous, content_hash(columns))
 
 

@@ -133,7 +133,6 @@ def requested(record: AuditRecord) -> str | None:
 
 
 def rule_text(rule: RuleReference | None) -> str | None:
-    """Return a rule with its file and line, or None."""
     return None if rule is None else f"[{rule.section}] {rule.key} {rule.file}:{rule.line}"
 
 

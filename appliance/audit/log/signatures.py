@@ -67,7 +67,6 @@ class Signatures:
 
     @property
     def key_was_pinned(self) -> bool:
-        """Whether a log at this path was ever signed."""
         return self._pin.exists()
 
     def sealed(self, number: int, text: bytes) -> None:

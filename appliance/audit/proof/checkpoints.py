@@ -163,7 +163,6 @@ class CheckpointVerifier:
 
 
 def _removed(text: bytes) -> list[int]:
-    """Return `removed` of a checkpoint as a list, which is empty if it is missing or the text is invalid."""
     try:
         removed = parse_checkpoint(text).removed
     except ValueError:

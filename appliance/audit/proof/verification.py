@@ -108,7 +108,6 @@ class _Row(NamedTuple):
     detail: bytes
 
     def follows(self, previous: bytes, sequence: int) -> bool:
-        """Return whether this record was written as `sequence` after the hash `previous`."""
         try:
             return follows(previous, (sequence, *self.columns[1:]), self.hash)
         except UnicodeEncodeError:  # bytes that no writer stored

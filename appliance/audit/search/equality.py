@@ -86,7 +86,6 @@ def times(record: AuditRecord) -> int:
 
 
 def times_of(event: str, detail: dict[str, Any]) -> int:
-    """Return how often an event happened, from its record's fields."""
     return 1 if event in _ABOUT_THE_LOG else repetitions(detail)
 
 

@@ -205,7 +205,6 @@ def _by(record: AuditRecord) -> str | None:
 
 
 def _why_of_several(row: EqualRecords) -> str:
-    """Return how often equal records happened, and the newest reason, with the rule."""
     newest = msgspec.structs.replace(row.last.record, reason=row.value, event="")
     return f"{row.count} times, last: {_why(newest)}" if row.value else f"{row.count} times"
 

@@ -50,7 +50,6 @@ class FileLog:
         return search(self.path, wanted, cursor, limit, newest_first=newest_first)
 
     def denials(self, wanted: Filter, limit: int) -> DenialSummary:
-        """Return the denials that match, by host."""
         return summary_of_log(self.path, wanted, limit)
 
     def show(self, record_id: str, neighbours: int) -> RecordInContext | None:
@@ -58,7 +57,6 @@ class FileLog:
         return show(self.path, record_id, neighbours)
 
     def export(self, wanted: Filter) -> Iterator[LogEntry]:
-        """Yield all records that match, the oldest first."""
         return export(self.path, wanted)
 
     def evidence(self, wanted: Filter) -> Iterator[tuple[int, str]]:
@@ -94,5 +92,4 @@ class FileLog:
         return signed_checkpoints(self.path, after)
 
     def last(self) -> int:
-        """Return the sequence of the last record; 0 for an empty log."""
         return last_sequence(self.path)

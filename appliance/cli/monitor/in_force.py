@@ -374,7 +374,6 @@ def _say_idle(appliance: Appliance, files: Collection[str]) -> None:
 
 
 def _say_held(rows: Collection[MonitorState]) -> None:
-    """List the monitors that hold their topics, with the reason and the command that releases them."""
     for row in (row for row in rows if row.held):
         why = row.why_held or "its relay process was restarted"
         say(f"{row.name} holds its topics: {why}; when it is safe: rosrv monitor resume {row.name}", "red")

@@ -141,7 +141,6 @@ class ListenerLimits:
         self._trail.happened("limit exceeded", reason, decision="deny", host=peer.text)
 
     def malformed(self, peer: Peer, reason: str) -> None:
-        """Record that a peer sent something that is not a request."""
         self._trail.happened("malformed", reason, decision="deny", host=peer.text)
 
     def probed(self, reason: str) -> None:

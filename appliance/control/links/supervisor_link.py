@@ -89,7 +89,6 @@ class ControlLifeline:
         return before
 
     def pause(self) -> None:
-        """Queue messages again until `hear` is called."""
         self._heard = self.queue
 
     def queue(self, message: Any, descriptors: tuple[int, ...]) -> None:

@@ -156,7 +156,6 @@ class Queries:
         )
 
     async def registrations(self, _request: admin.RegistrationsWanted) -> Registrations:
-        """Return all live rights that a change of the policy may end."""
         return Registrations([Registration(**live.fields()) for live in self.live()])
 
     def present(self) -> Status:

@@ -203,7 +203,6 @@ class RequestAuthenticator:
 
 
 def _role_for(request: RestRequest) -> TokenRole | None:
-    """Return the least role that a token needs for this request, or None if the request needs no token."""
     operation = admin.operation_of(request)
     if operation is None or operation.role is None:
         return None if operation is not None else "admin"

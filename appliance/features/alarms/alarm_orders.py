@@ -38,7 +38,6 @@ class AlarmOrders:
         self._status = status
 
     async def listed(self, _request: AlarmsWanted) -> AlarmList:
-        """Return the present alarms, the most severe first."""
         return self._list()
 
     async def acknowledge(self, request: AlarmAcknowledge, who: str) -> AlarmList:

@@ -316,7 +316,6 @@ def _difference(before: requests.BlockEnded, after: requests.BlockEnded) -> requ
 
 
 def in_words(held: requests.BlockEnded) -> str:
-    """Return numbers of registrations and connections as text."""
     return f"{_registrations_of(held)} registrations and {held.connections} connections"
 
 

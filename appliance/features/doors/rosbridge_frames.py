@@ -165,7 +165,6 @@ def publish_frame(topic: str, message: DoorMessage, compression: Compression) ->
 
 
 def json_frame(fields: dict[str, Any], reply_to: ClientId = None) -> str:
-    """Return a text frame, with the id if the client gave one."""
     return msgspec.json.encode(fields if reply_to is None else fields | {"id": reply_to}).decode()
 
 

@@ -302,7 +302,6 @@ def _line(connection: sqlite3.Connection, places: ChainReader, sequence: int, fo
 
 
 def _proof(log: Path, record: str) -> bytes:
-    """Return the line of the export's record, with its chain up to the checkpoint that seals the record."""
     with reading(log) as connection:
         (sequence,) = connection.execute(
             "SELECT max(sequence) FROM record WHERE id = ?", (record,)

@@ -268,7 +268,6 @@ def _checked(path: str, answer: httpcore.Response) -> httpcore.Response:
 
 
 def _header(answer: httpcore.Response, name: bytes) -> bytes:
-    """Return a header by its name in lower case; empty without it."""
     return next((value for key, value in answer.headers if key.lower() == name), b"")
 
 

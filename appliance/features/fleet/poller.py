@@ -122,7 +122,6 @@ class Poller:
 
 
 def _fate_of(report: RobotReport) -> RobotReport:
-    """Return a report without the counters that change all the time."""
     return msgspec.structs.replace(report, denials=0, failing=0)
 
 

@@ -269,7 +269,6 @@ def _newest_signed(log: Path) -> tuple[str, int]:
 
 
 def _sequence_of(log: Path, number: int, hashes: list[str]) -> int | None:
-    """Return the sequence of the log's checkpoint `number` if its hash is one of `hashes`, or None."""
     found = signed_checkpoints(log, number - 1, 1) if number else []
     same = found and found[0].number == number and checkpoint_hash(found[0].text()) in hashes
     return found[0].sequence if same else None

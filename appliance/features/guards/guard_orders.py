@@ -52,7 +52,6 @@ def _written(value: bool | int | float | str) -> str:
 
 
 def _same(one: str, other: str) -> bool:
-    """Return whether two values of a parameter are equal, as numbers if they are numbers."""
     try:
         return float(one) == float(other)
     except ValueError:

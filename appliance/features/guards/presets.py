@@ -146,7 +146,6 @@ class Preset:
 
     @property
     def given_topics(self) -> dict[str, str]:
-        """The topics that are given to it, with their defaults."""
         return {one["name"]: one["default"] for one in self._given if one["kind"] == "topic"}
 
     def parameter(self, name: str) -> Parameter:

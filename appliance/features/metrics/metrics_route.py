@@ -58,7 +58,6 @@ def routes(services: Services) -> Routes:
 
 
 def rendered(body: Measures, calls: Mapping[tuple[str, str], int]) -> bytes:
-    """Return control's measures and the numbers of REST calls by method and status, in Prometheus's format."""
     return _page({**_samples(body), "rosrv_rest_calls_total": calls.items()}, METRICS)
 
 

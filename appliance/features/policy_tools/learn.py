@@ -162,7 +162,6 @@ def _text(rights: dict[tuple[Category, str], _Right], robot: Collection[Address 
 
 
 def _hosts(hosts: set[Address], robot: Collection[Address | Network]) -> tuple[str, str]:
-    """Return the group `robot`, if it covers one of the hosts, and the addresses of the other hosts."""
     known = {host for host in hosts if any(_within(host, network) for network in robot)}
     rest = sorted(hosts - known, key=lambda host: (host.version, int(host)))
     return "robot" if known else "", " ".join(map(str, rest))

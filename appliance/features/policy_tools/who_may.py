@@ -99,7 +99,6 @@ def _outside(policy: Policy, networks: list[Network]) -> Address | None:
 
 
 def _ends(networks: Iterable[Network]) -> Iterator[Address]:
-    """Yield the address after each network, if it is not the last address of all."""
     for network in networks:
         last = network.broadcast_address
         if int(last) + 1 < 1 << network.max_prefixlen:

@@ -87,7 +87,6 @@ class RecordingStore:
 
     @property
     def largest(self) -> int:
-        """Return the bytes that one recording may have."""
         return self._disk // _LARGEST
 
     @property
@@ -98,7 +97,6 @@ class RecordingStore:
         return self._folder / f".{recording_id}.part"
 
     def parts(self) -> list[Path]:
-        """Return the folders of unfinished recordings, the oldest first."""
         return self._named(_PART)
 
     def _named(self, kind: re.Pattern[str]) -> list[Path]:
@@ -152,7 +150,6 @@ class RecordingStore:
         return next((found for found in self.recordings if found.id == recording_id), None)
 
     def knows(self, recording_id: str) -> bool:
-        """Return whether a recording with this id is stored, or its removal is not in the audit log yet."""
         return self.find(recording_id) is not None or self._gone(recording_id).exists()
 
     def remove(self, recording: Recording, who: str, reason: str) -> None:
@@ -188,7 +185,6 @@ class RecordingStore:
             self._discard(self._gone(recording_id))
 
     def unnoted(self) -> list[Recording]:
-        """Return the recordings that may not be in the audit log yet."""
         return [found for found in self.recordings if not (self._folder / found.id / _NOTED).exists()]
 
     def outdated(self, now: int) -> Iterator[tuple[Recording, str]]:

@@ -307,7 +307,6 @@ def messages_around(
 
 
 def _last_until(reader: BagReader, time: int, wanted: Collection[int]) -> MessagePosition:
-    """Return the position of the last message at or before a time; without one, that of the time."""
     for place, _number in reader.before(MessagePosition(time + 1, 0, 0), wanted, 1):
         return place
     return MessagePosition(time, 0, 0)

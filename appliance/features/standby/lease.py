@@ -176,7 +176,6 @@ class ApplianceLease:
         return self.answers_alone or now < self._valid_until + _RENEWABLE
 
     def may_answer(self, now: float, *, acknowledged: bool) -> bool:
-        """Return whether a change may be answered now; `acknowledged` by the standby."""
         return self.is_active(now) and (acknowledged or self.answers_alone)
 
     def next_event(self, now: float) -> float:

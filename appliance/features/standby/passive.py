@@ -233,7 +233,6 @@ class PassiveControl:
             await asyncio.sleep(_AGAIN_SECONDS)
 
     async def _prepare_tunnels(self) -> None:
-        """Prepare the tunnels as soon as the active appliance has an enrolled host."""
         while not await asyncio.to_thread(self._replica.has_hosts):
             await asyncio.sleep(_AGAIN_SECONDS)
         pool = self._settings.ipsec.pool

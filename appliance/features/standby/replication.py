@@ -125,12 +125,10 @@ def state_of(
 
 
 def waits_for(settings: Settings) -> Literal["standby", "none"]:
-    """Return whether answers to nodes wait for the standby (`availability.wait`)."""
     return settings.sections.of(Availability).wait
 
 
 def host_endpoint(settings: Settings, membership: Membership) -> str:
-    """Return the address or name at which hosts open their tunnels to this one of two appliances."""
     return settings.ipsec.endpoint or membership.address
 
 

@@ -314,7 +314,6 @@ class ReplicationSender:
         return number
 
     async def _free_to_send(self, most: int) -> None:
-        """Wait until fewer than `most` messages are unanswered."""
         while self._unanswered >= most:
             self._answered.clear()
             await self._answered.wait()

@@ -50,7 +50,6 @@ def is_silent(witness: WitnessSeen) -> bool:
 
 
 def is_blind(other: OtherAppliance) -> bool:
-    """Return whether the other appliance is connected, but the witness does not answer it."""
     return other.connected and other.witness_seconds is not None and other.witness_seconds >= SILENT_SECONDS
 
 

@@ -148,11 +148,9 @@ class TakeoverLog:
         return DecisionPlace(*row)
 
     def clock_was_set(self, after: int, through: int) -> bool:
-        """Return whether a change of the machine's clock is recorded after a place and up to another."""
         return any(self._first(event, after, through) for event in CLOCK_EVENTS)
 
     def stayed(self, after: int, through: int) -> int | None:
-        """Return the place of the first failed switchover after a place and up to another."""
         return self._first(STAYED, after, through)
 
     def _first(self, event: str, after: int, through: int) -> int | None:

@@ -42,7 +42,6 @@ class EnrolmentTokens:
         return dict(self._rows)
 
     def addresses(self) -> dict[str, str]:
-        """Return the addresses promised to awaited hosts, with the hosts' names."""
         return {row.address: name for name, row in self.rows().items()}
 
     def add(

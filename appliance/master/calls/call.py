@@ -354,5 +354,4 @@ def with_record(text: str, record: str) -> str:
 
 
 def claimed_name(params: Sequence[Value]) -> str:
-    """Return the claimed `caller_id` of a rejected call, for the audit record."""
     return params[0][:_CLAIM_SHOWN] if params and isinstance(params[0], str) else ""

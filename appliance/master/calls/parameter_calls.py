@@ -198,7 +198,6 @@ class ParameterCalls:
         return outcomes
 
     def _written(self, write: ParameterWrite, reserved: Reservation | None, outcome: Answer) -> None:
-        """Update mirror and subscribers according to the ROS master's answer to a write."""
         if reserved is not None and _is_set(outcome, write):
             self.mirror.set(write.key, write.value, reserved)
             self.enactor.carry_out(self.graph.parameter_set(write.key, write.value, write.caller.caller_id))

@@ -60,7 +60,6 @@ def _only_named(method: str, caller_id: str | None, about: dict[str, str] | None
 
 
 def _parts(params: tuple[Value, ...]) -> str:
-    """Return the names of the first methods in a multicall, and the number of further methods."""
     parts = params[0] if params and isinstance(params[0], list) else []
     names = [str(part.get("methodName"))[:_LONGEST] for part in parts if isinstance(part, dict)]
     more = f" and {len(names) - _MOST_PARTS} more" if len(names) > _MOST_PARTS else ""

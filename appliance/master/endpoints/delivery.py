@@ -121,7 +121,6 @@ class Delivery:
 
     @property
     def weight(self) -> int:
-        """Return the approximate size of all waiting calls in bytes."""
         return self._held.total
 
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
@@ -218,6 +217,5 @@ class Delivery:
 
 
 def _publishers(call: NodeCall) -> frozenset[object]:
-    """Return the publishers of a list; any other call has none."""
     publishers = call.parameters[1] if call.method == _LISTS else ()
     return frozenset(publishers if isinstance(publishers, list) else ())

@@ -76,7 +76,6 @@ class MasterSideApi:
         self._registry = registry
 
     async def handle(self, request: HttpRequest) -> bytes:
-        """Acknowledge a call; this method is the handler of the server."""
         return self.acknowledge(request)
 
     def acknowledge(self, request: HttpRequest) -> bytes:

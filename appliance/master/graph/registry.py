@@ -108,7 +108,6 @@ class Incarnation:
 
     @property
     def of_monitors(self) -> bool:
-        """Whether this is the appliance's own publisher of the monitors' messages."""
         return self.own and self.api.path == PUBLISHER_PATH
 
     @property
@@ -131,7 +130,6 @@ class Incarnation:
         return NodeUri("http", host, self.api.port, self.api.path)
 
     def outer_uri(self, told: str) -> str:
-        """Return the URI for other nodes that reach the appliance at `told`."""
         return node_uri(told, self.outer_port)
 
     def uri_for(self, told: str, *, hidden: bool) -> str:

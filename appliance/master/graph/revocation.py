@@ -118,7 +118,6 @@ class Revocation:
         return [*self.grants.take(row), record]
 
     def may_have(self, incarnation: Incarnation, kind: Kind, resource: str) -> bool:
-        """Return whether the policy in force grants a node a registration."""
         return self._decide(incarnation, kind, resource).allowed
 
     def _decide(self, incarnation: Incarnation, kind: Kind, resource: str) -> Decision:
@@ -145,5 +144,4 @@ class Revocation:
 
 
 def revoked(effects: Iterable[Effect]) -> int:
-    """Return the number of registrations and grants that these effects revoke."""
     return sum(isinstance(effect, WriteRecord) and effect.event == "revoked" for effect in effects)

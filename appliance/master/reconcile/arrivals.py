@@ -40,7 +40,6 @@ class Arrivals:
     addresses: AdvertisedAddresses
 
     def known(self, caller: Caller, api: ApiUri) -> Incarnation | None:
-        """Return the calling incarnation, or None if it is unknown."""
         return self.registry.find(caller.caller_id, caller.peer.host, api.text)
 
     async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:

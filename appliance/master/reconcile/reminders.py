@@ -108,7 +108,6 @@ class RelayMoves:
         return self._relay.live_resources()
 
     def withdraw(self, moves: Sequence[Move]) -> None:
-        """Withdraw moving topics and services from the relays, before the new allocation is adopted."""
         self._relay.withdraw_moving(moves)
 
     def place(self, moves: Sequence[Move]) -> None:

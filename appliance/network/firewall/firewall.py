@@ -28,7 +28,6 @@ class FirewallReport:
 
     @property
     def intact(self) -> bool:
-        """Whether every rule is in the kernel."""
         return self.backend is not None and all(rule.in_force for rule in self.rules)
 
 

@@ -68,7 +68,6 @@ class ServiceExchange:
 
     @property
     def ready(self) -> bool:
-        """Whether a waiting request may go to the service."""
         return bool(self._waiting) and not self._busy and self._asking is None and not self.done
 
     @property

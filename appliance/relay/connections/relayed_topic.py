@@ -410,7 +410,6 @@ class RelayedTopic:
 
     @property
     def undelivered(self) -> int:
-        """Return the bytes of a batch that some subscribers get at the publisher's next turn (`hand_out`)."""
         return self._served.undelivered
 
     def hand_out(self, *, divided: bool = True) -> None:
@@ -512,7 +511,6 @@ class RelayedTopic:
             self._startup_replay = None
 
     def _forget_header(self) -> None:
-        """Drop the header if there is no connection and no subscriber that has read it."""
         if self._state is TopicState.LOST and not self._served:
             self._state, self._header = TopicState.UNKNOWN, None
 

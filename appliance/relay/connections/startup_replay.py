@@ -37,7 +37,6 @@ class StartupReplay:
         self._given: set[str] = set()
 
     def over(self, now: float) -> bool:
-        """Return whether the time for keeping messages has passed."""
         return now > self._until
 
     def add(self, batch: Batch, now: float) -> bool:

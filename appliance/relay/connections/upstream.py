@@ -308,7 +308,6 @@ class PublisherConnection(Upstream):
 
 
 def _refusal(header: dict[str, str]) -> tuple[str, Violation] | None:
-    """Return why a publisher's header is rejected, and the kind of violation."""
     if "error" in header:
         return f"the publisher says: {header['error']}", "connection refused"
     missing = [field for field in ("type", "md5sum") if field not in header]

@@ -71,7 +71,6 @@ class _Repeated:
         self.last_time, self.last_text = max(last_time, self.last_time), text
 
     def detail(self) -> dict[str, Any]:
-        """Return what the events have in common, their first and last time, and their first and last text if known."""
         found = dict(self.shared)
         if self.first_time:
             found |= {"first_time": self.first_time, "last_time": self.last_time}

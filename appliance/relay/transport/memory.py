@@ -53,12 +53,10 @@ class HostMemory:
 
     @property
     def exhausted(self) -> bool:
-        """Whether no more data of this host should be kept."""
         return bool(self.refusal())
 
     @property
     def plenty(self) -> bool:
-        """Whether less than half of the pool is in use."""
         return self._pool.total * 2 < self._pool.bounds.whole
 
 

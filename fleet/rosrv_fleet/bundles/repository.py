@@ -257,7 +257,6 @@ class BundleRepository:
         return signed
 
     def _newest(self, role: str) -> int:
-        """Return the newest version of a role on the disk; 0 for none."""
         names = (_VERSIONED.fullmatch(path.name) for path in self.metadata.glob("*.json"))
         return max((int(name[1]) for name in names if name is not None and name[2] == role), default=0)
 

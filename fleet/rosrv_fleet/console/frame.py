@@ -58,7 +58,6 @@ _CURRENT = ' aria-current="page"'
 
 
 def text(value: object) -> str:
-    """Return a text of a robot or an operator, escaped, with visible control characters."""
     return escape(printable(str(value)))
 
 

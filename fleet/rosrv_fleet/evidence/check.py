@@ -110,7 +110,6 @@ def check_evidence(config: FleetConfig, bundle: Path, robot: Robot) -> EvidenceC
 
 
 def _bounded(sentences: list[str]) -> list[str]:
-    """Return the first sentences, without control characters, and the number of the others."""
     first = [printable(sentence[:_LONGEST_SENTENCE]) for sentence in sentences[:_MOST_SENTENCES]]
     others = len(sentences) - len(first)
     return [*first, *([f"{others} more"] if others else [])]

@@ -78,7 +78,6 @@ def revert(place: Place, collector: Url, ca: Authority = None, token_file: Token
 def _asked(  # noqa: PLR0917  a request and its connection
     method: str, path: str, url: str, ca: Path | None, token_file: Path, body: dict[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Return the collector's answer; print an error and exit with status 1 if there is none."""
     with answer_to(
         method, f"rollouts{path}", url, ca, token_file, not_found=_NO_BUNDLES, json=body
     ) as answer:

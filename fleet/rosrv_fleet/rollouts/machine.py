@@ -162,7 +162,6 @@ def _healthy(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float
 
 
 def stopped(rollout: BundleRollout, why: str) -> BundleRollout:
-    """Return a running rollout as stopped, for a reason other than its robots."""
     return _stopped(rollout, why) if rollout.state == "running" else rollout
 
 
