@@ -155,6 +155,7 @@ def _add_reading(router: Routes, services: Services) -> None:
 
 
 async def bag_response(services: Services, recording_id: str, bearer: Bearer, *, mcap: bool) -> Response:
+    """Answer with the file, after the audit log has recorded which bearer fetches it."""
     found = answered(await services.control.ask(recording_requests.RecordingFetch(recording_id), bearer))
     try:  # open it before the answer begins: a recording that is then removed is still sent completely
         pieces = await asyncio.to_thread(as_mcap if mcap else _pieces_of, _bag_of(services, found.id))
