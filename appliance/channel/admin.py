@@ -454,7 +454,6 @@ class AdminAnswer(msgspec.Struct, Generic[A], frozen=True):
     active: str = ""
 
     def given(self) -> A:
-        """Return the body of a successful answer (`ok`)."""
         assert self.body is not None  # noqa: S101  it has one
         return self.body
 

@@ -42,7 +42,6 @@ class Child:
         self.ended = asyncio.Event()
 
     def attach(self, ready: Ready) -> None:
-        """Begin to listen, and report that this process is in service."""
         self._lifeline.attach(asyncio.get_running_loop(), self._supervisor_said, self.ended.set)
         self._answer(ready)
 

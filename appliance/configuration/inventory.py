@@ -43,7 +43,6 @@ def inventory() -> Inventory:
 
 
 def debian_packages(status: str) -> Iterator[Message]:
-    """Yield the fields of each installed package in dpkg's list."""
     for stanza in status.strip().split("\n\n"):
         fields = HeaderParser().parsestr(stanza)
         if fields["Status"] == "install ok installed":

@@ -212,7 +212,6 @@ class Runs:
         self.beside = {edge: False for first, last in pairs for edge in (first - 1, last + 1)}
 
     def meet(self, first: int, last: int) -> bool:
-        """Return whether one of these records is in a run."""
         after = bisect_left(self.last, first)
         return after < len(self.last) and self.first[after] <= last
 

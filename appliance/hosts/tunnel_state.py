@@ -165,7 +165,6 @@ class Tunnels:
             self._spawn(needed)
 
     def state_anew(self) -> None:
-        """Send charon its whole configuration soon."""
         self._changes += 1
         self._dirty.set()
 

@@ -235,7 +235,6 @@ class Isolation:
             )
 
     def forward_also(self, ports: tuple[PortRange, ...]) -> None:
-        """Forward these TCP ports besides those of the settings."""
         if self._tcp != ports:
             self._tcp = ports
             self._install(self._wanted())

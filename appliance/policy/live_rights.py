@@ -60,7 +60,6 @@ def live_by(call: str, host: Address, caller_id: str, resource: str, tree: Tree)
 
 
 def may_keep(policy: Policy, live: LiveRight) -> Decision:
-    """Decide whether the host may keep a live right under a policy."""
     request = request_of(live.call, live.host, live.caller_id, live.resource)
     return decide(policy, rights_to_keep(request, live.call, live.resource, namespace=live.namespace))
 

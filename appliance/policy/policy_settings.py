@@ -37,7 +37,6 @@ class MonitorSection:
 
 
 def read_ports(section: SectionText | None, findings: Findings) -> range:
-    """Return the range of ports for proxy endpoints and relay."""
     ports = DEFAULT_PORTS
     for entry in _entries(section, ("range",), findings):
         ports = _range(entry, findings) or DEFAULT_PORTS

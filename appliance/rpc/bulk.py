@@ -72,7 +72,6 @@ class Bulk:
             self._processor.charge_beside(self._host, used)
 
     def give_back(self) -> None:
-        """Release the reservation, if the request has it."""
         if self.taken:
             self.taken = False
             self._turns.leave(self._host)

@@ -136,13 +136,11 @@ class Front(asyncio.BaseProtocol, ABC):
         self._begins = self.is_quiet
 
     def on_url(self, url: bytes) -> None:
-        """Count the bytes of a piece of the path."""
         self._head_bytes += len(url)
         if self._head_bytes > self.limits.head_bytes and not self.closing:
             self._reject_head()
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Count the bytes of a header field."""
         self._head_bytes += len(name) + len(value) + _FIELD_FRAMING
         if self._head_bytes > self.limits.head_bytes and not self.closing:
             self._reject_head()

@@ -157,7 +157,6 @@ class ProcessorTime:
         return True
 
     def end(self, host: Address) -> None:
-        """End the piece of work, and charge this host for it."""
         assert self._since is not None  # noqa: S101  by `begin`
         seconds, self._since = self._clock() - self._since, None
         self.charge(host, seconds)

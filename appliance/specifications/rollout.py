@@ -168,7 +168,6 @@ class Rollout:
             return [await answer for answer in [*self._left.values()]]
 
     def pass_again(self) -> None:
-        """Make all relays pass messages again after `leave`."""
         self._leaving = False
         for relay in range(self.allocation.relays):
             self.relays.send(self.statement(relay), relay)
@@ -204,7 +203,6 @@ class Rollout:
         await self.relays.carried_out()
 
     def resumed(self, monitor: str) -> None:
-        """Note that a monitor no longer holds its topics."""
         for names in self._held.values():
             names.pop(monitor, None)
 

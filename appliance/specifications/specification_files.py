@@ -249,7 +249,6 @@ def _is(kind: Callable[[int], bool], path: Path) -> bool:
 
 
 def signatures_of(paths: Mapping[str, Path]) -> dict[str, str]:
-    """Return the signatures beside these files, by name."""
     found = {name: read_signature(path) for name, path in paths.items()}
     return {name: text for name, text in found.items() if text}
 

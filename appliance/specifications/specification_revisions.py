@@ -124,7 +124,6 @@ def _without_unusable(
 
 
 def unknown_monitors(names: Sequence[str], checked: CheckedSpecifications) -> str:
-    """Return the text of an error about names that no monitor has."""
     known = ", ".join(checked.monitors) or "none is loaded"
     return f"no monitor is named {', '.join(names)}; there are: {known}"
 

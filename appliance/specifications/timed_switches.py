@@ -105,7 +105,6 @@ class TimedSwitches:
         self._save()
 
     def end(self, names: Iterable[str]) -> None:
-        """Forget monitors that were switched or removed."""
         ended = self._kept.keys() & set(names)
         if ended:
             self._kept = {name: one for name, one in self._kept.items() if name not in ended}

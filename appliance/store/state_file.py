@@ -302,7 +302,6 @@ class StateStore:
         self.database.delete("monitor_state", ("relay", ">", -1))
 
     def monitor_states(self, epoch: int) -> list[bytes]:
-        """Return the states that relays left at the end of this epoch."""
         query = "SELECT content FROM monitor_state WHERE epoch = ? ORDER BY relay"
         return [content for (content,) in self.database.query(query, (epoch,))]
 

@@ -44,7 +44,6 @@ class InheritedListeners:
         self._sockets[name] = descriptor
 
     def drop(self, name: str) -> None:
-        """Close a socket, if it is known."""
         descriptor = self._sockets.pop(name, None)
         if descriptor is not None:
             os.close(descriptor)

@@ -229,7 +229,6 @@ class ProcessHandle:
 
 
 def link_processes(one: ProcessHandle, other: ProcessHandle) -> None:
-    """Send the two ends of a new link to two processes."""
     here, there = socket.socketpair()
     with here, there:
         one.send(LinkOpened(role=other.role, index=other.index), (here.fileno(),))

@@ -37,7 +37,6 @@ class OperatorToken(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     added: int
 
     def may(self, role: FleetRole) -> bool:
-        """Return whether the holder may do what `role` may do."""
         order = list(FleetRole)
         return order.index(self.role) >= order.index(role)
 

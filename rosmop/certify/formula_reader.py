@@ -65,7 +65,6 @@ class WordReader:
         return not (sign[-1].isalnum() and self._text[end : end + 1].replace("_", "a").isalnum())
 
     def accept(self, word: str) -> bool:
-        """Take this word if it is next."""
         if self.word != word:
             return False
         self.take()

@@ -79,7 +79,6 @@ Method = Callable[[MemberCall], Value]
 
 
 def length(call: MemberCall) -> Value:
-    """Compile `size()` or `length()`."""
     call.count(0)
     return call.value(value_types.ULONG, "l_len")
 

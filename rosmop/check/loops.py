@@ -234,7 +234,6 @@ def _leave_unless(scope: FunctionScope, node: tree.Expression) -> None:
 def body(
     scope: FunctionScope, statements: Sequence[tree.Statement], write: Write
 ) -> tuple[nodes.Statement, ...]:
-    """Return statements, written in a block with names of its own."""
     with scope.nested() as found:
         _block(scope, statements, write)
     return tuple(found)

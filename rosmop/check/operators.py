@@ -31,7 +31,6 @@ class Operands:
         return Value(result, self.position)
 
     def refused(self, operator: str, hint: str = "") -> SpecificationError:
-        """Return the error that rejects this operation."""
         left, right = self.left.type, self.right.type
         return SpecificationError.at(
             self.position, f"`{operator}` has no meaning for {left} and {right}{hint}"

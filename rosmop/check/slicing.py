@@ -109,7 +109,6 @@ def _enforces(shared: CompilationContext, functions: Sequence[str]) -> bool:
 
 
 def binds(names: SpecificationNames, event: tree.EventDefinition) -> tuple[int, ...]:
-    """Return the numbers of the specification's parameters that an event binds."""
     own = {parameter.name for parameter in event.parameters}
     return tuple(number for number, name in enumerate(names.parameters) if name in own)
 

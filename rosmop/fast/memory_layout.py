@@ -138,7 +138,6 @@ class MemoryLayout:
         return at
 
     def reference(self) -> int:
-        """Return the address of memory for the value of a reference."""
         at = self.take(8)
         self.references.append(range(at, at + 8))
         return at
@@ -149,7 +148,6 @@ class MemoryLayout:
         return self.constants[raw]
 
     def budget(self, context: str) -> int:
-        """Return the address of the budget of a specification."""
         if context not in self.budgets:
             self.budgets[context] = self.take(8)
         return self.budgets[context]

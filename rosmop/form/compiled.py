@@ -111,7 +111,6 @@ class Given:
         return fits and self.bounds[0] <= value <= self.bounds[1]  # type: ignore[operator]  # a number
 
     def held(self, value: Any) -> bool | int | float:
-        """Return a value that it `holds`, as a variable of its type."""
         if not isinstance(self.type, value_types.FloatingType):
             return value  # type: ignore[no-any-return]  # a number
         return float(value) if self.type.bits == 64 else struct.unpack("<f", struct.pack("<f", value))[0]

@@ -56,7 +56,6 @@ class Symbols:
         return name.partition(" ")[2]
 
     def site(self, site: Site) -> int:
-        """Add a site and return its number."""
         self.sites.append(site)
         return len(self.sites) - 1
 

@@ -33,7 +33,6 @@ class LearningStep(msgspec.Struct, frozen=True, tag=True):
     topics: dict[str, str]
 
     def messages(self, source: RecordingSource) -> Iterator[tuple[Received, int]]:
-        """Yield the part's messages on these topics, each with its window."""
         length = self.ended - self.began + 1
         for message in source.messages():
             if message[0] in self.topics and self.began <= message[1] <= self.ended:

@@ -161,7 +161,6 @@ class FiniteProperty(CompiledProperty):
         return FiniteRun(self.automaton)
 
     def categories_after(self, event: int) -> frozenset[str]:
-        """Return the categories of the states that this event leads to."""
         verdicts = self.automaton.verdicts
         return frozenset(name for row in self.automaton.table for name in verdicts[row[event]])
 

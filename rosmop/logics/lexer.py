@@ -140,12 +140,10 @@ class TokenReader:
             self.findings.append(self.source.finding(token.offset, text))
 
     def finish(self) -> None:
-        """Reject the formula if an error was noted."""
         if self.findings:
             raise FormulaError(sorted(self.findings, key=lambda finding: finding.position))
 
     def check_event(self, token: FormulaToken) -> None:
-        """Note an error if the name is not one of the events."""
         if token.text not in self.source.events:
             hint = suggestion(token.text, self.source.events)
             self.note(token, f"`{token.text}` is not an event of this specification{hint}")

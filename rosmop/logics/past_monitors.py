@@ -152,7 +152,6 @@ class FoldedProgram:
         return slice(2, 2 + len(self.bounds))
 
     def start(self) -> list[Any]:
-        """Return the values before the first event."""
         kept = [False if bounds is None else SinceWindow(*bounds) for bounds in self.bounds]
         return [False, True, *kept, *[False] * (self.size - 2 - len(kept))]
 

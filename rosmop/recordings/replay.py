@@ -64,7 +64,6 @@ class OutputBag:
         self._writer.close()
 
     def relay(self, connection: Connection, time_ns: int, data: bytes) -> None:
-        """Write a message of a recorded publisher."""
         sent = connection.topic, connection.msgtype, connection.msgdef.data, connection.digest
         self._write((*sent, *_sender(connection)), time_ns, data, published=False)
 

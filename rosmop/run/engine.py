@@ -336,7 +336,6 @@ class MonitorSet:
         )
 
     def withholds(self, monitor: MonitorInstance) -> bool:
-        """Return whether a monitor withholds a topic from hosts now."""
         return monitor.enabled and any(
             self._is_true(monitor, one.condition) for one in monitor.code.withholdings
         )

@@ -34,7 +34,6 @@ class Quota(Generic[Thing]):
         return len(self._of.get(holder, ()))
 
     def fits(self, holder: Holder, more: int) -> bool:
-        """Return whether the holder may have this many more things."""
         left = self.whole - self.total - more
         return left >= 0 and (holder is None or self.held(holder) + more <= max(left, 1))
 

@@ -185,7 +185,6 @@ class Context:
         return go_on
 
     def spend(self, instructions: int, site: int) -> None:
-        """Charge instructions to the budget; fault if it is used up."""
         self.budget -= instructions
         if self.budget < 0:
             self._go_on(site, "; is there an endless loop?")

@@ -36,7 +36,6 @@ def extend(context: Context, text: bytes, added: bytes, site: int) -> bytes:
 
 
 def repeat(context: Context, count: int, character: int, site: int) -> bytes:
-    """Return `std::string(count, character)`."""
     context.allocate(count, site)
     return bytes((character & 0xFF,)) * count
 
@@ -82,7 +81,6 @@ def find(context: Context, text: bytes, wanted: bytes, start: int, site: int) ->
 
 
 def find_last(context: Context, text: bytes, wanted: bytes, start: int, site: int) -> int:
-    """Return `text.rfind(wanted, start)`."""
     context.spend(len(text) // 16, site)
     found = text.rfind(wanted, 0, min(start, len(text)) + len(wanted))
     return NOT_FOUND if found < 0 else found

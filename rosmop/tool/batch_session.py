@@ -87,7 +87,6 @@ class BatchSession:
         return rows
 
     def keep(self, rows: Iterable[dict[str, Any]]) -> None:
-        """Keep rows for `write_report`, in a temporary file."""
         if self.options.report is not None:
             lines = "".join(json.dumps(msgspec.to_builtins(row)) + "\n" for row in rows)
             self.kept.append(lines.encode("ascii"))

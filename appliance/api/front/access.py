@@ -92,7 +92,6 @@ class TokenAuthenticator:
         self._of_token = {}
 
     def still_good(self, bearer: Bearer) -> bool:
-        """Return whether a previously valid token may still be used."""
         kept = self._tokens.get(bearer.id)
         # A rotation may have brought its end forward.
         return kept is not None and not self._ends.passed(kept.id, kept.expires)

@@ -95,7 +95,6 @@ def answered(answer: AdminAnswer[A]) -> A:
 
 
 def problem_of(trouble: Trouble, detail: str) -> ProblemError:
-    """Return the problem for a rejection by control."""
     status, kind = _PROBLEMS.get(trouble, (503, "not-available"))
     return ProblemError(status, kind, detail)
 

@@ -49,12 +49,10 @@ class Contract:
         self.kinds: set[Any] = set()
 
     def reference(self, kind: Any) -> dict[str, Any]:
-        """Return the reference to a struct's schema, and add the schema to the contract."""
         self.kinds.add(kind)
         return {"$ref": f"#/components/schemas/{kind.__name__}"}
 
     def components(self) -> dict[str, Any]:
-        """Return the schemas of all added structs and of the structs within them."""
         kinds = sorted(self.kinds, key=lambda kind: str(kind.__name__))
         return msgspec.json.schema_components(kinds, ref_template="#/components/schemas/{name}")[1]
 

@@ -73,7 +73,6 @@ class Budget:
             self._charged_bytes += size
 
     def folded(self, record: AuditRecord) -> None:
-        """Undo the charge for a record that was only counted."""
         if record.host is not None and not record.unknown:
             self._changes.append((record.host, -weight(record)))
 

@@ -213,7 +213,6 @@ class ChainWriter:
         return bool(end < self.sequence)
 
     def size(self) -> int:
-        """Return the bytes of the database that are in use."""
         (pages,) = self._connection.execute("PRAGMA page_count").fetchone()
         (free,) = self._connection.execute("PRAGMA freelist_count").fetchone()
         (page_size,) = self._connection.execute("PRAGMA page_size").fetchone()

@@ -73,7 +73,6 @@ class FoldState(msgspec.Struct, kw_only=True):
             counts[key] = counts.get(key, 0) + number
 
     def reset(self) -> None:
-        """Start again at zero, after a summary."""
         self.count = 0
         self.tallies = {}
 

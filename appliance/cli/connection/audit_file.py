@@ -60,7 +60,6 @@ class FileLog:
         return export(self.path, wanted)
 
     def evidence(self, wanted: Filter) -> Iterator[tuple[int, str]]:
-        """Yield the sequence and the NDJSON line of all matching records, oldest first."""
         found, robot = evidence(self.path, wanted), self._robot()
         return ((entry.sequence, evidence_line(entry, chain, robot)) for entry, chain in found)
 

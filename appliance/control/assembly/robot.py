@@ -25,7 +25,6 @@ def robot_addresses(settings: Settings, robot: str | None = None) -> list[Addres
 
 
 def own_address(settings: Settings) -> str:
-    """Return the address at which the robot reaches the appliance if it listens on all addresses."""
     robots = robot_addresses(settings)
     return "127.0.0.1" if settings.isolation == "none" or not robots else _towards(robots[0])
 

@@ -66,7 +66,6 @@ class DriveOrders:
         return requests.GroupStates([self._state(groups[name]) for name in sorted(groups)])
 
     async def take(self, request: requests.DriveTake, who: str) -> requests.GroupState:
-        """Give a group to a host that may take it now."""
         group, host = self._group(request.group), self._host(request.host)
         async with self._turn(group):
             await self._taken(group, host, who)

@@ -101,7 +101,6 @@ class Recorder:
         return answers
 
     def close(self) -> None:
-        """Leave unfinished recordings to the next recorder."""
         for making in self._making:
             making.leave()
 

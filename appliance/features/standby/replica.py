@@ -101,7 +101,6 @@ class Replica:
             raise StoreError(f"{self._path}: {error}; free space there") from error
 
     def abandon_snapshot(self) -> None:
-        """Return to the state before an incomplete snapshot."""
         with self._lock:
             self._roll_back()
 

@@ -323,7 +323,6 @@ class ReplicationSender:
         await link.send(message)
 
     def note_sent(self, number: int) -> None:
-        """Note that all changes up to this number are sent on the present link."""
         self._sent = number
         self._most_sent = max(self._most_sent, number)
 

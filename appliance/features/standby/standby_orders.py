@@ -145,7 +145,6 @@ class StandbyAdministration:
 
 
 def on_standby(state: StandbyState) -> admin.AdminAnswer[Any]:
-    """Return the answer of a standby to a request that only the active appliance can carry out."""
     other = state.other
     text = f"this appliance is the standby of {other.name} ({other.address}); give the command there"
     return admin.AdminAnswer(False, error=text, trouble="standby", active=other.address)

@@ -54,7 +54,6 @@ def is_blind(other: OtherAppliance) -> bool:
 
 
 def lag_of(other: OtherAppliance) -> str:
-    """Return how far the standby is behind, in words."""
     changes = "1 change" if other.behind_changes == 1 else f"{other.behind_changes} changes"
     return f"{changes} ({other.behind_bytes} bytes) behind" if other.behind_changes else "catching up"
 

@@ -28,7 +28,6 @@ class StandbyTunnels:
         self._link.attach(channel)
 
     def answered(self, message: messages.TunnelsEnclosed) -> None:
-        """Take the supervisor's answer to `TunnelsWanted`."""
         if message.esp is None:
             _log.warning("this appliance cannot take over the tunnels of hosts", reason=message.reason)
 

@@ -69,7 +69,6 @@ class Certification:
         self._served = asyncio.Event()
 
     def served_by(self, pin: str) -> None:
-        """Store the pin by which hosts recognise the api."""
         self.pin = pin
         self._appliances.is_served(pin)
         self._served.set()

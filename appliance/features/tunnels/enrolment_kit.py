@@ -34,7 +34,6 @@ class Kit:
 
     @property
     def remotes(self) -> dict[str, str]:
-        """Return the appliances' addresses by the name of their connection."""
         other = {SECOND: self.host.second} if self.host.second not in ("", self.endpoint) else {}
         return {CONNECTION: self.endpoint} | other
 

@@ -137,7 +137,6 @@ class Delivery:
             self._workers[incarnation.key] = worker
 
     def drop(self, incarnation: Incarnation) -> None:
-        """Drop the waiting calls of a node."""
         self._lists.pop(incarnation.key, None)
         queue = self._queues.pop(incarnation.key, None)
         if queue is not None:

@@ -335,7 +335,6 @@ class RosGraph:
         return effects
 
     def tell_parameters(self, subscriber: Incarnation) -> Effects:
-        """Send a node the present values of the parameters that it subscribed to."""
         keys = subscriber.resources(Kind.PARAMETER)
         return [effect for key in keys for effect in self._tell_parameter(subscriber, key)]
 

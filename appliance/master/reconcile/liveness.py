@@ -189,7 +189,6 @@ class Liveness:
             self.look_at_watched()
 
     def look_at_watched(self) -> None:
-        """Check the nodes on the watchlist now."""
         for incarnation in self.watchlist.take():
             self.look_at(incarnation)
 

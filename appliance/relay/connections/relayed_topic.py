@@ -236,7 +236,6 @@ class RelayedTopic:
         return not any(member.exhausted for member in self._served)
 
     def limit(self, own: RateAllowance | None, together: RateAllowance | None) -> None:
-        """Set the limit of the publication's host, and the limit of its topic."""
         self.flow.set(own, together)
         self.differs()
 

@@ -47,7 +47,6 @@ class ServiceTraffic:
         self.changed = True
 
     def connected(self, change: int) -> None:
-        """Add `change` to the number of clients."""
         self.clients += change
         self.changed = True
 

@@ -57,7 +57,6 @@ class BatchProgress:
         self._gone += gone
 
     def cut(self, position: int, following: int) -> None:
-        """Remove the message between these positions."""
         self._gone += 1
         if position > self.run:
             self.pieces.append(self.view[self.run : position])

@@ -352,7 +352,6 @@ class Interceptor:
         return self._time_budgets[point]
 
     def invalidate_prepared(self) -> None:
-        """Invalidate all options that pipelines and services have prepared."""
         self.preparation.change()
         self._prepared.clear()
 

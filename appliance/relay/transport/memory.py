@@ -106,7 +106,6 @@ class HeldBytes:
         self._size = 0
 
     def set(self, size: int) -> None:
-        """Set how many bytes the connection holds now."""
         self.share.add(size - self._size)
         self._size = size
 

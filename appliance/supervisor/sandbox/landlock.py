@@ -39,7 +39,6 @@ def version() -> int:
 
 
 def lacking(abi: int) -> list[str]:
-    """Return the limits that this ABI version lacks, in words."""
     if abi < FILES:
         return ["the kernel has no Landlock: only file permissions protect files"]
     missing = [(PORTS, "TCP ports"), (SIGNALS, "signals to other processes of its user")]

@@ -240,7 +240,6 @@ class BundleRepository:
         return {"root": days.root, "targets": days.targets, "snapshot": days.snapshot}.get(role, days.group)
 
     def keyids_of(self, role: str) -> list[str]:
-        """Return the ids of the keys that may sign for a role."""
         if role in _TOP:
             return list(self._open("root", Root).roles[role].keyids)
         return list(self._delegated(self._open("targets", Targets))[role].keyids)
