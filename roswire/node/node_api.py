@@ -7,6 +7,9 @@ from roswire.node.services import ServiceServer
 from roswire.node.topics import NodePublication, NodeSubscription
 from roswire.xmlrpc import MethodCall, Value
 
+ParameterChanged = Callable[[str, Value], None]
+"""Takes the key that changed, and its new value; `{}` if it was deleted."""
+
 _DONE: list[Value] = [1, "", 0]
 
 
@@ -24,6 +27,10 @@ class NodeTables(Protocol):
     @property
     def services(self) -> Mapping[str, ServiceServer]:
         """Return the offered services by name."""
+
+    @property
+    def parameters(self) -> Mapping[str, ParameterChanged]:
+        """Return the subscriptions to parameters by key."""
 
     @property
     def tcpros(self) -> tuple[str, int]:
@@ -55,8 +62,8 @@ class NodeApi:
                 answer = self._update(topic, uris)
             case "requestTopic", (str(), str(topic), list(protocols)):
                 answer = self._request_topic(topic, protocols)
-            case "paramUpdate", (str(), str(), _):
-                answer = _DONE
+            case "paramUpdate", (str(), str(key), value):
+                answer = self._parameter_update(key.rstrip("/") or "/", value)
             case "shutdown", (str(), *reason):
                 self._shut_down(str(reason[0])[:1000] if reason else "")
                 answer = _DONE
@@ -75,6 +82,18 @@ class NodeApi:
         if subscriber is None:
             return [0, f"this node does not subscribe to {topic[:200]}", 0]
         self._node.follow(subscriber, uris)
+        return _DONE
+
+    def _parameter_update(self, key: str, value: Value) -> Value:
+        told = [
+            changed
+            for subscribed, changed in self._node.parameters.items()
+            if key == subscribed or key.startswith(f"{subscribed.rstrip('/')}/")
+        ]
+        if not told:
+            return [0, f"this node does not subscribe to the parameter {key[:200]}", 0]
+        for changed in told:
+            changed(key, value)
         return _DONE
 
     def _request_topic(self, topic: str, protocols: list[Value]) -> Value:

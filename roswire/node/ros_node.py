@@ -2,8 +2,8 @@
 
 Invariants:
 
-1. A topic or service is in the tables of the node from before its registration until after the end of it, so that a
-   call of the master about it always finds it.
+1. A topic, service or subscribed parameter is in the tables of the node from before its registration until after the
+   end of it, so that a call of the master about it always finds it.
 2. Registrations of one name happen one after another.
 3. After `close`, the node has no task and no connection.
 """
@@ -16,6 +16,7 @@ from typing import Literal
 from weakref import WeakValueDictionary
 
 from roswire.errors import InvalidUriError, ProtocolError, RosError
+from roswire.names import resolve_parameter
 from roswire.node.network import (
     ByteWriter,
     ListeningServer,
@@ -23,7 +24,7 @@ from roswire.node.network import (
     NodeNetwork,
     OwnedTasks,
 )
-from roswire.node.node_api import NodeApi
+from roswire.node.node_api import NodeApi, ParameterChanged
 from roswire.node.services import ServiceServer, ServiceType, call_service, probe_service
 from roswire.node.tcpros_streams import ANY_TYPE, MessageType, NodeLimits, read_header, refuse
 from roswire.node.topics import NodeLink, NodePublication, NodeSubscription, Received
@@ -32,7 +33,7 @@ from roswire.uris import NodeUri, node_uri, parse_node_uri, parse_service_uri, s
 from roswire.xmlrpc import FaultReceived, Value
 
 _CLOSE_SECONDS = 2.0  # for all unregistrations together
-_Kind = Literal["publisher", "subscriber", "service"]
+_Kind = Literal["publisher", "subscriber", "service", "parameter"]
 
 
 class RosNode:
@@ -54,6 +55,7 @@ class RosNode:
         self.publishers: dict[str, NodePublication] = {}
         self.subscribers: dict[str, NodeSubscription] = {}
         self.services: dict[str, ServiceServer] = {}
+        self.parameters: dict[str, ParameterChanged] = {}
         self._master: NodeUri = parse_node_uri(master)
         self._network = network
         self._limits = limits
@@ -98,6 +100,8 @@ class RosNode:
             await self.unsubscribe(topic)
         for topic in [*self.publishers]:
             await self.unadvertise(topic)
+        for key in [*self.parameters]:
+            await self.unsubscribe_parameter(key)
 
     # --- the master ---
 
@@ -106,9 +110,12 @@ class RosNode:
 
         Raises `MasterDenialError` with the master's reason, or another `RosError`.
         """
+        return await self._call_master(self.name, method, *params)
+
+    async def _call_master(self, caller_id: str, method: str, *params: Value) -> Value:
         try:
             answer = await call_xmlrpc(
-                self._network, self._master, method, (self.name, *params), seconds=self._limits.call_seconds
+                self._network, self._master, method, (caller_id, *params), seconds=self._limits.call_seconds
             )
         except ProtocolError as error:
             if isinstance(error.__cause__, FaultReceived):
@@ -197,6 +204,39 @@ class RosNode:
             if topic in self.publishers:
                 await self._forget("unregisterPublisher", topic, self._uri)
                 await self.publishers.pop(topic).close()
+
+    # --- parameters ---
+
+    async def subscribe_parameter(self, key: str, changed: ParameterChanged) -> None:
+        """Subscribe to a canonical key; `changed` is called for each new value of it, or of a key below.
+
+        Raises ValueError if the node already subscribes to it, and `RosError` if the master denies it.
+        """
+        async with self._lock("parameter", key):
+            if key in self.parameters:
+                raise ValueError(f"{self.name} already subscribes to the parameter {key}")
+            self.parameters[key] = changed
+            try:
+                await self.master("subscribeParam", self._uri, key)
+            except BaseException:
+                del self.parameters[key]
+                raise
+
+    async def unsubscribe_parameter(self, key: str) -> None:
+        """End a subscription, if there is one."""
+        async with self._lock("parameter", key):
+            if key in self.parameters:
+                await self._forget("unsubscribeParam", self._uri, key)
+                del self.parameters[key]
+
+    async def set_parameter(self, name: str, value: Value) -> None:
+        """Set a parameter. Raises `RosError`.
+
+        A master sends the node that sets a parameter no update. So the call has a name of its own, and subscriptions
+        of this node get all values in the order of the master.
+        """
+        key = resolve_parameter(name, self.name)
+        await self._call_master(f"{self.name}/parameters", "setParam", key, value)
 
     # --- services ---
 

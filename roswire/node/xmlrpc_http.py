@@ -26,7 +26,9 @@ from roswire.xmlrpc import (
 )
 
 CALL_LIMITS = XmlRpcLimits(body=1 << 20, elements=20_000, depth=8, string=1 << 16, parts=1)
-"""Limits for a call to a node, whose largest one lists the publishers of a topic."""
+"""Limits for the answer of a node, whose largest one names its topics."""
+SERVED_LIMITS = XmlRpcLimits(parts=1)
+"""Limits for a call to the node itself, whose largest one has the value of a parameter."""
 
 _HEAD_BYTES = 16 << 10
 _IDLE_SECONDS = 120.0
@@ -140,7 +142,7 @@ async def serve_xmlrpc(
             async with asyncio.timeout(_IDLE_SECONDS):
                 data = await reader.read(_PIECE)
             received += len(data)
-            if not data or received > CALL_LIMITS.body + _HEAD_BYTES:
+            if not data or received > SERVED_LIMITS.body + _HEAD_BYTES:
                 return
             _feed(parser, data)
             while message.bodies:
@@ -158,7 +160,7 @@ async def serve_xmlrpc(
 
 async def _answer(body: bytes, answer: Callable[[MethodCall], Awaitable[Value]]) -> bytes:
     try:
-        return build_response(await answer(parse_call(body, CALL_LIMITS)))
+        return build_response(await answer(parse_call(body, SERVED_LIMITS)))
     except RosError as error:
         return build_fault(-1, str(error))
 

@@ -7,7 +7,7 @@ and every call of a service is decided by the master and the relay, as for any h
 """
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 from weakref import WeakValueDictionary
@@ -16,6 +16,7 @@ import msgspec
 from msgspec import Raw
 
 from appliance.base import clock
+from appliance.features.doors.door_parameters import DoorParameters, ParameterClient
 from appliance.features.doors.known_types import DoorMessage, KnownTypes
 from appliance.features.doors.message_writer import Now
 from appliance.features.doors.requests import (
@@ -26,8 +27,10 @@ from appliance.features.doors.requests import (
     OfferService,
     PublishMessage,
     ReadParameters,
+    SubscribeParameter,
     SubscribeTopic,
     UnadvertiseTopic,
+    UnsubscribeParameter,
     UnsubscribeTopic,
     WithdrawService,
     WriteParameter,
@@ -49,7 +52,6 @@ _LINGER_SECONDS = 10.0
 _REPLAY_SECONDS = 1.0  # not longer: an old command must not reach a robot
 _LEARN_SECONDS = 1.0
 _ASK_SECONDS, _ASK_AGAIN_SECONDS = 1.0, 10.0
-_MOST_PARAMETERS = 1000  # of one request
 _ANSWER_SECONDS = 60.0  # for a client that answers a call of its service
 
 BuiltIn = Callable[[CallOfService], "Awaitable[Raw] | None"]
@@ -66,7 +68,7 @@ class _Learner:
         """Ignore a message: only the header of its publisher is wanted."""
 
 
-class DoorClient(_Subscriber, Protocol):
+class DoorClient(_Subscriber, ParameterClient, Protocol):
     """A connection, as the node uses it."""
 
     def answered(self, call: int, values: Raw | bytes) -> None:
@@ -135,11 +137,13 @@ class DoorNode:
         self._heard: dict[str, set[_Subscriber]] = {}
         self._offers: dict[str, _Offer] = {}
         self._call_bytes = 0
+        self._parameters = DoorParameters(node)
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         self._tasks = OwnedTasks()
 
     async def close(self) -> None:
         await self._tasks.close()
+        await self._parameters.close()
         await self.node.close()
 
     async def carry_out(self, request: DoorRequest, client: DoorClient) -> None:
@@ -164,9 +168,11 @@ class DoorNode:
             case AnswerCall():
                 self._answer(request)
             case ReadParameters():
-                client.parameters(await self._parameters(request.names), request.reply_to)
+                client.parameters(await self._parameters.read(request.names), request.reply_to)
             case WriteParameter():
-                await self._write_parameter(request)
+                await self._parameters.write(request)
+            case SubscribeParameter() | UnsubscribeParameter():
+                await self._parameters.carry_out(request, client)
 
     async def forget(self, client: DoorClient) -> None:
         """Release all that a connection used, and publish its wills."""
@@ -180,6 +186,7 @@ class DoorNode:
             self._unsubscribe(topic, client)
         for service in [service for service, offer in self._offers.items() if offer.client is client]:
             await self._withdraw(service)
+        self._parameters.forget(client)
 
     # --- publications ---
 
@@ -387,26 +394,6 @@ class DoorNode:
             future.set_exception(ServiceFailedError(reason))
             if request.ok:
                 raise
-
-    # --- parameters ---
-
-    async def _parameters(self, names: Sequence[str]) -> dict[str, Any]:
-        if not names:
-            listed = await self.node.master("getParamNames")
-            names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []
-        if len(names) > _MOST_PARAMETERS:
-            raise LimitExceededError(f"{len(names)} parameters; name at most {_MOST_PARAMETERS} of them")
-        return {
-            name: await self.node.master("getParam", name)
-            for name in names
-            if await self.node.master("hasParam", name)
-        }
-
-    async def _write_parameter(self, request: WriteParameter) -> None:
-        if request.value is None:
-            await self.node.master("deleteParam", request.name)
-        else:
-            await self.node.master("setParam", request.name, msgspec.json.decode(request.value))
 
     async def learn(self, topic: str) -> None:
         """Subscribe to a topic for a moment, to learn its definition. Raises `RosError`."""

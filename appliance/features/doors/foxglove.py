@@ -1,8 +1,8 @@
 """Foxglove's WebSocket protocol of one connection, without I/O: `foxglove.websocket.v1`, also named `foxglove.sdk.v1`.
 
 Channels carry the bytes of ROS messages unchanged, in the encoding `ros1`. The door announces what its
-identity may see, and refuses in words: a status with the level error, or `serviceCallFailure`. It has no
-assets and no updates of parameters, and does not announce these capabilities.
+identity may see, and refuses in words: a status with the level error, or `serviceCallFailure`. An asset is a file of
+the robot. The door has none, does not announce this capability, and answers each `fetchAsset` with an error.
 """
 
 import struct
@@ -21,9 +21,11 @@ from appliance.features.doors.foxglove_frames import (
     FoxgloveSetParameters,
     FoxgloveSubscribe,
     FoxgloveSubscribeGraph,
+    FoxgloveSubscribeParameters,
     FoxgloveUnadvertise,
     FoxgloveUnsubscribe,
     FoxgloveUnsubscribeGraph,
+    FoxgloveUnsubscribeParameters,
     channel_fields,
     service_fields,
 )
@@ -35,15 +37,18 @@ from appliance.features.doors.requests import (
     Frame,
     PublishMessage,
     ReadParameters,
+    SubscribeParameter,
     SubscribeTopic,
     UnadvertiseTopic,
+    UnsubscribeParameter,
     UnsubscribeTopic,
     WriteParameter,
 )
 from appliance.features.doors.surroundings import DoorSurroundings, SeenService, SeenTopic
 from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.errors import PeerError, quoted
-from roswire.names import resolve
+from roswire.names import resolve, resolve_parameter
+from roswire.xmlrpc import Value
 
 SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 _ERROR = 2
@@ -63,6 +68,7 @@ class FoxgloveLimits:
     subscriptions: int = 1000
     channels: int = 200  # of the client
     calls: int = 100
+    parameters: int = 1000  # subscribed
 
 
 class _FoxgloveError(PeerError):
@@ -74,7 +80,7 @@ class Foxglove:
 
     wants_surroundings = True
 
-    def __init__(self, node: str, limits: FoxgloveLimits, queue: ViewerQueue[int]) -> None:
+    def __init__(self, node: str, limits: FoxgloveLimits, queue: ViewerQueue[int | str]) -> None:
         self.queue = queue
         self._node = node
         self._limits = limits
@@ -87,6 +93,7 @@ class Foxglove:
         self._channels: dict[int, tuple[str, str]] = {}  # of the client: topic and encoding
         self._calls: dict[int, tuple[int, int]] = {}  # service and call of the client
         self._number = 0
+        self._parameters: dict[str, None] = {}  # subscribed, by canonical name
         self._graph: dict[str, dict[str, Sequence[str]]] | None = None  # as last sent to the client
         self._seen: DoorSurroundings | None = None
         self._carry_out: dict[type[Any], Callable[[Any], list[DoorRequest]]] = {
@@ -96,6 +103,8 @@ class Foxglove:
             FoxgloveUnadvertise: self._unadvertise,
             FoxgloveGetParameters: self._get_parameters,
             FoxgloveSetParameters: self._set_parameters,
+            FoxgloveSubscribeParameters: self._subscribe_parameters,
+            FoxgloveUnsubscribeParameters: self._unsubscribe_parameters,
             FoxgloveSubscribeGraph: self._subscribe_graph,
             FoxgloveUnsubscribeGraph: self._unsubscribe_graph,
             FoxgloveFetchAsset: self._fetch_asset,
@@ -103,7 +112,13 @@ class Foxglove:
         self._tell(
             "serverInfo",
             name="rosrv door",
-            capabilities=["clientPublish", "parameters", "services", "connectionGraph"],
+            capabilities=[
+                "clientPublish",
+                "parameters",
+                "parametersSubscribe",
+                "services",
+                "connectionGraph",
+            ],
             supportedEncodings=[*_ENCODINGS],
             metadata={"ROS_DISTRO": "noetic"},
         )
@@ -223,6 +238,35 @@ class Foxglove:
             requests.append(ReadParameters(tuple(one.name for one in operation.parameters), operation.id))
         return requests
 
+    def _subscribe_parameters(self, operation: FoxgloveSubscribeParameters) -> list[DoorRequest]:
+        requests: list[DoorRequest] = []
+        for name in self._parameter_names(operation.parameterNames or ["/"]):
+            if name in self._parameters:
+                continue
+            if len(self._parameters) >= self._limits.parameters:
+                self._refuse(
+                    f"{name}: {len(self._parameters)} subscribed parameters; at most {self._limits.parameters}"
+                )
+                break
+            self._parameters[name] = None
+            self.queue.configure(name, depth=None, interval=0.0)
+            requests.append(SubscribeParameter(name))
+        return requests
+
+    def _unsubscribe_parameters(self, operation: FoxgloveUnsubscribeParameters) -> list[DoorRequest]:
+        names = self._parameter_names(operation.parameterNames) or [*self._parameters]
+        ended = [name for name in names if name in self._parameters]
+        for name in ended:
+            self._end_parameter(name)
+        return [UnsubscribeParameter(name) for name in ended]
+
+    def _parameter_names(self, names: Sequence[str]) -> list[str]:
+        return [*dict.fromkeys(resolve_parameter(name, self._node) for name in names)]
+
+    def _end_parameter(self, name: str) -> None:
+        self._parameters.pop(name, None)
+        self.queue.remove(name)
+
     def _subscribe_graph(self, _operation: FoxgloveSubscribeGraph) -> list[DoorRequest]:
         self._graph = {"publishedTopics": {}, "subscribedTopics": {}, "advertisedServices": {}}
         if self._seen is not None:
@@ -258,6 +302,8 @@ class Foxglove:
             case SubscribeTopic(topic):
                 for number in [*self._by_topic.get(topic, ())]:
                     self._end_subscription(number)
+            case SubscribeParameter(name):
+                self._end_parameter(name)
         self._refuse(reason)
 
     def answered(self, number: int, values: Raw | bytes) -> None:
@@ -269,6 +315,12 @@ class Foxglove:
     def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
         rows = [{"name": name, "value": value} for name, value in values.items()]
         self._tell("parameterValues", parameters=rows, **({} if reply_to is None else {"id": reply_to}))
+
+    def parameter_changed(self, subscribed: str, name: str, value: Value, now: float) -> None:
+        """Queue a new value, for which the client may wait as for a message; a deleted parameter has none."""
+        row = {"name": name} if value == {} else {"name": name, "value": value}
+        frame = msgspec.json.encode({"op": "parameterValues", "parameters": [row]}).decode()
+        self.queue.put(subscribed, frame, len(frame), now)
 
     def ask(self, service: str, _values: Raw) -> str:
         """Refuse a call: a client of this protocol offers no services."""
@@ -348,6 +400,8 @@ class Foxglove:
         if taken is None or taken[0] is None:
             return None if taken is None else taken[1]
         number, message = taken
+        if isinstance(message, str):  # of a parameter
+            return message
         return _MESSAGE_DATA.pack(1, number, message.received) + bytes(message.body)
 
     def next_time(self) -> float | None:

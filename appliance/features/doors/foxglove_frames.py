@@ -71,6 +71,18 @@ class FoxgloveSetParameters(_Operation, tag="setParameters"):
     id: _Id = None
 
 
+class FoxgloveSubscribeParameters(_Operation, tag="subscribeParameterUpdates"):
+    """Follow parameters; without names, all of them."""
+
+    parameterNames: list[_Name]  # noqa: N815  the protocol's name
+
+
+class FoxgloveUnsubscribeParameters(_Operation, tag="unsubscribeParameterUpdates"):
+    """Follow parameters no longer; without names, none of them."""
+
+    parameterNames: list[_Name]  # noqa: N815  the protocol's name
+
+
 class FoxgloveSubscribeGraph(_Operation, tag="subscribeConnectionGraph"):
     """Follow the graph."""
 
@@ -93,6 +105,8 @@ _Operations = (
     | FoxgloveUnadvertise
     | FoxgloveGetParameters
     | FoxgloveSetParameters
+    | FoxgloveSubscribeParameters
+    | FoxgloveUnsubscribeParameters
     | FoxgloveSubscribeGraph
     | FoxgloveUnsubscribeGraph
     | FoxgloveFetchAsset

@@ -118,6 +118,22 @@ class WriteParameter:
     reply_to: str | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class SubscribeParameter:
+    """Subscribe to a parameter, or to all below a namespace."""
+
+    name: str
+    reply_to: ClientId = None
+
+
+@dataclass(frozen=True, slots=True)
+class UnsubscribeParameter:
+    """Subscribe to a parameter no longer."""
+
+    name: str
+    reply_to: ClientId = None
+
+
 DoorRequest: TypeAlias = (
     AdvertiseTopic
     | UnadvertiseTopic
@@ -130,6 +146,8 @@ DoorRequest: TypeAlias = (
     | AnswerCall
     | ReadParameters
     | WriteParameter
+    | SubscribeParameter
+    | UnsubscribeParameter
 )
 Frame: TypeAlias = str | bytes
 """A WebSocket message: text or binary."""

@@ -40,7 +40,10 @@ class Sight(Protocol):
         """Return the URI of a service."""
 
     async def parameter(self, call: str, *arguments: Value) -> Value:
-        """Make a call of the parameter API."""
+        """Make a call of the parameter API, except `setParam`."""
+
+    async def set_parameter(self, name: str, value: Value) -> None:
+        """Set a parameter."""
 
     def time(self) -> Now:
         """Return the present time."""
@@ -71,6 +74,9 @@ class MasterSight:
 
     async def parameter(self, call: str, *arguments: Value) -> Value:
         return await self._node.master(call, *arguments)
+
+    async def set_parameter(self, name: str, value: Value) -> None:
+        await self._node.set_parameter(name, value)
 
     def time(self) -> Now:
         return self._now()
@@ -259,7 +265,7 @@ class Rosapi:
         return {"value": _as_text(await self._sight.parameter("getParam", given.name))}
 
     async def _set_param(self, given: _Arguments) -> dict[str, Any]:
-        await self._sight.parameter("setParam", given.name, _as_value(given.value))
+        await self._sight.set_parameter(given.name, _as_value(given.value))
         return {}
 
     async def _has_param(self, given: _Arguments) -> dict[str, Any]:

@@ -57,6 +57,7 @@ from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.errors import PeerError, quoted
 from roswire.names import resolve
+from roswire.xmlrpc import Value
 
 _LEVELS = ("none", "error", "warning", "info")
 _STRENGTH: tuple[Compression, ...] = ("none", "png", "cbor", "cbor-raw")
@@ -309,6 +310,9 @@ class Rosbridge:
 
     def parameters(self, _values: Mapping[str, Any], _reply_to: str | None) -> None:
         """Do nothing: this protocol has parameters as services of rosapi."""
+
+    def parameter_changed(self, _subscribed: str, _name: str, _value: Value, _now: float) -> None:
+        """Do nothing: clients of this protocol do not subscribe to parameters."""
 
     def surroundings(self, _seen: DoorSurroundings) -> list[DoorRequest]:
         """Do nothing: clients of this protocol call rosapi."""

@@ -43,6 +43,7 @@ from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerStalledError
 from roswire.errors import RosError
 from roswire.node.network import ByteWriter
+from roswire.xmlrpc import Value
 
 _READ_BYTES = 1 << 16
 _READ_DEFLATED_BYTES = 1 << 12  # the frames that are read at once take up to 1000 times as much inflated
@@ -84,6 +85,9 @@ class ClientProtocol(Protocol):
 
     def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
         """Send the values of parameters."""
+
+    def parameter_changed(self, subscribed: str, name: str, value: Value, now: float) -> None:
+        """Queue the new value of a parameter."""
 
     def surroundings(self, seen: DoorSurroundings) -> Sequence[DoorRequest]:
         """Announce what the door sees, and return the requests that follow; only if `wants_surroundings`."""
@@ -374,6 +378,10 @@ class DoorSession:
 
     def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
         self._tell(lambda: self._protocol.parameters(values, reply_to))
+
+    def parameter_changed(self, subscribed: str, name: str, value: Value) -> None:
+        self._protocol.parameter_changed(subscribed, name, value, asyncio.get_running_loop().time())
+        self._wake.set()
 
     def failed(self, request: DoorRequest, reason: str) -> None:
         self.refusals += 1

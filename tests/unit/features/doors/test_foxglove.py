@@ -54,7 +54,9 @@ async def test_a_viewer_gets_channels_with_definitions_and_the_bytes_of_messages
         client = await world.client(subprotocols=["other", subprotocol])
         assert client.socket.subprotocol == subprotocol
         info = await next_op(client, "serverInfo")
-        assert info["capabilities"] == ["clientPublish", "parameters", "services", "connectionGraph"]
+        assert info["capabilities"] == [
+            "clientPublish", "parameters", "parametersSubscribe", "services", "connectionGraph",
+        ]  # fmt: skip
         channels = {one["topic"]: one for one in (await next_op(client, "advertise"))["channels"]}
         assert channels["/load"]["schema"] == definitions.full_text("own/Load")
         assert (
@@ -142,6 +144,35 @@ async def test_a_viewer_calls_services_and_reads_parameters() -> None:
         assert (await next_op(client, "status"))["message"] == "denied by [Parameters] /a (site.ini:9)"
 
 
+async def test_a_viewer_follows_parameters_until_it_leaves() -> None:
+    async with door_world() as world:
+        sees(world, topics={})
+        first, second = [await world.client(subprotocols=SUBPROTOCOLS) for _ in range(2)]
+        for client in (first, second):
+            client.send({"op": "subscribeParameterUpdates", "parameterNames": ["a", "/robot"]})
+        await asyncio.sleep(1)
+        assert world.master.calls.count("subscribeParam") == 2
+        long = "x" * 100_000  # as a description of a robot
+        for key, value in (("/a/", 1), ("/robot/model/", long), ("/robots/", 2), ("/a/", {})):
+            await world.master.call(world.node.uri, "paramUpdate", key, value)
+        rows = [(await next_op(first, "parameterValues"))["parameters"] for _ in range(3)]
+        assert [row for (row,) in rows if row["name"] == "/a"] == [{"name": "/a", "value": 1}, {"name": "/a"}]
+        assert [row for (row,) in rows if row["name"] != "/a"] == [{"name": "/robot/model", "value": long}]
+        first.send({"op": "unsubscribeParameterUpdates", "parameterNames": []})
+        await asyncio.sleep(1)
+        assert "unsubscribeParam" not in world.master.calls
+        second.send({"op": "unsubscribeParameterUpdates", "parameterNames": ["/a"]})
+        await asyncio.sleep(1)
+        assert world.master.calls.count("unsubscribeParam") == 1
+        second.writer.close()
+        await asyncio.sleep(5)
+        assert world.master.calls.count("unsubscribeParam") == 2 and not world.node.parameters
+        world.master.denials["subscribeParam"] = "denied by [Parameters] /a (site.ini:9)"
+        first.send({"op": "subscribeParameterUpdates", "parameterNames": []})
+        assert "site.ini:9" in (await next_op(first, "status"))["message"]
+        assert not world.node.parameters
+
+
 async def test_a_viewer_follows_the_graph() -> None:
     async with door_world() as world:
         sees(world, topics={"/text": ("std_msgs/String", "/robot")}, services={"/gone": "/other"})
@@ -173,9 +204,9 @@ async def test_a_denied_look_is_one_status_in_words() -> None:
         assert frames[1]["level"] == 2 and "site.ini:4" in frames[1]["message"]
 
 
-def viewer(**limits: int) -> tuple[Foxglove, ViewerQueue[int]]:
+def viewer(**limits: int) -> tuple[Foxglove, ViewerQueue[int | str]]:
     """Return a connection that has announced the channel 1."""
-    queue: ViewerQueue[int] = ViewerQueue()
+    queue: ViewerQueue[int | str] = ViewerQueue()
     foxglove = Foxglove("/door_alice", FoxgloveLimits(**limits), queue)
     graph = VisibleGraph({"/t": ["/n"]}, {}, {}, {"/t": "a/B"})
     foxglove.surroundings(DoorSurroundings(graph, [SeenTopic("/t", "a/B", "int8 x")], []))
@@ -203,7 +234,7 @@ def viewer(**limits: int) -> tuple[Foxglove, ViewerQueue[int]]:
             '{"op":"advertise","channels":[{"id":1,"topic":" /a","encoding":"ros1","schemaName":"a/B"}]}',
             "' /a'",
         ),
-        ('{"op":"subscribeParameterUpdates","parameterNames":[]}', "Invalid value"),
+        ('{"op":"subscribeParameterUpdates","parameterNames":["/a b "]}', "refused"),
         (b"", "begins with nothing"),
         (b"\x01\x01", "a binary frame of 2 bytes"),
         (b"\x07" + bytes(20), "begins with 07"),

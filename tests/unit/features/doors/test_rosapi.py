@@ -47,12 +47,12 @@ class StatedSight:
                 return self.parameters[name]
             case "hasParam", (str(name),) if name != "/secret":
                 return name in self.parameters
-            case "setParam", (str(name), value):
-                self.parameters[name] = value
-                return 0
             case "getParamNames", ():
                 return [*self.parameters]
         raise MasterDenialError(f"{call}: denied by [Parameters] (site.ini:9)")
+
+    async def set_parameter(self, name: str, value: Value) -> None:
+        self.parameters[name] = value
 
     def time(self) -> tuple[int, int]:
         return 7, 8

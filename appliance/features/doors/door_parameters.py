@@ -1,0 +1,107 @@
+"""The parameters of a door: reads, writes, and subscriptions, which all connections of its identity share.
+
+The master sees one subscription for each parameter, however many connections use it, and decides each call. A
+subscription ends with its last connection. Connections get the values in the order in which the master set them.
+"""
+
+import asyncio
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, Protocol
+
+import msgspec
+
+from appliance.features.doors.requests import SubscribeParameter, UnsubscribeParameter, WriteParameter
+from roswire.errors import LimitExceededError
+from roswire.node import RosNode
+from roswire.node.network import OwnedTasks
+from roswire.xmlrpc import Value
+
+_MOST_READ = 1000  # of one request
+_MOST_SUBSCRIBED = 2000  # of all connections
+
+
+class ParameterClient(Protocol):
+    """A connection that subscribes to parameters."""
+
+    def parameter_changed(self, subscribed: str, name: str, value: Value) -> None:
+        """Take the new value of a parameter, which is the subscribed one or below it; `{}` if it was deleted."""
+
+
+class DoorParameters:
+    """Carries out the requests about parameters."""
+
+    def __init__(self, node: RosNode) -> None:
+        self._node = node
+        self._clients: dict[str, set[ParameterClient]] = {}
+        self._lock = asyncio.Lock()  # for registrations
+        self._tasks = OwnedTasks()
+
+    async def close(self) -> None:
+        await self._tasks.close()
+
+    async def read(self, names: Sequence[str]) -> dict[str, Any]:
+        """Return the values of parameters; those that do not exist are left out."""
+        if not names:
+            listed = await self._node.master("getParamNames")
+            names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []
+        if len(names) > _MOST_READ:
+            raise LimitExceededError(f"{len(names)} parameters; name at most {_MOST_READ} of them")
+        return {
+            name: await self._node.master("getParam", name)
+            for name in names
+            if await self._node.master("hasParam", name)
+        }
+
+    async def write(self, request: WriteParameter) -> None:
+        if request.value is None:
+            await self._node.master("deleteParam", request.name)
+        else:
+            await self._node.set_parameter(request.name, msgspec.json.decode(request.value))
+
+    async def carry_out(
+        self, request: SubscribeParameter | UnsubscribeParameter, client: ParameterClient
+    ) -> None:
+        """Begin or end the subscription of a connection. Raises `RosError`."""
+        if isinstance(request, SubscribeParameter):
+            await self._subscribe(request.name, client)
+        else:
+            self._unsubscribe([request.name], client)
+
+    async def _subscribe(self, name: str, client: ParameterClient) -> None:
+        async with self._lock:
+            if name in self._clients:
+                self._clients[name].add(client)
+                return
+            if len(self._clients) >= _MOST_SUBSCRIBED:
+                raise LimitExceededError(
+                    f"{name}: the clients of this door subscribe to {_MOST_SUBSCRIBED} parameters, the most there "
+                    f"may be; subscribe to a namespace above them"
+                )
+            self._clients[name] = {client}
+            try:
+                await self._node.subscribe_parameter(name, partial(self._changed, name))
+            except BaseException:
+                del self._clients[name]
+                raise
+
+    def _changed(self, subscribed: str, name: str, value: Value) -> None:
+        for client in self._clients.get(subscribed, ()):
+            client.parameter_changed(subscribed, name, value)
+
+    def _unsubscribe(self, names: Sequence[str], client: ParameterClient) -> None:
+        ended = [name for name in names if client in self._clients.get(name, ())]
+        for name in ended:
+            self._clients[name].discard(client)
+        if ended:
+            self._tasks.start(self._end(ended))
+
+    def forget(self, client: ParameterClient) -> None:
+        self._unsubscribe([*self._clients], client)
+
+    async def _end(self, names: Sequence[str]) -> None:
+        for name in names:
+            async with self._lock:
+                if name in self._clients and not self._clients[name]:
+                    del self._clients[name]
+                    await self._node.unsubscribe_parameter(name)
