@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from appliance.features.doors.door_memory import ClientMemory
 from appliance.features.doors.requests import ClientId
 from appliance.features.doors.rosbridge_frames import FragmentOp, OperationError
 
@@ -17,9 +18,10 @@ class _Incomplete:
 
 
 class FragmentStore:
-    """The frames of one client that are not complete, of at most `most_bytes` together."""
+    """The frames of one client that are not complete, of at most `most_bytes` together, charged to `memory`."""
 
-    def __init__(self, most_bytes: int) -> None:
+    def __init__(self, most_bytes: int, memory: ClientMemory) -> None:
+        self._memory = memory
         self._most_bytes = most_bytes
         self._bytes = 0
         self._frames: dict[ClientId, _Incomplete] = {}
@@ -37,11 +39,13 @@ class FragmentStore:
             )
         frame.parts[fragment.num] = fragment.data
         self._charge(frame, len(fragment.data) + _OVERHEAD)
-        if self._bytes > self._most_bytes:
+        if self._bytes > self._most_bytes or self._memory.refusal(0):
             self._frames.clear()
+            self._memory.add(-self._bytes)
             self._bytes = 0
             raise OperationError(
-                f"more than {self._most_bytes} bytes of fragments without the rest of their frames; all are dropped"
+                f"more than {self._most_bytes} bytes of fragments without the rest of their frames, or no memory of"
+                " the door is left; all are dropped"
             )
         if len(frame.parts) < frame.total:
             return None
@@ -51,6 +55,9 @@ class FragmentStore:
     def _charge(self, frame: _Incomplete, size: int) -> None:
         frame.bytes += size
         self._bytes += size
+        self._memory.add(size)
 
     def _remove(self, key: ClientId) -> None:
-        self._bytes -= self._frames.pop(key).bytes
+        size = self._frames.pop(key).bytes
+        self._bytes -= size
+        self._memory.add(-size)

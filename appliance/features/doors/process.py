@@ -22,6 +22,7 @@ from appliance.features.doors import door_link
 from appliance.features.doors.client_counts import SAMPLE_SECONDS, CountedClient, shown
 from appliance.features.doors.connections import ConnectionLimits, DoorConnections
 from appliance.features.doors.door_link import node_name
+from appliance.features.doors.door_memory import ClientMemory, DoorMemory
 from appliance.features.doors.door_node import DoorNode, present_time
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
 from appliance.features.doors.given_network import GivenNetwork
@@ -84,6 +85,7 @@ class _Door:
     node: DoorNode
     lookout: Lookout
     connections: DoorConnections
+    memory: DoorMemory
 
 
 class _Process:
@@ -203,7 +205,12 @@ class _Process:
             sight = MasterSight(node, present_time)
             door = DoorNode(node, types, Rosapi(sight, types).answer, most_topics=_MOST_TOPICS)
             limits = ConnectionLimits(given.connections, given.in_ten_seconds)
-            self._door = _Door(door, Lookout(sight, types, door.learn), DoorConnections(limits))
+            self._door = _Door(
+                door,
+                Lookout(sight, types, door.learn),
+                DoorConnections(limits),
+                DoorMemory(given.connections),
+            )
         self._started.set()
 
     def _shut_down(self, reason: str) -> None:
@@ -244,14 +251,16 @@ class _Process:
             writer.close()  # the ticket was over before the door could serve
             return
         queues: list[ViewerQueue[Any]] = []
+        memory = door.memory.client()
         session = DoorSession(
             reader,
             writer,
             door=door.node,
             lookout=door.lookout,
-            protocols=partial(_protocol, node_name(given.name), queues),
+            protocols=partial(_protocol, node_name(given.name), queues, memory),
             subprotocols=SUBPROTOCOLS,
             options=SessionOptions(origins=tuple(given.origins)),
+            memory=memory,
         )
         client = CountedClient(session, peer, ticket, queues)
         self._clients.add(client)
@@ -304,8 +313,10 @@ class _Process:
         return door_link.DoorCounted(connections=len(self._clients), refused=refused, **asdict(totals))
 
 
-def _protocol(node: str, queues: list[ViewerQueue[Any]], subprotocol: str | None) -> ClientProtocol:
-    queue: ViewerQueue[Any] = ViewerQueue()
+def _protocol(
+    node: str, queues: list[ViewerQueue[Any]], memory: ClientMemory, subprotocol: str | None
+) -> ClientProtocol:
+    queue: ViewerQueue[Any] = ViewerQueue(memory=memory)
     queues.append(queue)
     if subprotocol is None:
         return Rosbridge(node, RosbridgeLimits(), queue)

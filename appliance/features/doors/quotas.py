@@ -17,4 +17,16 @@ DOOR_CONNECTIONS = QuotaRow(
     ),
 )
 
-ROWS = (DOOR_CONNECTIONS,)
+DOOR_BYTES = QuotaRow(
+    thing="bytes that clients of one door hold: unfinished frames, and replies and messages that wait for a client",
+    bounds=Bounds(whole=256 << 20, host=48 << 20, unknown=0, kept=0),
+    at_limit="the client's oldest messages are dropped; a client with an unfinished frame, or that does not read its"
+    " replies, is disconnected with the reason",
+    between="each client has 1/64 for itself (half of the whole, divided by `doors.connections`); beyond that, a client"
+    " gets at most as much as it leaves for all others",
+    counting="host: a client's connection",
+    alarm="`rosrv_door_messages_dropped_total`",
+    shown_by=("unit/features/doors/test_door_memory.py::test_greedy_clients_leave_memory_for_the_next_one",),
+)
+
+ROWS = (DOOR_CONNECTIONS, DOOR_BYTES)

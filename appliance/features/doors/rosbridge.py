@@ -109,7 +109,7 @@ class Rosbridge:
         self._calls: dict[int, _Call] = {}
         self._asked: dict[str, str] = {}  # calls to the client: their service, by id
         self._number = 0
-        self._fragments = FragmentStore(limits.fragment_bytes)
+        self._fragments = FragmentStore(limits.fragment_bytes, queue.memory)
         self._carry_out: dict[type[Any], Callable[[Any], list[DoorRequest]]] = {
             AdvertiseOp: self._advertise,
             UnadvertiseOp: self._unadvertise,

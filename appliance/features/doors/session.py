@@ -28,6 +28,7 @@ from websockets.protocol import State
 from websockets.server import ServerProtocol
 from websockets.typing import Subprotocol
 
+from appliance.features.doors.door_memory import ClientMemory, DoorMemory
 from appliance.features.doors.door_node import DoorNode
 from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.lookout import Lookout
@@ -125,6 +126,7 @@ class DoorSession:
         protocols: Protocols,
         subprotocols: Sequence[str],
         options: SessionOptions,
+        memory: ClientMemory | None = None,
     ) -> None:
         self.end = ""
         self.received = self.sent = 0  # frames
@@ -138,6 +140,8 @@ class DoorSession:
         self._protocol: ClientProtocol
         self._wills: set[str] = set()  # the topics on which the client has a will
         self._pings = 0
+        self._memory = memory or DoorMemory().client()
+        self._unfinished = 0  # bytes of a frame that has not come whole, as charged to the memory
         self._frame = bytearray()  # the fragments that have come; empty ones take nothing
         self._is_text = False
         self._wake = asyncio.Event()
@@ -173,6 +177,7 @@ class DoorSession:
         finally:
             self._writer.close()
             await self._door.forget(self)
+            self._memory.close()
 
     async def _handshake(self) -> bool:
         async with asyncio.timeout(self._options.handshake_seconds):
@@ -250,12 +255,21 @@ class DoorSession:
             for event in self._socket.events_received():
                 if isinstance(event, WebSocketFrame):
                     await self._take(event)
+            self._charge_unfinished()
             self._wake.set()  # for the answer to a ping
             if self._pings > _MOST_PINGS:
                 await self._flush()
         self.end = self.end or f"the client ended the connection{_reason(self._socket)}"
         if self._socket.parser_exc is not None:
             await self._drop_rest()
+
+    def _charge_unfinished(self) -> None:
+        """Charge the bytes of an unfinished frame; disconnect the client if its door has no memory for more."""
+        size = len(self._frame) + len(self._socket.reader.buffer)
+        self._memory.add(size - self._unfinished)
+        self._unfinished = size
+        if size > _READ_BYTES and (reason := self._memory.refusal(0)):
+            self._disconnect(CloseCode.MESSAGE_TOO_BIG, reason)
 
     async def _drop_rest(self) -> None:
         """Read for a short time; else the client would get a reset instead of the closing frame with the reason."""

@@ -4,7 +4,9 @@ A client that reads slowly loses the oldest messages of its topics, never a repl
 
 1. At most `message_bytes` of messages wait. If more come, the topic with the most bytes loses its oldest message.
 2. At most `reply_bytes` of replies wait. A client that requests more without reading gets `ViewerStalledError`.
-3. Topics take turns, so that a large topic delays a small one by one message.
+3. All frames that wait are charged to the client's part of the memory of its door. Without room, the client's oldest
+   messages are dropped, and a reply ends the connection.
+4. Topics take turns, so that a large topic delays a small one by one message.
 """
 
 from collections import OrderedDict, deque
@@ -12,11 +14,15 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
+from appliance.features.doors.door_memory import ClientMemory, DoorMemory
 from appliance.features.doors.requests import Frame
 
 _BURST = 1000
 _BURST_BYTES = 256 << 10
 """Messages and bytes of a topic that may come at once, in one packet, before the first is sent."""
+
+_OVERHEAD = 300
+"""Bytes that a waiting frame takes besides its own."""
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -37,10 +43,19 @@ class _Waiting:
 
 
 class ViewerQueue(Generic[Key]):
-    """The queue of one client; times are those of a monotonic clock, in seconds."""
+    """The queue of one client; times are those of a monotonic clock, in seconds. `memory` is by default that of a door
+    with one client.
+    """
 
-    def __init__(self, *, message_bytes: int = 16 << 20, reply_bytes: int = 16 << 20) -> None:
+    def __init__(
+        self,
+        *,
+        message_bytes: int = 16 << 20,
+        reply_bytes: int = 16 << 20,
+        memory: ClientMemory | None = None,
+    ) -> None:
         self.dropped = 0
+        self.memory = memory or DoorMemory().client()
         self._most_message_bytes = message_bytes
         self._most_reply_bytes = reply_bytes
         self._replies: deque[Frame] = deque()
@@ -51,6 +66,11 @@ class ViewerQueue(Generic[Key]):
 
     def reply(self, frame: Frame) -> None:
         """Add a reply. Raises `ViewerStalledError`."""
+        if self.memory.closed:
+            return
+        if reason := self.memory.refusal(len(frame) + _OVERHEAD):
+            raise ViewerStalledError(reason)
+        self.memory.add(len(frame) + _OVERHEAD)
         self._reply_bytes += len(frame)
         if self._reply_bytes > self._most_reply_bytes and self._replies:
             raise ViewerStalledError(
@@ -80,16 +100,23 @@ class ViewerQueue(Generic[Key]):
         self._turns.pop(key, None)
         if topic is not None:
             self._message_bytes -= topic.bytes
+            self.memory.add(-topic.bytes - _OVERHEAD * len(topic.items))
 
     def put(self, key: Key, item: object, size: int, now: float) -> None:
         """Add a message of a topic that is configured; otherwise it is dropped."""
         topic = self._topics.get(key)
-        if topic is None:
+        if topic is None or self.memory.closed:
             return
         if topic.interval and not topic.queued:
             if now < topic.next_time:
                 return
             topic.next_time = now + topic.interval
+        while self._turns and self.memory.refusal(size + _OVERHEAD):
+            self._drop_from_largest()
+        if self.memory.refusal(size + _OVERHEAD):
+            self.dropped += 1
+            return
+        self.memory.add(size + _OVERHEAD)
         topic.items.append((item, size))
         self._turns.setdefault(key)
         topic.bytes += size
@@ -100,15 +127,14 @@ class ViewerQueue(Generic[Key]):
             largest = self._topics[key]
             if len(largest.items) == 1 and largest is topic:
                 break  # the newest message of the topic stays, whatever its size
-            self._drop(largest)
-            if not largest.items:
-                del self._turns[key]
+            self._drop_from_largest()
 
     def take(self, now: float) -> "tuple[None, Frame] | tuple[Key, Any] | None":
         """Return the next reply (with the key None) or message; None if nothing may be sent now."""
         if self._replies:
             frame = self._replies.popleft()
             self._reply_bytes -= len(frame)
+            self.memory.add(-len(frame) - _OVERHEAD)
             return None, frame
         for key in self._turns:
             topic = self._topics[key]
@@ -116,6 +142,7 @@ class ViewerQueue(Generic[Key]):
                 item, size = topic.items.popleft()
                 topic.bytes -= size
                 self._message_bytes -= size
+                self.memory.add(-size - _OVERHEAD)
                 if topic.queued:
                     topic.next_time = now + topic.interval
                 if topic.items:
@@ -136,8 +163,15 @@ class ViewerQueue(Generic[Key]):
         while len(topic.items) > topic.depth or (topic.bytes > topic.most_bytes and len(topic.items) > 1):
             self._drop(topic)
 
+    def _drop_from_largest(self) -> None:
+        key = max(self._turns, key=lambda one: self._topics[one].bytes)
+        self._drop(self._topics[key])
+        if not self._topics[key].items:
+            del self._turns[key]
+
     def _drop(self, topic: _Waiting) -> None:
         _item, size = topic.items.popleft()
         topic.bytes -= size
         self._message_bytes -= size
+        self.memory.add(-size - _OVERHEAD)
         self.dropped += 1

@@ -1,0 +1,57 @@
+"""Divide the memory of one door among its clients.
+
+A client holds frames that have not come whole, fragments, replies and messages that wait for it. Invariants:
+
+1. Each client may hold `least` bytes, whatever the others hold: half of the whole, divided by the most connections.
+2. Beyond `least`, clients share the other half. A client gets no more of it than it leaves for all others.
+"""
+
+from appliance.features.doors.quotas import DOOR_BYTES, DOOR_CONNECTIONS
+
+
+class DoorMemory:
+    """The memory of one door with at most this many connections; `shared` bytes of the shared half are in use."""
+
+    def __init__(self, connections: int = DOOR_CONNECTIONS.bounds.host) -> None:
+        self.most_shared = DOOR_BYTES.bounds.whole // 2
+        self.least = self.most_shared // connections
+        self.shared = 0
+
+    def client(self) -> "ClientMemory":
+        """Return the memory of a new client."""
+        return ClientMemory(self)
+
+
+class ClientMemory:
+    """The memory of one client, of which it holds `held` bytes. After `close`, the client holds nothing."""
+
+    def __init__(self, door: DoorMemory) -> None:
+        self.held = 0
+        self.closed = False
+        self._door = door
+
+    def add(self, size: int) -> None:
+        """Charge `size` bytes; give bytes back if `size` is negative."""
+        if not self.closed:
+            before = self._shared(self.held)
+            self.held += size
+            self._door.shared += self._shared(self.held) - before
+
+    def refusal(self, size: int) -> str:
+        """Return why this client should not hold `size` more bytes; empty if it may."""
+        held, most = self.held + size, DOOR_BYTES.bounds.host
+        mine = self._shared(held)
+        left = self._door.most_shared - self._door.shared + self._shared(self.held) - mine
+        if held > most:
+            return f"the client would hold {held} bytes; at most {most}"
+        if mine > max(left, 0):
+            return f"the client would hold {held} bytes of its door and leave {max(left, 0)} for all others"
+        return ""
+
+    def close(self) -> None:
+        """Give back all that this client holds."""
+        self.add(-self.held)
+        self.closed = True
+
+    def _shared(self, held: int) -> int:
+        return max(0, held - self._door.least)

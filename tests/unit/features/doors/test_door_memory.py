@@ -1,0 +1,48 @@
+"""The memory of one door, under clients that take as much as they can."""
+
+import pytest
+
+from appliance.features.doors.door_memory import ClientMemory, DoorMemory
+from appliance.features.doors.fragments import FragmentStore
+from appliance.features.doors.quotas import DOOR_BYTES
+from appliance.features.doors.rosbridge_frames import FragmentOp, OperationError
+from appliance.features.doors.viewer_queue import ViewerQueue, ViewerStalledError
+
+_MIB = 1 << 20
+
+
+def fill(memory: ClientMemory) -> tuple[ViewerQueue[str], FragmentStore]:
+    """Send a client that reads nothing messages, replies and fragments until each is refused."""
+    queue, fragments = ViewerQueue[str](memory=memory), FragmentStore(8 * _MIB, memory)
+    queue.configure("/image", depth=1000, interval=0.0)
+    with pytest.raises(OperationError):
+        for number in range(9):
+            fragments.add(FragmentOp(id=str(number), data="x" * _MIB, num=0, total=2))
+    with pytest.raises(ViewerStalledError):
+        for _ in range(17):
+            queue.reply(b"x" * _MIB)
+    for _ in range(17):
+        queue.put("/image", b"", _MIB, 0.0)
+    return queue, fragments
+
+
+def test_greedy_clients_leave_memory_for_the_next_one() -> None:
+    door = DoorMemory()
+    clients = [door.client() for _ in range(31)]
+    greedy = [fill(memory) for memory in clients]
+    held = sum(memory.held for memory in clients)
+    assert DOOR_BYTES.bounds.whole * 0.9 < held <= DOOR_BYTES.bounds.whole
+    assert min(memory.held for memory in clients) > 2 * _MIB
+    quiet = ViewerQueue[str](memory=door.client())
+    quiet.configure("/image", depth=1, interval=0.0)
+    quiet.put("/image", b"", _MIB, 0.0)
+    quiet.reply(b"pong")
+    assert quiet.dropped == 0
+    queue, _fragments = greedy[0]
+    while queue.take(0.0) is not None:
+        pass
+    for memory in clients:
+        memory.close()
+    queue.reply(b"an answer after the end")
+    assert quiet.take(0.0) and quiet.take(0.0)
+    assert door.shared == 0
