@@ -18,6 +18,8 @@ from appliance.base.validation_messages import refusal
 from appliance.cli.verb_table import Group, Verb, Verbs, joined
 from rosmop.tool.renamed_options import renamed
 
+_HELP_OPTIONS = ["-h", "--help"]
+
 
 def application(
     verbs: Verbs,
@@ -34,7 +36,7 @@ def application(
         cls=_group_of(verbs, further),
         no_args_is_help=True,
         pretty_exceptions_enable=False,
-        context_settings={"help_option_names": ["-h", "--help"]},
+        context_settings={"help_option_names": _HELP_OPTIONS},
         **settings,
     )
     app.callback()(callback or _nothing)
@@ -133,7 +135,9 @@ def loaded(verb: Verb, name: str) -> Any:
     words = "\n\n".join(filter(None, (verb.first, inspect.getdoc(function))))
     app.command(name, cls=kind, help=words)(function)  # type: ignore[arg-type]  # typer only calls `cls`
     command = typer.main.get_command(app)
-    _without_type_of_flags(command.get_params(typer.Context(command, info_name=name)))
+    # click keeps the help option of the first context that asks for it
+    context = typer.Context(command, info_name=name, help_option_names=_HELP_OPTIONS)
+    _without_type_of_flags(command.get_params(context))
     return command
 
 

@@ -45,7 +45,7 @@ def test_every_verb_has_help_with_an_example(name: str, command: Any) -> None:
     for one in command.params:
         if one.param_type_name == "option":
             assert one.help, (name, one.opts)
-    shown = CliRunner().invoke(app, [*name.split(), "--help"])
+    shown = CliRunner().invoke(app, [*name.split(), "-h"])
     assert "<bool>" not in shown.output, "a flag takes no value"
     assert shown.exit_code == 0
     assert "Usage: " in shown.output
