@@ -14,7 +14,7 @@ from appliance.policy.policy_findings import FindingSeverity, PolicyError, Polic
 from appliance.signing.site_keys import UnsignedError, signer
 
 
-def approvals_of(rows: Iterable[tuple[str, str, str]]) -> frozenset[Approval]:
+def approvals_of(rows: Iterable[Iterable[str]]) -> frozenset[Approval]:
     return frozenset((ipaddress.ip_address(host), Category(category), name) for host, category, name in rows)
 
 
@@ -60,7 +60,7 @@ class PolicyContext:
             "site_keys": list(self.site_keys),
             "blocks": {str(address): block for address, block in self.blocks.items()},
             "holders": {group: str(host) for group, host in (self.holders or {}).items()},
-            "approved": [(str(host), category.value, name) for host, category, name in self.approved or ()],
+            "approved": [[str(host), category.value, name] for host, category, name in self.approved or ()],
         }
 
 

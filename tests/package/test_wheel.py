@@ -51,7 +51,7 @@ def run(rosrv: Path, *arguments: str, folder: Path, seconds: float = 60) -> subp
 
 
 def test_it_reports_its_version_and_packages(rosrv: Path, tmp_path: Path) -> None:
-    assert re.fullmatch(r"rosrv \d+\.\d+\.\d+\n", run(rosrv, "--version", folder=tmp_path).stdout)
+    assert re.fullmatch(r"rosrv \d+\.\d+\.\d+(\.dev\d+)?\n", run(rosrv, "--version", folder=tmp_path).stdout)
     facts = json.loads(run(rosrv, "version", "--json", folder=tmp_path).stdout)
     constraints = ROOT / "dist" / f"rosrv_appliance-{__version__}-constraints.txt"
     locked = dict(line.split("==") for line in constraints.read_text().splitlines())

@@ -46,7 +46,7 @@ class PolicyInForce(RevisionText, frozen=True, kw_only=True):
         doc("hosts that an operator blocks, by address: the end of the reason of their denials"),
     ] = {}
     holders: Annotated[dict[str, str], doc("address of the host that holds each group of [Authority]")] = {}
-    approved: Annotated[list[tuple[str, str, str]], doc("approvals that last: host, category, name")] = []
+    approved: Annotated[list[list[str]], doc("approvals that last: host, category, name")] = []
 
 
 class PolicyKnown(PolicyInForce, frozen=True):
