@@ -95,9 +95,8 @@ def test_it_brings_what_is_not_code(wheel: Path) -> None:
 
 
 def test_it_contains_the_compiled_module(wheel: Path) -> None:
-    assert re.fullmatch(
-        r"rosrv_appliance-[0-9.]+-cp311-abi3-manylinux_2_\d+_(x86_64|aarch64)\.whl", wheel.name
-    )
+    named = rf"rosrv_appliance-{re.escape(__version__)}-cp311-abi3-manylinux_2_\d+_(x86_64|aarch64)\.whl"
+    assert re.fullmatch(named, wheel.name)
     assert wheel in map(
         wheel.with_name, (f"{wheel.name.partition('-cp311')[0]}-{tag}.whl" for tag in sys_tags())
     )
