@@ -84,7 +84,7 @@ def test_a_door_a_held_group_and_guards(site: StandbySite) -> None:
         site.cut("a")
         site.until_taken_over("b")
         assert tablet.run(lambda: eventually(lambda: watched("b", path), site.story))
-        assert not b.row("drive", "status")["holder"]
+        assert not b.row("drive", "status")["groups"][0]["holder"]
         assert {name: row["shadow"] for name, row in guards(site, "b").items()} == {
             "speed": False,
             "deadman": True,
