@@ -31,6 +31,7 @@ from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
 from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusView, Watch, watched
 from appliance.features.views import pair_view, states_of
+from appliance.policy.host_names import HostInWords
 from rosmop.tool.tables import table_of
 from rosmop.tool.terminal import counted
 
@@ -96,7 +97,7 @@ def _answer(appliance: Appliance) -> AdminAnswer[StatusView]:
     if answer.trouble == "standby":
         pair = pair_view()
         return _shown(appliance.ask(pair.request()), pair.status)
-    return _shown(answer, _view)
+    return _shown(answer, partial(_view, appliance=appliance))
 
 
 def _shown(answer: AdminAnswer[A], view: Callable[[A], StatusView]) -> AdminAnswer[StatusView]:
@@ -105,11 +106,13 @@ def _shown(answer: AdminAnswer[A], view: Callable[[A], StatusView]) -> AdminAnsw
     return AdminAnswer(False, error=answer.error, findings=answer.findings, trouble=answer.trouble)
 
 
-def _view(body: Status) -> StatusView:
+def _view(body: Status, appliance: Appliance) -> StatusView:
     troubles = list(troubles_of(body))
     attention = [alarm.text for alarm in (*activity(body), *open_alarms(body)) if _is_attention(alarm, body)]
     fields = {**in_full(body), "troubles": troubles, "attention": attention}
-    return StatusView(1 if troubles else 0, StatusScreen(body, troubles, attention), fields)
+    host_in_words = str if appliance.as_json or not body.ipsec.ports else appliance.host_in_words
+    screen = StatusScreen(body, troubles, attention, host_in_words)
+    return StatusView(1 if troubles else 0, screen, fields)
 
 
 def _is_attention(alarm: Alarm, body: Status) -> bool:
@@ -133,17 +136,18 @@ class StatusScreen:
     body: Status
     troubles: list[str]
     attention: list[str]
+    host_in_words: HostInWords
 
     def __rich_console__(self, _console: Console, options: ConsoleOptions) -> RenderResult:
         for trouble in shortened(self.troubles, _MOST_TROUBLES):
             yield Text(f"! {trouble}", style=_RED)
         for line in shortened(self.attention, _MOST_TROUBLES):
             yield Text(f"attention: {line}", style=_YELLOW)
-        yield _grid(self.body)
+        yield _grid(self.body, self.host_in_words)
         yield processes_table(self.body.processes, options.max_width)
 
 
-def _grid(body: Status) -> Table:
+def _grid(body: Status, host_in_words: HostInWords) -> Table:
     audit = body.audit
     grid = Table.grid(padding=(0, 2))
     if body.name:
@@ -183,7 +187,7 @@ def _grid(body: Status) -> Table:
         relay.append("; only monitored topics: NO BOUNDARY, the rest bypasses the relay", style=_YELLOW)
     grid.add_row("relay", relay)
     grid.add_row("tunnels", _tunnels(body.ipsec))
-    grid.add_row("hosts' ports", _ports(body.ipsec.ports))
+    grid.add_row("hosts' ports", _ports(body.ipsec.ports, host_in_words))
     lines = [view.line(state) for view, state in states_of(body) if view.line is not None]
     forwarded = "".join(f", {text}" for name, text in lines if not name)
     grid.add_row("audit log", f"{counted(audit.lag_records, 'record')} waiting to be written{forwarded}")
@@ -218,14 +222,18 @@ def _tunnels(ipsec: IpsecState) -> str:
     return text
 
 
-def _ports(known: dict[str, PortsSeen]) -> str:
+def _ports(known: dict[str, PortsSeen], host_in_words: HostInWords) -> str:
     """Summarize whether the machines with nodes have closed their ROS ports to all but the appliance."""
     by_state = {
         state: [name for name, ports in known.items() if ports.state == state] for state in _PORT_STATES
     }
     if not known:
         return "no other machine runs nodes"
-    words = [f"{state}: {', '.join(names[:_MOST_NAMED])}" for state, names in by_state.items() if names]
+    words = [
+        f"{state}: {', '.join(map(host_in_words, names[:_MOST_NAMED]))}"
+        for state, names in by_state.items()
+        if names
+    ]
     return "; ".join(words) + (
         " (on another machine: rosrv protect --check ADDRESS)" if by_state["unknown"] else ""
     )

@@ -1,6 +1,7 @@
 """`rosrv up`: start the appliance and run until a signal stops it."""
 
-from appliance.supervisor.logs import configure_logs  # must precede the first import of structlog: see there
+# must precede the first import of structlog: see there
+from appliance.supervisor.logs import configure_logs, write_line
 
 # isort: split
 import contextlib
@@ -125,8 +126,16 @@ def _announce_waiting(pairing: Pairing | None, *, as_json: bool) -> None:
     if pairing is None:
         return
     with contextlib.suppress(OSError):
-        sys.stdout.write(f"{json.dumps(pairing.event) if as_json else pairing.text}\n")
+        _write(json.dumps(pairing.event) if as_json else pairing.text, as_json=as_json)
+
+
+def _write(line: str, *, as_json: bool) -> None:
+    """Write a line to standard output, as it is for `--json`. Raises `OSError`."""
+    if as_json:
+        sys.stdout.write(f"{line}\n")
         sys.stdout.flush()
+    else:
+        write_line(line, sys.stdout)
 
 
 def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
@@ -164,14 +173,14 @@ def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
         if said.token is not None:
             more.append(f"The first access token (admin) is in {_keep_token(settings.state, said.token)}")
     try:
-        sys.stdout.write(line + "\n")
-        sys.stdout.flush()
+        _write(line, as_json=as_json)
     except OSError as error:  # closed pipe, full disk, closed terminal
         kept = None if said.token is None else str(_keep_token(settings.state, said.token))
         shown = None if said.token else line
         log.warning("cannot write to standard output", error=error.strerror, first_token=kept, line=shown)
     with contextlib.suppress(OSError):
-        typer.echo("".join(f"{line}\n" for line in more), err=True, nl=False)
+        for one in more:
+            write_line(one, sys.stderr)
 
 
 def _rest_url(settings: Settings) -> str | None:

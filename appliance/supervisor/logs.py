@@ -5,7 +5,7 @@ Messages from the standard library's `logging` have the same format.
 
 import logging
 import sys
-from typing import Any, cast
+from typing import Any, TextIO, cast
 
 _rich = sys.modules.pop("rich", None)
 sys.modules["rich"] = cast(Any, None)  # otherwise structlog would load rich for its tracebacks
@@ -46,3 +46,12 @@ def configure_logs(process: str) -> None:
         cache_logger_on_first_use=False,
     )
     structlog.contextvars.bind_contextvars(process=process)
+
+
+def write_line(text: str, stream: TextIO) -> None:
+    """Write a line for operators in the form of the logs: text with a terminal, otherwise JSON. Raises `OSError`."""
+    if stream.isatty() or sys.stderr.isatty():
+        stream.write(f"{text}\n")
+        stream.flush()
+    else:
+        structlog.wrap_logger(structlog.WriteLogger(stream)).info(text)

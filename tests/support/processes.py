@@ -125,9 +125,12 @@ class Process:
                 self._changed.wait(left)
 
     def wait_for_text(self, text: str, *, timeout: float = LIMIT, since: int = 0) -> str:
-        """Return the first line of plain output that contains `text`."""
-        line = self.wait_for(lambda event: text in event.get("text", ""), timeout=timeout, since=since)
-        return str(line["text"])
+        """Return the first line, plain or of a log, that contains `text`."""
+
+        def said(event: Event) -> str:
+            return str(event.get("text", event.get("event", "")))
+
+        return said(self.wait_for(lambda event: text in said(event), timeout=timeout, since=since))
 
     def wait_for_error(self, text: str, *, timeout: float = LIMIT) -> None:
         """Wait until a line that contains `text` is on its standard error."""

@@ -24,31 +24,50 @@ class Full(io.StringIO):
         raise OSError(errno.ENOSPC, "No space left on device")
 
 
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
 def test_the_first_token_is_in_its_file_before_the_line_is_printed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    shown = Terminal()
+    monkeypatch.setattr(sys, "stderr", shown)
     _announce(READY, Settings(state=tmp_path, api="127.0.0.1:8443"), as_json=False)
     kept = tmp_path / "first-token"
     assert (kept.read_text(), stat.S_IMODE(kept.stat().st_mode)) == ("secret\n", 0o600)
-    said = capsys.readouterr()
-    assert said.out.count("\n") == 1
-    assert said.err.endswith(
+    assert capsys.readouterr().out.count("\n") == 1
+    assert shown.getvalue().endswith(
         f"Console: https://127.0.0.1:8443/console/\nREST: https://127.0.0.1:8443\n"
         f"The first access token (admin) is in {kept}\n"
     )
 
 
+def test_without_a_terminal_all_lines_are_of_the_log(tmp_path: Path) -> None:
+    with capture_logs() as said:
+        _announce(READY, Settings(state=tmp_path, api="127.0.0.1:8443"), as_json=False)
+    assert [str(one["event"]).partition(":")[0] for one in said] == [
+        "Nodes may connect",
+        "Nodes on other machines",
+        "Console",
+        "REST",
+        f"The first access token (admin) is in {tmp_path / 'first-token'}",
+    ]
+
+
 def test_the_policys_warnings_are_printed_at_start(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    shown = Terminal()
+    monkeypatch.setattr(sys, "stderr", shown)
     said = msgspec.structs.replace(
         READY, token=None, warnings=tuple(f"p.ini:{n}:1: warning" for n in range(12))
     )
     settings = Settings(state=tmp_path, api="off", policy=Path("p.ini"))
     _announce(said, settings, as_json=False)
-    shown = capsys.readouterr()
-    assert shown.out.count("\n") == 1
-    assert "p.ini:9:1: warning\nand 2 more warnings: rosrv policy check p.ini\n" in shown.err
+    assert capsys.readouterr().out.count("\n") == 1
+    assert "p.ini:9:1: warning\nand 2 more warnings: rosrv policy check p.ini\n" in shown.getvalue()
     _announce(said, settings, as_json=True)
     event = json.loads(capsys.readouterr().out)
     assert event["warnings"] == [*said.warnings]
@@ -75,6 +94,7 @@ def test_a_closed_standard_output_does_not_end_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, as_json: bool
 ) -> None:
     monkeypatch.setattr(sys, "stdout", Full())
+    monkeypatch.setattr(sys, "stderr", Terminal())
     with capture_logs() as said:
         _announce(READY, Settings(state=tmp_path, api="off"), as_json=as_json)
     assert (tmp_path / "first-token").read_text() == "secret\n"

@@ -9,10 +9,11 @@ import pytest
 pytestmark = pytest.mark.nightly
 
 _PROGRAM = """
-import logging, structlog
-from appliance.supervisor.logs import configure_logs
+import logging, structlog, sys
+from appliance.supervisor.logs import configure_logs, write_line
 
 configure_logs("tester")
+write_line("Nodes may connect", sys.stdout)
 
 def fail(token):
     raise ValueError("odd")
@@ -36,4 +37,5 @@ def test_lines_are_json_without_secrets() -> None:
         assert line["exception"][0]["exc_type"] == "ValueError"
         assert [frame["name"] for frame in line["exception"][0]["frames"]] == ["<module>", "fail"]
     assert "sesame-42" not in done.stderr
-    assert done.stdout == ""
+    announced = json.loads(done.stdout)
+    assert (announced["event"], announced["process"]) == ("Nodes may connect", "tester")
