@@ -301,11 +301,11 @@ def drop(number: int, reason: str = "", monitor: str = "limit", **detail: Any) -
     return LogEntry(number, record)
 
 
-def denial(number: int, resource: str) -> LogEntry:
+def denial(number: int, resource: str, event: str = "decision", **detail: Any) -> LogEntry:
     record = AuditRecord(
-        id=f"{number:020x}", time=number * 10**9, event="decision", severity=Severity.NOTICE, decision="deny",
+        id=f"{number:020x}", time=number * 10**9, event=event, severity=Severity.NOTICE, decision="deny",
         host="10.0.0.9", caller_id="/x", category="publish", resource=resource, reason="no rule",
-        rule=RuleReference("Publishers", "/arm", "robot.ini", 7),
+        rule=RuleReference("Publishers", "/arm", "robot.ini", 7), detail=detail,
     )  # fmt: skip
     return LogEntry(number, record)
 
@@ -364,6 +364,21 @@ def test_a_host_that_makes_several_calls_in_turn_is_a_few_rows(opened: Callable[
         expect(rows.nth(1)).to_contain_text(text)
     page.get_by_label("Text", exact=True).fill("arm")
     expect(rows).to_have_count(42)
+
+
+def test_a_row_of_repetitions_alone_names_the_request(opened: Callable[..., Reader]) -> None:
+    entries = [
+        denial(number, "/arm", "denials folded", of="decision", call="registerPublisher", count=10)
+        for number in (1, 2)
+    ]
+    reader = opened()
+    reader.page.route(re.compile(r"/v1/audit\?"), lambda route: route.fulfill(json=page_of(entries)))
+    rows = reader.go("audit").locator("tbody tr")
+    expect(rows).to_have_count(1)
+    expect(rows).to_contain_text("publish")
+    expect(rows).not_to_contain_text("folded")
+    rows.get_by_role("button", name="20 times").press("Enter")
+    expect(rows.last).to_contain_text("denials folded")
 
 
 def test_equal_records_are_one_row_that_opens(opened: Callable[..., Reader]) -> None:

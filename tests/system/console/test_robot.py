@@ -69,6 +69,13 @@ def test_all_of_it_is_in_the_picture(opened: Callable[..., Reader], size: tuple[
 
 
 @pytest.mark.usefixtures("robot")
+def test_nodes_on_the_appliances_own_machine_are_not_denied(opened: Callable[..., Reader]) -> None:
+    page = opened().go("hosts")
+    expect(page.locator(".head-sub")).to_contain_text("0 other machines without a tunnel")
+    expect(page.get_by_text("No other machine runs nodes without a tunnel")).to_be_visible()
+
+
+@pytest.mark.usefixtures("robot")
 def test_a_group_opens_where_it_stands(opened: Callable[..., Reader]) -> None:
     page = _graph(opened(width=WIDE[0], height=WIDE[1]))
     group = page.locator('[data-key="gnode:/arm/*"]')

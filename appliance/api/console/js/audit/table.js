@@ -35,10 +35,15 @@ function Row(/** @type {{record: any, others?: number, callers?: number, time: a
   return html`<tr class=${`pick${chosen ? " chosen" : ""}${part ? " part" : ""}`} aria-selected=${chosen ? "true" : undefined} onClick=${open} data-id=${record.id} data-sequence=${record.sequence}>
     <td class="time"><a href=${auditPath(filter, record.id)} onClick=${link}>${time}</a></td>
     <td><${Outcome} record=${record} /></td>
-    <td><${Given} value=${record.event === "decision" ? requested(record) : record.event} most=${30} /> ${record.detail.monitor && html`<span class="muted small"><${Given} value=${record.detail.monitor} most=${40} /></span> `}${count}</td>
+    <td><${Given} value=${isRequest(record, part) ? requested(record) : record.event} most=${30} /> ${record.detail.monitor && html`<span class="muted small"><${Given} value=${record.detail.monitor} most=${40} /></span> `}${count}</td>
     <td data-label="Who" class=${who ? "" : "bare"}><${Given} value=${who} most=${40} mono />${callers > 0 && html` <span class="muted small nowrap">and ${callers} more</span>`}</td>
     <td class=${`nowrap${record.host ? "" : " bare"}`} data-label="Host"><${Host} value=${record.host} /></td>
     <td data-label="Resource" class=${record.resource ? "" : "bare"}><${Given} value=${record.resource} most=${60} mono />${others > 0 && html` <span class="muted small nowrap">and ${others} more</span>`}</td>
     <td data-label="Rule" class=${`wide-only${record.rule ? "" : " bare"}`}>${record.rule ? html`<${Given} value=${`[${record.rule.section}]`} most=${22} mono /> <${Given} value=${record.rule.key} most=${40} mono />` : html`<span class="muted">–</span>`}</td>
     <td data-label="Reason" class=${`wide-only reason${reason ? "" : " bare"}`}><${Given} value=${reason} most=${240} /></td></tr>`;
+}
+
+/** Whether a row is about a request. Of the records behind a row, those that count repetitions have their own words. */
+function isRequest(/** @type {any} */ { event, category, detail }, /** @type {boolean} */ part) {
+  return event === "decision" || (!part && category && detail.of === "decision");
 }
