@@ -2,7 +2,7 @@
 
 import datetime
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -31,12 +31,12 @@ class MonitorRecords:
 
     `counts` has the number of events by kind and monitor; a change by several monitors counts for each of them. `at`
     has the number of dropped or changed messages by topic. Actions that monitors in shadow mode would have taken are
-    separate kinds. Each callback in `told` gets every event.
+    separate kinds. Each callback in `told` gets every event; a feature adds its own.
     """
 
     trail: AuditTrail
     fields: Callable[[str, bytes], dict[str, Any] | None]
-    told: Collection[Callable[[MonitorEvent], None]]
+    told: list[Callable[[MonitorEvent], None]]
     counts: Counter[tuple[str, str]] = field(default_factory=Counter, init=False)
     at: Counter[tuple[str, str]] = field(default_factory=Counter, init=False)
 

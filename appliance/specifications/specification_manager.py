@@ -167,7 +167,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self.returns = TimedSwitches(store, self._come_back)
         self.sources = Sources()
         self.checked = CheckedSpecifications()
-        self.records = MonitorRecords(trail, lambda topic, data: self.checked.fields(topic, data), told)  # noqa: PLW0108 - of whatever is in force then
+        self.records = MonitorRecords(trail, lambda topic, data: self.checked.fields(topic, data), [*told])  # noqa: PLW0108 - of whatever is in force then
         self._published = published
 
     # --- start ---
@@ -385,7 +385,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 text = f"this would also remove {', '.join(left)} from the same file: name the file, or load it without"
                 raise SpecificationsRefusedError([text])
             sources, note = self.sources.without(files), f"removed {', '.join(sorted(files))}"
-            return await self._change(sources, who, who, note, request.confirm_within, consent=_Consent())
+            found = self._folder.looked_at() if self.folder is not None else None
+            of_folder = found is not None and found.with_topics(sources.topics) == sources
+            keeper = DISK if of_folder else who  # what is left is the baseline again
+            return await self._change(sources, keeper, who, note, request.confirm_within, consent=_Consent())
 
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
         """Bring a kept revision into force again (None: the previous revision; 0: no specifications).

@@ -77,6 +77,8 @@ EVENTS: dict[str, str] = {
     " or publish, or `missed` for a message that it did not get.",
     "monitor set": "An operator set a constant that is given to a monitor, or its default applies again, because the"
     " text no longer declares it with this range; `detail` has who ordered it, `values` and `before`.",
+    "driver checked": "An operator measured whether a robot's driver stops its base when commands end; `detail` has"
+    " `outcome`, `seconds` from the last command, and who ordered it.",
     "monitor resumed": "The topics that a monitor held after a restart resume; `detail` has who ordered it.",
     "monitors restarted": "A relay process was restarted: its monitors are in their initial state, and some hold their"
     " topics.",
@@ -195,7 +197,8 @@ SEVERITIES: dict[str, Severity] = {
             "authority asked", "authority handed over", "host block ended", "motion stopped", "host unblocked",
             "appliance started", "appliance stopped", "bundle in force", "clock not synchronised", "clock synchronised",
             "evidence exported", "forwarding resumed", "handed over", "host awaited", "host awaited no longer",
-            "host enrolled", "host renewed", "hosts reloaded", "monitor resumed", "monitor set", "policy loaded",
+            "host enrolled", "host renewed", "hosts reloaded", "driver checked", "monitor resumed", "monitor set",
+            "policy loaded",
             "recording closed", "door added", "door removed", "door ticket made", "signed off", "signed on",
             "recording ordered", "recording fetched", "recording read", "recording removed", "specifications loaded",
             "switchover ordered", "token added", "token revoked", "token rotated", "took over", "topic looked into",

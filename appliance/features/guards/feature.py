@@ -18,10 +18,15 @@ def _operations() -> "tuple[type[AdminRequest[Any]], ...]":
 
 
 def _operate(context: OperatorContext) -> FeaturePart:
+    from appliance.features.guards.driver_check import DriverChecks  # noqa: PLC0415  only control needs it
     from appliance.features.guards.guard_orders import GuardOrders  # noqa: PLC0415  only control needs it
 
     orders = GuardOrders(context.monitors, context.graph)
-    return FeaturePart(methods=orders.methods(), work={"the guards": orders.watch})
+    checks = DriverChecks(context.monitors, context.core.trail, context.graph, context.processes)
+    return FeaturePart(
+        methods=(*orders.methods(), *checks.methods()),
+        work={"the guards": orders.watch, "the check of a driver": checks.watch},
+    )
 
 
 GUARDS = Feature(
@@ -39,6 +44,7 @@ GUARDS = Feature(
                 "set": Verb(f"{_VERBS}:set_values"),
                 "enforce": Verb(f"{_VERBS}:enforce"),
                 "remove": Verb(f"{_VERBS}:remove"),
+                "check-driver": Verb("appliance.features.guards.driver_verb:check_driver"),
             },
             after="monitor",
         )

@@ -104,3 +104,22 @@ class Suggestions(msgspec.Struct, frozen=True):
     """Guards for each topic that commands a base or an arm, in the order in which they act."""
 
     suggestions: Annotated[list[Suggestion], doc("the proposed guards")]
+
+
+class DriverCheck(msgspec.Struct, frozen=True):
+    """The present check of a robot's driver, or the last one since control started."""
+
+    command: Annotated[str, doc("the topic whose motions are withheld; empty: there was no check")] = ""
+    by: Annotated[str, doc("the topic that shows how the base moves")] = ""
+    outcome: Annotated[
+        str,
+        doc(
+            "empty: under way; `stopped`: the driver stopped the base; `moving`: it did not, within the time; not"
+            " measured: `idle`: no slow drive; `ended`: a stop command came; `silent`: the odometry was silent;"
+            " `interrupted`: a process ended, or the client no longer asked"
+        ),
+    ] = ""
+    seconds: Annotated[
+        float | None, doc("from the last command that the base got to the outcome; `idle`: that it waited")
+    ] = None
+    text: Annotated[str, doc("the outcome, for a person")] = ""

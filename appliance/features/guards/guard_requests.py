@@ -11,7 +11,7 @@ from appliance.channel.admin import MONITORS, AdminRequest, Confirm, Hold, OneMo
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.monitor_answers import Replacement
 from appliance.channel.rest_operation import rest
-from appliance.features.guards.guard_answers import GuardList, GuardPlan, Suggestions
+from appliance.features.guards.guard_answers import DriverCheck, GuardList, GuardPlan, Suggestions
 
 _NO_GUARD = {404: "There is no such guard."}
 _Text = Annotated[str, msgspec.Meta(max_length=4096)]
@@ -46,6 +46,15 @@ class GuardDraft(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     values: Annotated[_Values, doc("by parameter, as text")] = {}
     shadow: Annotated[bool, doc("a new guard only records what it would have done")] = False
     enforce: Annotated[bool, doc("bring the guard from shadow mode into force")] = False
+
+
+class NewDriverCheck(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A check of a robot's driver to begin; somebody drives the base slowly meanwhile."""
+
+    command: Annotated[_Name, doc("the topic of the base's velocities")]
+    by: Annotated[_Name, doc("the topic that shows how the base moves")]
+    seconds: Annotated[float, doc("motions are withheld for at most this time")] = 2.0
+    patience: Annotated[float, doc("how long it waits for a slow drive, in seconds")] = 30.0
 
 
 @rest("viewer", "GET", "/v1/guards", name="guards")
@@ -107,4 +116,28 @@ class GuardTry(WaitingRequest[GuardPlan], frozen=True, tag="guard try"):
     hold: Hold = False
 
 
-REQUESTS = (GuardsWanted, GuardSuggestionsWanted, GuardNew, GuardSet, GuardTry)
+@rest(
+    "admin", "POST", "/v1/guards/driver-check", name="check_driver", body=NewDriverCheck, of=MONITORS,
+)  # fmt: skip
+class DriverCheckBegin(AdminRequest[DriverCheck], frozen=True, tag="driver check"):
+    """Withhold the motions of a slowly driven base once, to measure how long its driver takes to stop it.
+
+    It loads a monitor, which acts once, and is removed afterwards. The client asks for the outcome at least every three
+    seconds; otherwise the check ends.
+    """
+
+    command: str
+    by: str
+    seconds: float = 2.0
+    patience: float = 30.0
+    expected: str | None = None
+
+
+@rest("operator", "GET", "/v1/guards/driver-check", name="driver_check")
+class DriverCheckWanted(WaitingRequest[DriverCheck], frozen=True, tag="driver check wanted"):
+    """The check of a driver. If it is under way, the answer comes with its end, or after a second."""
+
+
+REQUESTS = (
+    GuardsWanted, GuardSuggestionsWanted, GuardNew, GuardSet, GuardTry, DriverCheckBegin, DriverCheckWanted,
+)  # fmt: skip

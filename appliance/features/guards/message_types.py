@@ -84,6 +84,14 @@ SPEEDS = {
     "geometry_msgs/TwistStamped": TypeRow({"v": "twist.linear.x"}),
     "geometry_msgs/TwistWithCovarianceStamped": TypeRow({"v": "twist.twist.linear.x"}),
 }
+MOTIONS = {
+    kind: TypeRow({"vx": f"{before}linear.x", "vy": f"{before}linear.y", "turn": f"{before}angular.z"})
+    for kind, before in (
+        ("nav_msgs/Odometry", "twist.twist."),
+        ("geometry_msgs/TwistStamped", "twist."),
+        ("geometry_msgs/TwistWithCovarianceStamped", "twist.twist."),
+    )
+}
 SENSORS = {
     "sensor_msgs/LaserScan": TypeRow({"values": "ranges"}),
     "sensor_msgs/Range": _listed("range"),

@@ -179,6 +179,9 @@ PRESETS = {
     )
 }
 
+DRIVER_CHECK = Preset("driver_check", {**_MOVES, "by": types.MOTIONS})
+"""Not a guard: a monitor that `rosrv guard check-driver` loads for a short time."""
+
 
 @dataclass(frozen=True)
 class Guard:

@@ -88,6 +88,7 @@ LOOKING = [
     ("drive", "ask", "base", "--host", "robot"), ("approve",),
     ("approve", "48213"), ("sso", "list"), ("sso", "end", "nobody"),
     ("guard", "set", "nobody", "vMax=1"), ("guard", "enforce", "nobody"), ("guard", "remove", "nobody"),
+    ("guard", "check-driver", "/nothing", "--by", "/odom", "--yes"),
 ]  # fmt: skip
 
 

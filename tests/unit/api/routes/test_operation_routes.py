@@ -71,6 +71,8 @@ REQUESTS: list[tuple[str, str, Any]] = [
     ("POST", "/v1/guards", {"preset": "speed", "topics": {"command": "/cmd_vel"}}),
     ("POST", "/v1/guards?confirm_within=9&hold=1", {"preset": "fence", "topics": {"command": "/a", "by": "/odom"},
                                                     "values": {"margin": "1"}, "name": "yard", "shadow": True}),
+    ("POST", "/v1/guards/driver-check", {"command": "/cmd_vel", "by": "/odom"}),
+    ("GET", "/v1/guards/driver-check", None),
     ("PATCH", "/v1/guards/fence?hold=1", {"values": {"margin": "0.5"}}),
     ("POST", "/v1/guards/plan?hold=1", {"name": "fence", "values": {"margin": "0.5"}}),
     ("POST", "/v1/drive/base/take", {"host": "robot"}),

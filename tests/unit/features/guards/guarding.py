@@ -6,7 +6,7 @@ import random
 from collections.abc import Iterable
 from typing import Any
 
-from appliance.features.guards.presets import PRESETS, Guard, text_of
+from appliance.features.guards.presets import DRIVER_CHECK, PRESETS, Guard, text_of
 from rosmop.check.sources import compiled_from
 from rosmop.fast.build import certified, parts_of
 from rosmop.fast.load import loaded
@@ -48,11 +48,12 @@ class Guarded:
 
     def __init__(self, preset: str, types: dict[str, str] | None = None, **values: object) -> None:
         wanted = {name: str(value).lower() for name, value in values.items()}
-        self.text = text_of(Guard("guard", PRESETS[preset], types=types or {}, values=wanted))
+        chosen = {**PRESETS, DRIVER_CHECK.name: DRIVER_CHECK}[preset]
+        self.text = text_of(Guard("guard", chosen, types=types or {}, values=wanted))
         compiled, fast = loaded(_part(self.text))
         self.monitors = MonitorSet.of(compiled, fast=fast)
         self.monitors.name_senders(lambda source: ("10.0.0.1", NODES[source]))
-        self.topics = PRESETS[preset].given_topics
+        self.topics = chosen.given_topics
         self.got: list[tuple[int, Any]] = []
         self.monitors.start(BEGIN - 100 * MS)
         self.advance(0)

@@ -1,0 +1,22 @@
+"""The outcomes of a driver check, as sentences and as exit statuses of `rosrv guard check-driver`."""
+
+_SENTENCES = {
+    "stopped": "the driver stopped the base {:.2f} s after its last command",
+    "moving": "the base still moved {:.2f} s after its last command, so the appliance sent a stop: if the appliance's"
+    " machine dies, this base drives on",
+    "idle": "not measured: no command moved the base slowly for a second, at most 0.3 m/s and 0.6 rad/s by its"
+    " odometry, within {:.0f} s",
+    "ended": "not measured: a stop command came {:.2f} s after the last motion; drive on during the measurement",
+    "silent": "not measured: the odometry was silent, so the appliance sent a stop {:.2f} s after the last command",
+}
+_STATUSES = {"stopped": 0, "moving": 1}
+
+
+def sentence_of(outcome: str, seconds: float | None, why: str = "") -> str:
+    form = _SENTENCES.get(outcome)
+    return f"not measured: {why}" if form is None or seconds is None else form.format(seconds)
+
+
+def status_of(outcome: str) -> int:
+    """Return the exit status: 2 if nothing was measured."""
+    return _STATUSES.get(outcome, 2)

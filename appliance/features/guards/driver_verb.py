@@ -1,0 +1,81 @@
+"""`rosrv guard check-driver`: measure whether a robot's own driver stops its base when commands end."""
+
+import sys
+from typing import Annotated
+
+import typer
+
+from appliance.cli import completion
+from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.durations import span_given
+from appliance.cli.output import say_json, usage_error
+from appliance.features.guards.driver_outcomes import status_of
+from appliance.features.guards.guard_answers import DriverCheck
+from appliance.features.guards.guard_requests import DriverCheckBegin, DriverCheckWanted
+from rosmop.tool.terminal import say
+
+_VERB = "rosrv guard check-driver"
+_RESTARTED = "not measured: the appliance was restarted; its relays pass commands again after at most --for"
+
+
+@speaks
+def check_driver(
+    appliance: Appliance,
+    topic: Annotated[
+        str, typer.Argument(metavar="TOPIC", autocompletion=completion.topics, show_default=False)
+    ],
+    *,
+    by: Annotated[
+        str,
+        typer.Option("--by", metavar="TOPIC", help="Topic of the odometry", autocompletion=completion.topics),
+    ],
+    longest: Annotated[
+        str, typer.Option("--for", metavar="TIME", help="Withhold motions at most for this time, up to 10s")
+    ] = "2s",
+    wait: Annotated[
+        str, typer.Option("--wait", metavar="TIME", help="Wait this long for a slow drive, up to 5m")
+    ] = "30s",
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask; needed without a terminal")] = False,
+) -> None:
+    """Measure whether the robot's driver stops the base when commands end, as if the appliance's machine had died.
+
+    Somebody drives the base slowly, with its wheels raised or in free space. After a second the appliance withholds the
+    motions of this topic once, and watches the odometry. Every stop command passes, guards stay in force, and commands
+    pass again afterwards. Exit status: 0 the driver stopped the base, 1 it still moved, 2 not measured.
+
+    Example: rosrv guard check-driver /cmd_vel --by /odom
+    """
+    seconds = span_given("--for", longest, "2s", _VERB)
+    request = DriverCheckBegin(topic, by, seconds, span_given("--wait", wait, "30s or 5m", _VERB))
+    _require_consent(seconds, yes=yes)
+    check = appliance.ask_or_exit(request)
+    if not appliance.as_json:
+        say("drive slowly now, at most 0.3 m/s and 0.6 rad/s, until the outcome is printed", "yellow")
+    while check.command and not check.outcome:
+        check = appliance.ask_or_exit(DriverCheckWanted())
+    _say_outcome(check, as_json=appliance.as_json)
+    raise typer.Exit(status_of(check.outcome))
+
+
+def _require_consent(seconds: float, *, yes: bool) -> None:
+    """Exit with status 2 unless the operator agrees."""
+    typer.echo(
+        f"While the base is driven slowly, its commands are withheld for up to {seconds:g} s. A driver without a"
+        " timeout drives on for that time: raise the wheels, or have free space and a hand on the emergency stop.",
+        err=True,
+    )
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise usage_error("without a terminal, agree with --yes", _VERB)
+    if not typer.confirm("May the base drive on?", err=True):
+        raise usage_error("nothing was changed", _VERB)
+
+
+def _say_outcome(check: DriverCheck, *, as_json: bool) -> None:
+    if as_json:
+        say_json(check)
+    elif not check.command:
+        say(_RESTARTED, "yellow")
+    else:
+        say(f"{check.command}: {check.text}", {0: "green", 1: "red"}.get(status_of(check.outcome), "yellow"))
