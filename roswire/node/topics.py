@@ -60,7 +60,9 @@ class NodeSubscription:
         self._received = received
         self._tasks = OwnedTasks()
         self._followed: dict[str, asyncio.Task[None]] = {}
-        self._heard: dict[str, int] = {}  # how many messages came over the present connection
+        self._latest: dict[
+            str, tuple[int, int]
+        ] = {}  # number and hash of each latched publisher's last message
 
     def update(self, uris: Sequence[str]) -> None:
         """Follow exactly the publishers of this list of node API URIs."""
@@ -97,7 +99,7 @@ class NodeSubscription:
                 self.problems[uri] = str(error) or f"{uri} did not answer in time"
             finally:
                 self.connected.pop(uri, None)
-                self._heard.pop(uri, None)
+                self._latest.pop(uri, None)
             if asyncio.get_running_loop().time() - before > _LONGEST_PAUSE:  # it was connected for a while
                 pause = _FIRST_PAUSE
             await asyncio.sleep(pause)
@@ -108,9 +110,11 @@ class NodeSubscription:
             self.connected[uri] = header
             self._connection.set()
             self.problems.pop(uri, None)
+            latched = header.get("latching") == "1"
             for number in itertools.count(1):
                 body = await read_frame(reader, self._link.limits.message_bytes)
-                self._heard[uri] = number
+                if latched:
+                    self._latest[uri] = number, hash(body)
                 self._received(body, header)
                 if number % _TURN == 0:
                     await asyncio.sleep(0)
@@ -137,19 +141,23 @@ class NodeSubscription:
             writer.close()
 
     def repeat(self, received: Received) -> None:
-        """Give `received` the last message of each latched publisher, which sends it over a connection of its own."""
+        """Give `received` the last message of each latched publisher, which sends it over a connection of its own.
+
+        A message that the present connection brings in the meantime, or has yet to bring, comes only from there.
+        """
         for uri in [uri for uri, header in self.connected.items() if header.get("latching") == "1"]:
             self._tasks.start(self._repeat(uri, received))
 
     async def _repeat(self, uri: str, received: Received) -> None:
-        before = self._heard.get(uri)
+        before = self._latest.get(uri)
         with contextlib.suppress(RosError, OSError):
             async with (
                 asyncio.timeout(self._link.limits.call_seconds),
                 self._connection_to(uri) as (reader, header),
             ):
                 body = await read_frame(reader, self._link.limits.message_bytes)
-                if self._heard.get(uri) == before:  # else a newer message has come
+                latest = self._latest.get(uri)
+                if latest is not None and latest == before and latest[1] == hash(body):
                     received(body, header)
 
     def _check(self, uri: str, header: Mapping[str, str]) -> None:

@@ -7,7 +7,7 @@ and every call of a service is decided by the master and the relay, as for any h
 """
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 from weakref import WeakValueDictionary
@@ -62,10 +62,16 @@ class _Subscriber(Protocol):
     def heard(self, message: DoorMessage) -> None:
         """Take a message of a subscribed topic."""
 
+    def failed(self, request: DoorRequest, reason: str) -> None:
+        """Take the refusal of a call, or the end of a subscription."""
+
 
 class _Learner:
     def heard(self, message: DoorMessage) -> None:
         """Ignore a message: only the header of its publisher is wanted."""
+
+    def failed(self, request: DoorRequest, reason: str) -> None:
+        """Do nothing: a learner accepts every type."""
 
 
 class DoorClient(_Subscriber, ParameterClient, Protocol):
@@ -73,9 +79,6 @@ class DoorClient(_Subscriber, ParameterClient, Protocol):
 
     def answered(self, call: int, values: Raw | bytes) -> None:
         """Take the answer to a call."""
-
-    def failed(self, request: DoorRequest, reason: str) -> None:
-        """Take the refusal of a call."""
 
     def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
         """Take the values of parameters."""
@@ -134,7 +137,7 @@ class DoorNode:
         self._types = types
         self._built_in = built_in
         self._publications: dict[str, _Publication] = {}
-        self._heard: dict[str, set[_Subscriber]] = {}
+        self._heard: dict[str, dict[_Subscriber, SubscribeTopic]] = {}
         self._offers: dict[str, _Offer] = {}
         self._call_bytes = 0
         self._parameters = DoorParameters(node)
@@ -275,11 +278,11 @@ class DoorNode:
         topic = request.topic
         async with self._lock(f"subscriber {topic}"):
             if topic in self._heard:
-                self._heard[topic].add(client)
-                self.node.repeat(topic, lambda body, header: client.heard(self._message(topic, body, header)))
+                self._heard[topic][client] = request
+                self.node.repeat(topic, lambda body, header: self._hear(topic, body, header, [client]))
                 return
             self._check_room(self._heard)
-            self._heard[topic] = {client}
+            self._heard[topic] = {client: request}
             try:
                 await self.node.subscribe(
                     topic,
@@ -290,18 +293,31 @@ class DoorNode:
                 del self._heard[topic]
                 raise
 
-    def _message(self, topic: str, body: bytes, header: Mapping[str, str]) -> DoorMessage:
-        return DoorMessage(topic, body, header, clock.wall_ns(), self._types.learn)
-
-    def _hear(self, topic: str, body: bytes, header: Mapping[str, str]) -> None:
-        message = self._message(topic, body, header)
-        for client in self._heard.get(topic, ()):
-            client.heard(message)
+    def _hear(
+        self,
+        topic: str,
+        body: bytes,
+        header: Mapping[str, str],
+        receivers: Iterable[_Subscriber] | None = None,
+    ) -> None:
+        """Give a message to the subscribers of its topic; a client that wants another type is refused."""
+        message = DoorMessage(topic, body, header, clock.wall_ns(), self._types.learn)
+        clients, kind = self._heard.get(topic, {}), header.get("type", ANY)
+        wrong = []
+        for client in clients if receivers is None else receivers:
+            request = clients.get(client)
+            if request is not None and request.type in (None, kind):
+                client.heard(message)
+            elif request is not None:
+                wrong.append((client, request))
+        for client, request in wrong:
+            self._unsubscribe(topic, client)
+            client.failed(request, f"{topic} has the type {kind[:200]}, not {request.type}")
 
     def _unsubscribe(self, topic: str, client: _Subscriber) -> None:
         clients = self._heard.get(topic)
         if clients is not None:
-            clients.discard(client)
+            clients.pop(client, None)
             if not clients:
                 self._tasks.start(self._end_subscription(topic))
 
@@ -349,7 +365,10 @@ class DoorNode:
         return received.json(await self.node.call_service(request.service, md5sum, body, seconds))
 
     async def _offer(self, request: OfferService, client: DoorClient) -> None:
-        if request.service in self._offers:
+        known = self._offers.get(request.service)
+        if known is not None and known.client is client:  # as in rosbridge, the newer offer replaces it
+            await self._withdraw(request.service)
+        elif known is not None:
             raise ProtocolError(f"{request.service} is already offered by a client of this door")
         given, response, definitions = self._types.service(request.type)
         offer = self._offers[request.service] = _Offer(client, response)

@@ -215,7 +215,8 @@ def _time(kind: str) -> tuple[Any, _Write]:
             return
         secs = value.sec if value.secs is UNSET else value.secs
         nsecs = value.nanosec if value.nsecs is UNSET else value.nsecs
-        out += whole.pack(0 if secs is UNSET else secs, 0 if nsecs is UNSET else nsecs)
+        whole_seconds, rest = divmod(0 if nsecs is UNSET else nsecs, 1_000_000_000)  # as ROS does
+        out += whole.pack((0 if secs is UNSET else secs) + whole_seconds, rest)
 
     return (_Time | Literal["now"] if kind == "time" else _Duration), write
 

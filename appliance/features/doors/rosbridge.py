@@ -52,6 +52,7 @@ from appliance.features.doors.rosbridge_frames import (
     id_of,
     json_frame,
     publish_frame,
+    type_name,
 )
 from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerQueue
@@ -79,11 +80,18 @@ class RosbridgeLimits:
 @dataclass(slots=True)
 class _Subscription:
     topic: str
+    type: str | None = None  # as the first client with a type named it
     clients: dict[ClientId, tuple[float, int, Compression]] = field(default_factory=dict)
 
     @property
     def compression(self) -> Compression:
         return max((one[2] for one in self.clients.values()), key=_STRENGTH.index)
+
+
+@dataclass(slots=True)
+class _Advertisement:
+    type: str | None
+    clients: set[ClientId] = field(default_factory=set)
 
 
 @dataclass(slots=True)
@@ -104,7 +112,7 @@ class Rosbridge:
         self._level = _LEVELS.index("error")
         self._subscriptions: dict[str, _Subscription] = {}  # by the client's spelling
         self._spellings: dict[str, set[str]] = {}  # of each topic with a subscription
-        self._advertised: dict[str, set[ClientId]] = {}
+        self._advertised: dict[str, _Advertisement] = {}
         self._services: dict[str, str] = {}  # the client's spelling, by canonical name
         self._calls: dict[int, _Call] = {}
         self._asked: dict[str, str] = {}  # calls to the client: their service, by id
@@ -141,27 +149,31 @@ class Rosbridge:
         topic, size = self._resolved(operation.topic), len(bytes(operation.will))
         if size > self._limits.will_bytes:
             raise OperationError(f"the will has {size} bytes; at most {self._limits.will_bytes}")
-        self._add_advertisement(topic, operation.id)
+        kind = type_name(operation.type)
+        self._add_advertisement(topic, kind, operation.id)
         queue, will = (
             operation.queue_size or 1,
             operation.will.copy() if size else None,
         )  # not the whole frame
-        return [AdvertiseTopic(topic, operation.type, operation.latch, queue, operation.id, will)]
+        return [AdvertiseTopic(topic, kind, operation.latch, queue, operation.id, will)]
 
-    def _add_advertisement(self, topic: str, client: ClientId) -> None:
+    def _add_advertisement(self, topic: str, kind: str | None, client: ClientId) -> None:
         _check_room(self._advertised, topic, self._limits.topics, "topics are advertised")
-        clients = self._advertised.setdefault(topic, set())
-        if client not in clients and len(clients) >= self._limits.ids:
-            raise OperationError(f"{topic} has {len(clients)} advertisements; at most {self._limits.ids}")
-        clients.add(client)
+        known = self._advertised.setdefault(topic, _Advertisement(kind))
+        known.type = _one_type(topic, "advertised", known.type, kind)
+        if client not in known.clients and len(known.clients) >= self._limits.ids:
+            raise OperationError(
+                f"{topic} has {len(known.clients)} advertisements; at most {self._limits.ids}"
+            )
+        known.clients.add(client)
 
     def _unadvertise(self, operation: UnadvertiseOp) -> list[DoorRequest]:
         topic = self._resolved(operation.topic)
-        clients = self._advertised.get(topic)
-        if clients is None:
+        known = self._advertised.get(topic)
+        if known is None:
             return []
-        clients.discard(operation.id)
-        if clients and operation.id is not None:
+        known.clients.discard(operation.id)
+        if known.clients and operation.id is not None:
             return []
         del self._advertised[topic]
         return [UnadvertiseTopic(topic, operation.id)]
@@ -171,14 +183,16 @@ class Rosbridge:
         publish = PublishMessage(topic, operation.msg, operation.id)
         if topic in self._advertised:
             return [publish]
-        self._add_advertisement(topic, None)
+        self._add_advertisement(topic, None, None)
         queue = operation.queue_size or 1
         return [AdvertiseTopic(topic, None, operation.latch, queue, operation.id), publish]
 
     def _subscribe(self, operation: SubscribeOp) -> list[DoorRequest]:
         topic = self._resolved(operation.topic)
+        kind = None if operation.type is None else type_name(operation.type)
         _check_room(self._subscriptions, operation.topic, self._limits.topics, "topics are subscribed")
         subscription = self._subscriptions.setdefault(operation.topic, _Subscription(topic))
+        subscription.type = _one_type(topic, "subscribed", subscription.type, kind)
         if operation.id not in subscription.clients and len(subscription.clients) >= self._limits.ids:
             raise OperationError(
                 f"{topic} has {len(subscription.clients)} subscriptions; at most {self._limits.ids}"
@@ -187,7 +201,7 @@ class Rosbridge:
         seconds, length = (operation.throttle_rate or 0) / 1000, operation.queue_length or 0
         subscription.clients[operation.id] = seconds, length, operation.compression
         self._configure(operation.topic, subscription)
-        return [SubscribeTopic(topic, operation.type, operation.id)]
+        return [SubscribeTopic(topic, kind, operation.id)]
 
     def _configure(self, spelling: str, subscription: _Subscription) -> None:
         """Use the least of the rates and lengths of all subscriptions to a topic, as rosbridge does."""
@@ -236,10 +250,10 @@ class Rosbridge:
         return [CallOfService(service, self._number, values, seconds or longest, reply_to)]
 
     def _offer(self, operation: AdvertiseServiceOp) -> list[DoorRequest]:
-        service = self._resolved(operation.service)
+        service, kind = self._resolved(operation.service), type_name(operation.type)
         _check_room(self._services, service, self._limits.services, "services are offered")
         self._services[service] = operation.service
-        return [OfferService(service, operation.type, operation.id)]
+        return [OfferService(service, kind, operation.id)]
 
     def _withdraw(self, operation: UnadvertiseServiceOp) -> list[DoorRequest]:
         service = self._resolved(operation.service)
@@ -362,6 +376,13 @@ class Rosbridge:
 
     def next_time(self) -> float | None:
         return self.queue.next_time()
+
+
+def _one_type(topic: str, use: str, known: str | None, given: str | None) -> str | None:
+    """Return the type of a topic of this client; raises `OperationError` if the client names a second one."""
+    if None not in (known, given) and known != given:
+        raise OperationError(f"{topic} is {use} as {known}, not {given}")
+    return known or given
 
 
 def _check_room(table: dict[str, Any], key: str, most: int, what: str) -> None:

@@ -183,6 +183,14 @@ def as_png(data: bytes) -> bytes:
     )
 
 
+def type_name(text: str) -> str:
+    """Return the name of a type without further slashes, which rosbridge accepts. Raises `OperationError`."""
+    parts = [part for part in text.split("/") if part]
+    if len(parts) != 2:
+        raise OperationError(f"{quoted(text)} is not a type; write PACKAGE/NAME")
+    return "/".join(parts)
+
+
 class OperationError(PeerError):
     """An operation that cannot be carried out."""
 

@@ -49,6 +49,7 @@ from roswire.xmlrpc import Value
 _READ_BYTES = 1 << 16
 _READ_DEFLATED_BYTES = 1 << 12  # the frames that are read at once take up to 1000 times as much inflated
 _BATCH_BYTES = 1 << 15
+_TURN = 64  # frames after which frames for clients are sent, although more have come
 _CLOSING_SECONDS = 2.0
 _WATCH_SECONDS = 2.0  # between two looks at the surroundings
 _MOST_PINGS = 100  # of the client that wait for their answers
@@ -252,9 +253,11 @@ class DoorSession:
                 break
             self.received_bytes += len(data)
             self._socket.receive_data(data)
-            for event in self._socket.events_received():
+            for number, event in enumerate(self._socket.events_received(), 1):
                 if isinstance(event, WebSocketFrame):
                     await self._take(event)
+                if number % _TURN == 0:
+                    await asyncio.sleep(0)
             self._charge_unfinished()
             self._wake.set()  # for the answer to a ping
             if self._pings > _MOST_PINGS:

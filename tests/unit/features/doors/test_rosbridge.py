@@ -102,6 +102,39 @@ def test_every_spelling_is_the_same_topic_to_the_node(client: Client, spelling: 
     assert len(client.sends(publish)) == 1
 
 
+@pytest.mark.parametrize(
+    "spelling", ["std_msgs//String", "//std_msgs/String", "/std_msgs//String/", "std_msgs/String//"]
+)
+def test_slashes_around_the_parts_of_a_type_do_not_count(client: Client, spelling: str) -> None:
+    for operation, name, made in (
+        ("advertise", "topic", AdvertiseTopic),
+        ("subscribe", "topic", SubscribeTopic),
+        ("advertise_service", "service", OfferService),
+    ):
+        [request] = client.sends({"op": operation, name: "/x", "type": spelling})
+        assert isinstance(request, made) and request.type == "std_msgs/String"
+
+
+@pytest.mark.parametrize(
+    "kind", ["", "/", "//", "bad", "not/better/still", "better/", "/better", "this\\isbad", "string"]
+)
+@pytest.mark.parametrize("operation", ["advertise", "subscribe", "advertise_service"])
+def test_a_type_without_two_parts_is_refused_in_words(client: Client, operation: str, kind: str) -> None:
+    status = client.refusal({"op": operation, "topic": "/x", "service": "/x", "type": kind, "id": 5})
+    assert "is not a type; write PACKAGE/NAME" in status["msg"] and status["id"] == 5
+
+
+@pytest.mark.parametrize("operation", ["advertise", "subscribe"])
+def test_a_second_type_of_a_topic_is_refused_and_the_first_one_stays(client: Client, operation: str) -> None:
+    assert client.sends({"op": operation, "topic": "/chatter", "type": "std_msgs/String", "id": 1})
+    status = client.refusal({"op": operation, "topic": "/chatter", "type": "std_msgs/Int32", "id": 2})
+    assert (
+        f"/chatter is {operation.removesuffix('e')}ed as std_msgs/String, not std_msgs/Int32" in status["msg"]
+    )
+    assert client.sends({"op": f"un{operation}", "topic": "/chatter", "id": 2}) == []
+    assert client.sends({"op": f"un{operation}", "topic": "/chatter", "id": 1})
+
+
 @pytest.mark.parametrize("spelling", [" /cmd_vel", "/cmd_vel ", "/cmd\u200bvel", "/cmd-vel", "", "/", "/a\n"])
 def test_a_name_that_no_topic_has_is_refused_in_words(client: Client, spelling: str) -> None:
     assert client.refusal({"op": "publish", "topic": spelling, "msg": {}, "id": 5})["id"] == 5

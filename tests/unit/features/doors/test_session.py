@@ -268,6 +268,60 @@ async def test_a_service_of_a_client_is_answered_or_fails_when_the_client_leaves
         assert world.master.services == {}
 
 
+async def test_a_subscription_with_a_type_that_the_topic_has_not_is_refused_in_words() -> None:
+    async with door_world() as world:
+        publication = await talks(await world.robot("10.0.0.3", "/robot"), "/state")
+        wrong, right = await world.client(), await world.client()
+        subscribe = {"op": "subscribe", "topic": "/state"}
+        wrong.send(subscribe | {"type": "std_msgs/Int32", "id": "w"})
+        right.send(subscribe | {"type": "std_msgs/String"})
+        await asyncio.sleep(1)
+        for _number in range(2):
+            publication.publish(string("ready"))
+            await asyncio.sleep(1)
+        status = await wrong.next()
+        assert (
+            status["msg"] == "/state has the type std_msgs/String, not std_msgs/Int32" and status["id"] == "w"
+        )
+        assert wrong.frames.empty() and right.frames.qsize() == 2
+        wrong.send(subscribe)
+        await asyncio.sleep(1)
+        publication.publish(string("ready"))
+        assert (await wrong.next())["msg"] == {"data": "ready"}
+
+
+async def test_a_service_that_a_client_offers_again_is_replaced_and_that_of_another_is_not() -> None:
+    async with door_world() as world:
+        robot, client, other = (
+            await world.robot("10.0.0.3", "/robot"),
+            await world.client(),
+            await world.client(),
+        )
+        offer = {"op": "advertise_service", "service": "/grip", "type": "std_srvs/SetBool"}
+        for _number in range(2):
+            client.send(offer)
+            await asyncio.sleep(1)
+        other.send(offer)
+        assert "is already offered by a client of this door" in (await other.next())["msg"]
+        call = asyncio.ensure_future(robot.call_service("/grip", "*", b"\x01", 100))
+        asked = await client.next()
+        answer = {"op": "service_response", "service": "/grip", "id": asked["id"], "result": True}
+        client.send(answer | {"values": {"success": True, "message": "ok"}})
+        assert await call == b"\x01" + string("ok")
+
+
+async def test_a_burst_of_a_client_on_a_topic_that_it_hears_itself_arrives_whole() -> None:
+    async with door_world() as world:
+        client = await world.client()
+        client.send({"op": "advertise", "topic": "/loop", "type": "std_msgs/Int32"})
+        client.send({"op": "subscribe", "topic": "/loop"})
+        await asyncio.sleep(1)
+        for number in range(3000):
+            client.socket.send_text(b'{"op":"publish","topic":"/loop","msg":{"data":%d}}' % number)
+        client.flush()
+        assert [(await client.next())["msg"]["data"] for _number in range(3000)] == [*range(3000)]
+
+
 async def test_an_agent_that_connects_for_each_call_registers_once() -> None:
     async with door_world() as world:
         for _ in range(5):

@@ -135,6 +135,7 @@ def test_cbor_has_typed_arrays_of_the_bytes_of_the_message() -> None:
         ('{"h":{"stamp":"now"}}', NOW),
         ('{"h":{"stamp":{"secs":7,"nsecs":8}}}', (7, 8)),
         ('{"h":{"stamp":{"sec":7,"nanosec":8}}}', (7, 8)),
+        ('{"h":{"stamp":{"secs":7,"nsecs":2000000001}}}', (9, 1)),
         ('{"h":{"stamp":{}}}', (0, 0)),
         ("{}", (0, 0)),
     ],

@@ -19,7 +19,8 @@ from roswire.node import (
     ServiceType,
 )
 from roswire.node.network import ByteWriter
-from roswire.tcpros import HeaderParser, encode_header
+from roswire.node.tcpros_streams import read_header
+from roswire.tcpros import HeaderParser, encode_frame, encode_header
 from roswire.uris import parse_node_uri
 from roswire.xmlrpc import MethodCall, Value, build_fault, build_response
 from tests.support.memory_network import MemoryNetwork
@@ -106,6 +107,50 @@ async def test_a_latched_message_reaches_a_late_subscriber() -> None:
         await listener.subscribe("/map", lambda body, _header: heard.append(body))
         await later()
         assert heard == [b"new"]
+
+
+@pytest.mark.parametrize(
+    ("sent", "heard"),
+    [
+        ("0a 1a", "a"),
+        ("0a 1a 0b", "ab"),
+        ("0a 0b 1b", "b"),
+        ("0a 1b 0b", "b"),
+        ("1a 0a", "a"),
+        ("1a 0a 0b", "ab"),
+    ],
+)
+async def test_a_repeated_message_is_neither_lost_nor_doubled(sent: str, heard: str) -> None:
+    """Connection 0 is the subscription's, 1 the repetition's. The client missed the messages before the repetition."""
+    async with nodes() as world:
+        talker, listener = await world.node("10.0.0.2"), await world.node("10.0.0.3")
+        publication = await talker.advertise("/map", STRING, latched=True, queue=1)
+        header = encode_header({"latching": "1", "md5sum": STRING.md5sum, "type": STRING.name})
+        connections: list[ByteWriter] = []
+
+        async def serve(reader: asyncio.StreamReader, writer: ByteWriter) -> None:
+            await read_header(reader, 10)
+            writer.write(header)
+            connections.append(writer)
+
+        world.network.servers[talker.tcpros] = serve
+        received: list[bytes] = []
+        await listener.subscribe(publication.topic, lambda body, _header: received.append(body))
+        await later()
+        first, *rest = sent.split()
+        before = first if first.startswith("0") else ""
+        if before:
+            connections[0].write(encode_frame(before[1:].encode()))
+            await later()
+            received.clear()
+        listener.repeat("/map", lambda body, _header: received.append(body))
+        await later()
+        for step in rest if before else sent.split():
+            connections[int(step[0])].write(encode_frame(step[1:].encode()))
+            await later()
+        assert b"".join(received).decode() == heard
+        for writer in connections:
+            writer.close()
 
 
 async def test_a_node_hears_its_own_topic_without_a_connection() -> None:
