@@ -56,8 +56,10 @@ _NOTE_NUMBER = (
 
 
 class _Queued(NamedTuple):
+    """Changes that are written in one transaction, and the number of the last."""
+
     number: int
-    change: Change
+    changes: list[Change]
 
 
 class _Waiter(NamedTuple):
@@ -159,7 +161,7 @@ class Database:
 
     @contextlib.contextmanager
     def together(self) -> Iterator[None]:
-        """Gather this thread's changes in the block into one write at its end; none survives the process before."""
+        """Write this thread's changes in the block together at its end; none survives the process before."""
         if self._gathered is not None:
             yield
             return
@@ -186,8 +188,7 @@ class Database:
                     self._ahead.append(kept)
                 except OSError as error:
                     self._fail(f"{self._path.with_suffix('.ahead')}: {error}")
-            for number, (change, _, _) in enumerate(encoded, first):
-                self._queue.append(_Queued(number, change))
+            self._queue.append(_Queued(self._number, [change for change, _, _ in encoded]))
             for feed in self._feeds:
                 bodies = [body or self._encoder.encode(change) for change, _, body in encoded]
                 feed.add([Encoded(number, body) for number, body in enumerate(bodies, first)])
@@ -320,7 +321,8 @@ class Database:
     def _commit(self, queued: list[_Queued]) -> bool:
         last = queued[-1].number
         try:
-            self._execute([self.tables.statement(item.change) for item in queued], last)
+            statement = self.tables.statement
+            self._execute([statement(change) for item in queued for change in item.changes], last)
         except sqlite3.Error as error:
             if self._connection.in_transaction:
                 self._connection.execute("ROLLBACK")

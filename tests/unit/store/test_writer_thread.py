@@ -288,6 +288,23 @@ def test_rows_of_one_table_are_one_statement(
     assert rows == expected
 
 
+def test_a_block_of_statements_is_one_transaction(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer_thread, "_GROUP", 1)
+    found: list[list[tuple[str]]] = []
+    for name in ("first", "second"):
+        with database.together():
+            database.put("thing", name, 1)
+            database.delete("thing", ("size", "<", 1))
+            database.put("thing", f"{name} too", 1)
+    with contextlib.closing(sqlite3.connect(tmp_path / "state.db")) as other:
+        for _turn in range(2):
+            database.turn(0)
+            found.append(other.execute("SELECT name FROM thing ORDER BY rowid").fetchall())
+    assert found == [[("first",), ("first too",)], [("first",), ("first too",), ("second",), ("second too",)]]
+
+
 @pytest.mark.nightly
 def test_a_block_of_statements_is_one_write_and_delays_no_other_thread(
     database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
