@@ -1,5 +1,6 @@
 """The tables of control's state file: registry, parameters, policy revisions, tokens, hosts, settings."""
 
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -136,7 +137,8 @@ class StateStore:
         self.hosts = host_tables.HostTables(self.database)
         self.doors = door_tables.DoorTables(self.database)
         self._parameter_changes = 0  # the number of the last change
-        self._largest_change: int | None = LARGEST_CHANGE
+        self._largest_change: float = LARGEST_CHANGE
+        self._only_in_tree = False  # whether a change waits for the next tree
         self._noted: dict[str, list[int]] = {}  # the changes of each key since the tree was stored, by number
 
     async def settled(self) -> None:
@@ -197,49 +199,46 @@ class StateStore:
 
     def save_parameters(self, tree: dict[str, Any]) -> None:
         """Store the whole parameter tree, and remove the single changes that it contains."""
-        self.database.put("parameters", 1, msgspec.msgpack.encode(tree), ahead=False)
-        # After a crash, changes that the tree contains may remain: repeated in order, they give the same tree.
-        self.database.delete("parameter_change", ("number", "<=", self._parameter_changes), ahead=False)
+        with self.database.together():  # a change that stays would undo a larger one below it
+            self.database.put("parameters", 1, msgspec.msgpack.encode(tree), ahead=False)
+            self.database.delete("parameter_change", ("number", "<=", self._parameter_changes), ahead=False)
         self._noted.clear()
+        self._only_in_tree = False
 
     def note_whole_parameters(self) -> None:
-        """Store also large values at once: another appliance must have each value before it is answered.
-
-        Then the tree is stored rarely (`tree_is_due`). It would be sent to that one, whichever host had changed
-        whichever part of it; so each change replaces the earlier ones of its key instead.
-        """
-        self._largest_change = None
+        """Store also large values at once: another appliance must have each value before it is answered."""
+        self._largest_change = math.inf
 
     @property
     def tree_is_due(self) -> bool:
-        return self._largest_change is not None or len(self._noted) > _MOST_NOTED
+        """Return whether the tree should be stored: for a large value, or because many keys have changed."""
+        return self._only_in_tree or len(self._noted) > _MOST_NOTED
 
     def note_parameter(self, key: str, value: Any) -> None:
         """Store one change until the next tree is stored: the parameter has this value (None: it was deleted).
 
-        The change then survives the process. A value larger than `LARGEST_CHANGE` is stored only with the tree.
+        The change then survives the process. It replaces the earlier changes of its key, so the tree, which may be
+        large, is stored rarely. A value larger than `LARGEST_CHANGE` is stored only with the tree.
         """
         data = None if value is None else msgspec.msgpack.encode(value)
-        if data is not None and self._largest_change is not None and len(data) > self._largest_change:
+        if data is not None and len(data) > self._largest_change:
+            self._only_in_tree = True
             return
-        if self._largest_change is not None:
-            self._put_change(key, data)
+        former = self._noted.pop(key, [])
+        if not former:
+            self._note_change(key, data)
             return
         with self.database.together():
-            former = self._noted.pop(key, [])
             for number in former:
                 self.database.delete("parameter_change", number=number)
-            if data is None and former:  # what is replaced may have made the namespaces above
+            if data is None:  # what is replaced may have made the namespaces above
                 self._note_change(key, _EMPTY)
             self._note_change(key, data)
 
     def _note_change(self, key: str, data: bytes | None) -> None:
-        self._put_change(key, data)
-        self._noted.setdefault(key, []).append(self._parameter_changes)
-
-    def _put_change(self, key: str, data: bytes | None) -> None:
         self._parameter_changes += 1
         self.database.put("parameter_change", self._parameter_changes, key, data)
+        self._noted.setdefault(key, []).append(self._parameter_changes)
 
     def parameter_changes(self) -> list[tuple[str, Any]]:
         """Return the changes since the tree was stored, in order; the value is None for a deleted parameter."""
