@@ -40,6 +40,15 @@ from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any, Callable, Iterator
 
+from appliance.signing.log_proof import (
+    Checkpoint,
+    Excerpt,
+    ProofFault,
+    parse_checkpoint,
+    sha256,
+    signature_fault,
+)
+
 FORMAT = "rosrv evidence 1"
 FIELDS = {"format", "log", "since", "until", "recording", "runs", "missing", "members"}
 OWN = ("manifest.json", "proof.json")
@@ -52,16 +61,11 @@ MOST = 16 << 20  # bytes of a member that is read in one piece, or of a line
 # which cannot be compressed: even with the longest texts they shrink to no less than 1/256.
 UNPACKED, PER_BYTE = 1 << 30, 256
 CHAIN = {"previous", "hash", "then", "checkpoint"}
-SEALED = ("log", "number", "sequence", "hash", "time", "previous", "removed")
 # Parts of a ZIP file: an entry of the directory, the header of a member, the end. FREE: the appliance's values of the
 # fields that a packer may choose.
 ENTRY, HEADER, END = map(struct.Struct, ("<4s4B4H3L5H2L", "<4s2B4H3L2H", "<4s4H2LH"))
 FREE, LARGE = (3, 0, 0, 33, 0, 0, 0o644 << 16), 0xFFFFFFFF
 Opener = Callable[[str], Any]
-
-
-def sha256(data: bytes) -> bytes:
-    return hashlib.sha256(data).digest()
 
 
 def printable(text: str) -> str:
@@ -355,8 +359,7 @@ class Verifier:
 
     def records(self, name: str, runs: Runs | None = None) -> Iterator[dict[str, Any]]:
         """Yield the records of a member, each after its check against the chain."""
-        # The last sequence of the chain, the hash there, and the first record that no checkpoint seals yet.
-        place, digest, begin = 0, b"", 0
+        walk = Excerpt()
         with self.open(name) as lines:
             for line in iter(lambda: lines.readline(MOST), b""):
                 record = json.loads(line)
@@ -369,56 +372,61 @@ class Verifier:
                     map(packed, [*(record[column] for column in COLUMNS), detail])
                 )
                 before, own = unhexed(chain["previous"]), unhexed(chain["hash"])
-                # Version 0.1.0 computed the second form.
-                if own not in (sha256(before + b"2" + sha256(columns)), sha256(before + columns)):
-                    self.findings.append(f"record {sequence}: was changed")
-                follows = sequence == place + 1 and before == digest
-                if place and not follows and (begin or sequence <= place + 1):
-                    self.findings.append(f"record {sequence}: does not follow the one before it")
-                begin, place, digest = begin or sequence, sequence, own
+                for fault in walk.add(sequence, before, columns, own):
+                    what = (
+                        "was changed" if fault is ProofFault.CHANGED else "does not follow the one before it"
+                    )
+                    self.findings.append(f"record {sequence}: {what}")
                 for content in chain["then"] or ():
-                    place, digest = place + 1, sha256(digest + b"2" + unhexed(content))
+                    walk.skip(unhexed(content))
                 if chain["then"] is None:
-                    matters = runs is None or runs.meet(begin, sequence)
-                    text = f"records {begin} to {sequence}: lead to no checkpoint; version 0.1.0 wrote later records"
+                    matters = runs is None or runs.meet(walk.begin, sequence)
+                    text = "lead to no checkpoint; version 0.1.0 wrote later records"
+                    text = f"records {walk.begin} to {sequence}: {text}"
                     (self.findings if matters else self.notes).append(text)
-                    begin = 0
+                    walk.begin = 0
                 elif chain.get("checkpoint"):
-                    self.look_at_checkpoint(chain["checkpoint"], place, digest.hex())
-                    begin = 0
+                    self.look_at_checkpoint(chain["checkpoint"], walk)
+                    walk.begin = 0
                 yield record
-        if begin or not place:
-            self.findings.append(f"{name}: no signed checkpoint seals the records from {begin} on")
+        if walk.begin or not walk.sequence:
+            self.findings.append(f"{name}: no signed checkpoint seals the records from {walk.begin} on")
 
-    def look_at_checkpoint(self, checkpoint: dict[str, Any], sequence: int, digest: str) -> None:
+    def look_at_checkpoint(self, given: dict[str, Any], walk: Excerpt) -> None:
         """Check that the key signed a checkpoint that seals these records and equals the copy kept elsewhere."""
-        number = checkpoint["number"]
-        sealed = checkpoint["log"], checkpoint["sequence"], checkpoint["hash"]
-        if sealed != (self.manifest["log"], sequence, digest):
+        number = given["number"]
+        place = self.manifest["log"], walk.sequence, walk.hash.hex()
+        if (given["log"], given["sequence"], given["hash"]) != place:
             self.findings.append(
-                f"checkpoint {number}: does not seal the records up to {sequence} of this bundle"
+                f"checkpoint {number}: does not seal the records up to {walk.sequence} of this bundle"
             )
-        if not self.is_signed(checkpoint) or {*checkpoint} - {*SEALED, "signature", "key"}:
+        if not self.is_signed(given) or {*given} - {*Checkpoint._fields, "signature", "key"}:
             self.findings.append(f"checkpoint {number}: is not signed with the key")
         copy = self.copies.get(number)
-        if copy and any(copy.get(field) != checkpoint.get(field) for field in SEALED):
+        if copy and any(copy.get(field) != given.get(field) for field in Checkpoint._fields):
             but = "" if self.is_signed(copy) else ", which is not signed with the key"
             self.findings.append(f"checkpoint {number}: differs from the one kept elsewhere{but}")
         self.checkpoints, self.agreeing = self.checkpoints + 1, self.agreeing + (copy is not None)
 
-    def is_signed(self, checkpoint: dict[str, Any]) -> bool:
-        fields = [f"{field} {checkpoint[field]}\n" for field in SEALED if checkpoint.get(field) is not None]
-        version = 1 if checkpoint.get("removed") is None else 2
-        text = f"rosrv audit checkpoint {version}\n{''.join(fields)}".encode()
-        right = self.has_signed(text, unhexed(checkpoint["signature"]))
-        return right and checkpoint["key"] == self.raw_key
+    def is_signed(self, given: dict[str, Any]) -> bool:
+        fields: Any = (given.get(field) for field in Checkpoint._fields)
+        made = Checkpoint(*fields)
+        try:
+            same = parse_checkpoint(made.text()) == made
+            fault = signature_fault(
+                made.text(), given["signature"], given["key"], self.raw_key, self.has_signed
+            )
+        except ValueError:
+            return False
+        return same and fault is None
 
-    def has_signed(self, data: bytes, signed: bytes) -> bool:
-        text, signature = (self.key.with_name(name) for name in ("text", "signature"))
-        text.write_bytes(data)
-        signature.write_bytes(signed)
+    def has_signed(self, _key: bytes, signature: bytes, text: bytes) -> bool:
+        """Return whether the key of this verifier signed a text."""
+        signed, stated = (self.key.with_name(name) for name in ("signature", "text"))
+        signed.write_bytes(signature)
+        stated.write_bytes(text)
         order = ["openssl", "pkeyutl", "-verify", "-rawin", "-pubin", "-inkey"]
-        files = [str(self.key), "-in", str(text), "-sigfile", str(signature)]
+        files = [str(self.key), "-in", str(stated), "-sigfile", str(signed)]
         return subprocess.run([*order, *files], capture_output=True).returncode == 0
 
 

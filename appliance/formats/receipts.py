@@ -4,8 +4,9 @@ A receipt has exactly one valid text, like the other signed statements.
 """
 
 import msgspec
-from cryptography.exceptions import InvalidSignature
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from appliance.audit.log.signatures import signature_is_valid
 
 
 class SegmentReceipt(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -36,7 +37,6 @@ class SegmentReceipt(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     def is_signed(self, key: bytes) -> bool:
         """Return whether the collector with the raw public key `key` signed this receipt."""
         try:
-            Ed25519PublicKey.from_public_bytes(key).verify(bytes.fromhex(self.signature), self.text())
-        except (InvalidSignature, ValueError):
+            return signature_is_valid(key, bytes.fromhex(self.signature), self.text())
+        except ValueError:
             return False
-        return True

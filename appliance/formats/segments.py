@@ -22,14 +22,13 @@ from typing import Annotated, NamedTuple, Protocol
 
 import msgspec
 
-from appliance.audit.log.chain import StoredColumns, follows, genesis
-from appliance.audit.log.columns import from_columns, to_columns
+from appliance.audit.log.columns import StoredColumns, from_columns, packed, to_columns
 from appliance.audit.log.log_database import COLUMNS, LogUnreadableError, reading
 from appliance.audit.log.record_format import LogEntry, entry_of
-from appliance.audit.log.signatures import signature_is_valid
 from appliance.audit.proof.chain_proofs import ChainProof, evidence_line
+from appliance.audit.proof.checkpoints import last_removal
 from appliance.audit.proof.copies import SignedCheckpoint
-from appliance.signing.signed_statements import NO_CHECKPOINT, checkpoint_hash
+from appliance.signing.log_proof import Excerpt, ProofFault, genesis
 
 LONGEST_LINE = 2 << 20  # bytes; details have at most 64 KiB, and escapes take twelve times as many
 _NOT_A_RECORD = (ValueError, KeyError, TypeError, RecursionError, OverflowError)
@@ -60,7 +59,7 @@ class SegmentHeader(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     def follows(self, other: "SegmentHeader") -> bool:
         """Return whether this segment continues `other`: the same log, and no record between them."""
         before = (other.end.sequence, bytes.fromhex(other.end.hash))
-        return self.end.previous == checkpoint_hash(other.end.text()) and self.start == before
+        return self.end.checkpoint.follows(other.end.checkpoint) and self.start == before
 
     @property
     def start(self) -> tuple[int, bytes]:
@@ -174,12 +173,10 @@ def _header(connection: sqlite3.Connection, number: int) -> SegmentHeader | None
         return None
     if len(found) == 2 or number == 1:
         return SegmentHeader(begin=found[0] if len(found) == 2 else None, end=found[-1])
-    query = "SELECT detail FROM record WHERE event = 'records removed' ORDER BY sequence DESC LIMIT 1"
-    row = connection.execute(query).fetchone()
-    removed = None if row is None else msgspec.json.decode(row[0])
-    if removed is None or removed["last_checkpoint"] != number - 1:
+    removed = last_removal(connection)
+    if removed is None or removed.last_checkpoint != number - 1:
         return None
-    after = RecordPlace(sequence=removed["last_sequence"], hash=removed["last_hash"])
+    after = RecordPlace(sequence=removed.last_sequence, hash=removed.last_hash)
     return SegmentHeader(begin=None, after=after, end=found[-1])
 
 
@@ -225,37 +222,36 @@ class SegmentReader:
         return self._done.add(line)
 
     def __iter__(self) -> Iterator[StoredColumns]:
-        end = self.header.end
-        sequence, digest = self.header.start
+        end, walk = self.header.end, Excerpt(*self.header.start)
         while line := self._read():
-            sequence += 1
-            if sequence > end.sequence:
+            if walk.sequence >= end.sequence:
                 raise SegmentError(f"it has more records than up to {end.sequence}")
-            columns, digest = self._record(line, sequence, digest)
+            columns = self._record(line, walk)
             self._done.saw(columns.time)
             yield columns
-        if sequence != end.sequence:
-            raise SegmentError(f"records {sequence + 1} to {end.sequence} are missing at its end")
-        if digest.hex() != end.hash:
+        if walk.sequence != end.sequence:
+            raise SegmentError(f"records {walk.sequence + 1} to {end.sequence} are missing at its end")
+        if end.checkpoint.contradiction(walk.sequence, walk.hash):
             raise SegmentError(f"its records do not lead to the hash of checkpoint {end.number}")
         self._ended = True
 
-    def _record(self, line: bytes, sequence: int, previous: bytes) -> tuple[StoredColumns, bytes]:
+    def _record(self, line: bytes, walk: Excerpt) -> StoredColumns:
+        previous, sequence = walk.hash, walk.sequence + 1
         try:
             fields = msgspec.json.decode(line)
             entry, chain = entry_of(fields), msgspec.convert(fields["chain"], ChainProof)
             columns, digest = to_columns(entry.record, entry.sequence), bytes.fromhex(chain.hash)
-            valid = columns.sequence == sequence and follows(previous, columns, digest)
-            same = valid and _line(columns, previous, digest, self.header.end) == line
+            fault = next(walk.add(columns.sequence, previous, packed(columns), digest), None)
+            same = fault is not None or _line(columns, previous, digest, self.header.end) == line
         except _NOT_A_RECORD as error:
             raise SegmentError(f"record {sequence}: {error}") from error
-        if not valid:
+        if fault is not None:
             raise SegmentError(
                 f"record {sequence} does not follow record {sequence - 1}: changed, missing or moved"
             )
         if not same:
             raise SegmentError(f"record {sequence} is not in its one valid spelling")
-        return columns, digest
+        return columns
 
     def summary(self) -> SegmentSummary:
         """Read what is left, and return the summary of the proven segment. Raises `SegmentError`."""
@@ -273,28 +269,18 @@ def _fault(header: SegmentHeader, keys: Collection[bytes]) -> str | None:
     known = sorted(key.hex() for key in keys)
     if end.key not in known:
         return f"checkpoint {end.number} is signed with {end.key[:64]}, expected is {' or '.join(known)}"
-    key = bytes.fromhex(end.key)
     for checkpoint in filter(None, (begin, end)):
-        name = f"checkpoint {checkpoint.number}"
-        if checkpoint.key != end.key:
-            return f"{name} is signed with {checkpoint.key[:64]}, expected is {end.key}"
-        signature = bytes.fromhex(checkpoint.signature)
-        if signature.hex() != checkpoint.signature or not signature_is_valid(
-            key, signature, checkpoint.text()
-        ):
-            return f"the signature of {name} is wrong"
-    if begin is None and header.after is not None:
-        follows_begin = end.number > 1 and header.after.sequence <= end.sequence
-    elif begin is None:
-        follows_begin = (end.number, end.previous) == (1, NO_CHECKPOINT)
-    elif header.after is not None:
+        match checkpoint.fault(end.key):
+            case ProofFault.KEY:
+                return f"checkpoint {checkpoint.number} is signed with {checkpoint.key[:64]}, expected is {end.key}"
+            case ProofFault.SIGNATURE:
+                return f"the signature of checkpoint {checkpoint.number} is wrong"
+    if begin is not None and header.after is not None:
         return "it has both begin and after"
+    if header.after is not None:
+        follows_begin = end.number > 1 and header.after.sequence <= end.sequence
     else:
-        follows_begin = (begin.log, begin.number + 1, checkpoint_hash(begin.text())) == (
-            end.log,
-            end.number,
-            end.previous,
-        ) and begin.sequence <= end.sequence
+        follows_begin = end.checkpoint.follows(None if begin is None else begin.checkpoint)
     return (
         None
         if follows_begin

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.ipsec.signed_checkpoints import CheckpointMemory, read_checkpoint
-from appliance.signing.signed_statements import Checkpoint, Removal, checkpoint_hash
+from appliance.signing.log_proof import Checkpoint, Removal, checkpoint_hash
 
 LARGEST_RECORD = 64 << 10
 """Bytes of a record with the largest details; the average is smaller."""

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from appliance.base.atomic_files import write_whole
-from appliance.signing.signed_statements import Checkpoint, parse_checkpoint
+from appliance.signing.log_proof import Checkpoint, parse_checkpoint
 
 MOST_LOGS = 64
 _HASH = 32

@@ -22,7 +22,7 @@ import psycopg
 import structlog
 from psycopg import sql
 
-from appliance.audit.log.chain import StoredColumns
+from appliance.audit.log.columns import StoredColumns
 from appliance.formats.segments import SegmentError, SegmentReader
 from rosrv_fleet.config import FleetConfig
 from rosrv_fleet.database import IndexDatabase, migrate

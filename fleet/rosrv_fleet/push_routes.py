@@ -16,7 +16,7 @@ from starlette.requests import ClientDisconnect
 
 from appliance.base import clock
 from appliance.formats.receipts import SegmentReceipt
-from appliance.signing.signed_statements import checkpoint_hash
+from appliance.signing.log_proof import checkpoint_hash
 from rosrv_fleet.access import certificate_of, robot_of
 from rosrv_fleet.collector import LONG_CHECKS, SHORT_CHECKS, Collector
 from rosrv_fleet.enrolment import Robot

@@ -10,8 +10,7 @@ import msgspec
 import psycopg
 from psycopg_pool import PoolTimeout
 
-from appliance.audit.log.chain import StoredColumns
-from appliance.audit.log.columns import from_columns
+from appliance.audit.log.columns import StoredColumns, from_columns
 from appliance.audit.log.record_format import LogEntry, as_object
 from appliance.audit.search.query import FilterError
 from rosrv_fleet.database import IndexDatabase

@@ -10,7 +10,7 @@ from typing import LiteralString, NamedTuple
 
 import msgspec
 
-from appliance.audit.log.chain import StoredColumns
+from appliance.audit.log.columns import StoredColumns
 from appliance.audit.log.record import Severity
 from appliance.audit.search.query import Filter, FilterError, checked_pattern
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from appliance.audit.log.chain import genesis, record_hash
+from appliance.audit.log.columns import record_hash
 from appliance.audit.log.log_database import COLUMNS
-from appliance.signing.signed_statements import NO_CHECKPOINT, checkpoint_hash, parse_checkpoint
+from appliance.signing.log_proof import NO_CHECKPOINT, checkpoint_hash, genesis, parse_checkpoint
 
 # ruff: noqa: S608  the attacker's statements are built from names of columns
 

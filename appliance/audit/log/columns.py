@@ -1,16 +1,17 @@
-"""Convert records to columns of the database and back.
+"""Convert records to columns of the database and back, and hash the columns.
 
 SQLite and JSON cannot store lone surrogates (undecodable bytes), integers beyond 64 bits, or arbitrary objects. These
 are escaped, limited, or stored as their `repr`. A text longer than `LONGEST_TEXT` characters is cut and marked with its
 length. If the details exceed `LARGEST_DETAIL` bytes, only the smallest are stored, with the names of the others.
 """
 
-from typing import Any
+import hashlib
+from typing import Any, NamedTuple
 
 import msgspec
 
-from appliance.audit.log.chain import StoredColumns
 from appliance.audit.log.record import SCHEMA_VERSION, AuditRecord, RuleReference, Severity
+from appliance.signing import log_proof
 
 LARGEST_DETAIL = 65_536
 LONGEST_TEXT = 4_096
@@ -26,7 +27,32 @@ _KINDS: tuple[tuple[type, ...], ...] = (
 )  # fmt: skip
 # The hash covers this text; an export and its verification must write it again, from dicts instead of structs.
 _encoder = msgspec.json.Encoder(order="sorted")
+_packer = msgspec.msgpack.Encoder()
 _decode_detail = msgspec.json.Decoder(dict[str, Any]).decode
+
+
+class StoredColumns(NamedTuple):
+    """The columns of table `record`, in order and without the hash."""
+
+    sequence: int
+    id: str
+    time: int
+    version: int
+    event: str
+    severity: str
+    decision: str | None
+    host: str | None
+    caller_id: str | None
+    category: str | None
+    resource: str | None
+    rule: str | None
+    rule_key: str | None
+    rule_file: str | None
+    rule_line: int | None
+    revision: int | None
+    reason: str
+    duration_us: int | None
+    detail: bytes
 
 
 def to_columns(record: AuditRecord, sequence: int) -> StoredColumns:
@@ -157,3 +183,21 @@ def _text(value: object) -> str:
     if len(value) > LONGEST_TEXT:
         value = f"{value[: LONGEST_TEXT - 64]}... ({len(value)} characters)"
     return value.encode("utf-8", "backslashreplace").decode()
+
+
+def packed(columns: tuple[object, ...]) -> bytes:
+    """Return the values of `StoredColumns` as the bytes that are hashed: an array, so the encoding is injective."""
+    return _packer.encode(columns)
+
+
+def content_hash(columns: tuple[object, ...]) -> bytes:
+    """Return the hash of the values of `StoredColumns`, independent of the preceding records."""
+    return hashlib.sha256(packed(columns)).digest()
+
+
+def follows(previous: bytes, columns: tuple[object, ...], digest: bytes) -> bool:
+    return log_proof.follows(previous, packed(columns), digest)
+
+
+def record_hash(previous: bytes, columns: tuple[object, ...]) -> bytes:
+    return log_proof.link(previous, content_hash(columns))

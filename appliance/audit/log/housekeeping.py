@@ -18,7 +18,7 @@ from appliance.audit.log.record import AuditRecord, Severity
 from appliance.audit.log.removal import Remover
 from appliance.audit.log.signatures import Signatures
 from appliance.audit.log.waiters import Waiter, answer
-from appliance.signing.signed_statements import parse_checkpoint
+from appliance.signing.log_proof import parse_checkpoint
 
 WRITE_ERRORS = (sqlite3.Error, OSError, LogUnreadableError)
 _TEXT_BACKLOG = 20_000

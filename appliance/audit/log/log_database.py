@@ -12,7 +12,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from urllib.parse import quote
 
-from appliance.audit.log.chain import StoredColumns
+from appliance.audit.log.columns import StoredColumns
 from appliance.base.atomic_files import name_to_make
 
 APPLICATION_ID = 0x52565541  # "RVUA"

@@ -12,18 +12,16 @@ import os
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
 
 from appliance.audit.log import log_database
-from appliance.audit.log.chain import StoredColumns, follows, genesis, record_hash
-from appliance.audit.log.columns import to_columns
+from appliance.audit.log.columns import StoredColumns, follows, record_hash, to_columns
 from appliance.audit.log.log_database import LogUnreadableError
 from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.repetition import FoldState
-from appliance.audit.log.retention import as_kept
-from appliance.signing.signed_statements import NO_CHECKPOINT, Checkpoint, checkpoint_hash, parse_checkpoint
+from appliance.audit.log.retention import RemovedRange, as_kept
+from appliance.signing.log_proof import NO_CHECKPOINT, Checkpoint, checkpoint_hash, genesis, parse_checkpoint
 
 # Rows of one INSERT. Each statement releases the GIL and takes it again. This may take 5 ms (the switch interval) while
 # an event loop is busy. With one row per statement, only 200 rows a second could be written.
@@ -44,18 +42,6 @@ def _insert(rows: int) -> str:
 
 
 _AHEAD_STEPS = 20  # the most steps of checkpoints that are skipped because the clock was ahead
-
-
-class RemovedRange(NamedTuple):
-    """The records that retention removes, and the hashes after which chain and checkpoints continue."""
-
-    first_sequence: int
-    last_sequence: int
-    last_hash: str
-    first_time: int
-    last_time: int
-    last_checkpoint: int
-    last_checkpoint_hash: str
 
 
 class ChainWriter:

@@ -4,20 +4,23 @@ Every removal is recorded in the same transaction. Records of a signed log are r
 over exactly these records. A refused removal is tried again later (`unremoved` gives the reason).
 """
 
+import re
 from collections.abc import Callable
 from typing import NamedTuple
 
-from appliance.audit.log.log_writer import ChainWriter, RemovedRange
+import msgspec
+
+from appliance.audit.log.log_writer import ChainWriter
 from appliance.audit.log.record import AuditRecord
-from appliance.audit.log.retention import Retention, worth_keeping
+from appliance.audit.log.retention import RemovedRange, Retention, worth_keeping
 from appliance.audit.log.signatures import RemovalSigner, Signatures
-from appliance.signing.signed_statements import Removal, limit_of_removal
 
 _AT_ONCE = 512
 _LOOK_SECONDS = 5.0
 _AGE_SECONDS = 3600.0
 _ANSWER_SECONDS = 30.0
 _REFUSED_SECONDS = 600.0
+_LIMIT = re.compile(rb"\nlimit ([0-9][0-9.e+-]{0,31}+ (?:days|bytes))\n\Z")
 
 
 class _Wanted(NamedTuple):
@@ -92,11 +95,8 @@ class Remover:
         what = f"the removal up to checkpoint {number}"
         wrong = self._signatures.wrong(what, text, signature, key)
         gone = wanted.gone
-        limit = "" if wrong is not None else limit_of_removal(text)
-        expected = Removal(
-            writer.log_id, number, gone.last_sequence, gone.last_hash, gone.last_checkpoint_hash, limit
-        )
-        if wrong is not None or expected.text() != text:
+        limit = "" if wrong is not None else _limit(text)
+        if wrong is not None or gone.statement(writer.log_id, limit) != text:
             self.unremoved = f"old records are not removed: {wrong or f'{what} is not what was signed'}"
             return False
         self._remove(writer, wanted, {"limit": limit, "signature": signature.hex(), "key": key.hex()})
@@ -132,6 +132,14 @@ class Remover:
         gone = wanted.gone
         count = gone.last_sequence - gone.first_sequence + 1
         kept = worth_keeping(writer.evidence(gone), count) if wanted.by_size else []
-        detail = gone._asdict() | {"count": count, "kept": len(kept)} | proof
+        detail = msgspec.to_builtins(gone) | {"count": count, "kept": len(kept)} | proof
         writer.remove(gone, self._report(wanted.reason, detail), kept)
         self.due, self.unremoved = 0.0, None
+
+
+def _limit(text: bytes) -> str:
+    """Return the limit in the text of a removal, or raise `ValueError`."""
+    match = _LIMIT.search(text)
+    if match is None:
+        raise ValueError("not the text of a removal")
+    return match[1].decode()

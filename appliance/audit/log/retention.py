@@ -11,15 +11,18 @@ from one host cannot displace the records of another.
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import msgspec
 
-from appliance.audit.log.chain import StoredColumns
-from appliance.audit.log.columns import from_columns
+from appliance.audit.log.columns import StoredColumns, from_columns
 from appliance.audit.log.record import AuditRecord, Severity
+from appliance.signing.log_proof import Removal
 
 _UNKNOWN_HOSTS = "(unknown hosts)"
 _DAY = 86_400_000_000_000
+_Count = Annotated[int, msgspec.Meta(ge=0)]
+_Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,28 @@ class Retention:
     def oldest_kept(self, now: int) -> int:
         """Return the age limit in nanoseconds since the epoch; 0 without one."""
         return 0 if self.days is None else now - int(self.days * _DAY)
+
+
+class RemovedRange(msgspec.Struct, frozen=True, omit_defaults=True):
+    """The records that retention removes, and the hashes after which chain and checkpoints continue.
+
+    `limit` and `signature` are those of the signer's statement; empty without one.
+    """
+
+    first_sequence: _Count
+    last_sequence: _Count
+    last_hash: _Hash
+    first_time: int
+    last_time: int
+    last_checkpoint: _Count
+    last_checkpoint_hash: _Hash
+    limit: str = ""
+    signature: str = ""
+
+    def statement(self, log: str, limit: str) -> bytes:
+        """Return the text that the signer signs for this removal."""
+        sequence, sealed = self.last_sequence, self.last_checkpoint_hash
+        return Removal(log, self.last_checkpoint, sequence, self.last_hash, sealed, limit).text()
 
 
 def as_kept(columns: StoredColumns, digest: bytes) -> AuditRecord:

@@ -13,13 +13,14 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.audit.log.chain import StoredColumns, content_hash, genesis, link
+from appliance.audit.log.columns import StoredColumns, content_hash
 from appliance.audit.log.log_database import COLUMNS, LogUnreadableError, reading
 from appliance.audit.log.record_format import LogEntry, as_json
+from appliance.audit.proof.checkpoints import last_removal
 from appliance.audit.proof.copies import SignedCheckpoint
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import search
-from appliance.signing.signed_statements import NO_CHECKPOINT
+from appliance.signing.log_proof import NO_CHECKPOINT, genesis, link
 
 _Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 
@@ -120,9 +121,8 @@ class ChainReader:
             return str(row[0].hex())
         if sequence == 1:
             return genesis(str(self._log)).hex()
-        query = "SELECT detail FROM record WHERE event = 'records removed' ORDER BY sequence DESC LIMIT 1"
-        row = self._connection.execute(query).fetchone()
-        return str(msgspec.json.decode(row[0])["last_hash"]) if row is not None else NO_CHECKPOINT
+        removed = last_removal(self._connection)
+        return NO_CHECKPOINT if removed is None else removed.last_hash
 
     def _checkpoint(self, sequence: int) -> SignedCheckpoint | None:
         known = self._sealing

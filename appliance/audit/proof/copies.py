@@ -23,7 +23,7 @@ from appliance.audit.log.log_database import LogUnreadableError, reading
 from appliance.audit.log.signatures import signature_is_valid
 from appliance.audit.proof.chain_findings import Elsewhere, FindingKind, LogFinding
 from appliance.base.input_files import open_given
-from appliance.signing.signed_statements import Checkpoint, parse_checkpoint
+from appliance.signing.log_proof import Checkpoint, ProofFault, parse_checkpoint, signature_fault
 
 SYSLOG_ELEMENT = "rosrvCheckpoint@32473"
 _LONGEST_LINE = 65_536
@@ -57,10 +57,24 @@ class SignedCheckpoint(msgspec.Struct, frozen=True, omit_defaults=True):
         """Parse the text of a checkpoint. Raises `ValueError`."""
         return cls(**parse_checkpoint(text)._asdict(), signature=signature.hex(), key=key.hex())
 
-    def text(self) -> bytes:
+    @property
+    def checkpoint(self) -> Checkpoint:
         return Checkpoint(
             self.log, self.number, self.sequence, self.hash, self.time, self.previous, self.removed
-        ).text()
+        )
+
+    def text(self) -> bytes:
+        return self.checkpoint.text()
+
+    def fault(self, expected: str | None = None) -> ProofFault | None:
+        """Return why the key `expected` (default: the checkpoint's) did not sign it, or None.
+
+        Raises `ValueError` for fields that are not those of a checkpoint.
+        """
+        parse_checkpoint(self.text())
+        return signature_fault(
+            self.text(), self.signature, self.key, expected or self.key, signature_is_valid
+        )
 
     def as_json(self) -> str:
         return msgspec.json.encode(self).decode("ascii")
@@ -190,19 +204,20 @@ class CopiesVerifier:
             self.removed += [] if copy.removed is None else [copy.removed]
             if copy.sequence < removed:
                 continue
-            if copy.sequence > last:
+            here = chain.get(copy.sequence)
+            fault = copy.checkpoint.contradiction(last, here)
+            if fault is ProofFault.CUT_OFF:
                 message = (
                     f"records {last + 1} to {copy.sequence} are gone from the end: checkpoint {copy.number},"
                     " kept elsewhere, has sealed them"
                 )
                 yield LogFinding(FindingKind.TRUNCATED, last + 1, copy.sequence, message)
                 return
-            here = chain.get(copy.sequence)
-            if here is None:
-                continue  # the sealed record is missing; the finding about that record reports it
-            if here.hex() != copy.hash:
+            if fault is not None:
                 yield self._rewritten(copy, proven)
                 return
+            if here is None:
+                continue  # the sealed record is missing; the finding about that record reports it
             proven = copy.sequence
             self._agreeing.append(copy)
             if stored.get(copy.number, copy.text().hex()) != copy.text().hex():
@@ -218,11 +233,12 @@ class CopiesVerifier:
 
     def _wrong_signature(self, copy: SignedCheckpoint) -> LogFinding | None:
         name, number = f"checkpoint {copy.number}, kept elsewhere", copy.number
-        if self._key is not None and copy.key != self._key.hex():
-            message = f"{name}: signed with {copy.key}, expected is {self._key.hex()}"
-            return LogFinding(FindingKind.WRONG_KEY, number, number, message)
-        if not signature_is_valid(bytes.fromhex(copy.key), bytes.fromhex(copy.signature), copy.text()):
-            return LogFinding(
-                FindingKind.SIGNATURE_WRONG, number, number, f"{name}: its signature does not fit it"
-            )
+        expected = None if self._key is None else self._key.hex()
+        match copy.fault(expected):
+            case ProofFault.KEY:
+                message = f"{name}: signed with {copy.key}, expected is {expected}"
+                return LogFinding(FindingKind.WRONG_KEY, number, number, message)
+            case ProofFault.SIGNATURE:
+                message = f"{name}: its signature does not fit it"
+                return LogFinding(FindingKind.SIGNATURE_WRONG, number, number, message)
         return None

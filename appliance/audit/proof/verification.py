@@ -18,18 +18,19 @@ from typing import Annotated, NamedTuple
 import msgspec
 
 from appliance.audit.log import log_database
-from appliance.audit.log.chain import StoredColumns, follows, genesis
+from appliance.audit.log.columns import StoredColumns, follows
 from appliance.audit.log.log_database import reading
+from appliance.audit.log.retention import RemovedRange
 from appliance.audit.log.signatures import pinned_key_path, read_public_key, signature_is_valid
 from appliance.audit.proof.chain_findings import Elsewhere, FindingKind, LogFinding, Verification
 from appliance.audit.proof.checkpoints import (
     CheckpointVerifier,
     SignerMemory,
-    checkpoint_rows,
+    last_removal,
     read_signer_memory,
 )
 from appliance.audit.proof.copies import CopiesVerifier, SignedCheckpoint
-from appliance.signing.signed_statements import NO_CHECKPOINT, Removal
+from appliance.signing.log_proof import NO_CHECKPOINT, genesis, signature_fault
 
 _WINDOW = 64
 _TOLD_EVERY = 5000
@@ -40,32 +41,8 @@ _DISTANCES = tuple(distance for step in range(1, 1000) for distance in (step, -s
 _WORDS_TABLES = ("words_data", "words_idx", "words_docsize", "words_config")
 _LOG_ID = re.compile("[0-9a-f]{32}")
 _Count = Annotated[int, msgspec.Meta(ge=0)]
-_Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
-
 
 _NOT_AS_WRITTEN = (TypeError, ValueError, RecursionError, MemoryError)
-
-
-class _Removal(msgspec.Struct, frozen=True):
-    """The detail of a `records removed` record, which has the hashes after which the chain continues."""
-
-    first_sequence: _Count
-    last_sequence: _Count
-    last_hash: _Hash
-    first_time: int
-    last_time: int
-    last_checkpoint: _Count
-    last_checkpoint_hash: _Hash
-    limit: str = ""
-    signature: str = ""
-
-    def is_signed(self, log: str, key: bytes) -> bool:
-        checkpoint, sequence = self.last_checkpoint, self.last_sequence
-        gone = Removal(log, checkpoint, sequence, self.last_hash, self.last_checkpoint_hash, self.limit)
-        try:
-            return signature_is_valid(key, bytes.fromhex(self.signature), gone.text())
-        except ValueError:
-            return False
 
 
 class _Reported(msgspec.Struct, frozen=True):
@@ -148,7 +125,6 @@ class _Verifier:
         self._progress = progress
         self._key = key
         self._log = log
-        self._remembered = remembered
         self._checkpoints = CheckpointVerifier(self._log, key, remembered)
         self._copies = None if copies is None else CopiesVerifier(self._log, key, copies)
         self._findings: list[LogFinding] = []
@@ -166,15 +142,16 @@ class _Verifier:
             self._structure("table log does not have the one id of a log: what it sealed is unknown")
         removed = self._last_removal()
         try:
-            sequences = self._connection.execute("SELECT sequence FROM checkpoint")
-            self._sealed = {sequence: b"" for (sequence,) in sequences}
-        except sqlite3.DatabaseError:
-            self._sealed = {}  # `_check_checkpoints` reports it
+            self._checkpoints.read(self._connection)
+        except sqlite3.DatabaseError as error:
+            self._structure(f"the checkpoints cannot be read: {error}")
+        self._sealed = {row.sequence: b"" for row in self._checkpoints.rows}
         if self._copies is not None:
             self._sealed |= dict.fromkeys(self._copies.sequences, b"")
         self._walk(removed)
-        self._check_checkpoints(removed)
-        elsewhere = self._check_copies(removed)
+        chain = {sequence: digest for sequence, digest in self._sealed.items() if digest}
+        self._check_checkpoints(removed, chain)
+        elsewhere = self._check_copies(removed, chain)
         removal = self._check_removal(removed)
         audit = self._checkpoints
         self._findings.sort(key=lambda finding: finding.first)
@@ -182,27 +159,23 @@ class _Verifier:
             self._findings.append(self._further)
         return Verification(
             ok=not self._findings, log=self._log, records=self.records, first=self.first, last=self.last,
-            removed=removed.last_sequence if removed else 0, checkpoints=audit.count,
+            removed=removed.last_sequence if removed else 0, checkpoints=len(audit.rows),
             signed_checkpoints=audit.signed, signed_through=audit.signed_through,
             unsealed=max(0, self.last - audit.signed_through), key=self._key.hex() if self._key else None,
             findings=self._findings, elsewhere=elsewhere, removal=removal,
         )  # fmt: skip
 
-    def _check_copies(self, removed: _Removal | None) -> Elsewhere | None:
+    def _check_copies(self, removed: RemovedRange | None, chain: dict[int, bytes]) -> Elsewhere | None:
         if self._copies is None:
             return None
-        chain = {sequence: digest for sequence, digest in self._sealed.items() if digest}
         gone, last = (removed.last_sequence if removed else 0), self.last - self._shift
         if removed is not None:
-            chain[gone] = bytes.fromhex(removed.last_hash)
-        try:
-            stored = {row[0]: row[2].hex() for row in checkpoint_rows(self._connection)}
-        except sqlite3.DatabaseError:
-            stored = {}  # `_check_checkpoints` reports it
+            chain = {**chain, gone: bytes.fromhex(removed.last_hash)}
+        stored = {row.number: row.text.hex() for row in self._checkpoints.rows}
         self._findings += self._copies.check(chain, gone, last, stored)
         return self._copies.result()
 
-    def _check_removal(self, removed: _Removal | None) -> str:
+    def _check_removal(self, removed: RemovedRange | None) -> str:
         """Return "signed", "unsigned", or "" without a removal.
 
         A removal without a signature is unfounded, unless it was made by a version that did not sign removals. In that
@@ -212,11 +185,10 @@ class _Verifier:
             return ""
         if self._key is None:
             return "unsigned"  # without a key, no signature can be checked
-        if removed.is_signed(self._log, self._key):
+        key, statement = self._key.hex(), removed.statement(self._log, removed.limit)
+        if signature_fault(statement, removed.signature, key, key, signature_is_valid) is None:
             return "signed"
         said = self._checkpoints.removed + (self._copies.removed if self._copies else [])
-        if self._remembered is not None and self._remembered.removed is not None:
-            said = [*said, self._remembered.removed]
         if min(said, default=removed.last_sequence) < removed.last_sequence or not self._checkpoints.signed:
             message = (
                 "said to have been removed for their age or the log's size, and the signer did not sign that: nothing"
@@ -257,17 +229,15 @@ class _Verifier:
         message = message.encode("utf-8", "backslashreplace").decode()  # bytes that were not text
         self._findings.append(LogFinding(FindingKind.STRUCTURE, 0, 0, f"database: {message}"))
 
-    def _last_removal(self) -> _Removal | None:
-        query = "SELECT detail FROM record WHERE event = 'records removed' ORDER BY sequence DESC LIMIT 1"
+    def _last_removal(self) -> RemovedRange | None:
         try:
-            row = self._connection.execute(query).fetchone()
-            return None if row is None else msgspec.json.decode(row[0], type=_Removal)
+            return last_removal(self._connection)
         except (*_NOT_AS_WRITTEN, sqlite3.DatabaseError):
             return None  # a damaged record is found when it is walked
 
     # --- the chain ------------------------------------------------------------------------------------------
 
-    def _walk(self, removed: _Removal | None) -> None:
+    def _walk(self, removed: RemovedRange | None) -> None:
         self.last = removed.last_sequence if removed else 0
         previous = bytes.fromhex(removed.last_hash) if removed else genesis(self._log)
         try:
@@ -346,12 +316,8 @@ class _Verifier:
         for distance in () if plain_change else _DISTANCES:
             if following is not None and following.follows(row.hash, place + 1 + distance):
                 if distance > 0:
-                    self._find(
-                        FindingKind.MISSING,
-                        place,
-                        place + distance - 1,
-                        "removed; what follows was renumbered",
-                    )
+                    message = "removed; what follows was renumbered"
+                    self._find(FindingKind.MISSING, place, place + distance - 1, message)
                 else:
                     message = "inserted with a hash of its own; what follows was renumbered"
                     self._find(FindingKind.INSERTED, row.sequence + distance, row.sequence - 1, message)
@@ -371,16 +337,10 @@ class _Verifier:
 
     # --- the checkpoints ------------------------------------------------------------------------------------
 
-    def _check_checkpoints(self, removed: _Removal | None) -> None:
+    def _check_checkpoints(self, removed: RemovedRange | None, chain: dict[int, bytes]) -> None:
         before = (removed.last_checkpoint, removed.last_checkpoint_hash) if removed else (0, NO_CHECKPOINT)
-        chain = {sequence: digest for sequence, digest in self._sealed.items() if digest}
         audit = self._checkpoints
-        last = self.last - self._shift
-        try:
-            self._findings += audit.check(checkpoint_rows(self._connection), before, chain, last)
-        except sqlite3.DatabaseError as error:
-            self._structure(f"the checkpoints cannot be read: {error}")
-            return
+        self._findings += audit.check(before, chain, self.last - self._shift)
         for number in sorted(self._reported):
             if number > audit.last_number:
                 message = f"checkpoint {number}: the chain has its record, but it was removed"

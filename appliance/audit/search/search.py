@@ -12,8 +12,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
-from appliance.audit.log.chain import StoredColumns
-from appliance.audit.log.columns import from_columns
+from appliance.audit.log.columns import StoredColumns, from_columns
 from appliance.audit.log.ids import ID_LENGTH
 from appliance.audit.log.log_database import COLUMNS, LogUnreadableError, open_for_reading
 from appliance.audit.log.record_format import LogEntry

@@ -13,6 +13,7 @@ Invariants:
 
 import hashlib
 import heapq
+import inspect
 import io
 import itertools
 import json
@@ -24,7 +25,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from appliance.audit.log.chain import StoredColumns
+from appliance.audit.log.columns import StoredColumns
 from appliance.audit.log.log_database import COLUMNS, LogUnreadableError, reading
 from appliance.audit.log.signatures import pinned_key_path
 from appliance.audit.proof.chain_proofs import ChainReader, stored_line
@@ -42,11 +43,11 @@ from appliance.features.evidence.evidence_requests import EvidenceExported, LogS
 from appliance.features.evidence.page import Names, Page
 from appliance.features.evidence.recorded import RecordingSummary
 from appliance.formats import bundle_verifier
+from appliance.signing import log_proof
 from appliance.signing.fingerprints import file_name
 
 FORMAT = "rosrv evidence 1"
 MOST_RECORDS = 1_000_000
-VERIFIER = Path(bundle_verifier.__file__)
 Ask = Callable[[AdminRequest[Any]], AdminAnswer[Any]]
 Member = tuple[str, Iterable[bytes]]
 _PAGE = 500
@@ -58,6 +59,14 @@ _LOADS = "SELECT sequence FROM record INDEXED BY record_event WHERE sequence BET
 _REVISIONS = "SELECT DISTINCT revision FROM record WHERE sequence BETWEEN ? AND ? AND revision > 0"
 _CLOSED = "SELECT sequence, detail FROM record WHERE event = 'recording closed' AND sequence <= ?"
 _LAST_LOAD = "SELECT max(sequence) FROM record INDEXED BY record_event WHERE event = ? AND sequence < ?"
+
+
+def verifier_program() -> str:
+    """Return the text of `verify.py`: `bundle_verifier.py`, with the text of `log_proof.py` instead of its import."""
+    program, core = map(inspect.getsource, (bundle_verifier, log_proof))
+    before, _imported, rest = program.partition("from appliance.signing.log_proof import")
+    own = core.partition("from __future__ import annotations\n\n")[2]
+    return before + own + "\n\n" + rest.partition("\n\n")[2]
 
 
 class BundleError(Exception):
@@ -202,7 +211,7 @@ class _Bundle:
 
     def members(self, manifest: dict[str, Any]) -> Iterator[Member]:
         """Yield all members; add the names of missing ones to the manifest."""
-        yield "verify.py", [VERIFIER.read_bytes()]
+        yield "verify.py", [verifier_program().encode()]
         yield "audit.pub", [pinned_key_path(self._log).read_bytes()]
         for revision in sorted(self._policies):
             place = f"policies/{revision}.ini"

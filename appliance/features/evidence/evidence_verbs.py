@@ -22,7 +22,13 @@ from appliance.cli.connection.rest_orders import RestWay
 from appliance.cli.connection.rest_session import RestProblemError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import Json, say_json, usage_error
-from appliance.features.evidence.bundle import VERIFIER, BundleError, RecordingSelection, TimeSpan, export
+from appliance.features.evidence.bundle import (
+    BundleError,
+    RecordingSelection,
+    TimeSpan,
+    export,
+    verifier_program,
+)
 from appliance.features.evidence.page import Names
 from appliance.formats import bundle_verifier as verifier_module
 from appliance.signing.fingerprints import fingerprint
@@ -124,7 +130,7 @@ def verifier(as_json: Json = False) -> None:
 
     Example: rosrv evidence verifier > verify.py
     """
-    text = VERIFIER.read_text(encoding="utf-8")
+    text = verifier_program()
     if as_json:
         say_json({"sha256": fingerprint(text), "text": text})
     else:

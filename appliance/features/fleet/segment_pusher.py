@@ -33,7 +33,7 @@ from appliance.channel.messages import ForwardingReported
 from appliance.features.fleet.connection import CollectorConnection, CollectorError
 from appliance.formats.receipts import SegmentReceipt
 from appliance.formats.segments import SegmentSummary, next_segment, write_segment
-from appliance.signing.signed_statements import checkpoint_hash
+from appliance.signing.log_proof import checkpoint_hash
 
 _IDLE_SECONDS = 1.0
 _PRESENCE_SECONDS = 60.0

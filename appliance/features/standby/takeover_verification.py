@@ -25,6 +25,7 @@ from appliance.audit.log.log_database import reading
 from appliance.audit.proof.chain_findings import Verification
 from appliance.audit.proof.copies import SignedCheckpoint
 from appliance.features.standby.takeovers import EpochOf, Handover, Takeover, TakeoverLog, checkpoint_fault
+from appliance.signing.log_proof import ProofFault
 
 _SECOND = 1_000_000_000
 _TOLERANCE = 5 * _SECOND
@@ -328,18 +329,19 @@ def _contradiction(
     named: SignedCheckpoint, what: str, log: TakeoverLog
 ) -> tuple[TakeoverFindingKind, str] | None:
     """Return how a log disagrees with a checkpoint that its key signed; None if it agrees."""
-    if named.sequence > log.result.last:
-        return (
-            TakeoverFindingKind.TRUNCATED,
-            f"{what}, which sealed record {named.sequence}; the other log ends with record {log.result.last}: its end"
-            " was cut off, or the copy is older",
-        )
-    if log.hash_at(named.sequence) != named.hash:
-        return (
-            TakeoverFindingKind.REWRITTEN,
-            f"{what}; record {named.sequence} of the other log is not the one that it sealed: the records up to there"
-            " were rewritten",
-        )
+    match named.checkpoint.contradiction(log.result.last, log.hash_at(named.sequence)):
+        case ProofFault.CUT_OFF:
+            return (
+                TakeoverFindingKind.TRUNCATED,
+                f"{what}, which sealed record {named.sequence}; the other log ends with record {log.result.last}: its"
+                " end was cut off, or the copy is older",
+            )
+        case ProofFault.REWRITTEN:
+            return (
+                TakeoverFindingKind.REWRITTEN,
+                f"{what}; record {named.sequence} of the other log is not the one that it sealed: the records up to"
+                " there were rewritten",
+            )
     if log.checkpoint_text(named.number) != named.text():
         return TakeoverFindingKind.CHECKPOINT_CHANGED, f"{what}; the other log has a different one"
     return None

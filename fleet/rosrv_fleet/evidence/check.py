@@ -15,6 +15,7 @@ from cryptography.hazmat.primitives.serialization import load_pem_public_key
 
 from appliance.audit.log.signatures import signature_is_valid
 from appliance.formats.bundle_verifier import Verifier, printable
+from appliance.signing.log_proof import Excerpt
 from rosrv_fleet.config import FleetConfig
 from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.evidence.store import EvidenceContent
@@ -51,7 +52,7 @@ class _RobotVerifier(Verifier):
     """The verifier with a robot's key and collected segments. It runs no other program, which would have no limits."""
 
     def __init__(self, bundle: Path, robot: Robot, store: SegmentStore) -> None:
-        self._robot, self._store, self._key = robot, store, b""
+        self._robot, self._store = robot, store
         super().__init__(bundle, None, Path(), {})
 
     def read_key(self, _key: Path | None) -> str:
@@ -59,22 +60,21 @@ class _RobotVerifier(Verifier):
         raw = key.public_bytes_raw().hex() if isinstance(key, Ed25519PublicKey) else "of another kind"
         if raw not in {one.key for one in self._robot.appliances.values()}:
             raise _OtherKeyError(raw)
-        self._key = bytes.fromhex(raw)
         return raw
 
-    def has_signed(self, data: bytes, signed: bytes) -> bool:
-        return signature_is_valid(self._key, signed, data)
+    def has_signed(self, key: bytes, signature: bytes, text: bytes) -> bool:
+        return signature_is_valid(key, signature, text)
 
-    def look_at_checkpoint(self, checkpoint: dict[str, Any], sequence: int, digest: str) -> None:
-        log, number = self.manifest["log"], checkpoint["number"]
+    def look_at_checkpoint(self, given: dict[str, Any], walk: Excerpt) -> None:
+        log, number = self.manifest["log"], given["number"]
         if _LOG.fullmatch(log) is None:
             raise ValueError(f"{log[:80]!a} is not the id of a log")
         with contextlib.suppress(OSError, EOFError, zlib.error, ValueError):  # `verify` reports it
             places: list[SegmentPlace] = self._store.numbered(self._robot.name, log, number)
             ends = [self._store.header(place).end for place in places]
-            ends.sort(key=lambda end: end.hash != checkpoint["hash"])  # of a fork, one history is enough
+            ends.sort(key=lambda end: end.hash != given["hash"])  # of a fork, one history is enough
             self.copies = {end.number: msgspec.to_builtins(end) for end in ends[:1]}
-        super().look_at_checkpoint(checkpoint, sequence, digest)
+        super().look_at_checkpoint(given, walk)
 
 
 def check_evidence(config: FleetConfig, bundle: Path, robot: Robot) -> EvidenceContent:

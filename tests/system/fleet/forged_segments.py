@@ -6,14 +6,13 @@ import secrets
 import time
 from typing import Any, NamedTuple
 
-from appliance.audit.log.chain import StoredColumns, genesis, record_hash
-from appliance.audit.log.columns import from_columns, to_columns
+from appliance.audit.log.columns import StoredColumns, from_columns, record_hash, to_columns
 from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import LogEntry
 from appliance.audit.proof.chain_proofs import ChainProof, evidence_line
 from appliance.audit.proof.copies import SignedCheckpoint
 from appliance.formats.segments import RecordPlace, SegmentHeader, SegmentSummary
-from appliance.signing.signed_statements import NO_CHECKPOINT, Checkpoint
+from appliance.signing.log_proof import NO_CHECKPOINT, Checkpoint, genesis
 from tests.system.fleet.fleet_site import FleetRobot
 
 

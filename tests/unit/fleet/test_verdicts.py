@@ -19,13 +19,14 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import msgspec
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.segment_store import SegmentStore
 from rosrv_fleet.verification import prove
 
-from appliance.audit.log.chain import StoredColumns
+from appliance.audit.log.columns import StoredColumns
 from appliance.audit.log.log import AuditLog
 from appliance.audit.log.log_database import COLUMNS, reading
 from appliance.audit.log.log_writer import ChainWriter
@@ -38,7 +39,7 @@ from appliance.base import clock
 from appliance.formats.bundle_verifier import FORMAT, Verifier
 from appliance.formats.segments import SegmentError, SegmentReader, write_segment
 from appliance.ipsec.signed_checkpoints import CheckpointMemory
-from appliance.signing.signed_statements import Removal
+from appliance.signing.log_proof import Removal
 from tests.support.audit import decision, settle
 from tests.support.engines import ByHand
 from tests.support.forgery import write_anew
@@ -243,7 +244,7 @@ def remove(site: Site, log: Path, proof: Callable[[Site, Removal], dict[str, obj
     gone = writer.removable(1, signed=True)
     assert gone is not None
     about = writer.log_id, gone.last_checkpoint, gone.last_sequence, gone.last_hash, gone.last_checkpoint_hash
-    detail = gone._asdict() | {"count": 1} | proof(site, Removal(*about, "30.0 days"))
+    detail = msgspec.to_builtins(gone) | {"count": 1} | proof(site, Removal(*about, "30.0 days"))
     writer.remove(gone, AuditRecord(id="f" * 20, time=1, event="records removed", detail=detail))
     writer.close()
 
@@ -315,8 +316,8 @@ class InProcess(Verifier):
     def read_key(self, _key: Path | None) -> str:
         return self._key.hex()
 
-    def has_signed(self, data: bytes, signed: bytes) -> bool:
-        return signature_is_valid(self._key, signed, data)
+    def has_signed(self, key: bytes, signature: bytes, text: bytes) -> bool:
+        return signature_is_valid(key, signature, text)
 
 
 def of_evidence(site: Site, folder: Path, lines: Lines, copies: list[SignedCheckpoint]) -> Iterator[str]:

@@ -5,21 +5,22 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
+import msgspec
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log.log import AuditLog
 from appliance.audit.log.log_database import LogUnreadableError, open_for_reading
-from appliance.audit.log.log_writer import ChainWriter, RemovedRange
+from appliance.audit.log.log_writer import ChainWriter
 from appliance.audit.log.record import AuditRecord, Severity
-from appliance.audit.log.retention import Retention
+from appliance.audit.log.retention import RemovedRange, Retention
 from appliance.audit.proof.chain_findings import FindingKind, Verification
 from appliance.audit.proof.copies import signed_checkpoints
 from appliance.audit.proof.verification import verify
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import export, search
 from appliance.base import clock
-from appliance.signing.signed_statements import Removal
+from appliance.signing.log_proof import Removal
 from tests.support.audit import decision, settle
 from tests.support.engines import ByHand
 from tests.unit.audit.conftest import MakeLog, Notary
@@ -37,7 +38,9 @@ def forge(path: Path, proof: dict[str, object] | None = None) -> RemovedRange:
     writer = ChainWriter(path, 0)
     gone = writer.removable(1 << 30, signed=True)
     assert gone is not None
-    detail = gone._asdict() | {"count": gone.last_sequence - gone.first_sequence + 1} | (proof or {})
+    detail = (
+        msgspec.to_builtins(gone) | {"count": gone.last_sequence - gone.first_sequence + 1} | (proof or {})
+    )
     report = AuditRecord(
         id=f"{clock.wall_ns():016x}0000", time=clock.wall_ns(), event="records removed", severity=Severity.NOTICE,
         reason="older than 30.0 days", detail=detail,

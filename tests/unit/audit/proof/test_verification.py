@@ -11,7 +11,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
-from appliance.audit.log.chain import genesis, record_hash
+from appliance.audit.log.columns import record_hash
 from appliance.audit.log.log import AuditLog
 from appliance.audit.log.log_database import COLUMNS, LogUnreadableError
 from appliance.audit.log.signatures import KeyUnreadableError, read_public_key
@@ -20,7 +20,7 @@ from appliance.audit.proof.chain_findings import FindingKind
 from appliance.audit.proof.checkpoints import SignerMemory, read_signer_memory
 from appliance.audit.proof.copies import signed_checkpoints
 from appliance.audit.proof.verification import verify
-from appliance.signing.signed_statements import parse_checkpoint
+from appliance.signing.log_proof import genesis, parse_checkpoint
 from tests.support.audit import decision, settle
 from tests.support.engines import ByHand
 from tests.unit.audit.conftest import MakeLog

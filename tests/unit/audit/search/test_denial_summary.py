@@ -3,8 +3,7 @@ import time
 import msgspec
 import pytest
 
-from appliance.audit.log.chain import StoredColumns
-from appliance.audit.log.columns import to_columns
+from appliance.audit.log.columns import StoredColumns, to_columns
 from appliance.audit.log.log_database import open_for_writing
 from appliance.audit.log.record import AuditRecord, RuleReference
 from appliance.audit.log.record_format import LogEntry, rfc3339

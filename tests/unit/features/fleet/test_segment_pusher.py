@@ -18,7 +18,7 @@ from appliance.features.fleet import segment_pusher
 from appliance.features.fleet.connection import CollectorConnection, CollectorError
 from appliance.features.fleet.segment_pusher import SegmentPusher
 from appliance.formats.receipts import SegmentReceipt
-from appliance.signing.signed_statements import checkpoint_hash
+from appliance.signing.log_proof import checkpoint_hash
 from tests.support.audit import decision
 from tests.support.virtual_clock import VirtualClock
 from tests.unit.features.conftest import MakeLog

@@ -24,7 +24,7 @@ from appliance.features.standby.takeover_verification import (
     verify_alone,
     verify_takeovers,
 )
-from appliance.signing.signed_statements import parse_checkpoint
+from appliance.signing.log_proof import parse_checkpoint
 from tests.support.audit import decision
 from tests.support.command import rosrv
 from tests.support.features.standby.appliance_pair import Member, Story, World, four_takeovers, play
