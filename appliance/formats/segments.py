@@ -27,7 +27,7 @@ from appliance.audit.log.log_database import COLUMNS, LogUnreadableError, readin
 from appliance.audit.log.record_format import LogEntry, entry_of
 from appliance.audit.proof.chain_proofs import ChainProof, evidence_line
 from appliance.audit.proof.checkpoints import last_removal
-from appliance.audit.proof.copies import SignedCheckpoint
+from appliance.audit.proof.copies import SignedCheckpoint, select_signed
 from appliance.signing.log_proof import Excerpt, ProofFault, genesis
 
 LONGEST_LINE = 2 << 20  # bytes; details have at most 64 KiB, and escapes take twelve times as many
@@ -162,14 +162,8 @@ def _number(row: tuple[int | None]) -> int | None:
 
 
 def _header(connection: sqlite3.Connection, number: int) -> SegmentHeader | None:
-    rows = connection.execute(
-        "SELECT text, signature, public_key FROM checkpoint WHERE number IN (?, ?) ORDER BY number",
-        (number - 1, number),
-    ).fetchall()
-    if not rows or any(None in row for row in rows):
-        return None
-    found = [SignedCheckpoint.of(*row) for row in rows]
-    if found[-1].number != number:
+    found = select_signed(connection, "number IN (?, ?) ORDER BY number", number - 1, number)
+    if not found or found[-1].number != number:
         return None
     if len(found) == 2 or number == 1:
         return SegmentHeader(begin=found[0] if len(found) == 2 else None, end=found[-1])

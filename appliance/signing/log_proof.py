@@ -29,8 +29,11 @@ class ProofFault(enum.Enum):
 
     CHANGED = "a record does not have its hash"
     MOVED = "a record does not follow the one before it"
+    LOG = "a checkpoint is of another log"
     CUT_OFF = "the sealed records are missing at the end"
+    MISSING = "the sealed record is missing"
     REWRITTEN = "the sealed record has another hash"
+    OTHER = "another checkpoint has its number"
     KEY = "another key signed"
     SIGNATURE = "the signature does not fit the text"
 
@@ -111,11 +114,13 @@ class Checkpoint(NamedTuple):
     def contradiction(self, last: int, here: bytes | None) -> ProofFault | None:
         """Return how a chain differs that ends with record `last` and has the hash `here` at this sequence.
 
-        None for `here`: that record is missing, which proves nothing about the others.
+        None for `here`: the chain has no such record.
         """
         if self.sequence > last:
             return ProofFault.CUT_OFF
-        return None if here is None or here.hex() == self.hash else ProofFault.REWRITTEN
+        if here is None:
+            return ProofFault.MISSING
+        return None if here.hex() == self.hash else ProofFault.REWRITTEN
 
 
 _CHECKPOINT = re.compile(

@@ -17,7 +17,7 @@ from appliance.audit.log.columns import StoredColumns, content_hash
 from appliance.audit.log.log_database import COLUMNS, LogUnreadableError, reading
 from appliance.audit.log.record_format import LogEntry, as_json
 from appliance.audit.proof.checkpoints import last_removal
-from appliance.audit.proof.copies import SignedCheckpoint
+from appliance.audit.proof.copies import SignedCheckpoint, select_signed
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import search
 from appliance.signing.log_proof import NO_CHECKPOINT, genesis, link
@@ -128,13 +128,9 @@ class ChainReader:
         known = self._sealing
         if self._unsealed or (known is not None and known.sequence >= sequence):
             return None if self._unsealed else known
-        query = (
-            "SELECT text, signature, public_key FROM checkpoint WHERE number > ? AND sequence >= ?"
-            " AND signature IS NOT NULL AND public_key IS NOT NULL ORDER BY number LIMIT 1"
-        )
-        row = self._connection.execute(query, (known.number if known else 0, sequence)).fetchone()
-        self._unsealed = row is None
-        self._sealing = None if row is None else SignedCheckpoint.of(*row)
+        where, after = "number > ? AND sequence >= ? ORDER BY number LIMIT 1", known.number if known else 0
+        self._sealing = next(iter(select_signed(self._connection, where, after, sequence)), None)
+        self._unsealed = self._sealing is None
         return self._sealing
 
     def _contents(self, digest: bytes, after: int, upto: int) -> list[str] | None:

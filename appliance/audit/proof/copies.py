@@ -13,9 +13,10 @@ on another machine are out of root's reach. Therefore:
 
 import json
 import re
-from collections.abc import Iterable, Iterator
+import sqlite3
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import msgspec
 
@@ -33,6 +34,21 @@ _PARAMETER = re.compile(r' ([a-z]++)="([0-9a-f]*+)"')
 
 class CopiesUnreadableError(Exception):
     """A file is unreadable or has no checkpoints."""
+
+
+class KnownLog(NamedTuple):
+    """A log that checkpoints are compared with, and the key that must have signed them (None: their own).
+
+    `hash_at` has the hashes of records from sequence `first` to `last`, and `text_of` the log's own checkpoints by
+    number; None for missing ones.
+    """
+
+    id: str
+    key: str | None
+    first: int
+    last: int
+    hash_at: Callable[[int], bytes | None]
+    text_of: Callable[[int], bytes | None]
 
 
 class SignedCheckpoint(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -67,17 +83,34 @@ class SignedCheckpoint(msgspec.Struct, frozen=True, omit_defaults=True):
         return self.checkpoint.text()
 
     def fault(self, expected: str | None = None) -> ProofFault | None:
-        """Return why the key `expected` (default: the checkpoint's) did not sign it, or None.
+        """Return why the key `expected` (default: the checkpoint's) did not sign it, or None."""
+        try:
+            parse_checkpoint(self.text())
+        except ValueError:
+            return ProofFault.SIGNATURE  # nothing that a signer signs
+        key = self.key if expected is None else expected
+        return signature_fault(self.text(), self.signature, self.key, key, signature_is_valid)
 
-        Raises `ValueError` for fields that are not those of a checkpoint.
-        """
-        parse_checkpoint(self.text())
-        return signature_fault(
-            self.text(), self.signature, self.key, expected or self.key, signature_is_valid
-        )
+    def fault_in(self, log: KnownLog) -> ProofFault | None:
+        """Return why it is not a checkpoint of this log, or None."""
+        if self.log != log.id:
+            return ProofFault.LOG
+        fault = self.fault(log.key)
+        if fault is not None or self.sequence < log.first:
+            return fault
+        fault = self.checkpoint.contradiction(log.last, log.hash_at(self.sequence))
+        changed = fault is None and log.text_of(self.number) not in (None, self.text())
+        return ProofFault.OTHER if changed else fault
 
     def as_json(self) -> str:
         return msgspec.json.encode(self).decode("ascii")
+
+
+def select_signed(connection: sqlite3.Connection, where: str, *values: int) -> list[SignedCheckpoint]:
+    """Return the signed checkpoints that meet a condition in SQL. Raises `ValueError` for a damaged one."""
+    query = "SELECT text, signature, public_key FROM checkpoint WHERE signature IS NOT NULL AND public_key IS NOT NULL"
+    found = connection.execute(f"{query} AND {where}", values)
+    return [SignedCheckpoint.of(*row) for row in found]
 
 
 def signed_checkpoints(log: Path, after: int = 0, limit: int = 1000) -> list[SignedCheckpoint]:
@@ -85,25 +118,20 @@ def signed_checkpoints(log: Path, after: int = 0, limit: int = 1000) -> list[Sig
 
     Raises `LogUnreadableError`.
     """
-    query = (
-        "SELECT text, signature, public_key FROM checkpoint WHERE number > ? AND signature IS NOT NULL"
-        " AND public_key IS NOT NULL ORDER BY number LIMIT ?"
-    )
-    with reading(log) as connection:
-        rows = connection.execute(query, (after, limit)).fetchall()
-    try:
-        return [SignedCheckpoint.of(*row) for row in rows]
-    except ValueError as error:
-        raise LogUnreadableError(f"{log}: cannot be read: {error}; run 'rosrv audit verify'") from error
+    return _read(log, "number > ? ORDER BY number LIMIT ?", after, limit)
 
 
 def newest_checkpoint(log: Path) -> SignedCheckpoint | None:
     """Return the last signed checkpoint of the log, or None. Raises `LogUnreadableError`."""
-    query = "SELECT max(number) FROM checkpoint WHERE signature IS NOT NULL AND public_key IS NOT NULL"
+    return next(iter(_read(log, "true ORDER BY number DESC LIMIT 1")), None)
+
+
+def _read(log: Path, where: str, *values: int) -> list[SignedCheckpoint]:
     with reading(log) as connection:
-        (number,) = connection.execute(query).fetchone()
-    found = [] if number is None else signed_checkpoints(log, number - 1, 1)
-    return found[0] if found else None
+        try:
+            return select_signed(connection, where, *values)
+        except ValueError as error:
+            raise LogUnreadableError(f"{log}: cannot be read: {error}; run 'rosrv audit verify'") from error
 
 
 def read_copies(file: Path) -> list[SignedCheckpoint]:
@@ -146,6 +174,16 @@ def _parse(line: str) -> SignedCheckpoint | None:
     return copy
 
 
+_WORDS = {
+    ProofFault.KEY: (
+        FindingKind.WRONG_KEY,
+        ", kept elsewhere: signed with {copy.key}, expected is {log.key}",
+    ),
+    ProofFault.SIGNATURE: (FindingKind.SIGNATURE_WRONG, ", kept elsewhere: its signature does not fit it"),
+    ProofFault.OTHER: (FindingKind.CHECKPOINT_CHANGED, ": another one than was given to the other machine"),
+}
+
+
 class CopiesVerifier:
     """Verifies copies against the chain of the log with the id `log`; `key` must have signed the copies."""
 
@@ -171,74 +209,56 @@ class CopiesVerifier:
         )
 
     def check(
-        self, chain: dict[int, bytes], removed: int, last: int, stored: dict[int, str]
-    ) -> Iterator[LogFinding]:
-        """Yield the findings. `chain` has the hashes at `sequences`; `stored` the log's own checkpoints by number.
+        self, chain: dict[int, bytes], removed: int, last: int, texts: dict[int, bytes]
+    ) -> list[LogFinding]:
+        """Return the findings. `chain` has the hashes at `sequences`; `texts` the log's own checkpoints by number.
 
         `removed` and `last` are the sequences of the last removed record and of the last record.
         """
+        key = None if self._key is None else self._key.hex()
+        log = KnownLog(self._log, key, removed, last, chain.get, texts.get)
+        found = list(self._compare(log))
         if not self._copies:
             names = ", ".join(self._others)
             message = (
                 f"the checkpoints kept elsewhere are of log {names}; this one, {self._log}, took its place"
             )
-            yield LogFinding(FindingKind.LOG_REPLACED, 0, 0, message)
-        found = list(self._compare(chain, removed, last, stored))
-        yield from found
-        if self._copies and not self._agreeing and not found:
+            found.append(LogFinding(FindingKind.LOG_REPLACED, 0, 0, message))
+        elif not self._agreeing and not found:
             message = (
                 f"of {len(self._copies)} checkpoints kept elsewhere none is of what is left of the log, which begins"
                 f" after record {removed}: they prove nothing of it"
             )
-            yield LogFinding(FindingKind.PROVES_NOTHING, 0, removed, message)
+            found.append(LogFinding(FindingKind.PROVES_NOTHING, 0, removed, message))
+        return found
 
-    def _compare(
-        self, chain: dict[int, bytes], removed: int, last: int, stored: dict[int, str]
-    ) -> Iterator[LogFinding]:
-        proven = removed
+    def _compare(self, log: KnownLog) -> Iterator[LogFinding]:
+        proven = log.first
         for copy in self._copies:
-            wrong = self._wrong_signature(copy)
-            if wrong is not None:
-                yield wrong
+            fault, sequence = copy.fault_in(log), copy.sequence
+            if fault in _WORDS:
+                kind, words = _WORDS[fault]
+                name = f"checkpoint {copy.number}"
+                yield LogFinding(kind, copy.number, copy.number, name + words.format(copy=copy, log=log))
+            if fault in (ProofFault.KEY, ProofFault.SIGNATURE):
                 continue
             self.removed += [] if copy.removed is None else [copy.removed]
-            if copy.sequence < removed:
-                continue
-            here = chain.get(copy.sequence)
-            fault = copy.checkpoint.contradiction(last, here)
             if fault is ProofFault.CUT_OFF:
                 message = (
-                    f"records {last + 1} to {copy.sequence} are gone from the end: checkpoint {copy.number},"
+                    f"records {log.last + 1} to {sequence} are gone from the end: checkpoint {copy.number},"
                     " kept elsewhere, has sealed them"
                 )
-                yield LogFinding(FindingKind.TRUNCATED, last + 1, copy.sequence, message)
+                yield LogFinding(FindingKind.TRUNCATED, log.last + 1, sequence, message)
                 return
-            if fault is not None:
-                yield self._rewritten(copy, proven)
+            if fault is ProofFault.REWRITTEN:
+                message = (
+                    f"records {proven + 1} to {sequence} are not those that checkpoint {copy.number}, kept elsewhere,"
+                    " sealed: history was rewritten with the signer's key"
+                )
+                yield LogFinding(FindingKind.REWRITTEN, proven + 1, sequence, message)
                 return
-            if here is None:
-                continue  # the sealed record is missing; the finding about that record reports it
-            proven = copy.sequence
-            self._agreeing.append(copy)
-            if stored.get(copy.number, copy.text().hex()) != copy.text().hex():
-                message = f"checkpoint {copy.number}: another one than was given to the other machine"
-                yield LogFinding(FindingKind.CHECKPOINT_CHANGED, copy.number, copy.number, message)
-
-    def _rewritten(self, copy: SignedCheckpoint, proven: int) -> LogFinding:
-        message = (
-            f"records {proven + 1} to {copy.sequence} are not those that checkpoint {copy.number}, kept elsewhere,"
-            " sealed: history was rewritten with the signer's key"
-        )
-        return LogFinding(FindingKind.REWRITTEN, proven + 1, copy.sequence, message)
-
-    def _wrong_signature(self, copy: SignedCheckpoint) -> LogFinding | None:
-        name, number = f"checkpoint {copy.number}, kept elsewhere", copy.number
-        expected = None if self._key is None else self._key.hex()
-        match copy.fault(expected):
-            case ProofFault.KEY:
-                message = f"{name}: signed with {copy.key}, expected is {expected}"
-                return LogFinding(FindingKind.WRONG_KEY, number, number, message)
-            case ProofFault.SIGNATURE:
-                message = f"{name}: its signature does not fit it"
-                return LogFinding(FindingKind.SIGNATURE_WRONG, number, number, message)
-        return None
+            if (
+                sequence >= log.first and fault is not ProofFault.MISSING
+            ):  # the finding about a record reports it
+                proven = sequence
+                self._agreeing.append(copy)

@@ -171,8 +171,8 @@ class _Verifier:
         gone, last = (removed.last_sequence if removed else 0), self.last - self._shift
         if removed is not None:
             chain = {**chain, gone: bytes.fromhex(removed.last_hash)}
-        stored = {row.number: row.text.hex() for row in self._checkpoints.rows}
-        self._findings += self._copies.check(chain, gone, last, stored)
+        texts = {row.number: row.text for row in self._checkpoints.rows}
+        self._findings += self._copies.check(chain, gone, last, texts)
         return self._copies.result()
 
     def _check_removal(self, removed: RemovedRange | None) -> str:

@@ -18,7 +18,7 @@ from appliance.audit.log.signatures import KeyUnreadableError, pinned_key_path, 
 from appliance.audit.proof.copies import SignedCheckpoint, newest_checkpoint
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import search
-from appliance.features.standby.takeovers import TOOK_OVER, EpochOf, TookOver, checkpoint_fault
+from appliance.features.standby.takeovers import TOOK_OVER, EpochOf, TookOver
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -135,8 +135,8 @@ class TakeoverRecorder:
         if not stored:
             return None, f"no checkpoint of {self._other} was replicated"
         found = _decoded(stored, SignedCheckpoint)
-        fault = "it is not a checkpoint" if found is None else checkpoint_fault(found)
-        if found is None or fault:
+        if found is None or found.fault() is not None:
+            fault = "it is not a checkpoint" if found is None else "its signature is wrong"
             return None, f"the replicated checkpoint of {self._other} is not valid: {fault}"
         if found.key == self._own_key():
             return None, f"the replicated checkpoint of {self._other} is of this appliance's own log"

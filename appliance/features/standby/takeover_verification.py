@@ -23,8 +23,8 @@ import msgspec
 
 from appliance.audit.log.log_database import reading
 from appliance.audit.proof.chain_findings import Verification
-from appliance.audit.proof.copies import SignedCheckpoint
-from appliance.features.standby.takeovers import EpochOf, Handover, Takeover, TakeoverLog, checkpoint_fault
+from appliance.audit.proof.copies import KnownLog, SignedCheckpoint
+from appliance.features.standby.takeovers import EpochOf, Handover, Takeover, TakeoverLog
 from appliance.signing.log_proof import ProofFault
 
 _SECOND = 1_000_000_000
@@ -309,42 +309,37 @@ def _has(log: TakeoverLog, previous: EpochOf) -> bool:
     return log.result.removed > 0 and (log.first_epoch is None or previous.epoch < log.first_epoch)
 
 
+_REWRITTEN = (
+    TakeoverFindingKind.REWRITTEN,
+    "; record {named.sequence} of the other log is not the one that it sealed: the records up to there were rewritten",
+)
+_WRONG = {
+    ProofFault.LOG: (
+        TakeoverFindingKind.LOG_REPLACED,
+        " of log {named.log}; the other log is {log.id}: it is of another pair, or took its place",
+    ),
+    ProofFault.KEY: (TakeoverFindingKind.WRONG_KEY, ", signed with {named.key}; expected is {log.key}"),
+    ProofFault.SIGNATURE: (TakeoverFindingKind.SIGNATURE_WRONG, ": its signature is wrong"),
+    ProofFault.CUT_OFF: (
+        TakeoverFindingKind.TRUNCATED,
+        ", which sealed record {named.sequence}; the other log ends with record {log.last}: its end was cut off, or the"
+        " copy is older",
+    ),
+    ProofFault.MISSING: _REWRITTEN,
+    ProofFault.REWRITTEN: _REWRITTEN,
+    ProofFault.OTHER: (TakeoverFindingKind.CHECKPOINT_CHANGED, "; the other log has a different one"),
+}
+
+
 def _wrong_checkpoint(named: SignedCheckpoint, log: TakeoverLog) -> tuple[TakeoverFindingKind, str] | None:
     """Return why a named checkpoint is not one of a log; None if it is, or if its records were removed."""
-    what, result = f"checkpoint {named.number}", log.result
-    if named.log != result.log:
-        return (
-            TakeoverFindingKind.LOG_REPLACED,
-            f"{what} of log {named.log}; the other log is {result.log}: it is of another pair, or took its place",
-        )
-    if named.key != result.key:
-        expected = result.key or "no key"
-        return TakeoverFindingKind.WRONG_KEY, f"{what}, signed with {named.key}; expected is {expected}"
-    if fault := checkpoint_fault(named):
-        return TakeoverFindingKind.SIGNATURE_WRONG, f"{what}: {fault}"
-    return None if named.sequence <= result.removed else _contradiction(named, what, log)
-
-
-def _contradiction(
-    named: SignedCheckpoint, what: str, log: TakeoverLog
-) -> tuple[TakeoverFindingKind, str] | None:
-    """Return how a log disagrees with a checkpoint that its key signed; None if it agrees."""
-    match named.checkpoint.contradiction(log.result.last, log.hash_at(named.sequence)):
-        case ProofFault.CUT_OFF:
-            return (
-                TakeoverFindingKind.TRUNCATED,
-                f"{what}, which sealed record {named.sequence}; the other log ends with record {log.result.last}: its"
-                " end was cut off, or the copy is older",
-            )
-        case ProofFault.REWRITTEN:
-            return (
-                TakeoverFindingKind.REWRITTEN,
-                f"{what}; record {named.sequence} of the other log is not the one that it sealed: the records up to"
-                " there were rewritten",
-            )
-    if log.checkpoint_text(named.number) != named.text():
-        return TakeoverFindingKind.CHECKPOINT_CHANGED, f"{what}; the other log has a different one"
-    return None
+    first, last, key = log.result.removed + 1, log.result.last, log.result.key or "no key"
+    known = KnownLog(log.result.log, key, first, last, log.hash_at, log.checkpoint_text)
+    fault = named.fault_in(known)
+    if fault is None:
+        return None
+    kind, words = _WRONG[fault]
+    return kind, f"checkpoint {named.number}{words.format(named=named, log=known)}"
 
 
 def _later_epoch(one: _Placed, named: SignedCheckpoint) -> str | None:

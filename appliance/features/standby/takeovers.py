@@ -74,14 +74,6 @@ class DecisionPlace(NamedTuple):
     time: int
 
 
-def checkpoint_fault(checkpoint: SignedCheckpoint) -> str:
-    """Return why a checkpoint is not valid in itself; empty for a valid one."""
-    try:
-        return "its signature is wrong" if checkpoint.fault() else ""
-    except ValueError as error:
-        return str(error)
-
-
 class TakeoverLog:
     """The verified part of one log, read from one snapshot. Methods raise `sqlite3.DatabaseError`."""
 
@@ -156,14 +148,14 @@ class TakeoverLog:
             _require_integers(place)
         return place  # type: ignore[no-any-return]  # checked above
 
-    def hash_at(self, sequence: int) -> bytes:
-        """Return the hash of a record; empty for a missing one."""
+    def hash_at(self, sequence: int) -> bytes | None:
         row = self._connection.execute("SELECT hash FROM record WHERE sequence = ?", (sequence,)).fetchone()
-        return row[0] if row is not None and isinstance(row[0], bytes) else b""
+        return row[0] if row is not None and isinstance(row[0], bytes) else None
 
-    def checkpoint_text(self, number: int) -> bytes | None:
+    def checkpoint_text(self, number: int) -> bytes:
+        """Return the text of a checkpoint; empty for a missing one."""
         row = self._connection.execute("SELECT text FROM checkpoint WHERE number = ?", (number,)).fetchone()
-        return None if row is None else row[0]
+        return b"" if row is None else row[0]
 
 
 def _require_integers(*values: object) -> None:
