@@ -156,7 +156,8 @@ def _checked(
         if version != LAYOUT_VERSION:
             raise LogUnreadableError(f"{path}: written by another version of rosrv (layout {version})")
         prepare(connection)
-    except sqlite3.DatabaseError as error:
+        connection.execute("SELECT count(*) FROM sqlite_schema")  # parses the schema, and may quote a part of it
+    except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
         connection.close()
         if isinstance(error, sqlite3.OperationalError):
             raise

@@ -14,6 +14,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from appliance.audit.log.columns import record_hash
 from appliance.audit.log.log import AuditLog
 from appliance.audit.log.log_database import COLUMNS, LogUnreadableError
+from appliance.audit.log.log_writer import ChainWriter
 from appliance.audit.log.signatures import KeyUnreadableError, read_public_key
 from appliance.audit.proof import verification
 from appliance.audit.proof.chain_findings import FindingKind
@@ -264,6 +265,14 @@ def test_a_truncated_file_is_found(log: Path) -> None:
         assert not verify(log).ok
     except LogUnreadableError as error:
         assert str(log) in str(error)
+
+
+def test_a_schema_that_is_not_text_is_an_error(log: Path) -> None:
+    log.write_bytes(log.read_bytes().replace(b"decision TEXT, host", b"decision TEXT\xac host"))
+    with pytest.raises(LogUnreadableError, match=r"audit\.db: damaged: .*; keep it as evidence"):
+        verify(log)
+    with pytest.raises(LogUnreadableError, match=r"audit\.db: damaged"):
+        ChainWriter(log, 0)
 
 
 def test_a_missing_log_is_an_error(tmp_path: Path) -> None:
