@@ -156,7 +156,7 @@ def _checked(
         if version != LAYOUT_VERSION:
             raise LogUnreadableError(f"{path}: written by another version of rosrv (layout {version})")
         prepare(connection)
-        connection.execute("SELECT count(*) FROM sqlite_schema")  # parses the schema, and may quote a part of it
+        connection.execute("SELECT count(*) FROM sqlite_schema")  # an error may quote bytes of the schema
     except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
         connection.close()
         if isinstance(error, sqlite3.OperationalError):

@@ -195,6 +195,13 @@ LINES: dict[str, Callable[[Lines, Lines], Lines]] = {
     "edit a host": lambda lines, _other: [*lines[:4], edited(lines[4], host="10.9.9.9"), *lines[5:]],
     "edit a sequence": lambda lines, _other: [*lines[:4], edited(lines[4], sequence=99), *lines[5:]],
     "add a field": lambda lines, _other: [*lines[:4], edited(lines[4], more=1), *lines[5:]],
+    "repeat a field": lambda lines, _other: [
+        *lines[:4], lines[4].replace(b'"revision":3,', b'"revision":3,"revision":3,', 1), *lines[5:]
+    ],
+    "add a space to the first line": lambda lines, _other: [lines[0].replace(b":", b": ", 1), *lines[1:]],
+    "name another version": lambda lines, _other: [lines[0].replace(b'"segment":1', b'"segment":2'), *lines[1:]],
+    "remove what comes before": lambda lines, _other: [edited(lines[0], begin=None, after=None), *lines[1:]],
+    "add a deep line": lambda lines, _other: [*lines, b"[" * 100_000 + b"\n"],
     "add a space": lambda lines, _other: [*lines[:4], lines[4].replace(b":", b": ", 1), *lines[5:]],
     "add a line of another log": lambda lines, other: [*lines, other[-1]],
     "take a line of another log": lambda lines, other: [*lines[:4], other[4], *lines[5:]],

@@ -1,6 +1,4 @@
 import io
-import json
-from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -10,7 +8,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from appliance.audit.log.log import AuditLog
 from appliance.audit.log.retention import Retention
 from appliance.audit.proof.chain_proofs import evidence, evidence_line
-from appliance.audit.proof.copies import SignedCheckpoint, signed_checkpoints
+from appliance.audit.proof.copies import signed_checkpoints
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import export
 from appliance.formats.segments import (
@@ -77,71 +75,6 @@ def test_its_records_are_the_lines_of_an_export(segments: list[bytes], path: Pat
 def test_an_unsigned_checkpoint_has_no_segment_yet(segments: list[bytes], path: Path) -> None:
     assert (len(segments), signed_checkpoints(path)[-1].number) == (3, 4)
     assert [write_segment(path, number, lambda _line: None) for number in (5, 6)] == [None, None]
-
-
-def _lines(change: Callable[[list[bytes]], list[bytes]]) -> Callable[[bytes], bytes]:
-    return lambda one: b"".join(change(one.splitlines(keepends=True)))
-
-
-def _fields(**changes: object) -> Callable[[bytes], bytes]:
-    def change(lines: list[bytes]) -> list[bytes]:
-        fields = json.loads(lines[2]) | changes
-        return [*lines[:2], json.dumps(fields, separators=(",", ":")).encode() + b"\n", *lines[3:]]
-
-    return _lines(change)
-
-
-CHANGES = {
-    "changed record": (_fields(host="10.9.9.9"), "does not follow"),
-    "renumbered record": (_fields(sequence=999), "does not follow"),
-    "removed record": (_lines(lambda lines: lines[:2] + lines[3:]), "does not follow"),
-    "removed end": (_lines(lambda lines: lines[:-1]), "missing at its end"),
-    "swapped records": (_lines(lambda lines: [lines[0], lines[2], lines[1], *lines[3:]]), "does not follow"),
-    "repeated end": (_lines(lambda lines: [*lines, lines[-1]]), "more records"),
-    "cut line": (lambda one: one[:-7], "was cut"),
-    "no records": (_lines(lambda lines: lines[:1]), "missing at its end"),
-    "nothing": (lambda _one: b"", "line 1"),
-    "another spelling": (lambda one: one.replace(b'"schema":1,', b'"schema": 1,', 1), "one valid spelling"),
-    "a further field": (lambda one: one.replace(b'"schema":1,', b'"schema":1,"x":1,', 1), "one valid spelling"),
-    "a field twice": (lambda one: one.replace(b'"schema":1,', b'"schema":1,"schema":1,', 1), "one valid spelling"),
-    "header spelt differently": (lambda one: one.replace(b'{"segment":1,', b'{"segment": 1,', 1), "one valid spelling"),
-    "another version": (lambda one: one.replace(b'{"segment":1,', b'{"segment":2,', 1), "version 2"),
-    "no beginning": (_lines(lambda lines: [_without_begin(lines[0]), *lines[1:]]), "does not follow"),
-    "deep": (lambda one: one + b"[" * 100_000 + b"\n", "more records"),
-}  # fmt: skip
-
-
-def _without_begin(line: bytes) -> bytes:
-    return (
-        json.dumps(json.loads(line) | {"begin": None, "after": None}, separators=(",", ":")).encode() + b"\n"
-    )
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", CHANGES)
-def test_a_changed_segment_is_refused(name: str, segments: list[bytes], public: bytes) -> None:
-    change, why = CHANGES[name]
-    with pytest.raises(SegmentError, match=why):
-        SegmentReader(io.BytesIO(change(segments[1])), (public,), _LARGEST).summary()
-
-
-def test_a_segment_of_another_key_is_refused(segments: list[bytes]) -> None:
-    other = Ed25519PrivateKey.generate().public_key().public_bytes_raw()
-    with pytest.raises(SegmentError, match="is signed with"):
-        SegmentReader(io.BytesIO(segments[0]), (other,), _LARGEST)
-
-
-def test_a_forged_checkpoint_is_refused(segments: list[bytes], public: bytes) -> None:
-    lines = segments[1].splitlines(keepends=True)
-    header = json.loads(lines[0])
-    end = SignedCheckpoint(**header["end"])
-    forged = Ed25519PrivateKey.generate().sign(end.text()).hex()
-    lines[0] = (
-        json.dumps(header | {"end": header["end"] | {"signature": forged}}, separators=(",", ":")).encode()
-        + b"\n"
-    )
-    with pytest.raises(SegmentError, match="signature of checkpoint 2 is wrong"):
-        SegmentReader(io.BytesIO(b"".join(lines)), (public,), _LARGEST)
 
 
 def test_a_large_segment_is_refused_early(segments: list[bytes], public: bytes) -> None:

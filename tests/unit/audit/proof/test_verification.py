@@ -128,7 +128,7 @@ ATTACKS = transcripts(Path(__file__).with_name("attacks.txt"))
 
 @pytest.mark.parametrize("title", ATTACKS, ids=ATTACKS)
 def test_attack(log: Path, title: str) -> None:
-    """Each attack (SQL on the file) has exactly its listed findings: kind, first and last record or checkpoint."""
+    """Each attack (SQL on the file) has exactly its listed findings; tests/unit/fleet/verdicts.txt has further ones."""
     statements = [line for line in ATTACKS[title] if not line.startswith(" ")]
     columns = COLUMNS.split(", ", 1)[1]
     attack(log, *(statement.replace("OTHER_COLUMNS", columns) for statement in statements))
