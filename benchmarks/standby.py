@@ -9,9 +9,9 @@
 message, an answer of a service, and an answer of the Master API. It includes the usual time between two of them: 20 ms
 for topics and calls. Afterwards no node has ended and no answered change is missing, or the program fails.
 
-`registrations`: one node registers and unregisters a topic behind a single appliance, two appliances with
-`availability.wait: none`, and two with `standby`. They take turns, so that other load affects all; ratios are of
-medians. `--load` starts processes that keep the machine's cores busy. `--monitors` loads the specifications there.
+`registrations`: one node registers and unregisters a topic behind a single appliance, and behind two. They take turns,
+so that other load affects both; ratios are of medians. `--load` starts processes that keep the machine's cores busy.
+`--monitors` loads the specifications there.
 """
 
 import argparse
@@ -207,10 +207,9 @@ def one_takeover(site: StandbySite, robot: StandbyRobot, *, planned: bool) -> di
 
 def registrations(rounds: int, load: int) -> None:
     """Print a table of the times of registrations."""
-    kinds = {"single": None, "two, wait: none": "none", "two, wait: standby": "standby"}
-    times: dict[str, list[float]] = {kind: [] for kind in kinds}
+    times: dict[str, list[float]] = {"one": [], "two": []}
     with contextlib.ExitStack() as stack:
-        turns = {kind: stack.enter_context(_behind(wait)) for kind, wait in kinds.items()}
+        turns = {kind: stack.enter_context(_behind(pair=kind == "two")) for kind in times}
         stack.enter_context(busy(load))
         for turn in range(rounds + 1):
             for kind, take_turn in turns.items():
@@ -219,7 +218,7 @@ def registrations(rounds: int, load: int) -> None:
     table = Table(
         "appliances", "median", "90 %", "ratio", title=f"milliseconds of a registration, load {load}"
     )
-    single = statistics.median(times["single"])
+    single = statistics.median(times["one"])
     for kind, found in times.items():
         middle = statistics.median(found)
         late = statistics.quantiles(found, n=10)[8]
@@ -228,17 +227,16 @@ def registrations(rounds: int, load: int) -> None:
 
 
 @contextlib.contextmanager
-def _behind(wait: str | None) -> Iterator[Callable[[], list[float]]]:
+def _behind(*, pair: bool) -> Iterator[Callable[[], list[float]]]:
     """Start one or two appliances; yield a function that returns the times of some registrations."""
-    lab = Lab(f"rosrv-bench-{wait or 'single'}")
+    lab = Lab(f"rosrv-bench-{'pair' if pair else 'single'}")
     with tempfile.TemporaryDirectory() as home, lab:
-        if wait is None:
+        if not pair:
             robot = lab.host("robot", "10.79.0.10/24")
             with Appliance(lab.host("a", "10.79.0.2/24")) as one:
                 yield lambda: robot.run(lambda: _registered(one.master_uri))
         else:
-            settings = f"availability:\n  wait: {wait}\n"
-            with StandbySite(lab, Path(home), settings=settings) as site:
+            with StandbySite(lab, Path(home)) as site:
                 site.start_witness()
                 site.start("a")
                 site.until_active("a")

@@ -280,7 +280,14 @@ def _dotted(path: KeyPath) -> str:
     return ".".join(map(str, path))
 
 
+_REMOVED = {
+    "availability": "answers of one of two appliances always wait for the standby; remove the section"
+}
+
+
 def _unknown_key(path: KeyPath) -> str:
+    if len(path) == 1 and path[0] in _REMOVED:
+        return f"{path[0]} is not a section any more: {_REMOVED[path[0]]}"
     known = sorted(_keys_at(Settings, path[:-1]))
     nearest = difflib.get_close_matches(str(path[-1]), known, n=1, cutoff=0.5)
     if not nearest:

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 from appliance.cli.verb_table import Group, Verb
 from appliance.features.feature import ConsolePart, Feature
 from appliance.features.standby.membership import FILE, FOLDER, LEASE_FILE, LEASE_NICE, LEFT_FILE
-from appliance.features.standby.settings import Availability
 from appliance.supervisor.role import Role
 from appliance.supervisor.sandbox.sandbox_plan import NETWORK, SandboxPlan
 
@@ -31,7 +30,6 @@ def _operations() -> "tuple[type[AdminRequest[Any]], ...]":
 
 STANDBY = Feature(
     "standby",
-    settings=Availability,
     roles=(
         Role(
             "lease", "rosrv-lease", "lease", f"{_PLACE}process:main",

@@ -7,7 +7,7 @@ from appliance.configuration.settings import Settings
 from appliance.control.assembly.active_role import ActiveRole
 from appliance.control.assembly.host_authority import HostAuthority
 from appliance.features.standby.appliance_table import ApplianceTable
-from appliance.features.standby.replication import Pair, Replication, host_endpoint, waits_for
+from appliance.features.standby.replication import Pair, Replication, host_endpoint
 from appliance.features.standby.shared_authority import SharedAuthority
 from appliance.features.standby.stored_times import adopt_times
 from appliance.hosts.certificate_requests import Authority
@@ -49,7 +49,6 @@ class PairedRole(ActiveRole):
             pair.lease,
             store.database,
             pair.epoch,
-            wait=waits_for(settings),
             taken_over=pair.taken_over,
             folder=settings.state / "control",
         )

@@ -27,7 +27,7 @@ from appliance.features.standby.membership import Membership
 from appliance.features.standby.passive_rest import PassiveRest, ReplicatedTokens
 from appliance.features.standby.replica import Replica
 from appliance.features.standby.replica_sync import ReplicaSync
-from appliance.features.standby.replication import Pair, host_endpoint, state_of, waits_for
+from appliance.features.standby.replication import Pair, host_endpoint, state_of
 from appliance.features.standby.replication_frames import ReplicationError
 from appliance.features.standby.replication_receiver import ReplicationReceiver
 from appliance.features.standby.replication_transport import follow_at
@@ -176,13 +176,11 @@ class PassiveControl:
             trouble_seconds=None if self._connected else round(clock.now() - self._away_since, 3),
             witness_seconds=None,
         )
-        wait = waits_for(self._settings)
         return state_of(
             self._membership,
             lease,
             role="standby",
             since=self._since,
-            wait=wait,
             other=other,
             obstacle=self._check.obstacle,
         )

@@ -1,6 +1,6 @@
 """Replicate the state of the active one of two appliances, and hold answers back until the standby has stored it.
 
-1. With `availability.wait: standby`, an answer waits until the standby has stored all changes made before it, or until
+1. An answer waits until the standby has stored all changes made before it, or until
    the witness has removed the standby from the in-sync set.
 2. Without a valid lease nothing is answered.
 3. A planned switchover begins only while the standby is in sync, and the lease is given up only after the standby has
@@ -28,7 +28,6 @@ from appliance.features.standby.membership import Membership
 from appliance.features.standby.replication_frames import Introduction, ReplicationError
 from appliance.features.standby.replication_sender import ReplicationSender
 from appliance.features.standby.replication_transport import ReplicationListener
-from appliance.features.standby.settings import Availability
 from appliance.features.standby.standby_answers import OtherAppliance, StandbyState, WitnessSeen
 from appliance.features.standby.standby_tunnels import StandbyTunnels
 from appliance.store.writer_thread import Database, StoreError
@@ -96,7 +95,6 @@ def state_of(
     *,
     role: Literal["active", "standby"],
     since: float,
-    wait: Literal["standby", "none"],
     other: OtherAppliance,
     obstacle: str,
 ) -> StandbyState:
@@ -108,7 +106,6 @@ def state_of(
         epoch=lease.epoch if lease is not None else 0,
         since=since,
         fixed=membership.fixed,
-        wait=wait,
         answers_alone=lease is not None and lease.alone,
         other=other,
         witness=WitnessSeen(
@@ -122,10 +119,6 @@ def state_of(
         ),
         obstacle=obstacle,
     )
-
-
-def waits_for(settings: Settings) -> Literal["standby", "none"]:
-    return settings.sections.of(Availability).wait
 
 
 def host_endpoint(settings: Settings, membership: Membership) -> str:
@@ -145,7 +138,6 @@ class Replication:
         database: Database,
         epoch: int,
         *,
-        wait: Literal["standby", "none"],
         taken_over: bool,
         folder: Path,
     ) -> None:
@@ -158,7 +150,6 @@ class Replication:
         self._membership = membership
         self._lease = lease
         self._database = database
-        self._wait = wait
         self._since = clock.wall()
         self.switchover_wanted = asyncio.Event()
         self.sender = ReplicationSender(database, lambda: epoch, switchover_wanted=self.switchover_wanted.set)
@@ -169,7 +160,7 @@ class Replication:
         self._unserved = ""  # why no standby can connect
         self._trouble_since: float | None = None
         self.admission = RobotAdmission()
-        self._taken_over = taken_over and wait == "standby"
+        self._taken_over = taken_over
         self._absent = False  # whether the first answers would wait for the other appliance in vain
         self._tasks: set[asyncio.Task[None]] = set()
         self._reported: lease_link.ReplicationReported | None = None
@@ -225,13 +216,11 @@ class Replication:
 
     async def stored(self) -> None:
         """Wait until all changes made so far may be answered. Raises `StoreError` if they cannot be written."""
-        if self._wait == "standby":
-            number = self._database.number
-            try:
-                await self.sender.acknowledged(number)
-            except ReplicationError as error:
-                _log.warning("a change is not answered", reason=str(error))
-                await asyncio.get_running_loop().create_future()  # the supervisor ends this process
+        try:
+            await self.sender.acknowledged(self._database.number)
+        except ReplicationError as error:
+            _log.warning("a change is not answered", reason=str(error))
+            await asyncio.get_running_loop().create_future()  # the supervisor ends this process
         await self._lease.until_active()
 
     def state(self) -> StandbyState:
@@ -255,7 +244,6 @@ class Replication:
             lease,
             role="active",
             since=self._since,
-            wait=self._wait,
             other=other,
             obstacle=lag.obstacle,
         )

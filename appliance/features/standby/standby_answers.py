@@ -54,10 +54,6 @@ class StandbyState(msgspec.Struct, frozen=True):
     epoch: Annotated[int, doc("number of the takeover that this appliance knows last")]
     since: Moment
     fixed: Annotated[str, doc("the address at which the robot's nodes reach the active appliance")]
-    wait: Annotated[
-        Literal["standby", "none"],
-        doc("whether an answer to a node waits until the other appliance has stored the change"),
-    ]
     answers_alone: Annotated[
         bool, doc("active: the other appliance is not in sync, so no answer waits for it")
     ]

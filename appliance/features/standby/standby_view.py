@@ -48,8 +48,6 @@ class StandbyScreen:
 
 
 def _answers(state: StandbyState) -> str:
-    if state.wait == "none":
-        return "do not wait for the standby (availability.wait: none)"
     if state.answers_alone:
         return "do not wait for the standby, because it is not in sync"
     return "wait until the standby has stored each change"

@@ -152,6 +152,14 @@ def test_relative_paths_depend_on_their_source(file: Path, monkeypatch: pytest.M
     assert resolve(file, {}, {"policy": Path("b.ini")}).policy == Path("/b.ini")
 
 
+def test_a_removed_section_says_why(tmp_path: Path) -> None:
+    file = tmp_path / "appliance.yaml"
+    file.write_text("availability: {wait: none}\n")
+    [found] = mistakes(file)
+    assert found.startswith(f"{file}:1: availability is not a section any more: answers")
+    assert found.endswith("remove the section")
+
+
 def test_an_unknown_variable_is_a_mistake() -> None:
     assert mistakes(None, {"ROSRV_LISTN": "x"}) == ["ROSRV_LISTN: unknown key listn: did you mean listen?"]
     assert "ROSRV_LISTEN__PORT: " in mistakes(None, {"ROSRV_LISTEN__PORT": "1"})[0]

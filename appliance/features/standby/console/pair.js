@@ -75,6 +75,5 @@ function Witness(/** @type {{witness: any, name: string, active: boolean}} */ { 
 }
 
 function waits(/** @type {any} */ state) {
-  if (state.wait === "none") return "Answers do not wait for the standby (availability.wait: none).";
   return state.answers_alone ? "Answers do not wait for the standby, because it is not in sync." : "Answers wait until the standby has stored each change.";
 }

@@ -101,9 +101,7 @@ class Pair:
         client: Any = self.client
         client.send = self.to_lease.append
         store: Any = self.database
-        self.control = Replication(
-            MEMBERSHIP, self.client, store, 2, wait="standby", taken_over=taken_over, folder=Path()
-        )
+        self.control = Replication(MEMBERSHIP, self.client, store, 2, taken_over=taken_over, folder=Path())
         self.lease.control_linked()
         self.control.begin()
 
