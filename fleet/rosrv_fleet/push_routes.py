@@ -127,14 +127,11 @@ class _Uploads:
             try:
                 with file:
                     await self._receive(request, file, cost)
-                receipt = await self._keep(Path(file.name), robot, place, cost)
+                return await self._keep(Path(file.name), robot, place, cost)
             except HTTPException as error:
                 if error.status_code not in _NOT_THE_ROBOT:
                     quotas.refused(robot.name, cost.seconds)
                 raise
-            else:
-                quotas.stored(robot.name)
-                return receipt
             finally:
                 await asyncio.to_thread(Path(file.name).unlink)
                 await asyncio.to_thread(quotas.charge, robot.name, cost.received, cost.unpacked)

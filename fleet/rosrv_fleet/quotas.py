@@ -7,7 +7,6 @@ faster. A new robot has saved none. The files are not synced: a power cut may lo
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
 import structlog
@@ -19,8 +18,8 @@ from rosrv_fleet.robots import make_folder
 _DAY_SECONDS = 86_400.0
 _SAVED_DAYS = 7.0
 _LEAST_BYTES = 64 << 10  # a segment costs at least this: files, markers and folders also cost
-_FIRST_PAUSE, _LONGEST_PAUSE = 0.05, 600.0
-_REST = 10.0  # a refused segment costs this many times its processor time
+_LEAST_PAUSE = 1.0
+_REST = 10.0  # after a refused segment, a robot pauses for this many times its processor time
 _log = structlog.get_logger()
 
 
@@ -43,11 +42,6 @@ class UsedBytes(msgspec.Struct, frozen=True):
     unpacked: float = 0.0
 
 
-class _Refusals(NamedTuple):
-    times: int
-    until: float
-
-
 class RobotQuotas:
     """The quotas of robots in a folder. One call for a robot at a time."""
 
@@ -56,11 +50,12 @@ class RobotQuotas:
         self._folder = folder
         self._limits = limits
         self._clock = clock
-        self._refusals: dict[str, _Refusals] = {}
+        self._pauses: dict[str, float] = {}
+        """The end of each robot's last pause."""
 
     def check(self, robot: str) -> None:
         """Raise `OverQuotaError` while the robot has used its quota, or has to pause. Raises `OSError`."""
-        rest = self._refusals.get(robot, _Refusals(0, 0.0)).until - clock.now()
+        rest = self._pauses.get(robot, 0.0) - clock.now()
         if rest > 0:
             raise OverQuotaError("uploads of this robot were refused: it has to pause", rest)
         used, limits = self._used(robot), self._limits
@@ -90,15 +85,7 @@ class RobotQuotas:
 
     def refused(self, robot: str, seconds: float) -> None:
         """Make the robot pause after a refused upload that took `seconds` of processor time."""
-        count = self._refusals.get(robot, _Refusals(0, 0.0)).times + 1
-        pause = min(_LONGEST_PAUSE, max(_FIRST_PAUSE * 2.0 ** min(count, 14), _REST * seconds))
-        self._refusals[robot] = _Refusals(count, clock.now() + pause)
-
-    def stored(self, robot: str) -> None:
-        """Shorten the next pause of the robot after a stored upload."""
-        count = self._refusals.pop(robot, _Refusals(0, 0.0)).times - 1
-        if count > 0:
-            self._refusals[robot] = _Refusals(count, 0.0)
+        self._pauses[robot] = clock.now() + max(_LEAST_PAUSE, _REST * seconds)
 
     def _used(self, robot: str) -> UsedBytes:
         now = self._clock()
