@@ -27,7 +27,15 @@ from roswire.node.network import (
 from roswire.node.node_api import NodeApi, ParameterChanged
 from roswire.node.services import ServiceServer, ServiceType, call_service, probe_service
 from roswire.node.tcpros_streams import ANY_TYPE, MessageType, NodeLimits, read_header, refuse
-from roswire.node.topics import NodeLink, NodePublication, NodeSubscription, Received
+from roswire.node.topics import (
+    NodeLink,
+    NodePublication,
+    NodeSubscription,
+    OwnMemory,
+    QueueMemory,
+    Received,
+    SendQueues,
+)
 from roswire.node.xmlrpc_http import call_xmlrpc, serve_xmlrpc
 from roswire.uris import NodeUri, node_uri, parse_node_uri, parse_service_uri, service_uri
 from roswire.xmlrpc import FaultReceived, Value
@@ -40,6 +48,7 @@ class RosNode:
     """A node with the canonical name `name`, registered with the master at the URI `master`.
 
     `shut_down` is called with the reason if the master ends the node, for example because another node has its name.
+    `memory` bounds the messages that wait for other nodes; by default, the node has one of its own.
     """
 
     def __init__(
@@ -50,6 +59,7 @@ class RosNode:
         *,
         limits: NodeLimits,
         shut_down: Callable[[str], None],
+        memory: QueueMemory | None = None,
     ) -> None:
         self.name = name
         self.publishers: dict[str, NodePublication] = {}
@@ -59,7 +69,7 @@ class RosNode:
         self._master: NodeUri = parse_node_uri(master)
         self._network = network
         self._limits = limits
-        self._link = NodeLink(name, network, limits)
+        self._link = NodeLink(name, network, limits, SendQueues(memory or OwnMemory(limits.queue_bytes)))
         self._api = NodeApi(self, master, os.getpid(), shut_down)
         self._tasks = OwnedTasks()
         self._servers: list[ListeningServer] = []

@@ -25,7 +25,7 @@ class NodeLimits:
     publishers: int = 256  # of one topic
     header_seconds: float = 10.0
     call_seconds: float = 10.0  # a call of the master or of another node
-    queue_bytes: int = 64 << 20  # that wait for one subscriber
+    queue_bytes: int = 64 << 20  # that wait for all subscribers, unless the node shares a memory with others
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,8 +9,9 @@ import itertools
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
-from roswire.errors import ProtocolError, RosError
+from roswire.errors import LimitExceededError, ProtocolError, RosError
 from roswire.node.network import ByteWriter, NodeNetwork, OwnedTasks
 from roswire.node.tcpros_streams import (
     ANY,
@@ -31,16 +32,43 @@ _FIRST_PAUSE = (
     0.1  # seconds between two attempts to reach a publisher; the pause doubles up to the second number
 )
 _LONGEST_PAUSE = 5.0
+_OVERHEAD = 64  # bytes that a waiting frame takes besides its own
 _TURN = 64  # messages after which other tasks get a turn, although more have come
+
+
+class QueueMemory(Protocol):
+    """The memory that the send queues of a node share with others."""
+
+    def add(self, size: int) -> None:
+        """Take bytes; return them if `size` is negative."""
+
+    def refusal(self, size: int) -> str:
+        """Return why there is no room for `size` more bytes; empty if there is."""
+
+
+class OwnMemory:
+    """A memory of at most `most` bytes for one node."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self.held = 0
+
+    def add(self, size: int) -> None:
+        self.held += size
+
+    def refusal(self, size: int) -> str:
+        held = self.held + size
+        return f"the node's queues would hold {held} bytes; at most {self._most}" if held > self._most else ""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeLink:
-    """The name and network of a node, as its topics and services use them."""
+    """The name, network and send queues of a node, as its topics and services use them."""
 
     name: str
     network: NodeNetwork
     limits: NodeLimits
+    queues: "SendQueues"
 
 
 class NodeSubscription:
@@ -189,7 +217,7 @@ class NodeSubscription:
 class NodePublication:
     """A publication of a node.
 
-    At most `queue` messages wait for each subscriber; if more come, the oldest are dropped, which `dropped` counts. A
+    At most `queue` messages wait for each subscriber; if more come, the oldest are dropped, as `dropped` counts. A
     latched publication sends its last message to each new subscriber. Subscribers connect some time after the
     registration; those that connect within `replay` seconds get the messages that were published until then. `own`
     returns the node's own subscription to the topic: as with rospy and roscpp, its messages take no connection.
@@ -211,7 +239,6 @@ class NodePublication:
         self.topic = topic
         self.type = kind
         self.latched = latched
-        self.dropped = 0
         self._link = link
         self._own = own
         self._header = {
@@ -224,23 +251,31 @@ class NodePublication:
         }
         self._queue = queue
         self._replay = replay
-        self._kept = _SendQueue("", 1 if latched else queue, link.limits.queue_bytes)  # for later subscribers
+        self._kept = _SendQueue(
+            "", 1 if latched else queue, link.queues, pinned=latched
+        )  # for later subscribers
         self._forget: asyncio.TimerHandle | None = None
         self.replay_from_now()
         self._served: set[_SendQueue] = set()
+        self._dropped = 0  # for subscribers that have left
         self._tasks = OwnedTasks()
 
     @property
     def subscribers(self) -> list[str]:
         return [one.name for one in self._served]
 
+    @property
+    def dropped(self) -> int:
+        return self._dropped + sum(one.dropped for one in self._served)
+
     def publish(self, body: bytes) -> None:
-        """Send a serialised message to all subscribers."""
-        if self.latched or self._replays():
-            self._kept.put(encode_frame(body))
-        frame = encode_frame(body) if self._served else b""
+        """Send a serialised message to all subscribers. Raises `LimitExceededError` if a latched one cannot be kept."""
+        stays = self.latched or self._replays()
+        frame = encode_frame(body) if self._served or stays else b""
+        if stays:
+            self._kept.put(frame)
         for one in self._served:
-            self.dropped += one.put(frame)
+            one.put(frame)
         if (own := self._own()) is not None:
             own.hear_own(body, self._header)
 
@@ -274,9 +309,9 @@ class NodePublication:
             )
             return
         writer.write(encode_header(self._header))
-        queue = _SendQueue(header.get("callerid", "")[:200], self._queue, self._link.limits.queue_bytes)
+        queue = _SendQueue(header.get("callerid", "")[:200], self._queue, self._link.queues)
         if self.latched or self._replays():
-            for frame in self._kept.frames:
+            for frame in [*self._kept.frames]:
                 queue.put(frame)
         self._served.add(queue)
         sending = self._tasks.start(queue.send_to(writer))
@@ -288,35 +323,86 @@ class NodePublication:
             self._served.discard(queue)
             sending.cancel()
             writer.close()
+            queue.close()
+            self._dropped += queue.dropped
 
     async def close(self) -> None:
+        if self._forget is not None:
+            self._forget.cancel()
+        self._kept.close()
         await self._tasks.close()
 
 
+class SendQueues:
+    """All messages of a node that wait for other nodes. Without room, the longest queue loses its oldest message."""
+
+    def __init__(self, memory: QueueMemory) -> None:
+        self.memory = memory
+        self.queues: set[_SendQueue] = set()
+
+    def make_room(self, own: "_SendQueue", size: int) -> str:
+        """Drop messages until `own` has room for a message of this size; return why it has none.
+
+        A queue drops messages of others only while it would not be the longest itself, unless it is pinned.
+        """
+        claim = 0 if own.pinned else own.bytes + size
+        wanted = size - own.bytes if own.pinned else size  # a pinned message is replaced
+        while reason := self.memory.refusal(wanted):
+            longest = max(
+                (one for one in self.queues if one.frames), key=lambda queue: queue.bytes, default=None
+            )
+            if longest is None or (claim >= longest.bytes and not own.frames):
+                return reason
+            (own if claim >= longest.bytes else longest).drop_oldest()
+            claim = 0 if own.pinned else own.bytes + size
+        return ""
+
+
 class _SendQueue:
-    """The messages that wait for one subscriber."""
+    """The messages that wait for one subscriber, or that are kept for later ones. Those `pinned` are never dropped."""
 
-    def __init__(self, name: str, most: int, most_bytes: int) -> None:
+    def __init__(self, name: str, most: int, queues: SendQueues, *, pinned: bool = False) -> None:
         self.name = name
-        self._most, self._most_bytes = most, most_bytes
         self.frames: deque[bytes] = deque()
-        self._bytes = 0
+        self.bytes = 0  # also of the message that is being sent
+        self.dropped = 0
+        self.pinned = pinned
+        self._most = most
+        self._queues = queues
         self._ready = asyncio.Event()
+        if not pinned:
+            queues.queues.add(self)
 
-    def put(self, frame: bytes) -> int:
-        """Add a frame; return how many older ones were dropped for it."""
-        dropped = 0
+    def put(self, frame: bytes) -> None:
+        """Add a frame; without room, drop older ones or this one. Raises `LimitExceededError` if it is pinned."""
+        size = _held(frame)
+        reason = self._queues.make_room(self, size)
+        if reason and self.pinned:
+            raise LimitExceededError(f"no memory to keep a latched message of {len(frame)} bytes: {reason}")
+        if reason:
+            self.dropped += 1
+            return
         self.frames.append(frame)
-        self._bytes += len(frame)
-        while len(self.frames) > 1 and (len(self.frames) > self._most or self._bytes > self._most_bytes):
-            self._bytes -= len(self.frames.popleft())
-            dropped += 1
+        self._charge(size)
+        while len(self.frames) > self._most:
+            self.drop_oldest()
         self._ready.set()
-        return dropped
+
+    def drop_oldest(self) -> None:
+        self._charge(-_held(self.frames.popleft()))
+        self.dropped += 1
+
+    def _charge(self, size: int) -> None:
+        self.bytes += size
+        self._queues.memory.add(size)
 
     def clear(self) -> None:
-        self.frames.clear()
-        self._bytes = 0
+        while self.frames:
+            self._charge(-_held(self.frames.popleft()))
+
+    def close(self) -> None:
+        self.clear()
+        self._queues.queues.discard(self)
 
     async def send_to(self, writer: ByteWriter) -> None:
         """Send what is added, until the connection ends."""
@@ -326,8 +412,14 @@ class _SendQueue:
                 self._ready.clear()
                 while self.frames:
                     frame = self.frames.popleft()
-                    self._bytes -= len(frame)
-                    writer.write(frame)
-                    await writer.drain()
+                    try:
+                        writer.write(frame)
+                        await writer.drain()
+                    finally:
+                        self._charge(-_held(frame))  # until here, the connection holds it
         except OSError:
             writer.close()
+
+
+def _held(frame: bytes) -> int:
+    return len(frame) + _OVERHEAD

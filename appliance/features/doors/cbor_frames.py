@@ -19,6 +19,9 @@ MOST_DEPTH = 70
 MOST_ITEMS = 50_000
 """Values of one frame; a typed array is one value."""
 
+MOST_NUMBERS = 500_000
+"""Numbers of the typed arrays of one frame, except those of `uint8`."""
+
 _CODES = {
     64: "B", 65: ">H", 66: ">I", 67: ">Q", 68: "B", 69: "<H", 70: "<I", 71: "<Q", 72: "b", 73: ">h", 74: ">i",
     75: ">q", 77: "<h", 78: "<i", 79: "<q", 81: ">f", 82: ">d", 85: "<f", 86: "<d",
@@ -42,7 +45,7 @@ def json_of_cbor(frame: bytes) -> bytes:
 
 
 def _scan(frame: bytes) -> None:
-    position = items = 0
+    position = items = numbers = 0
     left, is_map = [1], [False]  # of each open array or object: the values that it still has
     while left:
         if not left[-1]:
@@ -62,7 +65,10 @@ def _scan(frame: bytes) -> None:
             left.append(argument * (2 if major == _MAP else 1))
             is_map.append(major == _MAP)
         elif major == _TAG:
-            position = _scan_typed_array(frame, position, argument)
+            position, count = _scan_typed_array(frame, position, argument)
+            numbers += count
+        if numbers > MOST_NUMBERS:
+            raise MessageValueError(f"a frame of more than {MOST_NUMBERS} numbers in typed arrays")
         if position + left[-1] > len(frame):
             raise MessageValueError(f"not CBOR: the frame ends inside the value at byte {start}")
         if len(left) > MOST_DEPTH:
@@ -90,7 +96,8 @@ def _head(frame: bytes, position: int) -> tuple[int, int, int]:
     return major, int.from_bytes(frame[position : position + size], "big"), position + size
 
 
-def _scan_typed_array(frame: bytes, position: int, tag: int) -> int:
+def _scan_typed_array(frame: bytes, position: int, tag: int) -> tuple[int, int]:
+    """Return the position behind a typed array, and the number of values that it becomes."""
     if tag not in _CODES:
         raise MessageValueError(f"the CBOR tag {tag}; only typed arrays (RFC 8746) may have tags")
     major, size, position = _head(frame, position)
@@ -99,7 +106,7 @@ def _scan_typed_array(frame: bytes, position: int, tag: int) -> int:
     element = struct.calcsize(_CODES[tag])
     if size % element:
         raise MessageValueError(f"a typed array of {size} bytes, with elements of {element} bytes")
-    return position + size
+    return position + size, 0 if tag in _BYTE_TAGS else size // element
 
 
 def _typed_array(tag: cbor2.CBORTag, _immutable: bool) -> Any:

@@ -1,12 +1,18 @@
-"""Divide the memory of one door among its clients.
+"""Divide the memory of one door among its clients and its node.
 
-A client holds frames that have not come whole, fragments, replies and messages that wait for it. Invariants:
+A client holds frames that have not come whole or are being carried out, with the values and messages that are made of
+them, fragments, and replies and messages that wait for it. Two more count as clients: the messages that wait for other
+nodes, and the arguments of calls that wait for answers. Invariants:
 
-1. Each client may hold `least` bytes, whatever the others hold: half of the whole, divided by the most connections.
+1. Each client may hold `least` bytes, whatever the others hold: half of the whole, divided by the most clients.
 2. Beyond `least`, clients share the other half. A client gets no more of it than it leaves for all others.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from appliance.features.doors.quotas import DOOR_BYTES, DOOR_CONNECTIONS
+from roswire.errors import LimitExceededError
 
 
 class DoorMemory:
@@ -14,7 +20,7 @@ class DoorMemory:
 
     def __init__(self, connections: int = DOOR_CONNECTIONS.bounds.host) -> None:
         self.most_shared = DOOR_BYTES.bounds.whole // 2
-        self.least = self.most_shared // connections
+        self.least = self.most_shared // (connections + 2)
         self.shared = 0
 
     def client(self) -> "ClientMemory":
@@ -47,6 +53,17 @@ class ClientMemory:
         if mine > max(left, 0):
             return f"the client would hold {held} bytes of its door and leave {max(left, 0)} for all others"
         return ""
+
+    @contextmanager
+    def holding(self, size: int) -> Iterator[None]:
+        """Charge `size` bytes during a block. Raises `LimitExceededError` if this client should not hold them."""
+        if reason := self.refusal(size):
+            raise LimitExceededError(reason)
+        self.add(size)
+        try:
+            yield
+        finally:
+            self.add(-size)
 
     def close(self) -> None:
         """Give back all that this client holds."""

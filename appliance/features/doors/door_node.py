@@ -7,6 +7,7 @@ and every call of a service is decided by the master and the relay, as for any h
 """
 
 import asyncio
+import contextlib
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -16,9 +17,10 @@ import msgspec
 from msgspec import Raw
 
 from appliance.base import clock
+from appliance.features.doors.door_memory import ClientMemory
 from appliance.features.doors.door_parameters import DoorParameters, ParameterClient
 from appliance.features.doors.known_types import DoorMessage, KnownTypes
-from appliance.features.doors.message_writer import Now
+from appliance.features.doors.message_writer import MessageWriter, Now
 from appliance.features.doors.requests import (
     AdvertiseTopic,
     AnswerCall,
@@ -77,6 +79,10 @@ class _Learner:
 class DoorClient(_Subscriber, ParameterClient, Protocol):
     """A connection, as the node uses it."""
 
+    @property
+    def memory(self) -> ClientMemory:
+        """The memory that what the connection sends is charged to."""
+
     def answered(self, call: int, values: Raw | bytes) -> None:
         """Take the answer to a call."""
 
@@ -102,10 +108,10 @@ class _Publication:
     clients: set[DoorClient] = field(default_factory=set)
     wills: dict[DoorClient, Raw] = field(default_factory=dict)
 
-    def publish(self, values: Raw | bytes) -> None:
+    def publish(self, values: Raw | bytes, memory: ClientMemory) -> None:
         """Publish a message. Raises `PeerError` if the values do not fit."""
         raw = isinstance(values, Raw)
-        self.publication.publish(self.codec.writer.from_json(values, present_time()) if raw else values)
+        self.publication.publish(_written(self.codec.writer, values, memory) if raw else values)
 
 
 @dataclass(slots=True)
@@ -119,7 +125,7 @@ class DoorNode:
     """Carries out the requests of all connections of one door.
 
     The connections use at most `most_topics` publications, and as many subscriptions. The arguments of their calls that
-    wait for answers have at most `call_bytes`.
+    wait for answers are in the memory `calls`, because they may outlive their connection.
     """
 
     def __init__(
@@ -129,17 +135,16 @@ class DoorNode:
         built_in: BuiltIn,
         *,
         most_topics: int,
-        call_bytes: int = 32 << 20,
+        calls: ClientMemory,
     ) -> None:
         self.node = node
         self._most_topics = most_topics
-        self._most_call_bytes = call_bytes
+        self._calls = calls
         self._types = types
         self._built_in = built_in
         self._publications: dict[str, _Publication] = {}
         self._heard: dict[str, dict[_Subscriber, SubscribeTopic]] = {}
         self._offers: dict[str, _Offer] = {}
-        self._call_bytes = 0
         self._parameters = DoorParameters(node)
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         self._tasks = OwnedTasks()
@@ -157,7 +162,7 @@ class DoorNode:
             case UnadvertiseTopic(topic):
                 self._unadvertise(topic, client)
             case PublishMessage():
-                await self._publish(request)
+                await self._publish(request, client)
             case SubscribeTopic():
                 await self._subscribe(request, client)
             case UnsubscribeTopic(topic):
@@ -169,7 +174,7 @@ class DoorNode:
             case WithdrawService(service):
                 await self._withdraw(service)
             case AnswerCall():
-                self._answer(request)
+                self._answer(request, client)
             case ReadParameters():
                 client.parameters(await self._parameters.read(request.names), request.reply_to)
             case WriteParameter():
@@ -183,7 +188,8 @@ class DoorNode:
             (topic, one) for topic, one in self._publications.items() if client in one.clients
         ]:
             if client in known.wills:
-                known.publish(known.wills[client])
+                with contextlib.suppress(LimitExceededError):  # its subscribers would not get it either
+                    known.publish(known.wills[client], client.memory)
             self._unadvertise(topic, client)
         for topic in [topic for topic, clients in self._heard.items() if client in clients]:
             self._unsubscribe(topic, client)
@@ -213,7 +219,7 @@ class DoorNode:
                     f"{request.topic} is advertised as {known.publication.type.name}, not {request.type}"
                 )
             if request.will is not None:
-                known.codec.writer.from_json(request.will, present_time())  # raises if it does not fit
+                _written(known.codec.writer, request.will, client.memory)  # raises if it does not fit
                 known.wills[client] = request.will
             known.clients.add(client)
 
@@ -246,12 +252,12 @@ class DoorNode:
                 del self._publications[topic]
                 await self.node.unadvertise(topic)
 
-    async def _publish(self, request: PublishMessage) -> None:
+    async def _publish(self, request: PublishMessage, client: DoorClient) -> None:
         known = self._publications.get(request.topic)
         if known is None:
             raise ProtocolError(f"{request.topic} is not advertised by this client")
         await self._check_granted(known)
-        known.publish(request.values)
+        known.publish(request.values, client.memory)
 
     async def _check_granted(self, known: _Publication) -> None:
         """Raise the master's refusal if the publication is no longer granted, such as after the end of an approval.
@@ -335,11 +341,11 @@ class DoorNode:
             request.values.copy() if isinstance(request.values, Raw) else request.values
         )  # not the whole frame
         size = memoryview(values).nbytes
-        if self._call_bytes + size > self._most_call_bytes:
+        if reason := self._calls.refusal(size):
             raise LimitExceededError(
-                f"{self._call_bytes} bytes of calls of this door wait for answers; repeat the call later"
+                f"too many calls of this door wait for answers; repeat it later: {reason}"
             )
-        self._call_bytes += size
+        self._calls.add(size)
         self._tasks.start(self._call(replace(request, values=values), client, size))
 
     async def _call(self, request: CallOfService, client: DoorClient, size: int) -> None:
@@ -349,7 +355,7 @@ class DoorNode:
         except RosError as error:
             client.failed(request, str(error))
         finally:
-            self._call_bytes -= size
+            self._calls.add(-size)
 
     async def _call_node(self, request: CallOfService) -> Raw | bytes:
         header = await self.node.probe_service(request.service)
@@ -361,7 +367,7 @@ class DoorNode:
         sent, received, definitions = self._types.service(name)
         if definitions.service_md5sum(name) != md5sum:
             raise DefinitionError(f"{request.service} has another version of this type", name[:200])
-        body = sent.writer.from_json(_named(request.values, sent.writer.fields), present_time())
+        body = _written(sent.writer, _named(request.values, sent.writer.fields), self._calls)
         return received.json(await self.node.call_service(request.service, md5sum, body, seconds))
 
     async def _offer(self, request: OfferService, client: DoorClient) -> None:
@@ -400,14 +406,14 @@ class DoorNode:
                     future.set_exception(ServiceFailedError("the client offers the service no longer"))
             await self.node.withdraw(service)
 
-    def _answer(self, request: AnswerCall) -> None:
+    def _answer(self, request: AnswerCall, client: DoorClient) -> None:
         offer = self._offers.get(request.service)
         future = offer.calls.get(request.call) if offer is not None else None
         if offer is None or future is None or future.done():
             raise ProtocolError(f"no call of {request.service} waits for this answer")
         try:
             # As in rosbridge, values that fit are the answer, whatever `result` is: some clients send false.
-            future.set_result(offer.response.writer.from_json(request.values, present_time()))
+            future.set_result(_written(offer.response.writer, request.values, client.memory))
         except PeerError as error:
             reason = str(error) if request.ok else bytes(request.values)[:1000].decode("utf-8", "replace")
             future.set_exception(ServiceFailedError(reason))
@@ -438,6 +444,13 @@ class DoorNode:
         lock = self._locks.get(name) or asyncio.Lock()
         self._locks[name] = lock
         return lock
+
+
+def _written(writer: MessageWriter, values: Raw | bytes, memory: ClientMemory) -> bytes:
+    """Return a message of JSON values, charged while it is written. Raises `PeerError`."""
+    text = bytes(values)
+    with memory.holding(writer.cost(text)):
+        return writer.from_json(text, present_time())
 
 
 def _named(values: Raw, names: list[str]) -> bytes:

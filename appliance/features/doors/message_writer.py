@@ -21,6 +21,9 @@ Now = tuple[int, int]
 
 _Write = Callable[[Any, bytearray, Now], None]
 _LENGTH = struct.Struct("<I")
+_VALUE_BYTES = (
+    100  # that a value takes at most, besides its text: its place in a list, a short string, an empty list
+)
 _HEADER = "std_msgs/Header"
 
 
@@ -71,7 +74,17 @@ class MessageWriter:
         writers = _Writers(definitions, most_bytes)
         self._schema, self._write = writers.message(name)
         self._decoder = msgspec.json.Decoder(self._schema)
+        self._most_bytes = most_bytes
+        made = [(definitions.layout(one).minimum, definitions.message(one)) for one in writers.made]
+        self._zero_bytes = max(minimum for minimum, _message in made)
+        self._object_bytes = _VALUE_BYTES + 8 * max(len(message.fields) for _minimum, message in made)
         self.fields = [field.name for field in definitions.message(name).fields]
+
+    def cost(self, text: bytes) -> int:
+        """Return an upper bound of the bytes that `from_json` takes at once, for the values and twice the message."""
+        objects, others = text.count(b"{"), text.count(b",") + text.count(b"[")
+        zeros = min(objects * self._zero_bytes, self._most_bytes)
+        return 4 * len(text) + objects * self._object_bytes + others * _VALUE_BYTES + 2 * zeros
 
     def from_json(self, text: bytes | msgspec.Raw, now: Now) -> bytes:
         """Return the message of a JSON object; raises `MessageValueError` with the path."""
@@ -104,12 +117,12 @@ class _Writers:
     def __init__(self, definitions: Definitions, most_bytes: int) -> None:
         self._definitions = definitions
         self._most_bytes = most_bytes
-        self._made: dict[str, tuple[type[Struct], _Write]] = {}
+        self.made: dict[str, tuple[type[Struct], _Write]] = {}
 
     def message(self, name: str) -> tuple[type[Struct], _Write]:
-        if name not in self._made:
-            self._made[name] = self._message(self._definitions.message(name))
-        return self._made[name]
+        if name not in self.made:
+            self.made[name] = self._message(self._definitions.message(name))
+        return self.made[name]
 
     def _message(self, message: MessageDefinition) -> tuple[type[Struct], _Write]:
         parts: list[tuple[str, _Write, int]] = []

@@ -187,6 +187,8 @@ class _Process:
 
     async def _start(self, given: door_link.DoorGiven, network: GivenNetwork) -> None:
         name = node_name(given.name)
+        memory = DoorMemory(given.connections)
+        waiting, calls = memory.client(), memory.client()
         while self._door is None:
             node = RosNode(
                 name,
@@ -194,6 +196,7 @@ class _Process:
                 network,
                 limits=NodeLimits(),
                 shut_down=self._shut_down,
+                memory=waiting,
             )
             try:
                 await node.start()
@@ -203,13 +206,13 @@ class _Process:
                 continue
             types = self._types
             sight = MasterSight(node, present_time)
-            door = DoorNode(node, types, Rosapi(sight, types).answer, most_topics=_MOST_TOPICS)
+            door = DoorNode(node, types, Rosapi(sight, types).answer, most_topics=_MOST_TOPICS, calls=calls)
             limits = ConnectionLimits(given.connections, given.in_ten_seconds)
             self._door = _Door(
                 door,
                 Lookout(sight, types, door.learn),
                 DoorConnections(limits),
-                DoorMemory(given.connections),
+                memory,
             )
         self._started.set()
 

@@ -18,12 +18,14 @@ DOOR_CONNECTIONS = QuotaRow(
 )
 
 DOOR_BYTES = QuotaRow(
-    thing="bytes that clients of one door hold: unfinished frames, and replies and messages that wait for a client",
+    thing="bytes that clients of one door hold: frames until they are carried out, and replies and messages that wait for"
+    " a client or another node",
     bounds=Bounds(whole=256 << 20, host=48 << 20, unknown=0, kept=0),
-    at_limit="the client's oldest messages are dropped; a client with an unfinished frame, or that does not read its"
-    " replies, is disconnected with the reason",
-    between="each client has 1/64 for itself (half of the whole, divided by `doors.connections`); beyond that, a client"
-    " gets at most as much as it leaves for all others",
+    at_limit="the oldest messages are dropped; a client with too large a frame, or that does not read its replies, is"
+    " disconnected with the reason; values that take too much are refused in words",
+    between="each client has 1/68 for itself (half of the whole, divided by `doors.connections` and two); beyond that, a"
+    " client gets at most as much as it leaves for all others. Two more count as clients: messages to other nodes, and"
+    " arguments of calls that wait for answers",
     counting="host: a client's connection",
     alarm="`rosrv_door_messages_dropped_total`",
     shown_by=("unit/features/doors/test_door_memory.py::test_greedy_clients_leave_memory_for_the_next_one",),

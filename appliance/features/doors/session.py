@@ -42,13 +42,14 @@ from appliance.features.doors.requests import (
 )
 from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerStalledError
-from roswire.errors import RosError
+from roswire.errors import LimitExceededError, RosError
 from roswire.node.network import ByteWriter
 from roswire.xmlrpc import Value
 
 _READ_BYTES = 1 << 16
 _READ_DEFLATED_BYTES = 1 << 12  # the frames that are read at once take up to 1000 times as much inflated
 _BATCH_BYTES = 1 << 15
+_COPIES = 3  # of a frame while it is carried out: its bytes, its text, and its operation
 _TURN = 64  # frames after which frames for clients are sent, although more have come
 _CLOSING_SECONDS = 2.0
 _WATCH_SECONDS = 2.0  # between two looks at the surroundings
@@ -141,7 +142,7 @@ class DoorSession:
         self._protocol: ClientProtocol
         self._wills: set[str] = set()  # the topics on which the client has a will
         self._pings = 0
-        self._memory = memory or DoorMemory().client()
+        self.memory = memory or DoorMemory().client()
         self._unfinished = 0  # bytes of a frame that has not come whole, as charged to the memory
         self._frame = bytearray()  # the fragments that have come; empty ones take nothing
         self._is_text = False
@@ -178,7 +179,7 @@ class DoorSession:
         finally:
             self._writer.close()
             await self._door.forget(self)
-            self._memory.close()
+            self.memory.close()
 
     async def _handshake(self) -> bool:
         async with asyncio.timeout(self._options.handshake_seconds):
@@ -269,9 +270,9 @@ class DoorSession:
     def _charge_unfinished(self) -> None:
         """Charge the bytes of an unfinished frame; disconnect the client if its door has no memory for more."""
         size = len(self._frame) + len(self._socket.reader.buffer)
-        self._memory.add(size - self._unfinished)
+        self.memory.add(size - self._unfinished)
         self._unfinished = size
-        if size > _READ_BYTES and (reason := self._memory.refusal(0)):
+        if size > _READ_BYTES and (reason := self.memory.refusal(0)):
             self._disconnect(CloseCode.MESSAGE_TOO_BIG, reason)
 
     async def _drop_rest(self) -> None:
@@ -295,7 +296,10 @@ class DoorSession:
                 data = bytes(self._frame)
                 self._frame.clear()
             try:
-                await self._carry_out(data.decode() if self._is_text else data)
+                with self.memory.holding(_COPIES * len(data)):
+                    await self._carry_out(data.decode() if self._is_text else data)
+            except LimitExceededError as error:
+                self._disconnect(CloseCode.MESSAGE_TOO_BIG, str(error))
             except UnicodeDecodeError:
                 self._disconnect(CloseCode.INVALID_DATA, "a text frame that is not UTF-8")
             except ViewerStalledError as error:

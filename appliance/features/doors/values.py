@@ -15,7 +15,7 @@ from roswire.definitions import Definitions
 class ValueLimits:
     """Upper bounds for one message."""
 
-    message_bytes: int = 64 << 20  # of a message that a client makes
+    message_bytes: int = 16 << 20  # of a message that a client makes
     values: int = 1_000_000  # of a message that JSON or CBOR shows
 
 

@@ -17,6 +17,7 @@ from websockets.typing import Origin, Subprotocol
 from websockets.uri import parse_uri
 
 from appliance.features.doors.connections import ConnectionLimits, DoorConnections
+from appliance.features.doors.door_memory import DoorMemory
 from appliance.features.doors.door_node import DoorNode
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
 from appliance.features.doors.known_types import KnownTypes
@@ -27,6 +28,7 @@ from appliance.features.doors.session import DoorSession, SessionOptions
 from appliance.features.doors.values import ValueLimits
 from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.node import NodeLimits, RosNode
+from roswire.node.topics import QueueMemory
 from roswire.standard import standard_definitions
 from tests.support.memory_network import MemoryNetwork, MemoryWriter
 from tests.support.scripted_master import MASTER, ScriptedMaster
@@ -97,6 +99,9 @@ class DoorWorld:
         self.network = MemoryNetwork()
         self.master = ScriptedMaster(self.network)
         self.limits = ConnectionLimits()
+        self.memory = DoorMemory()
+        self.waiting, self.calls = self.memory.client(), self.memory.client()
+        self.memories = [self.waiting, self.calls]
         self.sessions: list[DoorSession] = []
         self.queues: list[ViewerQueue[Any]] = []
         self.options = SessionOptions(origins=("https://robot.example",))
@@ -107,24 +112,31 @@ class DoorWorld:
         self.lookout: Lookout
 
     async def start(self) -> None:
-        self.node = await self.robot("10.0.0.2", "/door_alice")
+        self.node = await self.robot("10.0.0.2", "/door_alice", self.waiting)
         sight = MasterSight(self.node, lambda: (7, 8))
         built_in = Rosapi(sight, self.types).answer
-        self.door = DoorNode(self.node, self.types, built_in, most_topics=50, call_bytes=1 << 20)
+        self.door = DoorNode(self.node, self.types, built_in, most_topics=50, calls=self.calls)
         self.lookout = Lookout(sight, self.types, self.door.learn)
         connections = DoorConnections(self.limits)
         self.network.listen(DOOR[0], partial(connections.serve, self.serve), DOOR[1])
 
-    async def robot(self, address: str, name: str) -> RosNode:
+    async def robot(self, address: str, name: str, memory: QueueMemory | None = None) -> RosNode:
         node = RosNode(
-            name, MASTER, self.network.at(address), limits=NodeLimits(), shut_down=lambda _reason: None
+            name,
+            MASTER,
+            self.network.at(address),
+            limits=NodeLimits(),
+            shut_down=lambda _reason: None,
+            memory=memory,
         )
         await node.start()
         self.nodes.append(node)
         return node
 
     async def serve(self, reader: asyncio.StreamReader, writer: Any) -> None:
-        queue: ViewerQueue[Any] = ViewerQueue(message_bytes=1 << 20, reply_bytes=1 << 20)
+        memory = self.memory.client()
+        self.memories.append(memory)
+        queue: ViewerQueue[Any] = ViewerQueue(message_bytes=1 << 20, reply_bytes=1 << 20, memory=memory)
         self.queues.append(queue)
         session = DoorSession(
             reader,
@@ -138,6 +150,7 @@ class DoorWorld:
             ),
             subprotocols=SUBPROTOCOLS,
             options=self.options,
+            memory=memory,
         )
         self.sessions.append(session)
         await session.run()
@@ -157,7 +170,7 @@ class DoorWorld:
 
 @asynccontextmanager
 async def door_world() -> AsyncIterator[DoorWorld]:
-    """Yield a door; at the end it is closed, and no task of it remains."""
+    """Yield a door; at the end it is closed, and no task of it remains and no memory is held."""
     before = asyncio.all_tasks()
     world = DoorWorld()
     await world.start()
@@ -172,3 +185,4 @@ async def door_world() -> AsyncIterator[DoorWorld]:
         await asyncio.sleep(1)
         left = [task for task in asyncio.all_tasks() - before if not task.done()]
         assert not left, left
+        assert not any(memory.held for memory in world.memories)

@@ -12,6 +12,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 from appliance.features.doors.connections import ConnectionLimits, DoorConnections
+from appliance.features.doors.door_memory import DoorMemory
 from appliance.features.doors.door_node import DoorNode, present_time
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
 from appliance.features.doors.known_types import KnownTypes
@@ -47,7 +48,7 @@ async def real_door(
     defined = standard_definitions()
     types = KnownTypes(defined.extended(definitions) if definitions else defined, ValueLimits())
     sight = MasterSight(node, present_time)
-    door = DoorNode(node, types, Rosapi(sight, types).answer, most_topics=2000)
+    door = DoorNode(node, types, Rosapi(sight, types).answer, most_topics=2000, calls=DoorMemory().client())
     lookout = Lookout(sight, types, door.learn)
 
     async def serve(reader: asyncio.StreamReader, writer: ByteWriter) -> None:

@@ -9,6 +9,7 @@ import pytest
 from websockets.datastructures import Headers
 
 from appliance.features.doors.origins import rejection
+from appliance.features.doors.quotas import DOOR_BYTES
 from roswire.node import MessageType, RosNode, ServiceFailedError, ServiceType
 from roswire.standard import standard_definitions
 from tests.support.features.doors.door_world import DOOR, WebSocketClient, door_world
@@ -138,12 +139,47 @@ async def test_wills_and_arguments_of_waiting_calls_are_bounded() -> None:
         taken, _peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         assert taken < 3 * len(large)
+        taken = DOOR_BYTES.bounds.host - 8 * len(large)
+        world.calls.add(taken)
         for _number in range(6):
             client.send({"op": "call_service", "service": "/slow", "args": {"logger": large}})
             await asyncio.sleep(0.1)
         refusal = await client.next()
-        assert "of calls of this door wait for answers" in refusal["values"]["message"]
-        assert client.frames.qsize() == 2
+        assert "would hold" in refusal["values"]["message"]
+        assert client.frames.qsize() < 5
+        world.calls.add(-taken)
+        await asyncio.sleep(100)
+
+
+async def test_a_frame_of_few_bytes_that_takes_much_memory_is_refused_in_words() -> None:
+    async with door_world() as world:
+        client = await world.client()
+        client.send({"op": "advertise", "topic": "/markers", "type": "visualization_msgs/MarkerArray"})
+        await asyncio.sleep(1)
+        tracemalloc.start()
+        client.send(
+            '{"op":"publish","id":1,"topic":"/markers","msg":{"markers":[' + "{}," * 2_000_000 + "{}]}}"
+        )
+        status = await client.next()
+        _taken, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert "the client would hold" in status["msg"] and status["id"] == 1
+        assert peak < DOOR_BYTES.bounds.host
+        client.send({"op": "publish", "topic": "/markers", "msg": {"markers": [{}] * 20_000}})
+        await asyncio.sleep(1)
+        assert client.frames.empty() and client.is_open
+
+
+async def test_a_frame_without_memory_to_carry_it_out_ends_the_connection_with_the_reason() -> None:
+    async with door_world() as world:
+        client = await world.client()
+        await asyncio.sleep(1)
+        world.memories[-1].add(DOOR_BYTES.bounds.host - 1_000_000)
+        client.send({"op": "advertise", "topic": "/a", "type": "std_msgs/String"})
+        await asyncio.sleep(1)
+        assert client.is_open and world.node.publishers
+        client.send({"op": "publish", "topic": "/a", "msg": {"data": "x" * 400_000}})
+        assert "the client would hold" in await client.closed()
 
 
 async def test_a_client_that_does_not_read_pictures_is_heard_at_once() -> None:

@@ -3,6 +3,7 @@
 import functools
 import math
 import struct
+import tracemalloc
 from collections.abc import Sequence
 from random import Random
 from typing import Any
@@ -13,7 +14,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from appliance.features.doors.cbor_frames import MOST_DEPTH, MOST_ITEMS, json_of_cbor
+from appliance.features.doors.cbor_frames import MOST_DEPTH, MOST_ITEMS, MOST_NUMBERS, json_of_cbor
 from appliance.features.doors.message_reader import MessageValueError
 from appliance.features.doors.values import MessageCodec, ValueLimits, cbor
 from roswire.definitions import Definitions
@@ -251,3 +252,46 @@ def test_the_scan_accepts_what_cbor2_writes_for_plain_values() -> None:
     }
     assert json_of_cbor(cbor2.dumps(plain)) == msgspec.json.encode(plain)
     assert json_of_cbor(cbor2.dumps({"nan": math.nan})) == b'{"nan":null}'
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [
+        ("t/P[] a", "{}"),
+        ("t/P[] a", '{"x":1.5}'),
+        ("float64[] a", "1.5"),
+        ("float64[] a", "0"),
+        ("int64[] a", "4611686018427387904"),
+        ("string[] a", '"ab"'),
+        ("string[] a", '"grüße"'),
+        ("time[] a", "{}"),
+        ("time[] a", '"now"'),
+        ("t/L[] a", '{"b":[]}'),
+        ("uint8[] a", "255"),
+    ],
+)
+def test_the_cost_of_a_text_is_an_upper_bound_of_the_memory_that_it_takes(text: str, unit: str) -> None:
+    definitions = standard().extended(
+        Definitions.from_files(
+            {
+                "t/T.msg": text,
+                "t/P.msg": "float64 x\nfloat64 y\nfloat64[9] z\nstring s",
+                "t/L.msg": "int32[] b",
+            }
+        )
+    )
+    writer = MessageCodec(definitions, "t/T", ValueLimits()).writer
+    sent = f'{{"a":[{",".join([unit] * 20_000)}]}}'.encode()
+    writer.from_json(sent, NOW)
+    tracemalloc.start()
+    writer.from_json(sent, NOW)
+    _taken, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < writer.cost(sent)
+
+
+def test_numbers_of_typed_arrays_are_bounded() -> None:
+    array = cbor2.CBORTag(72, bytes(MOST_NUMBERS + 1))
+    with pytest.raises(MessageValueError, match=f"more than {MOST_NUMBERS} numbers"):
+        json_of_cbor(cbor2.dumps({"op": "publish", "msg": {"data": array}}))
+    assert json_of_cbor(cbor2.dumps({"data": cbor2.CBORTag(64, bytes(MOST_NUMBERS + 1))}))

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from roswire.errors import ProtocolError
+from roswire.errors import LimitExceededError, ProtocolError
 from roswire.node import (
     MasterDenialError,
     MessageType,
@@ -20,6 +20,7 @@ from roswire.node import (
 )
 from roswire.node.network import ByteWriter
 from roswire.node.tcpros_streams import read_header
+from roswire.node.topics import OwnMemory
 from roswire.tcpros import HeaderParser, encode_frame, encode_header
 from roswire.uris import parse_node_uri
 from roswire.xmlrpc import MethodCall, Value, build_fault, build_response
@@ -45,13 +46,14 @@ class Nodes:
         self.nodes: list[RosNode] = []
         self.ends: list[str] = []
 
-    async def node(self, address: str, **limits: Any) -> RosNode:
+    async def node(self, address: str, memory: OwnMemory | None = None, **limits: Any) -> RosNode:
         node = RosNode(
             f"/node_{address.rpartition('.')[2]}",
             MASTER,
             self.network.at(address),
             limits=NodeLimits(**limits),
             shut_down=self.ends.append,
+            memory=memory,
         )
         await node.start()
         self.nodes.append(node)
@@ -224,6 +226,48 @@ async def test_a_slow_subscriber_loses_the_oldest_messages() -> None:
         stuck.close()
         await later()
         assert publisher.subscribers == ["/node_3"]
+
+
+async def test_queues_share_one_memory_and_a_stalled_subscriber_costs_no_other_a_message() -> None:
+    async with nodes() as world:
+        memory = OwnMemory(1 << 20)
+        talker, listener = await world.node("10.0.0.2", memory), await world.node("10.0.0.3")
+        publisher = await talker.advertise("/image", STRING, latched=False, queue=1000)
+        heard: list[bytes] = []
+        await listener.subscribe("/image", lambda body, _header: heard.append(body))
+        stalled = [world.network.connect("10.0.0.4", talker.tcpros) for _number in range(5)]
+        for _reader, writer in stalled:
+            writer.write(encode_header({"topic": "/image", "md5sum": "*", "callerid": "/stalled"}))
+        await later()
+        for number in range(100):
+            publisher.publish(b"%03d" % number + bytes(100_000))
+            await later()
+            assert memory.held <= 1 << 20
+        assert [int(body[:3]) for body in heard] == [*range(100)]
+        assert memory.held > 900_000 and publisher.dropped > 400
+        for _reader, writer in stalled:
+            writer.close()
+        await later()
+        assert memory.held == 0
+
+
+async def test_a_latched_message_without_memory_is_an_error_in_words() -> None:
+    async with nodes() as world:
+        talker, listener = await world.node("10.0.0.2", OwnMemory(200_000)), await world.node("10.0.0.3")
+        first = await talker.advertise("/map", STRING, latched=True, queue=1)
+        second = await talker.advertise("/other", STRING, latched=True, queue=1)
+        heard: list[int] = []
+        await listener.subscribe("/other", lambda body, _header: heard.append(len(body)))
+        await later()
+        first.publish(bytes(60_000))
+        second.publish(bytes(30_000))
+        await later()
+        with pytest.raises(LimitExceededError, match="no memory to keep a latched message of 150004 bytes"):
+            second.publish(bytes(150_000))
+        await talker.unadvertise("/map")
+        second.publish(bytes(80_000))
+        await later()
+        assert heard == [30_000, 80_000]
 
 
 async def test_a_subscriber_connects_again_after_the_publisher_breaks_off() -> None:
