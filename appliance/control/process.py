@@ -233,4 +233,4 @@ async def _restore(base: Foundation, parts: Parts) -> None:
         claimed |= set(incarnation.ports)
     ends.places.close_unclaimed(claimed)
     # The policy's file may have changed while the appliance was down, or control may have died during a change.
-    ends.enforcement.policy_changed(base.policies.current, base.policies.current)
+    ends.enforcement.policy_changed(base.policies.current)

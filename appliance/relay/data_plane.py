@@ -27,7 +27,7 @@ from appliance.relay.connections.service_client import ServiceClient, ServiceTra
 from appliance.relay.connections.subscriber import Subscriber
 from appliance.relay.connections.upstream import PublisherConnection
 from appliance.relay.context import RelayContext
-from appliance.relay.grant_table import GrantTable, PeerGrant, Statement
+from appliance.relay.grant_table import GrantTable, PeerGrant
 from appliance.relay.loop import EventLoop
 from appliance.relay.monitors.interceptor import Interceptor
 from appliance.relay.monitors.observation_points import ObservationPoint
@@ -112,7 +112,7 @@ class DataPlane:
             self._table.begin(message.epoch)
         elif isinstance(message, messages.StateEnded):
             self._restated(message.epoch)
-        elif isinstance(message, Statement):
+        elif isinstance(message, messages.RelayFact):
             self._state(message, descriptors)
         elif isinstance(message, messages.UpstreamFound | messages.UpstreamRefused):
             self._upstream_answered(message)
@@ -149,7 +149,7 @@ class DataPlane:
 
     # --- control's statements ------------------------------------------------------------------------------
 
-    def _state(self, message: Statement, descriptors: tuple[int, ...]) -> None:
+    def _state(self, message: messages.RelayFact, descriptors: tuple[int, ...]) -> None:
         self._table.state(message)
         if isinstance(message, messages.NodePlaced):
             self.ports.open(message.key, descriptors[0])
@@ -462,7 +462,7 @@ class DataPlane:
     def _not_all_is_stated(self) -> bool:
         return self._table.restating or self.interceptor.preparing
 
-    def _recheck_waiting(self, message: Statement) -> None:
+    def _recheck_waiting(self, message: messages.RelayFact) -> None:
         """Serve the waiting peers that this statement allows; a grant concerns only peers of its host."""
         hosts = self.waiting[message.key]
         if isinstance(message, messages.GrantInstalled | messages.ClientGranted):

@@ -13,42 +13,14 @@ Invariants:
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from appliance.channel import messages
 from appliance.quotas.pool import QuotaClass
 from appliance.relay.loop import ANYBODY, UNKNOWN
 
-Statement = (
-    messages.NodePlaced
-    | messages.PublicationPlaced
-    | messages.ServicePlaced
-    | messages.GrantInstalled
-    | messages.ClientGranted
-)
 PeerGrant = tuple[str, str, str, str, str]
 """The grant of a peer: `topic` or `service`, key of the incarnation, name of the topic or service, host, caller id."""
 _Fact = tuple[str, ...]
-
-
-class _About(NamedTuple):
-    """A kind of fact: its message, the message that withdraws it, and the fields that identify it."""
-
-    stated: type[Statement]
-    withdrawn: type[messages.Message]
-    fields: tuple[str, ...]
-
-
-_ABOUT = {
-    "node": _About(messages.NodePlaced, messages.NodeWithdrawn, ("key",)),
-    "publication": _About(messages.PublicationPlaced, messages.PublicationWithdrawn, ("key", "topic")),
-    "service": _About(messages.ServicePlaced, messages.ServiceWithdrawn, ("key", "service")),
-    "grant": _About(messages.GrantInstalled, messages.GrantRevoked, ("key", "topic", "host", "caller_id")),
-    "client": _About(messages.ClientGranted, messages.ClientRevoked, ("key", "service", "host", "caller_id")),
-}
-_KINDS: dict[type, str] = {
-    type_: kind for kind, about in _ABOUT.items() for type_ in (about.stated, about.withdrawn)
-}
 
 
 @dataclass(frozen=True)
@@ -88,13 +60,13 @@ class GrantTable:
             return []
         gone = [fact for fact in self._facts if fact not in self._restated]
         self._restated = None
-        withdrawals = [_ABOUT[kind].withdrawn(*about) for kind, *about in gone]
+        withdrawals = [messages.FACTS[kind].withdrawn(*about) for kind, *about in gone]
         for message in withdrawals:
             self.withdraw(message)
         return withdrawals
 
-    def state(self, message: Statement) -> None:
-        fact = _fact(message)
+    def state(self, message: messages.RelayFact) -> None:
+        fact = messages.identity(message)
         self._take_out(fact)
         self._facts[fact] = message
         self._by_key.setdefault(fact[1], {})[fact] = None
@@ -110,7 +82,7 @@ class GrantTable:
             for fact in list(self._by_key.get(message.key, ())):
                 self._forget(fact)
         else:
-            self._forget(_fact(message))
+            self._forget(messages.identity(message))
 
     def is_registered(self, host: str) -> bool:
         return self.quota_class(host) is QuotaClass.REGISTERED
@@ -153,7 +125,7 @@ class GrantTable:
     def client_of(self, key: str, service: str, host: str) -> str | None:
         return next(iter(self._clients.get(("client", key, service, host), ())), None)
 
-    def _name(self, message: Statement) -> None:
+    def _name(self, message: messages.RelayFact) -> None:
         if isinstance(message, messages.NodePlaced | messages.ServicePlaced):
             return
         if isinstance(message, messages.PublicationPlaced):
@@ -188,13 +160,6 @@ class GrantTable:
             del names[fact[4]]
             if not names:
                 del self._clients[fact[:4]]
-
-
-def _fact(message: messages.Message) -> _Fact:
-    kind = _KINDS.get(type(message))
-    if kind is None:
-        raise TypeError(f"{type(message).__name__} is not a withdrawal")
-    return (kind, *(getattr(message, field) for field in _ABOUT[kind].fields))
 
 
 def _host(fact: _Fact, message: messages.Message) -> str:

@@ -8,9 +8,11 @@ import asyncio
 import functools
 import ipaddress
 import itertools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from types import SimpleNamespace
 from typing import Any, NamedTuple, Self, cast
 
+from appliance.channel import messages
 from appliance.configuration import settings
 from appliance.master.caller import Answer, ApiUri, Caller
 from appliance.master.calls.parameter_rights import ParameterRights
@@ -23,7 +25,7 @@ from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Incarnation, Kind, Life, NodeRegistration, Registry, new_key
 from appliance.master.graph.revocation import Revocation, revoked
-from appliance.master.reconcile.enactor import Enactor
+from appliance.master.reconcile.enactor import Enactor, Enforcement
 from appliance.master.reconcile.entries import MasterRegistrations
 from appliance.master.reconcile.liveness import Liveness, Watchlist
 from appliance.master.reconcile.reconciler import Reconciler
@@ -34,12 +36,13 @@ from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import MASTER_CHANGES
 from appliance.rpc.server import HttpRequest, Peer
 from appliance.rpc.xmlrpc_client import RefusedError, UnansweredError
+from appliance.specifications.allocation import Allocation
 from appliance.store.state_file import StateStore
 from appliance.telemetry.metrics import Meter
 from roswire.parameter_tree import standing_at
 from roswire.uris import node_uri, parse_node_uri
 from roswire.xmlrpc import Value, XmlRpcLimits, build_call, parse_response
-from tests.support.idle import idle, idle_class
+from tests.support.idle import idle
 from tests.support.parameters import mirror, put
 from tests.support.serving import serving
 
@@ -118,18 +121,40 @@ class Deliveries:
         """Do nothing."""
 
 
-class Relays(idle_class(RelayControl)):  # type: ignore[misc]  # a class made at run time
-    """A relay control that remembers the nodes it restated."""
+class RelayEnd:
+    """A relay's end of its link, which notes what it gets."""
 
-    def __init__(self) -> None:
-        self.returned: list[str] = []
-        self.carried = idle(RelayTraffic)
+    def __init__(self, note: Callable[[messages.Message], None]) -> None:
+        self._note = note
 
-    def place_node(self, incarnation: Incarnation) -> None:
-        self.returned.append(incarnation.name)
+    def attach(self, *_given: object) -> None:
+        """Act as `Channel`."""
 
-    def port(self, incarnation: Incarnation, _kind: Kind, _resource: str) -> int:
-        return incarnation.relay_port
+    def close(self) -> None:
+        """Act as `Channel`."""
+
+    def send(self, message: messages.Message, _descriptors: tuple[int, ...] = (), **_when: bool) -> None:
+        self._note(message)
+
+
+class RelayPorts:
+    """`NodePorts` without sockets: the descriptor of a socket is its port."""
+
+    def socket(self, port: int) -> Any:
+        return SimpleNamespace(fileno=lambda: port)
+
+    def policy_changed(self, _ports: range) -> None:
+        """Act as `NodePorts`."""
+
+
+class NoSpecifications:
+    """The specifications in force: none."""
+
+    def statement(self, _relay: int) -> messages.SpecificationsStated:
+        return messages.SpecificationsStated(0, b"", {}, restarted=False)
+
+    def relay_lost(self, _relay: int) -> None:
+        """Act as `SpecificationManager`."""
 
 
 class HiddenMaster:
@@ -310,7 +335,7 @@ class Noted(Enactor):
 
     def __init__(self, *given: Any, **named: Any) -> None:
         super().__init__(*given, **named)
-        self.noted: list[Effect] = []
+        self.noted: list[Effect | messages.Message] = []
 
     def carry_out(self, effects: Iterable[Effect]) -> None:
         self.noted += (effects := list(effects))
@@ -324,10 +349,11 @@ class ControlParts:
         """Make the parts; `silent` is the number of seconds without an answer until a node is lost."""
         self._not_ours = asyncio.all_tasks()  # the test's own
         self.current = compile_policy(OPEN, file="policy")
-        self.registry, self.grants = Registry(), Grants(set)
+        self.registry = Registry()
+        self.grants = Grants(self.registry.mark, set)
         self.records, self.watchlist = Records(), Watchlist()
         self.hidden, self.clients = HiddenMaster(), Clients()
-        self.deliveries, self.relay, self.store = Deliveries(), Relays(), idle(StateStore)
+        self.deliveries, self.store = Deliveries(), idle(StateStore)
         self.faces = Inner(self.registry)
         self.nodes = NodeApiClient(self.registry, timeout=3.0)
         cast(Any, self.nodes).client = self.clients.client
@@ -348,6 +374,19 @@ class ControlParts:
         self.rosmaster = RosMaster(1, limits=XmlRpcLimits(), hold=1.0)
         self.rosmaster.calls = cast(Any, self.hidden)
         self.entries = MasterRegistrations(self.rosmaster, self.registry, self.faces.inner_uri)
+        self.relay = RelayControl(
+            self.registry,
+            self.grants,
+            cast(Any, RelayPorts()),
+            self.nodes,
+            idle(RelayTraffic),
+            allocation=Allocation(1),
+            policy=lambda: self.current,
+            monitors=lambda: cast(Any, NoSpecifications()),
+            broken=lambda _node: None,
+            own_header=None,
+            own_call=cast(Any, None),
+        )
         self.enactor = Noted(
             self.graph,
             self.entries,
@@ -358,6 +397,8 @@ class ControlParts:
             faces=cast(Any, self.faces),
             places=idle(NodePorts),
         )
+        self.enforcement = Enforcement(self.revocation, self.enactor)
+        self.start_relay()
         self.reconciler = Reconciler(
             self.rosmaster,
             self.entries,
@@ -445,7 +486,7 @@ class ControlParts:
         serve = self._serving(own=own, target=target) if own or target is not None else self._serve
         return parse_response(await serve(HttpRequest(peer, "/", build_call(method, params), 0)))
 
-    async def register(self, node: Incarnation, kind: Kind, resource: str, detail: str = "t") -> None:
+    async def register(self, node: Incarnation, kind: Kind, resource: str, detail: str = "4001") -> None:
         self.enactor.carry_out(self.graph.registered(node, kind, resource, detail))
         await self.settle()
 
@@ -462,10 +503,17 @@ class ControlParts:
 
     def reload(self, text: str) -> int:
         """Put this policy in force; return the number of revocations."""
-        before, self.current = self.current, compile_policy(text, file="policy")
-        effects = self.revocation.policy_changed(before, self.current)
-        self.enactor.carry_out(effects)
-        return revoked(effects)
+        self.current = compile_policy(text, file="policy")
+        return self.enforcement.policy_changed(self.current)
+
+    def start_relay(self) -> list[messages.Message]:
+        """Attach a new relay; return the messages that it gets."""
+        noted = self.enactor.noted
+        before, told = len(noted), noted
+        self.relay.attach(0, cast(Any, RelayEnd(self.enactor.noted.append)))
+        told = noted[before:]
+        del noted[before:]
+        return cast(list[messages.Message], told)
 
     async def round(self) -> None:
         await self.reconciler.round()

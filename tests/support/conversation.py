@@ -55,15 +55,9 @@ from appliance.master.graph.effects import (
     DropCalls,
     Effect,
     NodeCall,
-    PlaceGrant,
-    PlaceNode,
-    PlaceResource,
     RegisterAtMaster,
-    RevokeGrant,
     TellNode,
     UnregisterAtMaster,
-    WithdrawNode,
-    WithdrawResource,
     WriteRecord,
 )
 from appliance.master.graph.registry import Incarnation, Kind
@@ -71,19 +65,9 @@ from appliance.policy.model import text_for_caller
 from roswire.xmlrpc import FaultReceived, Value
 from tests.support.control_parts import ControlParts
 from tests.support.conversation_calls import OWN, PORTS, QUESTIONS, WrittenCall, call_of, is_call
-from tests.support.new_relay import told_to_a_new_relay
 
 _REGISTER = {Kind.PUBLICATION: "registerPublisher", Kind.SUBSCRIPTION: "registerSubscriber"}
-_WORDS = {
-    PlaceResource: "place",
-    PlaceNode: "place",
-    PlaceGrant: "grant",
-    WithdrawResource: "withdraw",
-    WithdrawNode: "withdraw",
-    RevokeGrant: "revoke",
-    CloseNode: "close",
-    DropCalls: "drop what waits for",
-}
+_WORDS = {CloseNode: "close", DropCalls: "drop what waits for"}
 
 
 class Conversation:
@@ -302,39 +286,31 @@ class Conversation:
         return node
 
     def _relay_starts(self) -> list[str]:
-        """Restate the nodes, as control does when it gets the link of a new relay."""
-        parts = self.parts
-        told = told_to_a_new_relay(parts.registry, parts.grants, lambda: parts.current)
-        parts.enactor.carry_out(parts.graph.tell_everybody(lambda _topic: True))
-        return [self._stated(message) for message in told]
+        """Attach a new relay, as control does when it gets its link."""
+        told = self.parts.start_relay()
+        self.parts.enactor.carry_out(self.parts.graph.tell_everybody(lambda _topic: True))
+        return list(filter(None, map(self._stated, told)))
 
     # --- as text ---
 
     def _stated(self, message: messages.Message) -> str:
-        match message:
-            case messages.NodePlaced(key, _name, host):
-                return f"relay: {self._names[key]} is at {host}"
-            case messages.PublicationPlaced(key, topic) | messages.ServicePlaced(key, topic):
-                return f"relay: {self._names[key]} has {topic}"
-            case messages.GrantInstalled(key, resource, host, name) | messages.ClientGranted(
-                key, resource, host, name
-            ):
-                return f"relay: {name} of {host} may have {resource} of {self._names[key]}"
-        return f"relay: {type(message).__name__}"
+        """Return one line; empty for the port of a node, which goes before its first topic."""
+        for word, kind in messages.FACTS.items():
+            if isinstance(message, (kind.stated, kind.withdrawn)):
+                key, *rest = (getattr(message, name) for name in kind.fields)
+                return _fact(word, self._names[key], rest, stated=isinstance(message, kind.stated))
+        return ""
 
-    def _shown(self, effect: Effect) -> str:
+    def _shown(self, effect: Effect | messages.Message) -> str:
         """Return one line; empty for changes of the store alone."""
+        if isinstance(effect, messages.Message):
+            return self._stated(effect)
         name = self._names[effect.node.key] if hasattr(effect, "node") else ""
         match effect:
             case TellNode(_, call):
                 text = f"tell {name} {call.method} {' '.join(self._value(one) for one in call.parameters)}"
-            case PlaceResource(_, kind, resource) | WithdrawResource(_, kind, resource):
-                text = f"{_WORDS[type(effect)]} {name} {kind} {resource}"
-            case PlaceNode() | WithdrawNode() | CloseNode() | DropCalls():
+            case CloseNode() | DropCalls():
                 text = f"{_WORDS[type(effect)]} {name}"
-            case PlaceGrant(row) | RevokeGrant(row):
-                whose = self._names[row.key]
-                text = f"{_WORDS[type(effect)]} {row.caller_id} of {row.host} {row.kind} {row.resource} of {whose}"
             case RegisterAtMaster(_, one):
                 text = f"ROSMaster: {name} has {one.kind} {one.resource}"
             case UnregisterAtMaster(_, one):
@@ -357,6 +333,16 @@ class Conversation:
                 text = text.replace(uri, name)
             text = text.replace(one.api_text, f"{name} itself")
         return text
+
+
+def _fact(word: str, node: str, about: list[str], *, stated: bool) -> str:
+    match about:
+        case [resource, host, name]:
+            kind = {"grant": "topic", "client": "service"}[word]
+            return f"{'grant' if stated else 'revoke'} {name} of {host} {kind} {resource} of {node}"
+        case [resource]:
+            return f"{'place' if stated else 'withdraw'} {node} {word} {resource}"
+    return "" if stated else f"withdraw {node}"
 
 
 def _listed(registrations: Iterable[tuple[Kind, str]]) -> str:

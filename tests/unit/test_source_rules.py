@@ -174,7 +174,7 @@ LOOKUPS = {
     "appliance/features/fleet/segment_pusher.py _failed": _TEXT,
     "appliance/master/calls/call.py _type_name": _TEXT,
     "appliance/features/table.py recorded_messages": _IMPORTED,
-    "appliance/relay/grant_table.py _fact": "a statement and its withdrawal have the same key",
+    "appliance/channel/messages/relay_link.py identity": "a statement and its withdrawal have the same key",
     "appliance/relay/process.py _obey": _IMPORTED,
     "appliance/supervisor/child_entry.py _call": _IMPORTED,
     "rosmop/batch/ray_cluster.py _reason": _TEXT,

@@ -21,21 +21,17 @@ from appliance.master.calls.gate import CallGate
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.effects import (
     Effect,
-    PlaceGrant,
-    PlaceNode,
-    PlaceResource,
-    RevokeGrant,
     SaveGrant,
 )
 from appliance.master.graph.graph import RosGraph
-from appliance.master.graph.registry import Incarnation, Kind, Registry, SaveRegistration
+from appliance.master.graph.registry import Incarnation, RegistrationKey, Registry, SaveRegistration
 from appliance.master.graph.revocation import Revocation
 from appliance.master.reconcile.enactor import Enactor, Enforcement
 from appliance.master.reconcile.reconciler import Reconciler
 from appliance.policy.model import Decision
 from appliance.relay.grant_table import GrantTable
 from appliance.store.changes import Value
-from appliance.store.state_file import StateStore
+from appliance.store.state_file import PermissionRow, StateStore
 from appliance.store.writer_thread import Database
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.world.pair import PairWorld
@@ -55,10 +51,25 @@ def _without(kind: type[Any]) -> Callable[[Enactor, Any], None]:
     return lambda enactor, effects: whole(enactor, [one for one in effects if not isinstance(one, kind)])
 
 
-def _granted_nowhere(self: RelayControl, post: Any, incarnation: Incarnation) -> None:
-    for one in incarnation.registrations.values():
-        if one.kind is Kind.PUBLICATION:
-            self._place_one(post, incarnation, one.kind, one.resource, one.detail)
+_state_node, _state_fact = RelayControl._state_node, RelayControl._state_fact
+
+
+def _granted_nowhere(self: RelayControl, post: Any, node: Incarnation) -> None:
+    self.grants.of = lambda _key: ()  # type: ignore[assignment, method-assign]
+    try:
+        _state_node(self, post, node)
+    finally:
+        del self.grants.of
+
+
+def _not_stated(kind: type[Any], *, withdrawn: bool = False) -> Callable[..., None]:
+    """Return the relay's sink, which leaves out the facts of a kind, or their withdrawals."""
+
+    def state(self: RelayControl, post: Any, node: Incarnation, fact: Any, wanted: Any) -> None:
+        if not (isinstance(fact, kind) and (wanted is None) is withdrawn):
+            _state_fact(self, post, node, fact, wanted)
+
+    return state
 
 
 _put = Database.put
@@ -84,14 +95,16 @@ MUTANTS: dict[str, tuple[Any, str, Any]] = {
     "what a policy took is not put back": (Revocation, "returned", _nothing),
     "an earlier life keeps its name": (RosGraph, "_take_name", _nothing),
     "a lost node keeps its publications": (Registry, "_unindex", _nothing),
-    "a new relay is not told of grants": (RelayControl, "_place", _granted_nowhere),
+    "a new relay is not told of grants": (RelayControl, "_state_node", _granted_nowhere),
     "a grant is not kept": (Enactor, "carry_out", _without(SaveGrant)),
     "a registration is not kept": (Enactor, "carry_out", _without(SaveRegistration)),
-    "the relay is not told of a grant": (Enactor, "carry_out", _without(PlaceGrant)),
-    "the relay is not told what is revoked": (Enactor, "carry_out", _without(RevokeGrant)),
-    "the relay is not told who publishes": (Enactor, "carry_out", _without(PlaceResource)),
+    "the relay is not told of a grant": (RelayControl, "_state_fact", _not_stated(PermissionRow)),
+    "the relay is not told what is revoked": (
+        RelayControl, "_state_fact", _not_stated(PermissionRow, withdrawn=True),
+    ),
+    "the relay is not told who publishes": (RelayControl, "_state_fact", _not_stated(RegistrationKey)),
     "a round leaves the ROS master as it is": (Reconciler, "_compare", _at_once),
-    "a node that comes back is placed nowhere": (Enactor, "carry_out", _without(PlaceNode)),
+    "a node that comes back is placed nowhere": (RelayControl, "_state_node", _nothing),
     "every call is allowed": (CallGate, "decide", _allowed),
     "a decision is not recorded": (Execution, "_recorded", _unrecorded),
     "a strict answer does not wait for its record": (AuditTrail, "durable", _at_once),

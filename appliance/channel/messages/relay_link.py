@@ -3,7 +3,7 @@
 `key` is the key of an incarnation.
 """
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import msgspec
 
@@ -148,6 +148,44 @@ class ClientRevoked(Message):
     service: str
     host: str
     caller_id: str
+
+
+RelayFact = NodePlaced | PublicationPlaced | ServicePlaced | GrantInstalled | ClientGranted
+"""A fact that control states and withdraws. The relay keeps the facts in a table (`relay/grant_table.py`)."""
+
+
+class FactKind(NamedTuple):
+    """A kind of fact: its message, the message that withdraws it, and the fields that identify it."""
+
+    stated: type[RelayFact]
+    withdrawn: type[Message]
+    fields: tuple[str, ...]
+
+
+FACTS = {
+    "node": FactKind(NodePlaced, NodeWithdrawn, ("key",)),
+    "publication": FactKind(PublicationPlaced, PublicationWithdrawn, ("key", "topic")),
+    "service": FactKind(ServicePlaced, ServiceWithdrawn, ("key", "service")),
+    "grant": FactKind(GrantInstalled, GrantRevoked, ("key", "topic", "host", "caller_id")),
+    "client": FactKind(ClientGranted, ClientRevoked, ("key", "service", "host", "caller_id")),
+}
+_FACT_KINDS: dict[type, str] = {
+    message: word for word, kind in FACTS.items() for message in (kind.stated, kind.withdrawn)
+}
+
+
+def identity(message: Message) -> tuple[str, ...]:
+    """Return the kind of a fact and its fields, which the statement and the withdrawal of a fact share."""
+    word = _FACT_KINDS.get(type(message))
+    if word is None:
+        raise TypeError(f"{type(message).__name__} is not a withdrawal")
+    return (word, *(getattr(message, name) for name in FACTS[word].fields))
+
+
+def withdrawal(fact: RelayFact) -> Message:
+    """Return the message that withdraws a fact."""
+    word, *about = identity(fact)
+    return FACTS[word].withdrawn(*about)
 
 
 class UpstreamWanted(Message):

@@ -47,7 +47,7 @@ def make_core(base: Foundation) -> Core:
 
     watchlist = Watchlist()
     carried = RelayTraffic(base.trail, registry, settings.relays, watchlist.cut_off)
-    grants = Grants(carried.used)
+    grants = Grants(registry.mark, carried.used)
     mediation = Mediation(
         policy,
         lambda: monitors().checked,

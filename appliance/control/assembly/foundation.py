@@ -171,7 +171,7 @@ async def make_foundation(
         holders=lambda: features().holders(),
         approved=lambda: features().approved(),
         live=lambda: enforcement().revocation.live(),  # noqa: PLW0108  it is assembled later
-        changed=lambda before, policy: enforcement().policy_changed(before, policy),
+        changed=lambda _before, policy: enforcement().policy_changed(policy),
         carried_out=lambda: enforcement().carried_out(),
         site_keys=settings.site_keys,
     )

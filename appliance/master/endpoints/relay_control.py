@@ -3,13 +3,14 @@
 The wanted state is derived from the registry (nodes, publications, services) and the grants. Each topic and service is
 sent to the relay that carries it (`allocation`). A node is sent to all relays that carry its topics or services.
 
-When a relay starts, control sends its whole state between `StateBegan` and `StateEnded`. The relay removes everything
-else.
+For each relay, control keeps the facts that it has stated. A change names what may differ; `_state_fact` compares the
+wanted fact with the stated one, and sends the difference. A new relay has no facts, so it gets all of them, between
+`StateBegan` and `StateEnded`; it removes everything else.
 """
 
 import asyncio
 from collections import deque
-from collections.abc import Awaitable, Callable, Iterable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -23,7 +24,7 @@ from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.topic_taps_control import TapRequests
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.grants import Grants
-from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.graph.registry import Change, Incarnation, Kind, Life, RegistrationKey, Registry
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
 from appliance.policy.rate_limits import LimitScope, Rate
@@ -46,14 +47,14 @@ class RelayOutbox(Link):
     def __init__(self, index: int, heard: Callable[[Any], None], lost: Callable[[str], None]) -> None:
         super().__init__(heard, lost)
         self.index = index
-        self.placed: set[str] = set()  # the keys of incarnations whose port this relay has
+        self.stated: dict[str, dict[Change, messages.RelayFact]] = {}  # by key of the node, whose port it has
         self._epoch = 0
         self._orders: deque[asyncio.Future[None]] = deque()
 
     def close(self) -> None:
         """Close the link; nothing waits any longer for the relay's orders."""
         super().close()
-        self.placed.clear()
+        self.stated.clear()
         while self._orders:
             self.carried_out()
 
@@ -110,6 +111,7 @@ class RelayControl:
     own_call: Callable[[OwnCall], Awaitable[OwnAnswer]]
     _posts: tuple[RelayOutbox, ...] = field(init=False)
     _asking: set[asyncio.Task[None]] = field(default_factory=set)
+    _moving: set[Resource] = field(default_factory=set)
     _taps: TapRequests = field(default_factory=TapRequests)
     _stops: dict[int, asyncio.Future[list[str]]] = field(default_factory=dict)
     _stop: int = 0
@@ -143,8 +145,8 @@ class RelayControl:
         if self.own_header is not None:
             post.send(self.own_header)
         with post.restating():
-            for incarnation in self.registry.live():
-                self._place(post, incarnation)
+            for node in self.registry.live():
+                self._state_node(post, node)
 
     def _lost(self, index: int, _reason: str) -> None:
         self.carried.lost(index)
@@ -211,103 +213,112 @@ class RelayControl:
 
     # --- what is wanted ---
 
-    def _place(self, post: RelayOutbox, incarnation: Incarnation) -> None:
-        for registration in incarnation.registrations.values():
-            word = _WORDS.get(registration.kind)
-            if word is not None and self.carries(post.index, word, registration.resource):
-                self._place_one(
-                    post, incarnation, registration.kind, registration.resource, registration.detail
-                )
-        for row in self.grants.of(incarnation.key):
-            if self.carries(post.index, row.kind, row.resource):
-                self.place_grant(row)
+    def flush(self, changed: Iterable[Change]) -> None:
+        """State what these changes have changed, at once if it is a grant."""
+        for change in changed:
+            for post in self._posts:
+                self._state(post, change)
 
-    def _place_one(
-        self, post: RelayOutbox, incarnation: Incarnation, kind: Kind, resource: str, detail: str
+    def compare(self) -> None:
+        """State all that a new policy has changed: limits, named hosts, hosts that command, and approvals."""
+        self.flush(self.registry.live())
+
+    def withdraw_moving(self, moves: Sequence[Move]) -> None:
+        """Withdraw moving topics and services with their grants, until they have their new relays."""
+        self._moving |= {(move.kind, move.name) for move in moves}
+        self.flush(self._moved(moves))
+
+    def place_moved(self, moves: Sequence[Move]) -> None:
+        """State moved topics and services with their grants to their new relays, after the new allocation."""
+        self._moving -= {(move.kind, move.name) for move in moves}
+        self.flush(self._moved(moves))
+
+    def _moved(self, moves: Iterable[Move]) -> Iterator[Change]:
+        for move in moves:
+            for node in list(self.registry.registered(_KINDS[move.kind], move.name)):
+                yield RegistrationKey(node, _KINDS[move.kind], move.name)
+                for row in list(self.grants.of(node.key)):
+                    if (row.kind, row.resource) == (move.kind, move.name):
+                        yield row
+
+    def _state(self, post: RelayOutbox, change: Change) -> None:
+        match change:
+            case Incarnation():
+                self._state_node(post, change)
+            case RegistrationKey(node, kind, _resource):
+                if kind in _WORDS:
+                    self._state_fact(post, node, change, self._placed(post, change))
+            case PermissionRow():
+                provider = self.registry.by_key(change.key)
+                if provider is not None:
+                    self._state_fact(post, provider, change, self._granted(post, provider, change))
+
+    def _state_node(self, post: RelayOutbox, node: Incarnation) -> None:
+        """State all facts about a live node; withdraw a node that has ended, with all its facts."""
+        if node.life is Life.LIVE:
+            for kind, resource in node.registrations:
+                self._state(post, RegistrationKey(node, kind, resource))
+            for row in self.grants.of(node.key):
+                self._state(post, row)
+        elif post.stated.pop(node.key, None) is not None:
+            post.send(messages.NodeWithdrawn(node.key))
+
+    def _state_fact(
+        self, post: RelayOutbox, node: Incarnation, fact: Change, wanted: messages.RelayFact | None
     ) -> None:
-        if incarnation.key not in post.placed:
-            post.placed.add(incarnation.key)
-            listening = self.places.socket(incarnation.relay_ports[post.index])
-            post.send(
-                messages.NodePlaced(
-                    incarnation.key, incarnation.name, str(incarnation.host), incarnation.of_monitors
-                ),
-                (listening.fileno(),),
-                soon=True,
-            )
-        if kind is Kind.PUBLICATION:
-            post.send(self._publication(incarnation, resource, detail), soon=True)
-        else:
-            placed = messages.ServicePlaced(incarnation.key, resource, str(incarnation.host), int(detail))
-            post.send(placed, soon=True)
+        """Send a fact that the relay does not have, or not like this. `wanted`: None if it must not have the fact."""
+        before = post.stated.get(node.key, {}).get(fact)
+        if wanted == before or post.channel is None:
+            return
+        soon = isinstance(fact, RegistrationKey)
+        if wanted is not None:
+            if node.key not in post.stated:
+                self._place_node(post, node)
+            post.send(wanted, soon=soon)
+            post.stated[node.key][fact] = wanted
+        elif before is not None:
+            post.send(messages.withdrawal(before), soon=soon)
+            del post.stated[node.key][fact]
 
-    def place_grant(self, row: PermissionRow) -> None:
-        post = self._post(row.kind, row.resource)
-        if row.kind == TOPIC:
-            post.send(_grant(self.policy(), row))
-        else:
-            named = _names(self.policy(), address_of(row.host))
-            asks = asks_to_call(self.policy(), address_of(row.host), row.resource)
-            post.send(messages.ClientGranted(row.key, row.resource, row.host, row.caller_id, named, asks))
+    def _place_node(self, post: RelayOutbox, node: Incarnation) -> None:
+        listening = self.places.socket(node.relay_ports[post.index])
+        placed = messages.NodePlaced(node.key, node.name, str(node.host), node.of_monitors)
+        post.send(placed, (listening.fileno(),), soon=True)
+        post.stated[node.key] = {}
 
-    def revoke_grant(self, row: PermissionRow) -> None:
-        _revoke(self._post(row.kind, row.resource), row)
+    def _carries(self, post: RelayOutbox, resource: Resource) -> bool:
+        return resource not in self._moving and self.carries(post.index, *resource)
 
-    def place(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> None:
-        self._place_one(self._post(_WORDS[kind], resource), incarnation, kind, resource, detail)
-
-    def withdraw(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
-        _withdraw(self._post(_WORDS[kind], resource), incarnation, kind, resource)
-
-    def withdraw_moving(self, moves: Iterable[Move]) -> None:
-        """Withdraw moving topics and services from their old relays, before the new allocation.
-
-        Their grants are also withdrawn: a later revocation goes only to the new relay.
-        """
-        for move in moves:
-            post = self._posts[move.source]
-            for incarnation in self.registry.registered(_KINDS[move.kind], move.name):
-                _withdraw(post, incarnation, _KINDS[move.kind], move.name)
-                for row in self._rows_of(incarnation, move):
-                    _revoke(post, row)
-
-    def place_moved(self, moves: Iterable[Move]) -> None:
-        """Send moved topics and services with their grants to their new relays, after the new allocation."""
-        for move in moves:
-            kind, post = _KINDS[move.kind], self._posts[move.target]
-            for incarnation in self.registry.registered(kind, move.name):
-                detail = incarnation.registrations[kind, move.name].detail
-                self._place_one(post, incarnation, kind, move.name, detail)
-                for row in self._rows_of(incarnation, move):
-                    self.place_grant(row)
-
-    def _rows_of(self, incarnation: Incarnation, move: Move) -> list[PermissionRow]:
-        rows = self.grants.of(incarnation.key)
-        return [row for row in rows if (row.kind, row.resource) == (move.kind, move.name)]
-
-    def withdraw_node(self, incarnation: Incarnation) -> None:
-        for post in self._posts:
-            if incarnation.key in post.placed:
-                post.placed.discard(incarnation.key)
-                post.send(messages.NodeWithdrawn(incarnation.key))
-
-    def place_node(self, incarnation: Incarnation) -> None:
-        for post in self._posts:
-            self._place(post, incarnation)
-
-    def _publication(self, incarnation: Incarnation, topic: str, detail: str) -> messages.PublicationPlaced:
+    def _placed(self, post: RelayOutbox, fact: RegistrationKey) -> messages.RelayFact | None:
+        node, kind, resource = fact
+        registration = node.registrations.get((kind, resource)) if node.life is Life.LIVE else None
+        if registration is None or not self._carries(post, (_WORDS[kind], resource)):
+            return None
+        if kind is Kind.SERVICE:
+            return messages.ServicePlaced(node.key, resource, str(node.host), int(registration.detail))
         policy = self.policy()
-        together = policy.limit(LimitScope.TOPIC, topic)
+        together = policy.limit(LimitScope.TOPIC, resource)
         return messages.PublicationPlaced(
-            incarnation.key,
-            topic,
-            detail,
-            _flow(policy.limit(LimitScope.PUBLISHER, topic, incarnation.host)),
+            node.key,
+            resource,
+            registration.detail,
+            _flow(policy.limit(LimitScope.PUBLISHER, resource, node.host)),
             _flow(together),
-            policy.counted_as(incarnation.host) if together else "",
-            _names(policy, incarnation.host),
-            not (incarnation.own or policy.may_command(topic, incarnation.host)),
+            policy.counted_as(node.host) if together else "",
+            _names(policy, node.host),
+            not (node.own or policy.may_command(resource, node.host)),
         )
+
+    def _granted(self, post: RelayOutbox, node: Incarnation, row: PermissionRow) -> messages.RelayFact | None:
+        stands = node.life is Life.LIVE and row in self.grants.of(row.key)
+        if not stands or not self._carries(post, (row.kind, row.resource)):
+            return None
+        policy, host = self.policy(), address_of(row.host)
+        about, named = (row.key, row.resource, row.host, row.caller_id), _names(policy, host)
+        if row.kind == SERVICE:
+            return messages.ClientGranted(*about, named, asks_to_call(policy, host, row.resource))
+        limit = policy.limit(LimitScope.SUBSCRIBER, row.resource, host)
+        return messages.GrantInstalled(*about, _flow(limit), named)
 
     # --- what the relays say ---
 
@@ -385,34 +396,12 @@ class RelayControl:
         post.send(messages.UpstreamFound(key, topic, str(incarnation.host), port))
 
 
-def _grant(policy: Policy, row: PermissionRow) -> messages.GrantInstalled:
-    host = address_of(row.host)
-    limit = policy.limit(LimitScope.SUBSCRIBER, row.resource, host)
-    return messages.GrantInstalled(
-        row.key, row.resource, row.host, row.caller_id, _flow(limit), _names(policy, host)
-    )
-
-
 def _names(policy: Policy, host: Address) -> bool:
     return host.is_loopback or policy.names(host)
 
 
 def _flow(rate: Rate) -> messages.FlowLimit:
     return messages.FlowLimit(rate.messages, rate.bytes)
-
-
-def _withdraw(post: RelayOutbox, incarnation: Incarnation, kind: Kind, resource: str) -> None:
-    if kind is Kind.PUBLICATION:
-        post.send(messages.PublicationWithdrawn(incarnation.key, resource), soon=True)
-    else:
-        post.send(messages.ServiceWithdrawn(incarnation.key, resource), soon=True)
-
-
-def _revoke(post: RelayOutbox, row: PermissionRow) -> None:
-    if row.kind == TOPIC:
-        post.send(messages.GrantRevoked(row.key, row.resource, row.host, row.caller_id))
-    else:
-        post.send(messages.ClientRevoked(row.key, row.resource, row.host, row.caller_id))
 
 
 def tcpros_port(answer: Value) -> int:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from appliance.audit.log.record import Severity
-from appliance.master.graph.registry import Durable, Incarnation, Kind, NodeRegistration
+from appliance.master.graph.registry import Durable, Incarnation, NodeRegistration
 from appliance.policy.model import Rule
 from appliance.store.state_file import PermissionRow
 from roswire.xmlrpc import Value
@@ -54,39 +54,6 @@ class DropCalls:
 
 
 @dataclass(frozen=True, slots=True)
-class PlaceResource:
-    """Have a relay carry a publication or service from now on."""
-
-    node: Incarnation
-    kind: Kind
-    resource: str
-    detail: str
-
-
-@dataclass(frozen=True, slots=True)
-class WithdrawResource:
-    """Have the relay stop carrying a publication or service."""
-
-    node: Incarnation
-    kind: Kind
-    resource: str
-
-
-@dataclass(frozen=True, slots=True)
-class PlaceNode:
-    """Have the relays carry a node's topics and services, with their grants, from now on."""
-
-    node: Incarnation
-
-
-@dataclass(frozen=True, slots=True)
-class WithdrawNode:
-    """Have the relays stop carrying a node."""
-
-    node: Incarnation
-
-
-@dataclass(frozen=True, slots=True)
 class CloseNode:
     """Close a node's endpoints, and add its traffic to the past traffic."""
 
@@ -103,20 +70,6 @@ class SaveGrant:
 @dataclass(frozen=True, slots=True)
 class EraseGrant:
     """Remove a grant from the store."""
-
-    row: PermissionRow
-
-
-@dataclass(frozen=True, slots=True)
-class PlaceGrant:
-    """Have the relay admit the subscriber or client of a grant."""
-
-    row: PermissionRow
-
-
-@dataclass(frozen=True, slots=True)
-class RevokeGrant:
-    """Have the relay revoke a grant and cut its connection."""
 
     row: PermissionRow
 
@@ -164,15 +117,9 @@ Effect = (
     Durable
     | TellNode
     | DropCalls
-    | PlaceResource
-    | WithdrawResource
-    | PlaceNode
-    | WithdrawNode
     | CloseNode
     | SaveGrant
     | EraseGrant
-    | PlaceGrant
-    | RevokeGrant
     | RegisterAtMaster
     | UnregisterAtMaster
     | UsePorts

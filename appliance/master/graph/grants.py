@@ -6,7 +6,7 @@ connection. Above the limit of all hosts, the host with the most grants loses th
 
 from collections.abc import Callable, Collection, Iterable
 
-from appliance.master.graph.effects import Effects, EraseGrant, PlaceGrant, RevokeGrant, SaveGrant
+from appliance.master.graph.effects import Effects, EraseGrant, SaveGrant
 from appliance.quotas.pool import Bounds
 from appliance.quotas.table import GRANTS
 from appliance.store.state_file import PermissionRow
@@ -15,9 +15,15 @@ _CLEARED_AT_ONCE = 1000
 
 
 class Grants:
-    """All grants. `used()` returns the grants that have a connection now."""
+    """All grants. `mark` notes a change; `used()` returns the grants that have a connection now."""
 
-    def __init__(self, used: Callable[[], Collection[PermissionRow]], bounds: Bounds = GRANTS.bounds) -> None:
+    def __init__(
+        self,
+        mark: Callable[[PermissionRow], None],
+        used: Callable[[], Collection[PermissionRow]],
+        bounds: Bounds = GRANTS.bounds,
+    ) -> None:
+        self._mark = mark
         self.used = used
         self._bounds = bounds
         self._of_node: dict[str, set[PermissionRow]] = {}  # by key of the publisher or provider
@@ -48,12 +54,13 @@ class Grants:
         effects: Effects = []
         if row not in self._of_node.get(row.key, ()):
             effects.append(SaveGrant(row))
+            self._mark(row)
         self._add(row)
         if effects and len(self._of_host[row.host]) > self._bounds.host:
             effects += self._clear_unused(row.host, row)
         elif effects and self._count > self._bounds.whole:
             effects += self._clear_unused(max(self._of_host, key=lambda host: len(self._of_host[host])), row)
-        return [*effects, PlaceGrant(row)]
+        return effects
 
     def take(self, row: PermissionRow) -> Effects:
         """Revoke a grant if it exists; its connection is cut."""
@@ -61,7 +68,7 @@ class Grants:
         if row not in rows:
             return []
         rows.discard(row)
-        return [*self._drop(row), RevokeGrant(row)]
+        return self._drop(row)
 
     def forget(self, key: str) -> Effects:
         return [effect for row in self._of_node.pop(key, ()) for effect in self._drop(row)]
@@ -78,6 +85,7 @@ class Grants:
         self._count -= 1
         if not mine:
             del self._of_host[row.host]
+        self._mark(row)
         return [EraseGrant(row)]
 
     def _clear_unused(self, host: str, newest: PermissionRow) -> Effects:

@@ -20,31 +20,21 @@ from appliance.master.graph.effects import (
     DropCalls,
     Effects,
     NodeCall,
-    PlaceGrant,
-    PlaceNode,
-    PlaceResource,
     RegisterAtMaster,
     TellNode,
     UnregisterAtMaster,
-    WithdrawNode,
-    WithdrawResource,
     WriteRecord,
 )
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.parameter_updates import settled, updates_of
 from appliance.master.graph.registry import Incarnation, Kind, Life, NodeRegistration, Registry
-from appliance.policy.model import Address, Decision, address_of
-from appliance.policy.policy import Policy
-from appliance.policy.rate_limits import LimitScope
-from appliance.policy.rights import asks_to_call
+from appliance.policy.model import Address, Decision
 from appliance.rpc.bulk import weigh
 from appliance.specifications.allocation import SERVICE, TOPIC
 from appliance.store.state_file import PermissionRow
 from roswire.parameter_tree import Tree, standing_at
 from roswire.xmlrpc import Value
-
-_CARRIED = (Kind.PUBLICATION, Kind.SERVICE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +63,6 @@ class RosGraph:
         new = (kind, resource) not in incarnation.registrations
         effects += self.registry.register(incarnation, kind, resource, detail)
         effects.append(RegisterAtMaster(incarnation, incarnation.registrations[kind, resource]))
-        if kind in _CARRIED:
-            effects.append(PlaceResource(incarnation, kind, resource, detail))
         if kind is Kind.PUBLICATION:
             effects += self.tell(resource)
         if new:
@@ -89,8 +77,6 @@ class RosGraph:
             return [*self.registry.unshelve(incarnation, kind, resource)]
         effects = _at_master(incarnation, [registration])
         effects += self.registry.unregister(incarnation, kind, resource)
-        if kind in _CARRIED:
-            effects.append(WithdrawResource(incarnation, kind, resource))
         if kind is Kind.PUBLICATION:
             effects += self.tell(resource)
         elif kind is Kind.SUBSCRIPTION:
@@ -163,7 +149,6 @@ class RosGraph:
             *_at_master(incarnation, incarnation.in_order()),
             *self.registry.overshadow(incarnation, clock.now()),
             *self._tell_withdrawn(incarnation.registrations.values()),
-            WithdrawNode(incarnation),
             DropCalls(incarnation),
             _record("node lost", why, incarnation, severity=Severity.NOTICE),
         ]
@@ -178,7 +163,6 @@ class RosGraph:
             if self._others_offer(incarnation, service):
                 effects += self.unregistered(incarnation, Kind.SERVICE, service)
         effects += self.registry.revive(incarnation, clock.now())
-        effects.append(PlaceNode(incarnation))
         for registration in incarnation.in_order():
             effects.append(RegisterAtMaster(incarnation, registration))
             if registration.kind is Kind.PUBLICATION:
@@ -203,7 +187,7 @@ class RosGraph:
         return [*effects, *self._close(incarnation), DropCalls(incarnation)]
 
     def _close(self, incarnation: Incarnation) -> Effects:
-        return [WithdrawNode(incarnation), *self.grants.forget(incarnation.key), CloseNode(incarnation)]
+        return [*self.grants.forget(incarnation.key), CloseNode(incarnation)]
 
     # --- grants ---
 
@@ -234,41 +218,6 @@ class RosGraph:
             for publisher in self.registry.registered(Kind.PUBLICATION, topic)
             for effect in self.grants.take(PermissionRow(publisher.key, TOPIC, topic, host, name))
         ]
-
-    def limits_changed(self, before: Policy, now: Policy) -> Effects:
-        """Send the relays all changed limits, and whether a host is named, may command or needs approvals."""
-        effects: Effects = []
-        for node in self.registry.live():
-            for registration in node.registrations.values():
-                parts = ((LimitScope.PUBLISHER, node.host), (LimitScope.TOPIC, None))
-                if registration.kind is Kind.PUBLICATION and (
-                    before.names(node.host) != now.names(node.host)
-                    or before.may_command(registration.resource, node.host)
-                    != now.may_command(registration.resource, node.host)
-                    or _differ(before, now, registration.resource, parts)
-                    or (
-                        now.limit(LimitScope.TOPIC, registration.resource)
-                        and before.counted_as(node.host) != now.counted_as(node.host)
-                    )
-                ):
-                    effects.append(
-                        PlaceResource(node, registration.kind, registration.resource, registration.detail)
-                    )
-            for row in self.grants.of(node.key):
-                host = address_of(row.host)
-                if (
-                    before.names(host) != now.names(host)
-                    or (
-                        row.kind == TOPIC
-                        and _differ(before, now, row.resource, ((LimitScope.SUBSCRIBER, host),))
-                    )
-                    or (
-                        row.kind == SERVICE
-                        and asks_to_call(before, host, row.resource) != asks_to_call(now, host, row.resource)
-                    )
-                ):
-                    effects.append(PlaceGrant(row))
-        return effects
 
     # --- updates for subscribers ---
 
@@ -451,12 +400,6 @@ def _list(subscriber: Incarnation, topic: str, uris: Iterable[str]) -> TellNode:
 def _emptied(subscriber: Incarnation, topic: str) -> TellNode:
     """Send a subscriber an empty list, because client libraries drop a publisher only if a list does not contain it."""
     return _list(subscriber, topic, ())
-
-
-def _differ(
-    before: Policy, now: Policy, topic: str, parts: Iterable[tuple[LimitScope, Address | None]]
-) -> bool:
-    return any(before.limit(part, topic, host) != now.limit(part, topic, host) for part, host in parts)
 
 
 def _param_update(key: str, value: Value) -> NodeCall:

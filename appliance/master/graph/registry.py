@@ -21,9 +21,11 @@ from bisect import bisect_left, insort
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from appliance.channel import rosout_address
 from appliance.policy.model import Address
+from appliance.store.state_file import PermissionRow
 from roswire.uris import NodeUri, node_uri
 
 ANY_TYPE = "*"
@@ -58,6 +60,7 @@ class Life(enum.StrEnum):
     LIVE = "live"
     SHADOW = "shadow"
     REPLACED = "replaced"
+    FORGOTTEN = "forgotten"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +73,7 @@ class NodeRegistration:
     order: int
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Incarnation:
     """One life of a node.
 
@@ -145,6 +148,18 @@ class Incarnation:
         ]
 
 
+class RegistrationKey(NamedTuple):
+    """A registration that a node has, had, or may have again."""
+
+    node: Incarnation
+    kind: Kind
+    resource: str
+
+
+Change = Incarnation | RegistrationKey | PermissionRow
+"""A node whose life may have changed, a registration of a node, or a grant."""
+
+
 @dataclass(frozen=True, slots=True)
 class SaveNode:
     """Save an incarnation, because it is new, or because its `life` or ports have changed."""
@@ -197,6 +212,16 @@ class Registry:
         self._registrations_of: Counter[Address] = Counter()
         self._order = 0
         self.version = 0  # increases with every change
+        self._changed: dict[Change, None] = {}
+
+    def mark(self, change: Change) -> None:
+        """Note a change for `take_changes`."""
+        self._changed[change] = None
+
+    def take_changes(self) -> list[Change]:
+        """Return what has changed since the last call: first the nodes, then the rest in order."""
+        changed, self._changed = self._changed, {}
+        return sorted(changed, key=lambda change: not isinstance(change, Incarnation))
 
     # --- looking ---
 
@@ -322,6 +347,7 @@ class Registry:
         self._by_key[incarnation.key] = incarnation
         self._known[incarnation.name, incarnation.host, incarnation.api_text] = incarnation
         self._nodes_of[incarnation.host] += 1
+        self.mark(incarnation)
         return [SaveNode(incarnation)]
 
     def restore(self, incarnation: Incarnation) -> None:
@@ -351,6 +377,7 @@ class Registry:
             self._registrations_of[incarnation.host] += registration is None
             registration = NodeRegistration(kind, resource, detail, order)
             incarnation.registrations[kind, resource] = registration
+            self.mark(RegistrationKey(incarnation, kind, resource))
             kept.append(SaveRegistration(incarnation.key, registration))
         self._index(incarnation, registration)
         return kept + self.unshelve(incarnation, kind, resource)
@@ -358,11 +385,13 @@ class Registry:
     def shelve(self, incarnation: Incarnation, registration: NodeRegistration) -> list[Durable]:
         """Store a registration that the policy withdrew, because its node never registers again."""
         incarnation.shelf[registration.kind, registration.resource] = registration
+        self.mark(RegistrationKey(incarnation, registration.kind, registration.resource))
         return [SaveRegistration(incarnation.key, registration, shelved=True)]
 
     def unshelve(self, incarnation: Incarnation, kind: Kind, resource: str) -> list[Durable]:
         if incarnation.shelf.pop((kind, resource), None) is None:
             return []
+        self.mark(RegistrationKey(incarnation, kind, resource))
         return [EraseRegistration(incarnation.key, kind, resource, shelved=True)]
 
     def unregister(self, incarnation: Incarnation, kind: Kind, resource: str) -> list[Durable]:
@@ -371,6 +400,7 @@ class Registry:
         self.version += 1
         self._registrations_of[incarnation.host] -= 1
         self._unindex(incarnation, kind, resource)
+        self.mark(RegistrationKey(incarnation, kind, resource))
         return [EraseRegistration(incarnation.key, kind, resource)]
 
     def replace(self, incarnation: Incarnation, when: float) -> list[Durable]:
@@ -393,6 +423,7 @@ class Registry:
         self._live[incarnation.name] = incarnation
         for registration in incarnation.registrations.values():
             self._index(incarnation, registration)
+        self.mark(incarnation)
         return [SaveNode(incarnation)]
 
     def forget(self, incarnation: Incarnation) -> list[Durable]:
@@ -407,6 +438,8 @@ class Registry:
         identity = incarnation.name, incarnation.host, incarnation.api_text
         if self._known.get(identity) is incarnation:
             del self._known[identity]
+        incarnation.life = Life.FORGOTTEN
+        self.mark(incarnation)
         return [EraseNode(incarnation.key)]
 
     def _retire(self, incarnation: Incarnation, life: Life, when: float) -> list[Durable]:
@@ -415,6 +448,7 @@ class Registry:
         incarnation.told_lists.clear()
         if self._live.get(incarnation.name) is incarnation:
             del self._live[incarnation.name]
+        self.mark(incarnation)
         return [SaveNode(incarnation)]
 
     def _index(self, incarnation: Incarnation, registration: NodeRegistration) -> None:

@@ -48,9 +48,9 @@ class Revocation:
             *(self._granted(row) for row in self.grants.all() if not self._is_own(row)),
         ]
 
-    def policy_changed(self, before: Policy, now: Policy) -> Effects:
+    def policy_changed(self, now: Policy) -> Effects:
         """Return all effects of a new policy, which is already in force."""
-        return [UsePorts(now.ports), *self.redecide(), *self.graph.limits_changed(before, now)]
+        return [UsePorts(now.ports), *self.redecide()]
 
     def redecide(self) -> Effects:
         """Revoke rights that the policy in force no longer allows, and restore registrations that it grants again."""

@@ -18,17 +18,11 @@ from appliance.master.graph.effects import (
     Effect,
     Effects,
     EraseGrant,
-    PlaceGrant,
-    PlaceNode,
-    PlaceResource,
     RegisterAtMaster,
-    RevokeGrant,
     SaveGrant,
     TellNode,
     UnregisterAtMaster,
     UsePorts,
-    WithdrawNode,
-    WithdrawResource,
     WriteRecord,
 )
 from appliance.master.graph.graph import RosGraph
@@ -103,26 +97,8 @@ class Enactor:
                         more=effect.more,
                     )
                 case _:
-                    self._tell_relays(effect)
-
-    def _tell_relays(
-        self, effect: PlaceResource | WithdrawResource | PlaceNode | WithdrawNode | PlaceGrant | RevokeGrant
-    ) -> None:
-        match effect:
-            case PlaceResource(node, kind, resource, detail):
-                self.relay.place(node, kind, resource, detail)
-            case WithdrawResource(node, kind, resource):
-                self.relay.withdraw(node, kind, resource)
-            case PlaceNode(node):
-                self.relay.place_node(node)
-            case WithdrawNode(node):
-                self.relay.withdraw_node(node)
-            case PlaceGrant(row):
-                self.relay.place_grant(row)
-            case RevokeGrant(row):
-                self.relay.revoke_grant(row)
-            case _:
-                assert_never(effect)
+                    assert_never(effect)
+        self.relay.flush(self.graph.registry.take_changes())
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,9 +108,11 @@ class Enforcement:
     revocation: Revocation
     enactor: Enactor
 
-    def policy_changed(self, before: Policy, policy: Policy) -> int:
-        """Revoke rights that a new policy does not allow. Return their number."""
-        return self._take_back(self.revocation.policy_changed(before, policy))
+    def policy_changed(self, policy: Policy) -> int:
+        """Revoke rights that a new policy does not allow, and state its limits. Return the number of revocations."""
+        count = self._take_back(self.revocation.policy_changed(policy))
+        self.enactor.relay.compare()
+        return count
 
     def expel(self, host: Address, reason: str) -> int:
         return self._take_back(self.revocation.expel(host, reason))

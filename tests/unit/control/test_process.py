@@ -45,7 +45,7 @@ async def test_restored_nodes_follow_the_policy_in_force(tmp_path: Path) -> None
     registry = Registry()
     decided: list[tuple[object, list[str]]] = []
 
-    def changed(_before: object, policy: object) -> int:
+    def changed(policy: object) -> int:
         decided.append((policy, [resource.resource for _node, resource in registry.in_order()]))
         return 1
 

@@ -27,7 +27,6 @@ from appliance.features.blocks.block_requests import (
 )
 from appliance.hosts.host_table import HostRefusedError
 from appliance.master.graph.registry import Kind
-from appliance.master.graph.revocation import revoked
 from appliance.policy.model import Category, Request, address_of
 from appliance.policy.policy import Policy
 from appliance.store.state_file import StateStore
@@ -98,11 +97,9 @@ class Control(ControlParts):
     def enrolled(self) -> Mapping[str, str]:
         return {"ocu-1": "10.99.0.2"}
 
-    def changed(self, before: Policy, policy: Policy) -> int:
+    def changed(self, _before: Policy, policy: Policy) -> int:
         self.current = policy
-        effects = self.revocation.policy_changed(before, policy)
-        self.enactor.carry_out(effects)
-        return revoked(effects)
+        return self.enforcement.policy_changed(policy)
 
     async def block(self, address: str, seconds: float | None = None, **more: Any) -> HostBlocked:
         return await self.orders.block(HostBlock(address, seconds, **more), "ann")

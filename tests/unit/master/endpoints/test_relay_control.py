@@ -103,7 +103,7 @@ class World:
             2,
             lambda node, topic: self.cut_off.append((node.name, topic)),
         )
-        self.grants = Grants(carried.used, grants)
+        self.grants = Grants(self.registry.mark, carried.used, grants)
         self.relay = RelayControl(
             self.registry,
             self.grants,
@@ -148,7 +148,7 @@ class World:
             (Kind.SERVICE, "/serve", "4001"),
         ):
             self.registry.register(self.node, kind, name, detail)
-            self.relay.place(self.node, kind, name, detail)
+        self.enactor.carry_out([])
 
     def statement(self, _relay: int) -> messages.SpecificationsStated:
         return stated(1, [], {}, {}, restarted=False)
@@ -163,8 +163,13 @@ class World:
     def grant_topic(self, topic: str, host: Address, caller_id: str) -> None:
         self.enactor.carry_out(self.graph.topic_granted(self.node, topic, host, caller_id))
 
-    def limits_changed(self, before: Policy, now: Policy) -> None:
-        self.enactor.carry_out(self.graph.limits_changed(before, now))
+    def use(self, now: Policy) -> None:
+        self.policy = now
+        self.relay.compare()
+
+    def withdraw(self, kind: Kind, resource: str) -> None:
+        self.registry.unregister(self.node, kind, resource)
+        self.enactor.carry_out([])
 
     def put(self, **topics: int) -> None:
         resources = {(TOPIC, f"/{name}"): relay for name, relay in topics.items()}
@@ -233,9 +238,10 @@ async def test_each_relay_receives_its_topics(world: World) -> None:
         messages.PublicationPlaced("key", "/right", "std_msgs/String"), grant,
         messages.StateEnded(2),
     ]  # fmt: skip
-    relay.withdraw(node, Kind.PUBLICATION, "/left")
+    world.withdraw(Kind.PUBLICATION, "/left")
     assert (first.heard(), again.heard()) == ([messages.PublicationWithdrawn("key", "/left")], [])
-    relay.withdraw_node(node)
+    world.registry.overshadow(node, 0.0)
+    world.enactor.carry_out([])
     assert first.heard() == again.heard() == [messages.NodeWithdrawn("key")]
 
 
@@ -245,8 +251,7 @@ async def test_relays_know_which_hosts_the_policy_names(world: World) -> None:
     world.enactor.carry_out(world.graph.service_granted(world.node, "/serve", HOST, "/client"))
     for link in world.links:
         link.heard()
-    before, world.policy = world.policy, policy(nodes="default = *")
-    world.limits_changed(before, world.policy)
+    world.use(policy(nodes="default = *"))
     assert first.heard() == [
         messages.PublicationPlaced("key", "/left", "std_msgs/String", named=False),
         messages.ClientGranted("key", "/serve", "10.0.0.5", "/client", named=False),
@@ -255,7 +260,7 @@ async def test_relays_know_which_hosts_the_policy_names(world: World) -> None:
         messages.PublicationPlaced("key", "/right", "std_msgs/String", named=False),
         messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear", named=False),
     ]
-    world.limits_changed(world.policy, policy(nodes="default = *"))
+    world.use(policy(nodes="default = *"))
     assert first.heard() == second.heard() == []
 
 
@@ -357,8 +362,7 @@ async def test_limits_of_the_policy_are_sent_and_sent_again_on_change(world: Wor
     first.heard()
     second.heard()
     line = "/right = publisher 10.0.0.5 30 Hz, topic 1 MB/s, subscriber 5 Hz"
-    before, world.policy = world.policy, policy(line)
-    world.limits_changed(before, world.policy)
+    world.use(policy(line))
     placed = messages.PublicationPlaced(
         "key",
         "/right",
@@ -369,14 +373,13 @@ async def test_limits_of_the_policy_are_sent_and_sent_again_on_change(world: Wor
     )
     grant = messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear", messages.FlowLimit(5))
     assert (first.heard(), second.heard()) == ([], [placed, grant])
-    world.limits_changed(world.policy, policy(line))
+    world.use(policy(line))
     assert second.heard() == []
     relay.attach(1, cast(Channel, second))
     told = second.heard()
     assert placed in told
     assert grant in told
-    before, world.policy = world.policy, policy()
-    world.limits_changed(before, world.policy)
+    world.use(policy())
     assert second.heard() == [
         messages.PublicationPlaced("key", "/right", "std_msgs/String"),
         messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear"),
