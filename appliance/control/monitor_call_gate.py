@@ -13,7 +13,6 @@ from appliance.channel.messages import MonitorCallAnswered, MonitorCallWanted
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.reconcile.enactor import Enactor
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, request_of, rights_of_call
 from appliance.rpc.front import plain_address
@@ -37,7 +36,7 @@ class MonitorCallGate:
 
     registry: Registry
     graph: RosGraph
-    enactor: Enactor
+    flush: Callable[[], None]
     policy: Callable[[], Policy]
     trail: AuditTrail
     mediation: Mediation
@@ -53,7 +52,8 @@ class MonitorCallGate:
         if refused or provider is None:
             return MonitorCallAnswered(wanted.number, "", 0, "", refused)
         host = ipaddress.ip_address(self.host)
-        self.enactor.carry_out(self.graph.service_granted(provider, wanted.service, host, self.name))
+        self.graph.service_granted(provider, wanted.service, host, self.name)
+        self.flush()  # the relay has the grant before this answer
         port = self.port(provider, Kind.SERVICE, wanted.service)
         return MonitorCallAnswered(wanted.number, self.host, port, self.name, "")
 

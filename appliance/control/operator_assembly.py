@@ -68,7 +68,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         features=base.features.state,
         audit=partial(_audit_state, base),
         clock=clock.state,
-        queued_deliveries=lambda: ends.enactor.delivery.waiting,
+        queued_deliveries=lambda: ends.subscribers.delivery.waiting,
         live=core.revocation.live,
         switched_off=switched_off.rows,
         blocks=base.blocks.state,

@@ -36,7 +36,7 @@ from appliance.features.table import start_gate
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.registry import Life
-from appliance.master.reconcile.enactor import restore
+from appliance.master.reconcile.sinks import restore
 from appliance.specifications.compiler_link import SpecificationCompiler
 from roswire.uris import node_uri
 
@@ -182,7 +182,7 @@ class _Control:
         base.listener_limits.close()
         ends.faces.close_all()
         parts.reminders.close()
-        ends.enactor.delivery.close()
+        ends.subscribers.delivery.close()
         ends.rosmaster.close()
         base.role.close()
         await _end_others(_TASKS_SECONDS)  # requests may still write state while they end
@@ -219,16 +219,16 @@ async def _restore(base: Foundation, parts: Parts) -> None:
         if name.startswith("port:"):
             ends.places.adopt(name, sock)
     restore(core.registry, base.store)
-    ends.enactor.carry_out(core.grants.restore(base.store.permissions()))
+    core.grants.restore(base.store.permissions())
     claimed: set[int] = set()
     for incarnation in core.registry.all():
         if incarnation.life is Life.REPLACED:
             continue
         try:
-            ends.enactor.carry_out(await ends.faces.reopen(incarnation))
+            await ends.faces.reopen(incarnation)
         except NoPortError as error:
             _log.error("a node cannot be restored", node=incarnation.name, error=str(error))
-            ends.enactor.carry_out(core.registry.forget(incarnation))
+            core.registry.forget(incarnation)
             continue
         claimed |= set(incarnation.ports)
     ends.places.close_unclaimed(claimed)

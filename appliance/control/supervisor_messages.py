@@ -95,7 +95,7 @@ class SupervisorMessages:
         link.attach(Channel(sock, accepted, longest=self._base.features.longest(role)))
 
     def _relay_link(self, index: int, channel: Channel) -> None:
-        ends, graph = self._parts.endpoints, self._parts.core.graph
+        ends, subscribers = self._parts.endpoints, self._parts.endpoints.subscribers
         ends.relay.attach(index, channel)
 
         def carried(topic: str) -> bool:
@@ -105,8 +105,8 @@ class SupervisorMessages:
             # Every connection ended, and roscpp may have given up: subscribers drop all publishers first.
             for kind, topic, _holders in list(self._parts.core.registry.resources()):
                 if kind is Kind.SUBSCRIPTION and carried(topic):
-                    ends.enactor.carry_out(graph.renew_all(topic))
-        ends.enactor.carry_out(graph.tell_everybody(carried))
+                    subscribers.renew_all(topic)
+        subscribers.remind_all(carried)
         self._parts.reminders.begin()
 
     async def _reload(self) -> None:

@@ -127,14 +127,6 @@ LARGE_WRITES = QuotaRow(
         "unit/rpc/test_bulk.py::test_a_large_value_has_its_turn_until_the_standby_has_it",
     ),
 )
-MASTER_CHANGES = QuotaRow(
-    thing="changes of registrations that wait for the hidden ROS master",
-    bounds=Bounds(whole=1024, host=512, unknown=512, kept=0),
-    at_limit="the host's registering calls wait",
-    counting="each host counts by its address; the whole is a tenth of a second of the ROS master's time",
-    alarm="none: nothing is rejected",
-    shown_by=("unit/master/reconcile/test_entries.py::test_a_host_leaves_room_in_the_queue",),
-)
 PROBES = QuotaRow(
     thing="liveness checks of nodes under way",
     bounds=Bounds(whole=64, host=16, unknown=8, kept=24),
@@ -445,7 +437,7 @@ DESCRIPTORS = QuotaRow(
 
 QUOTA_ROWS = (
     RVMASTER_CONNECTIONS, RVMASTER_ARRIVALS, RVMASTER_BYTES, RVMASTER_FAREWELLS, RVMASTER_REQUESTS, RVMASTER_TIME,
-    PARAMETER_BYTES, LARGE_WRITES, MASTER_CHANGES, PROBES, NODE_CALLS_UNDER_WAY, QUEUED_NODE_CALLS, RELAY_FRAMES,
+    PARAMETER_BYTES, LARGE_WRITES, PROBES, NODE_CALLS_UNDER_WAY, QUEUED_NODE_CALLS, RELAY_FRAMES,
     RELAY_QUEUES, RELAY_LATCHED, RELAY_CONNECTIONS, RELAY_HEADERS, RELAY_TURN, LIMITED_TOPIC, RELAY_MESSAGE,
     DRY_RUNS, SLICES, REST_CONNECTIONS, REST_STREAMS, REST_STREAM_PEERS,
     REST_EXPORTS, REST_WORK, AUDIT_KINDS, AUDIT_READ_KINDS, AUDIT_BYTES, AUDIT_RESERVE, NODE_PORTS, NAMES, GRANTS,

@@ -8,7 +8,7 @@ import asyncio
 import functools
 import ipaddress
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, NamedTuple, Self, cast
 
@@ -16,24 +16,24 @@ from appliance.channel import messages
 from appliance.configuration import settings
 from appliance.master.caller import Answer, ApiUri, Caller
 from appliance.master.calls.parameter_rights import ParameterRights
+from appliance.master.endpoints.delivery import NodeCall
 from appliance.master.endpoints.node_api import NodeApiClient
 from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.endpoints.traffic import RelayTraffic
-from appliance.master.graph.effects import Effect, NodeCall
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import RosGraph
-from appliance.master.graph.registry import Incarnation, Kind, Life, NodeRegistration, Registry, new_key
-from appliance.master.graph.revocation import Revocation, revoked
-from appliance.master.reconcile.enactor import Enactor, Enforcement
+from appliance.master.graph.registry import Incarnation, Kind, Life, Registry, new_key
+from appliance.master.graph.revocation import Revocation
 from appliance.master.reconcile.entries import MasterRegistrations
 from appliance.master.reconcile.liveness import Liveness, Watchlist
 from appliance.master.reconcile.reconciler import Reconciler
-from appliance.master.rosmaster import RosMaster
+from appliance.master.reconcile.sinks import Enforcement, Sinks
+from appliance.master.reconcile.subscribers import Subscribers
+from appliance.master.rosmaster import RosMaster, Wanted
 from appliance.policy.model import Address, Decision
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass
-from appliance.quotas.table import MASTER_CHANGES
 from appliance.rpc.server import HttpRequest, Peer
 from appliance.rpc.xmlrpc_client import RefusedError, UnansweredError
 from appliance.specifications.allocation import Allocation
@@ -62,10 +62,40 @@ class Denied(NamedTuple):
     about: dict[str, str]
 
 
+class Told(NamedTuple):
+    """A call that a node gets."""
+
+    node: Incarnation
+    call: NodeCall
+
+
+class Ended(NamedTuple):
+    """The end of a node's endpoint, or of the calls that wait for it."""
+
+    what: str
+    node: Incarnation
+
+
+class Record(NamedTuple):
+    """An audit record of a change of the graph."""
+
+    event: str
+    caller_id: str
+    category: str
+    resource: str
+
+
+Seen = Told | Ended | Record | messages.Message | Wanted
+"""An action of control: for a node, in the audit log, at the relay, or at the ROS master."""
+
+_OF_GRAPH = {"registered", "unregistered", "revoked", "replaced", "takeover", "node lost", "node returned"}
+
+
 class Records:
     """An audit trail that keeps (event, resource), the denied decisions, and the requests that were not understood."""
 
-    def __init__(self) -> None:
+    def __init__(self, note: Callable[[Seen], None] = lambda _seen: None) -> None:
+        self._note = note
         self.events: list[tuple[str, str | None]] = []
         self.denied: list[Denied] = []
         self.refused: list[str] = []
@@ -103,6 +133,8 @@ class Records:
 
     def happened(self, event: str, _reason: str, *, resource: str | None = None, **detail: Any) -> str:
         self.events.append((event, resource))
+        if event in _OF_GRAPH:
+            self._note(Record(event, detail["caller_id"], detail["category"], str(resource)))
         if event in {"malformed", "limit exceeded"}:
             self.refused.append(f"{event}: {detail.get('caller_id', '')} {detail['category']} {resource}")
         return "id"
@@ -111,14 +143,16 @@ class Records:
 class Deliveries:
     """Deliveries to nodes: (name of the node, method, parameters)."""
 
-    def __init__(self) -> None:
+    def __init__(self, note: Callable[[Seen], None]) -> None:
         self.told: list[tuple[str, str, tuple[Value, ...]]] = []
+        self._note = note
 
     def push(self, incarnation: Incarnation, call: NodeCall) -> None:
         self.told.append((incarnation.name, call.method, call.parameters))
+        self._note(Told(incarnation, call))
 
-    def drop(self, _incarnation: Incarnation) -> None:
-        """Do nothing."""
+    def drop(self, incarnation: Incarnation) -> None:
+        self._note(Ended("drop what waits for", incarnation))
 
 
 class RelayEnd:
@@ -160,7 +194,8 @@ class NoSpecifications:
 class HiddenMaster:
     """A model of `rosmaster`: its registrations with their URIs, its parameters, and every call it received."""
 
-    def __init__(self) -> None:
+    def __init__(self, note: Callable[[Seen], None]) -> None:
+        self._note = note
         self.calls: list[tuple[Value, ...]] = []
         self.tables: dict[Kind, dict[str, dict[str, str]]] = {kind: {} for kind in _TABLES.values()}
         self.nodes: dict[str, str] = {}
@@ -183,6 +218,7 @@ class HiddenMaster:
         for beginning in ("register", "unregister"):
             kind = _TABLES.get(method.removeprefix(beginning))
             if kind is not None and method.startswith(beginning):
+                self._note((method, params))
                 return self._change(beginning, kind, *(str(one) for one in params))
         return self._answer(method, params)
 
@@ -254,18 +290,21 @@ class HiddenMaster:
 class Inner:
     """Proxy endpoints and arrivals: URIs only; an unknown incarnation is made."""
 
-    def __init__(self, registry: Registry) -> None:
+    def __init__(self, registry: Registry, note: Callable[[Seen], None]) -> None:
         self._registry = registry
-        self.closed: list[str] = []
+        self._note = note
         self._ports = itertools.count(20_001)
+        self.go = asyncio.Event()
+        self.go.set()
 
     def close(self, incarnation: Incarnation) -> None:
-        self.closed.append(incarnation.key)
+        self._note(Ended("close", incarnation))
 
     def known(self, caller: Caller, api: ApiUri) -> Incarnation | None:
         return self._registry.find(caller.caller_id, caller.peer.host, api.text)
 
     async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
+        await self.go.wait()
         known = self.known(caller, api)
         if known is None:
             outer, relay = next(self._ports), next(self._ports)
@@ -330,18 +369,6 @@ class Addresses:
         return "10.0.0.1"
 
 
-class Noted(Enactor):
-    """An enactor that carries out effects and keeps them."""
-
-    def __init__(self, *given: Any, **named: Any) -> None:
-        super().__init__(*given, **named)
-        self.noted: list[Effect | messages.Message] = []
-
-    def carry_out(self, effects: Iterable[Effect]) -> None:
-        self.noted += (effects := list(effects))
-        super().carry_out(effects)
-
-
 class ControlParts:
     """The parts, with an open policy; `reload(text)` puts another in force, `settle()` waits for its consequences."""
 
@@ -349,22 +376,26 @@ class ControlParts:
         """Make the parts; `silent` is the number of seconds without an answer until a node is lost."""
         self._not_ours = asyncio.all_tasks()  # the test's own
         self.current = compile_policy(OPEN, file="policy")
-        self.registry = Registry()
+        self.seen: list[Seen] = []
+        note = self.seen.append
+        self.registry = Registry(woken=lambda: self.sinks.soon())  # noqa: PLW0108  it is made later
         self.grants = Grants(self.registry.mark, set)
-        self.records, self.watchlist = Records(), Watchlist()
-        self.hidden, self.clients = HiddenMaster(), Clients()
-        self.deliveries, self.store = Deliveries(), idle(StateStore)
-        self.faces = Inner(self.registry)
+        self.records, self.watchlist = Records(note), Watchlist()
+        self.hidden, self.clients = HiddenMaster(note), Clients()
+        self.deliveries, self.store = Deliveries(note), idle(StateStore)
+        self.faces = Inner(self.registry, note)
         self.nodes = NodeApiClient(self.registry, timeout=3.0)
         cast(Any, self.nodes).client = self.clients.client
         self.surround()
         self.mediation, self.addresses, self.parameters = (Modes(), Addresses(), mirror())
         trail = cast(Any, self.records)
         rights = ParameterRights(lambda: self.current, trail)
-        self.graph = RosGraph(
+        self.graph = RosGraph(self.registry, self.grants, trail)
+        self.subscribers = Subscribers(
             self.registry,
             self.grants,
             cast(Any, self.mediation),
+            cast(Any, self.deliveries),
             lambda: self.parameters.tree,
             may_read_value=rights.may_read_value,
         )
@@ -387,25 +418,22 @@ class ControlParts:
             own_header=None,
             own_call=cast(Any, None),
         )
-        self.enactor = Noted(
-            self.graph,
+        self.sinks = Sinks(
+            self.registry,
+            self.grants,
+            self.store,
+            self.subscribers,
             self.entries,
-            store=self.store,
-            trail=trail,
-            delivery=cast(Any, self.deliveries),
-            relay=self.relay,
-            faces=cast(Any, self.faces),
-            places=idle(NodePorts),
+            self.relay,
+            cast(Any, self.faces),
         )
-        self.enforcement = Enforcement(self.revocation, self.enactor)
+        self.enforcement = Enforcement(self.revocation, self.sinks, idle(NodePorts))
         self.start_relay()
         self.reconciler = Reconciler(
             self.rosmaster,
             self.entries,
             self.registry,
-            cast(Any, self.faces),
-            self.graph,
-            self.enactor,
+            self.subscribers,
             self.parameters,
             trail,
             own_parameters=dict,
@@ -415,7 +443,7 @@ class ControlParts:
             self.registry,
             self.graph,
             self.revocation,
-            self.enactor,
+            self.subscribers,
             self.watchlist,
             nodes=self.nodes,
             settings=settings.LivenessSection(silent=silent),
@@ -428,7 +456,8 @@ class ControlParts:
             policy=lambda: self.current,
             registry=self.registry,
             graph=self.graph,
-            enactor=self.enactor,
+            subscribers=self.subscribers,
+            flush=self.sinks.flush,
             rosmaster=self.rosmaster,
             mirror=self.parameters,
             trail=self.records,
@@ -440,7 +469,7 @@ class ControlParts:
             addresses=self.addresses,
             liveness=self.liveness,
             nodes=self.nodes,
-            redecide_for=self.redecide_for,
+            redecide_for=self.enforcement.redecide_for,
         )
         self._serve = self._serving()
 
@@ -449,12 +478,6 @@ class ControlParts:
 
     def arrivals(self) -> Any:
         return self.faces
-
-    def redecide_for(self, host: Address, caller_id: str) -> int:
-        """Decide again for one caller; return the number of revocations."""
-        effects = self.revocation.redecide_for(host, caller_id)
-        self.enactor.carry_out(effects)
-        return revoked(effects)
 
     @classmethod
     async def begun(cls) -> Self:
@@ -487,33 +510,22 @@ class ControlParts:
         return parse_response(await serve(HttpRequest(peer, "/", build_call(method, params), 0)))
 
     async def register(self, node: Incarnation, kind: Kind, resource: str, detail: str = "4001") -> None:
-        self.enactor.carry_out(self.graph.registered(node, kind, resource, detail))
+        """Register as a call does, with the list of publishers or the value in its answer."""
+        self.graph.registered(node, kind, resource, detail)
+        if kind is Kind.SUBSCRIPTION:
+            self.subscribers.list_for(node, resource)
+        elif kind is Kind.PARAMETER:
+            self.subscribers.value_given(node, resource)
         await self.settle()
-
-    def fill_queue(self) -> None:
-        """Shut the door, and fill the queue of changes: registering calls then wait for the next round."""
-        self.rosmaster.shut()
-        for host in ("10.0.0.8", "10.0.0.9"):
-            self.fill_part_of_queue(host)
-
-    def fill_part_of_queue(self, host: str) -> None:
-        node = self.node("/filler", 999, ipaddress.ip_address(host))
-        for number in range(MASTER_CHANGES.bounds.host):
-            self.entries.make(node, NodeRegistration(Kind.PUBLICATION, f"/filler_{number}", "t", number))
 
     def reload(self, text: str) -> int:
         """Put this policy in force; return the number of revocations."""
         self.current = compile_policy(text, file="policy")
         return self.enforcement.policy_changed(self.current)
 
-    def start_relay(self) -> list[messages.Message]:
-        """Attach a new relay; return the messages that it gets."""
-        noted = self.enactor.noted
-        before, told = len(noted), noted
-        self.relay.attach(0, cast(Any, RelayEnd(self.enactor.noted.append)))
-        told = noted[before:]
-        del noted[before:]
-        return cast(list[messages.Message], told)
+    def start_relay(self) -> None:
+        """Attach a new relay."""
+        self.relay.attach(0, cast(Any, RelayEnd(self.seen.append)))
 
     async def round(self) -> None:
         await self.reconciler.round()
@@ -524,8 +536,10 @@ class ControlParts:
 
     async def settle(self) -> None:
         """Check the nodes on the watchlist, and wait until all started work is done."""
+        self.sinks.flush()
         self.liveness.look_at_watched()
         while others := asyncio.all_tasks() - self._not_ours:
             await asyncio.wait(others, timeout=5.0)
             assert all(task.done() for task in others), "tasks are still running"
+            self.sinks.flush()
             self.liveness.look_at_watched()

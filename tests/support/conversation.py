@@ -21,8 +21,8 @@ Events:
     `ROSMaster starts anew` | `a relay starts anew`                 the ROS master or a relay restarts
     `ROSMaster is slow` | `ROSMaster answers`                       its answers wait until then
     `ROSMaster stops`                                               until a round
-    `the queue of changes is full`                                  calls that change the graph wait for a round
     a round                                                         of the reconcile loop
+    `registering calls wait` | `registering calls go on`            after their decision, for the ports of their node
     `ROSMaster has /talker publication /chatter of /other`          a registration that control has not made
     state                                                           what control and the ROS master have
     given LINE                                                      another action, whose effects are not listed
@@ -50,24 +50,15 @@ from typing import Any, NamedTuple
 
 from appliance.channel import messages
 from appliance.configuration.settings import LivenessSection
-from appliance.master.graph.effects import (
-    CloseNode,
-    DropCalls,
-    Effect,
-    NodeCall,
-    RegisterAtMaster,
-    TellNode,
-    UnregisterAtMaster,
-    WriteRecord,
-)
+from appliance.master.endpoints.delivery import NodeCall
 from appliance.master.graph.registry import Incarnation, Kind
+from appliance.master.graph.revocation import CALLS
 from appliance.policy.model import text_for_caller
 from roswire.xmlrpc import FaultReceived, Value
-from tests.support.control_parts import ControlParts
+from tests.support.control_parts import ControlParts, Ended, Record, Seen, Told
 from tests.support.conversation_calls import OWN, PORTS, QUESTIONS, WrittenCall, call_of, is_call
 
 _REGISTER = {Kind.PUBLICATION: "registerPublisher", Kind.SUBSCRIPTION: "registerSubscriber"}
-_WORDS = {CloseNode: "close", DropCalls: "drop what waits for"}
 
 
 class Conversation:
@@ -87,7 +78,7 @@ class Conversation:
         return effects if line == given else []
 
     async def _effects(self, line: str) -> list[str]:
-        self.parts.enactor.noted.clear()
+        self.parts.seen.clear()
         self.parts.records.clear()
         call = line.removeprefix("begin ")
         if call != line:
@@ -99,7 +90,7 @@ class Conversation:
         answers += self._finished()
         if self._only_answers:
             return answers
-        shown = [self._shown(effect) for effect in self.parts.enactor.noted]
+        shown = [self._shown(seen) for seen in self.parts.seen]
         refused = [f"record {record}" for record in self.parts.records.refused]
         withheld = [f"withhold {one.resource}" for one in self.parts.records.denied]
         return [*answers, *refused, *filter(None, shown), *withheld]
@@ -196,19 +187,22 @@ class Conversation:
             case ["state"]:
                 return self._state()
             case ["a", "relay", "starts", "anew"]:
-                return self._relay_starts()
+                parts.start_relay()
+                parts.subscribers.remind_all()
             case ["policy", *names]:
                 for name in names:
                     parts.reload(self._policies[name.rstrip(",")])
             case ["host", host, "is", "expelled"]:
-                expelled = parts.revocation.expel(ipaddress.ip_address(host), "the host was expelled")
-                parts.enactor.carry_out(expelled)
+                parts.enforcement.expel(ipaddress.ip_address(host), "the host was expelled")
+            case ["registering", "calls", "wait"]:
+                self._held = True
+                parts.faces.go.clear()
+            case ["registering", "calls", "go", "on"]:
+                self._held = False
+                parts.faces.go.set()
             case ["a", "round"]:
                 self._held = False
                 await parts.round()
-            case ["the", "queue", "of", "changes", "is", "full"]:
-                self._held = True
-                parts.fill_queue()
             case ["nodes", "may", "be", "silent", "for", seconds, "s"]:
                 parts.liveness.settings = LivenessSection(silent=float(seconds))
             case ["ROSMaster", *happening]:
@@ -247,7 +241,7 @@ class Conversation:
             case ["loses", "its", "connection", "for", topic]:
                 self.parts.watchlist.cut_off(node, topic)
             case ["is", "forgotten"]:
-                self.parts.enactor.carry_out(self.parts.graph.forgotten(node))
+                self.parts.graph.forgotten(node)
             case ["dies"] | ["is", "silent"] | ["answers"]:
                 clients = self.parts.clients
                 for names, word in ((clients.gone, "dies"), (clients.silent, "silent")):
@@ -285,12 +279,6 @@ class Conversation:
         assert node is not None
         return node
 
-    def _relay_starts(self) -> list[str]:
-        """Attach a new relay, as control does when it gets its link."""
-        told = self.parts.start_relay()
-        self.parts.enactor.carry_out(self.parts.graph.tell_everybody(lambda _topic: True))
-        return list(filter(None, map(self._stated, told)))
-
     # --- as text ---
 
     def _stated(self, message: messages.Message) -> str:
@@ -301,25 +289,24 @@ class Conversation:
                 return _fact(word, self._names[key], rest, stated=isinstance(message, kind.stated))
         return ""
 
-    def _shown(self, effect: Effect | messages.Message) -> str:
-        """Return one line; empty for changes of the store alone."""
-        if isinstance(effect, messages.Message):
-            return self._stated(effect)
-        name = self._names[effect.node.key] if hasattr(effect, "node") else ""
-        match effect:
-            case TellNode(_, call):
-                text = f"tell {name} {call.method} {' '.join(self._value(one) for one in call.parameters)}"
-            case CloseNode() | DropCalls():
-                text = f"{_WORDS[type(effect)]} {name}"
-            case RegisterAtMaster(_, one):
-                text = f"ROSMaster: {name} has {one.kind} {one.resource}"
-            case UnregisterAtMaster(_, one):
-                text = f"ROSMaster: {name} has {one.kind} {one.resource} no more"
-            case WriteRecord():
-                text = f"record {effect.event}: {effect.caller_id} {effect.category} {effect.resource}"
-            case _:
-                text = ""
-        return text
+    def _shown(self, seen: Seen) -> str:
+        """Return one line; empty for what is not shown."""
+        match seen:
+            case Told(node, call):
+                values = " ".join(self._value(one) for one in call.parameters)
+                return f"tell {self._names[node.key]} {call.method} {values}"
+            case Ended(what, node):
+                return f"{what} {self._names[node.key]}"
+            case Record(event, caller_id, category, resource):
+                return f"record {event}: {caller_id} {category} {resource}"
+            case messages.Message():
+                return self._stated(seen)
+        method, (caller, about, *_detail, uri) = seen
+        registered = self.parts.faces.by_inner_uri(str(uri))
+        name = caller if registered is None else self._names[registered.key]
+        kind = next(kind for kind, calls in CALLS.items() if method in calls)
+        ended = " no more" if method == CALLS[kind][1] else ""
+        return f"ROSMaster: {name!s} has {kind} {about!s}{ended}"
 
     def _value(self, value: Value) -> str:
         if isinstance(value, list):

@@ -29,7 +29,8 @@ def serving(
     policy: Callable[[], Policy],
     registry: Registry,
     graph: Any,
-    enactor: Any,
+    subscribers: Any,
+    flush: Any,
     rosmaster: Any,
     mirror: ParameterMirror,
     trail: Any,
@@ -48,13 +49,13 @@ def serving(
 ) -> Handler:
     """Return the handler of RVMaster's listener; `own`: of our own listener; `target`: of its endpoint."""
     gate = CallGate(policy, registry, HostLimits())
-    parameters = ParameterCalls(rosmaster, mirror, graph, enactor, rights, offload)
+    parameters = ParameterCalls(rosmaster, mirror, subscribers, rights, offload)
     execution = Execution(
         gate=gate,
         policy=policy,
         trail=trail,
         registry=registry,
-        enactor=enactor,
+        flush=flush,
         liveness=liveness,
         parameters=parameters,
         redecide_for=redecide_for,
@@ -74,17 +75,14 @@ def serving(
     )
     monitors: Any = None
     if target is not None:
-        node_calls = NodeCalls(
-            registry, graph, enactor, relay, mediation, addresses, nodes, liveness, gate, 11311
-        )
+        node_calls = NodeCalls(registry, graph, relay, mediation, addresses, nodes, liveness, gate, 11311)
         return pipeline.handler(served(NODE_CALLS.values(), node_calls), target=target)
     return pipeline.handler(
         master_table(
-            RegistrationCalls(registry, graph, enactor, arrivals, relay, mediation, parameters),
+            RegistrationCalls(registry, graph, arrivals, relay, mediation, parameters, subscribers),
             LookupCalls(
                 registry,
                 graph,
-                enactor,
                 relay,
                 mediation,
                 addresses,

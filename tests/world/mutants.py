@@ -19,15 +19,12 @@ from appliance.features.standby.replication_sender import ReplicationSender
 from appliance.master.calls.call_execution import Execution
 from appliance.master.calls.gate import CallGate
 from appliance.master.endpoints.relay_control import RelayControl
-from appliance.master.graph.effects import (
-    Effect,
-    SaveGrant,
-)
 from appliance.master.graph.graph import RosGraph
-from appliance.master.graph.registry import Incarnation, RegistrationKey, Registry, SaveRegistration
+from appliance.master.graph.registry import Incarnation, RegistrationKey, Registry
 from appliance.master.graph.revocation import Revocation
-from appliance.master.reconcile.enactor import Enactor, Enforcement
 from appliance.master.reconcile.reconciler import Reconciler
+from appliance.master.reconcile.sinks import Enforcement
+from appliance.master.reconcile.subscribers import Subscribers
 from appliance.policy.model import Decision
 from appliance.relay.grant_table import GrantTable
 from appliance.store.changes import Value
@@ -38,17 +35,13 @@ from tests.world.pair import PairWorld
 from tests.world.world import World, run
 
 
-def _nothing(*_given: Any, **_named: Any) -> list[Effect]:
-    return []
+def _nothing(*_given: Any, **_named: Any) -> Any:
+    """Do nothing; of a number, none."""
+    return 0
 
 
 async def _at_once(*_given: Any, **_named: Any) -> None:
     """Wait for nothing."""
-
-
-def _without(kind: type[Any]) -> Callable[[Enactor, Any], None]:
-    whole = Enactor.carry_out
-    return lambda enactor, effects: whole(enactor, [one for one in effects if not isinstance(one, kind)])
 
 
 _state_node, _state_fact = RelayControl._state_node, RelayControl._state_fact
@@ -88,7 +81,7 @@ def _unrecorded(_execution: Execution, _attempt: Any, decision: Decision) -> Any
 
 
 MUTANTS: dict[str, tuple[Any, str, Any]] = {
-    "a subscriber is not told of a new publisher": (RosGraph, "tell", _nothing),
+    "a subscriber is not told of a new publisher": (Subscribers, "_state", _nothing),
     "nodes are told each other's own URIs": (Incarnation, "uri_for", lambda node, _told, hidden: node.real_uri),
     "a reload takes back no registration": (RosGraph, "revoked", _nothing),
     "a reload takes back no grant": (Revocation, "_revoke", _nothing),
@@ -96,8 +89,8 @@ MUTANTS: dict[str, tuple[Any, str, Any]] = {
     "an earlier life keeps its name": (RosGraph, "_take_name", _nothing),
     "a lost node keeps its publications": (Registry, "_unindex", _nothing),
     "a new relay is not told of grants": (RelayControl, "_state_node", _granted_nowhere),
-    "a grant is not kept": (Enactor, "carry_out", _without(SaveGrant)),
-    "a registration is not kept": (Enactor, "carry_out", _without(SaveRegistration)),
+    "a grant is not kept": (StateStore, "save_permission", _nothing),
+    "a registration is not kept": (StateStore, "save_registration", _nothing),
     "the relay is not told of a grant": (RelayControl, "_state_fact", _not_stated(PermissionRow)),
     "the relay is not told what is revoked": (
         RelayControl, "_state_fact", _not_stated(PermissionRow, withdrawn=True),

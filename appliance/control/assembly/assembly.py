@@ -48,12 +48,12 @@ def assemble(base: Foundation) -> Parts:
     core = make_core(base)
     ends = make_endpoints(base, core)
     settings = base.settings
-    reminders = Reminders(core.registry, core.graph, ends.enactor)
+    reminders = Reminders(core.registry, ends.subscribers)
     base.role.on_end_of_gap(reminders.begin)
     arrivals = Arrivals(
         core.registry,
         core.graph,
-        ends.enactor,
+        ends.sinks.flush,
         ends.liveness,
         places=ends.places,
         faces=ends.faces,
@@ -62,24 +62,22 @@ def assemble(base: Foundation) -> Parts:
     parameters = ParameterCalls(
         ends.rosmaster,
         core.parameters,
-        core.graph,
-        ends.enactor,
+        ends.subscribers,
         core.rights,
         int(base.settings.limits.offload_bytes),
     )
     registration = RegistrationCalls(
         core.registry,
         core.graph,
-        ends.enactor,
         arrivals,
         ends.relay,
         core.mediation,
         parameters,
+        ends.subscribers,
     )
     publisher = OwnPublisher(
         core.registry,
         core.graph,
-        ends.enactor,
         name=settings.publish_as,
         inner_port=base.port(INNER),
         wanted=lambda: (
@@ -98,7 +96,6 @@ def assemble(base: Foundation) -> Parts:
     node_calls = NodeCalls(
         core.registry,
         core.graph,
-        ends.enactor,
         ends.relay,
         core.mediation,
         ends.addresses,
@@ -116,11 +113,9 @@ def assemble(base: Foundation) -> Parts:
         endpoints=ends,
         reconciler=Reconciler(
             ends.rosmaster,
-            ends.enactor.entries,
+            ends.entries,
             core.registry,
-            ends.faces,
-            core.graph,
-            ends.enactor,
+            ends.subscribers,
             core.parameters,
             base.trail,
             own_parameters=own_parameters,
@@ -151,7 +146,7 @@ def _make_monitors(
         on_fault=settings.on_fault,
         slices=settings.slices,
         allocation=ends.relay.allocation,
-        relays=RelayMoves(ends.relay, core.graph, ends.enactor, reminders),
+        relays=RelayMoves(ends.relay, ends.subscribers, reminders),
         published=publisher.wake,
         told=[log.reported] if settings.monitors_on_rosout else [],
         site_keys=settings.site_keys,
@@ -174,7 +169,6 @@ def _make_calls(
     lookups = LookupCalls(
         core.registry,
         core.graph,
-        ends.enactor,
         ends.relay,
         core.mediation,
         ends.addresses,
@@ -187,7 +181,7 @@ def _make_calls(
         policy=core.policy,
         trail=trail,
         registry=core.registry,
-        enactor=ends.enactor,
+        flush=ends.sinks.flush,
         liveness=ends.liveness,
         parameters=registration.parameters,
         redecide_for=ends.enforcement.redecide_for,

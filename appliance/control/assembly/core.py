@@ -60,7 +60,7 @@ def make_core(base: Foundation) -> Core:
     def tree() -> Tree:
         return parameters.tree
 
-    graph = RosGraph(registry, grants, mediation, tree, may_read_value=rights.may_read_value)
+    graph = RosGraph(registry, grants, base.trail)
     limits = HostLimits(settings.limits.topics_per_host)
     return Core(
         policy=policy,

@@ -16,9 +16,10 @@ from appliance.master.endpoints.node_ports import AdvertisedAddresses, NodePorts
 from appliance.master.endpoints.proxy_endpoints import MasterSideApi, ProxyEndpoints
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.registry import Incarnation
-from appliance.master.reconcile.enactor import Enactor, Enforcement
 from appliance.master.reconcile.entries import MasterRegistrations
 from appliance.master.reconcile.liveness import Liveness
+from appliance.master.reconcile.sinks import Enforcement, Sinks
+from appliance.master.reconcile.subscribers import Subscribers
 from appliance.master.rosmaster import RosMaster, limits_of_answers
 from appliance.rpc.server import Handler
 from appliance.specifications.allocation import Allocation
@@ -40,7 +41,9 @@ class Endpoints:
     rosmaster: RosMaster
     faces: ProxyEndpoints
     inner: MasterSideApi
-    enactor: Enactor
+    subscribers: Subscribers
+    entries: MasterRegistrations
+    sinks: Sinks
     enforcement: Enforcement
     liveness: Liveness
     handler: Current[Callable[[Incarnation], Handler]]
@@ -92,21 +95,21 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         server=base.listener_limits.server,
     )
     entries = MasterRegistrations(rosmaster, core.registry, faces.inner_uri)
-    enactor = Enactor(
-        core.graph,
-        entries,
-        store=base.store,
-        trail=base.trail,
-        delivery=delivery,
-        relay=relay,
-        faces=faces,
-        places=places,
+    subscribers = Subscribers(
+        core.registry,
+        core.grants,
+        core.mediation,
+        delivery,
+        lambda: core.parameters.tree,
+        may_read_value=core.rights.may_read_value,
     )
+    sinks = Sinks(core.registry, core.grants, base.store, subscribers, entries, relay, faces)
+    base.sinks.set(sinks)
     gate.set(
         MonitorCallGate(
             core.registry,
             core.graph,
-            enactor,
+            sinks.flush,
             core.policy,
             base.trail,
             core.mediation,
@@ -115,7 +118,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
             own_host(base.sockets[RVMASTER].getsockname()[0]),
         )
     )
-    enforcement = Enforcement(core.revocation, enactor)
+    enforcement = Enforcement(core.revocation, sinks, places)
     base.enforcement.set(enforcement)
     return Endpoints(
         places=places,
@@ -130,13 +133,15 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         rosmaster=rosmaster,
         faces=faces,
         inner=MasterSideApi(core.registry),
-        enactor=enactor,
+        subscribers=subscribers,
+        entries=entries,
+        sinks=sinks,
         enforcement=enforcement,
         liveness=Liveness(
             core.registry,
             core.graph,
             core.revocation,
-            enactor,
+            subscribers,
             core.watchlist,
             nodes=nodes,
             settings=settings.liveness,

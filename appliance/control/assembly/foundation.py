@@ -27,7 +27,7 @@ from appliance.hosts.host_table import HostTable
 from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHosts
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.graph.registry import Registry
-from appliance.master.reconcile.enactor import Enforcement
+from appliance.master.reconcile.sinks import Enforcement, Sinks
 from appliance.quotas.pool import QuotaClass
 from appliance.rpc.server import listen
 from appliance.specifications.compiler_link import SpecificationCompiler
@@ -64,7 +64,8 @@ class Current(Generic[T]):
 class Foundation:
     """The durable state, the policy and the listeners.
 
-    `enforcement` gets its value later. So does `in_force`, which returns the revisions of policy and specifications.
+    `enforcement` and `sinks` get their values later. So does `in_force`, which returns the revisions of policy and
+    specifications.
     `parameters_dirty` is set whenever the mirror of the parameters changes.
     """
 
@@ -88,6 +89,7 @@ class Foundation:
     listener_limits: ListenerLimits
     sockets: Mapping[str, socket.socket]
     enforcement: Current[Enforcement]
+    sinks: Current[Sinks]
     parameters_dirty: asyncio.Event
     role: ActiveRole
 
@@ -176,7 +178,8 @@ async def make_foundation(
         site_keys=settings.site_keys,
     )
     policies.start(restarted=restarted or role.paired)
-    registry = Registry(settings.limits.nodes_per_host)
+    sinks = Current[Sinks]()
+    registry = Registry(settings.limits.nodes_per_host, woken=lambda: sinks().soon())
     quota_class.set(HostQuotaClass(policies.policy, registry.registrations_of))
     return Foundation(
         settings=settings,
@@ -199,6 +202,7 @@ async def make_foundation(
         listener_limits=ListenerLimits(settings, trail, policies.policy, quota_class()),
         sockets=_open_listeners(settings, lifeline),
         enforcement=enforcement,
+        sinks=sinks,
         parameters_dirty=asyncio.Event(),
         role=role,
     )

@@ -31,7 +31,7 @@ from appliance.features.standby.link_certificates import replication_context
 from appliance.features.standby.membership import Membership
 from appliance.features.standby.standby_summary import UNCHECKED
 from appliance.master.graph.registry import Registry
-from appliance.master.reconcile.enactor import restore
+from appliance.master.reconcile.sinks import restore
 from appliance.policy.judgement import PolicyContext
 from appliance.specifications.rollout import Parts, Revision, parts_wanted
 from appliance.specifications.specification_files import SpecificationFolder

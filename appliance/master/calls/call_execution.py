@@ -38,7 +38,6 @@ from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.registry import HostFullError, Kind, Registry
 from appliance.master.parameter_charges import LimitReachedError
 from appliance.master.reconcile.arrivals import NodeElsewhereError
-from appliance.master.reconcile.enactor import Enactor
 from appliance.master.reconcile.liveness import Liveness, Probe
 from appliance.policy.model import Address, Category, Decision, Request
 from appliance.policy.policy import Policy
@@ -67,7 +66,8 @@ class ServedRequest(NamedTuple):
 class Execution:
     """Carry out calls. A write of at least `large` bytes waits for other large writes.
 
-    `hold_call(request)` holds a call that needs an approval, and returns the answer to its host.
+    `flush` carries out the changes of the registry. `hold_call(request)` holds a call that needs an approval, and
+    returns the answer to its host.
     `redecide_for(host, caller_id)` revokes the rights of a caller that the policy in force does not allow.
     """
 
@@ -75,7 +75,7 @@ class Execution:
     policy: Callable[[], Policy]
     trail: AuditTrail
     registry: Registry
-    enactor: Enactor
+    flush: Callable[[], None]
     liveness: Liveness
     parameters: ParameterCalls
     redecide_for: Callable[[Address, str], None]
@@ -164,7 +164,8 @@ class Execution:
         policy, verb = self.policy(), attempt.call.verb
         denied = self._recorded(attempt, decision)
         if denied is not None and verb is CallVerb.UNREGISTER:
-            self.enactor.carry_out(given_up(self.registry, attempt))
+            given_up(self.registry, attempt)
+            self.flush()
         obstacle = await self._obstacle() if self.trail.strict else None
         if obstacle is not None:
             return [0, obstacle, attempt.call.denial]
@@ -252,7 +253,9 @@ class Execution:
     async def _perform(self, visit: ServedRequest, attempt: Attempt) -> Value:
         call, part = visit.table[attempt.call.name]
         try:
-            return await call.method.perform(part, attempt.caller, *attempt.arguments)
+            answer = await call.method.perform(part, attempt.caller, *attempt.arguments)
+            self.flush()
+            return answer
         except _FAILURES as error:
             return self._failed(attempt, error)
 

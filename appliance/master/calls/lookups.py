@@ -10,7 +10,6 @@ from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Kind, Registry
-from appliance.master.reconcile.enactor import Enactor
 from roswire.uris import node_uri, service_uri
 from roswire.xmlrpc import Value
 
@@ -25,7 +24,6 @@ class LookupCalls:
 
     registry: Registry
     graph: RosGraph
-    enactor: Enactor
     relay: RelayControl
     mediation: Mediation
     addresses: AdvertisedAddresses
@@ -47,8 +45,7 @@ class LookupCalls:
         if provider is None:
             return [-1, "no provider", ""]
         if provider.of_monitors or self.mediation.carries_service(service):
-            granted = self.graph.service_granted(provider, service, caller.peer.host, caller.caller_id)
-            self.enactor.carry_out(granted)
+            self.graph.service_granted(provider, service, caller.peer.host, caller.caller_id)
             port = self.relay.port(provider, Kind.SERVICE, service)
             uri = service_uri(self.addresses.address_for(caller.peer), port)
         else:

@@ -22,7 +22,6 @@ from appliance.master.endpoints.traffic import Traffic
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.reconcile.enactor import Enactor
 from appliance.master.reconcile.liveness import Liveness
 from appliance.rpc.server import NoAnswerError
 from appliance.rpc.xmlrpc_client import CallFailedError
@@ -39,7 +38,6 @@ class NodeCalls:
 
     registry: Registry
     graph: RosGraph
-    enactor: Enactor
     relay: RelayControl
     mediation: Mediation
     addresses: AdvertisedAddresses
@@ -60,8 +58,7 @@ class NodeCalls:
         own = target.own or self.gate.is_own_subscriber(caller, topic)  # always connected through the relay
         if not own and not self.mediation.carries_topic(topic):
             return await self._negotiated_directly(target, topic, caller)
-        granted = self.graph.topic_granted(target, topic, caller.peer.host, caller.caller_id)
-        self.enactor.carry_out(granted)
+        self.graph.topic_granted(target, topic, caller.peer.host, caller.caller_id)
         address = self.addresses.address_for(caller.peer)
         port = self.relay.port(target, Kind.PUBLICATION, topic)
         return [1, f"ready on {address}:{port}", ["TCPROS", address, port]]

@@ -19,11 +19,10 @@ from typing import NamedTuple
 from appliance.master.caller import Answer, Caller
 from appliance.master.calls.call import Attempt
 from appliance.master.calls.parameter_rights import ParameterRights
-from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.parameter_updates import settled
 from appliance.master.parameter_charges import APPLIANCE, NAME_WEIGHT, LimitReachedError, measure
 from appliance.master.parameter_mirror import ParameterMirror, Reservation
-from appliance.master.reconcile.enactor import Enactor
+from appliance.master.reconcile.subscribers import Subscribers
 from appliance.master.rosmaster import RosMaster, Wanted
 from appliance.policy.model import Address, Decision
 from appliance.rpc.bulk import weigh
@@ -52,8 +51,7 @@ class ParameterCalls:
 
     rosmaster: RosMaster
     mirror: ParameterMirror
-    graph: RosGraph
-    enactor: Enactor
+    subscribers: Subscribers
     rights: ParameterRights
     large: int
 
@@ -200,10 +198,10 @@ class ParameterCalls:
     def _written(self, write: ParameterWrite, reserved: Reservation | None, outcome: Answer) -> None:
         if reserved is not None and _is_set(outcome, write):
             self.mirror.set(write.key, write.value, reserved)
-            self.enactor.carry_out(self.graph.parameter_set(write.key, write.value, write.caller.caller_id))
+            self.subscribers.parameter_set(write.key, write.value, write.caller.caller_id)
         elif reserved is None and outcome[0] == 1:
             self.mirror.delete(write.key)
-            self.enactor.carry_out(self.graph.parameter_deleted(write.key))
+            self.subscribers.parameter_deleted(write.key)
 
     async def _make(self, calls: list[Wanted]) -> list[Answer | Exception]:
         if not calls:

@@ -13,32 +13,29 @@ from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.mediation import Mediation
-from appliance.master.graph.registry import Durable, Incarnation, Kind, Life, Registry
+from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.master.reconcile.arrivals import Arrivals
-from appliance.master.reconcile.enactor import Enactor
+from appliance.master.reconcile.subscribers import Subscribers
 
 
 @dataclass(frozen=True, slots=True)
 class RegistrationCalls:
-    """Change the graph by the calls of nodes, and answer them.
-
-    A call waits only at its beginning, while the changes before it wait for the ROS master.
-    """
+    """Change the graph by the calls of nodes, and answer them."""
 
     registry: Registry
     graph: RosGraph
-    enactor: Enactor
     arrivals: Arrivals
     relay: RelayControl
     mediation: Mediation
     parameters: ParameterCalls
+    subscribers: Subscribers
 
     async def register_publisher(
         self, caller: Caller, topic: str, topic_type: str, caller_api: ApiUri
     ) -> Answer:
         """`registerPublisher(caller_id, topic, topic_type, caller_api)` → the subscribers' (outer) URIs."""
-        node = await self._registering(caller, caller_api)
-        self.enactor.carry_out(self.graph.registered(node, Kind.PUBLICATION, topic, topic_type))
+        node = await self.arrivals.incarnation_for(caller, caller_api)
+        self.graph.registered(node, Kind.PUBLICATION, topic, topic_type)
         hidden = self.mediation.hides_publishers(topic)
         subscribers = self.registry.uris_for(node, Kind.SUBSCRIPTION, topic, hidden=hidden)
         return [1, f"Registered [{node.name}] as publisher of [{topic}]", list(subscribers)]
@@ -47,17 +44,17 @@ class RegistrationCalls:
         self, caller: Caller, topic: str, topic_type: str, caller_api: ApiUri
     ) -> Answer:
         """`registerSubscriber(caller_id, topic, topic_type, caller_api)` → the publishers' (outer) URIs."""
-        node = await self._registering(caller, caller_api)
-        self.enactor.carry_out(self.graph.registered(node, Kind.SUBSCRIPTION, topic, topic_type))
-        return [1, f"Subscribed to [{topic}]", list(self.graph.list_for(node, topic))]
+        node = await self.arrivals.incarnation_for(caller, caller_api)
+        self.graph.registered(node, Kind.SUBSCRIPTION, topic, topic_type)
+        return [1, f"Subscribed to [{topic}]", list(self.subscribers.list_for(node, topic))]
 
     async def register_service(
         self, caller: Caller, service: str, service_api: ApiUri, caller_api: ApiUri
     ) -> Answer:
         """`registerService(caller_id, service, service_api, caller_api)`."""
-        node = await self._registering(caller, caller_api)
+        node = await self.arrivals.incarnation_for(caller, caller_api)
         port = str(service_api.uri.port)
-        self.enactor.carry_out(self.graph.registered(node, Kind.SERVICE, service, port))
+        self.graph.registered(node, Kind.SERVICE, service, port)
         return [1, f"Registered [{node.name}] as provider of [{service}]", 1]
 
     async def subscribe_param(self, caller: Caller, caller_api: ApiUri, key: str) -> Answer:
@@ -68,8 +65,9 @@ class RegistrationCalls:
             return [0, hidden, 0]
         if read[0] == 0:  # the ROS master failed
             return read
-        node = await self._registering(caller, caller_api)
-        self.enactor.carry_out(self.graph.registered(node, Kind.PARAMETER, key, ""))
+        node = await self.arrivals.incarnation_for(caller, caller_api)
+        self.graph.registered(node, Kind.PARAMETER, key, "")
+        self.subscribers.value_given(node, key)
         return [1, f"Subscribed to parameter [{key}]", read[2] if read[0] == 1 else {}]
 
     async def unregister_publisher(self, caller: Caller, topic: str, caller_api: ApiUri) -> Answer:
@@ -82,7 +80,6 @@ class RegistrationCalls:
 
     async def unregister_service(self, caller: Caller, service: str, service_api: ApiUri) -> Answer:
         """`unregisterService(caller_id, service, service_api)`: the caller's node is found by what it offers."""
-        await self.enactor.entries.room(caller.peer.host)
         port = service_api.uri.port
         provider = next(
             (
@@ -102,12 +99,10 @@ class RegistrationCalls:
 
     async def unsubscribe_param(self, caller: Caller, caller_api: ApiUri, key: str) -> Answer:
         """`unsubscribeParam(caller_id, caller_api, key)`: the ROS master's answer is always the same."""
-        await self.enactor.entries.room(caller.peer.host)
         self._unregistered(caller, self.arrivals.known(caller, caller_api), Kind.PARAMETER, key, "")
         return [1, f"Unsubscribe to parameter [{key}]", 1]
 
     async def _unregister_topic(self, caller: Caller, kind: Kind, topic: str, caller_api: ApiUri) -> Answer:
-        await self.enactor.entries.room(caller.peer.host)
         node = self.arrivals.known(caller, caller_api) or self._by_lookup_uri(caller, caller_api)
         other = f"[{caller.caller_id}] is not a known provider of [{topic}]"
         return self._unregistered(caller, node, kind, topic, other)
@@ -123,7 +118,7 @@ class RegistrationCalls:
         else:
             answer = [1, f"Unregistered [{name}] as provider of [{resource}]", 1]
         if node is not None:
-            self.enactor.carry_out(self.graph.unregistered(node, kind, resource))
+            self.graph.unregistered(node, kind, resource)
         return answer
 
     def _by_lookup_uri(self, caller: Caller, api: ApiUri) -> Incarnation | None:
@@ -132,21 +127,15 @@ class RegistrationCalls:
         meant = holder is not None and (holder.host, holder.outer_port) == (caller.peer.host, api.uri.port)
         return holder if meant else None
 
-    async def _registering(self, caller: Caller, api: ApiUri) -> Incarnation:
-        await self.enactor.entries.room(caller.peer.host)
-        return await self.arrivals.incarnation_for(caller, api)
 
-
-def given_up(registry: Registry, denied: Attempt) -> list[Durable]:
+def given_up(registry: Registry, denied: Attempt) -> None:
     """Forget a withdrawn registration that its node unregisters, although this call is denied."""
     kind, caller = denied.call.kind, denied.caller
     asked = next(argument for argument in denied.arguments if isinstance(argument, ApiUri))
-    kept: list[Durable] = []
     for incarnation in registry.all():
         shelved = None if kind is None else incarnation.shelf.get((kind, denied.resource))
         if shelved is None or (incarnation.name, incarnation.host) != (caller.caller_id, caller.peer.host):
             continue
         by_port = shelved.kind is Kind.SERVICE and shelved.detail == str(asked.uri.port)
         if by_port or incarnation.api_text == asked.text:
-            kept += registry.unshelve(incarnation, shelved.kind, shelved.resource)
-    return kept
+            registry.unshelve(incarnation, shelved.kind, shelved.resource)

@@ -18,20 +18,42 @@ import structlog
 
 from appliance.base import clock
 from appliance.master.endpoints.node_api import NodeApiClient
-from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.model import Address
 from appliance.quotas.pool import Bounds, Pool, QuotaClass
 from appliance.quotas.table import NODE_CALLS_UNDER_WAY, QUEUED_NODE_CALLS
 from appliance.rpc.fair_queue import Turns
 from appliance.rpc.xmlrpc_client import CallFailedError
-from roswire.xmlrpc import FaultReceived
+from roswire.xmlrpc import FaultReceived, Value
 
 _log = structlog.get_logger()
 MASTER_NAME = "/master"
 _APART_SECONDS = 0.3  # between a list that removes a publisher and a list that adds it
 _LISTS = "publisherUpdate"
 _SHORTEST_WAIT = 0.001  # seconds: a timer that ends a little early does not make the worker spin
+_CALL_BYTES = 200  # an empty call in Python's memory
+_TEXT_BYTES = 60  # an empty text in Python's memory
+
+
+@dataclass(frozen=True, slots=True)
+class NodeCall:
+    """A call to a node: the method, and the parameters after the caller's name.
+
+    `size` is the approximate size of the call in bytes, if known. Otherwise, `weight` measures the call.
+    """
+
+    method: str
+    parameters: tuple[Value, ...]
+    size: int = 0
+
+    @property
+    def weight(self) -> int:
+        if self.size:
+            return self.size
+        texts = [
+            text for given in self.parameters for text in (given if isinstance(given, list) else [given])
+        ]
+        return _CALL_BYTES + sum(_TEXT_BYTES + len(text) for text in texts if isinstance(text, str))
 
 
 @dataclass(slots=True)

@@ -5,8 +5,8 @@ a URI is the key of an incarnation. The *outer* (peer-side) endpoint is for othe
 endpoint reveals the node's real URI.
 
 The ROS master's calls to a master-side endpoint are acknowledged and ignored. The ROS master joins the names in a value
-to keys that the policy did not decide, and its threads may be late. Instead, `graph` makes the calls to nodes when a
-decided call is carried out: lists of publishers come from the registry, values of parameters from the call.
+to keys that the policy did not decide, and its threads may be late. Instead, `Subscribers` makes the calls to nodes
+when a decided call is carried out: lists of publishers come from the registry, values of parameters from the call.
 """
 
 import socket
@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from appliance.master.endpoints.node_ports import NodePorts, NoPortError
-from appliance.master.graph.registry import PUBLISHER_PATH, Durable, Incarnation, Registry, SaveNode
+from appliance.master.graph.registry import PUBLISHER_PATH, Incarnation, Registry
 from appliance.rpc.server import Handler, HttpRequest, HttpServer
 from roswire.uris import node_uri
 from roswire.xmlrpc import build_fault, build_response
@@ -45,16 +45,14 @@ class ProxyEndpoints:
         self.servers[incarnation.key] = server
         await server.start()
 
-    async def reopen(self, incarnation: Incarnation) -> list[Durable]:
-        """Serve the proxy endpoint of a restored incarnation. Return the change to save, if its ports have changed.
-
-        Raises `NoPortError` if a port is in use.
-        """
+    async def reopen(self, incarnation: Incarnation) -> None:
+        """Serve the proxy endpoint of a restored incarnation. Raises `NoPortError` if a port is in use."""
         ports = incarnation.ports
         if not self.places.reopen(incarnation):
             raise NoPortError(f"a port of {incarnation.name} is in use by another program")
         await self.open(incarnation)
-        return [SaveNode(incarnation)] if incarnation.ports != ports else []
+        if incarnation.ports != ports:
+            self.registry.mark(incarnation)
 
     def close(self, incarnation: Incarnation) -> None:
         """Close the proxy endpoint and all ports of an incarnation, if open; the ports may be reused."""

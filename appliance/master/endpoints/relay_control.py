@@ -245,8 +245,8 @@ class RelayControl:
         match change:
             case Incarnation():
                 self._state_node(post, change)
-            case RegistrationKey(node, kind, _resource):
-                if kind in _WORDS:
+            case RegistrationKey(node, kind, _resource, shelved):
+                if kind in _WORDS and not shelved:
                     self._state_fact(post, node, change, self._placed(post, change))
             case PermissionRow():
                 provider = self.registry.by_key(change.key)
@@ -290,7 +290,7 @@ class RelayControl:
         return resource not in self._moving and self.carries(post.index, *resource)
 
     def _placed(self, post: RelayOutbox, fact: RegistrationKey) -> messages.RelayFact | None:
-        node, kind, resource = fact
+        node, kind, resource, _shelved = fact
         registration = node.registrations.get((kind, resource)) if node.life is Life.LIVE else None
         if registration is None or not self._carries(post, (_WORDS[kind], resource)):
             return None

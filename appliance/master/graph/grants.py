@@ -6,7 +6,6 @@ connection. Above the limit of all hosts, the host with the most grants loses th
 
 from collections.abc import Callable, Collection, Iterable
 
-from appliance.master.graph.effects import Effects, EraseGrant, SaveGrant
 from appliance.quotas.pool import Bounds
 from appliance.quotas.table import GRANTS
 from appliance.store.state_file import PermissionRow
@@ -30,18 +29,16 @@ class Grants:
         self._of_host: dict[str, dict[PermissionRow, None]] = {}  # by client host, oldest grant first
         self._count = 0
 
-    def restore(self, rows: Iterable[PermissionRow]) -> Effects:
+    def restore(self, rows: Iterable[PermissionRow]) -> None:
         """Restore stored grants, but erase those of an earlier version that were for all names of a host.
 
         The clients of erased grants look up the service again.
         """
-        effects: Effects = []
         for row in rows:
             if row.caller_id:
                 self._add(row)
             else:
-                effects.append(EraseGrant(row))
-        return effects
+                self._mark(row)
 
     def all(self) -> list[PermissionRow]:
         return [row for rows in self._of_node.values() for row in rows]
@@ -49,29 +46,28 @@ class Grants:
     def of(self, key: str) -> Collection[PermissionRow]:
         return self._of_node.get(key, ())
 
-    def give(self, row: PermissionRow) -> Effects:
+    def give(self, row: PermissionRow) -> None:
         """Give a grant, which becomes the newest of its host even if it existed before."""
-        effects: Effects = []
-        if row not in self._of_node.get(row.key, ()):
-            effects.append(SaveGrant(row))
-            self._mark(row)
+        new = row not in self._of_node.get(row.key, ())
         self._add(row)
-        if effects and len(self._of_host[row.host]) > self._bounds.host:
-            effects += self._clear_unused(row.host, row)
-        elif effects and self._count > self._bounds.whole:
-            effects += self._clear_unused(max(self._of_host, key=lambda host: len(self._of_host[host])), row)
-        return effects
+        if not new:
+            return
+        self._mark(row)
+        if len(self._of_host[row.host]) > self._bounds.host:
+            self._clear_unused(row.host, row)
+        elif self._count > self._bounds.whole:
+            self._clear_unused(max(self._of_host, key=lambda host: len(self._of_host[host])), row)
 
-    def take(self, row: PermissionRow) -> Effects:
+    def take(self, row: PermissionRow) -> None:
         """Revoke a grant if it exists; its connection is cut."""
         rows = self._of_node.get(row.key, set())
-        if row not in rows:
-            return []
-        rows.discard(row)
-        return self._drop(row)
+        if row in rows:
+            rows.discard(row)
+            self._drop(row)
 
-    def forget(self, key: str) -> Effects:
-        return [effect for row in self._of_node.pop(key, ()) for effect in self._drop(row)]
+    def forget(self, key: str) -> None:
+        for row in self._of_node.pop(key, ()):
+            self._drop(row)
 
     def _add(self, row: PermissionRow) -> None:
         rows, mine = self._of_node.setdefault(row.key, set()), self._of_host.setdefault(row.host, {})
@@ -79,16 +75,16 @@ class Grants:
         rows.add(row)
         mine[row] = mine.pop(row, None)
 
-    def _drop(self, row: PermissionRow) -> Effects:
+    def _drop(self, row: PermissionRow) -> None:
         mine = self._of_host[row.host]
         del mine[row]
         self._count -= 1
         if not mine:
             del self._of_host[row.host]
         self._mark(row)
-        return [EraseGrant(row)]
 
-    def _clear_unused(self, host: str, newest: PermissionRow) -> Effects:
+    def _clear_unused(self, host: str, newest: PermissionRow) -> None:
         used = self.used()
         unused = [row for row in self._of_host[host] if row != newest and row not in used]
-        return [effect for row in unused[:_CLEARED_AT_ONCE] for effect in self.take(row)]
+        for row in unused[:_CLEARED_AT_ONCE]:
+            self.take(row)

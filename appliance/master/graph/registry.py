@@ -1,9 +1,7 @@
-"""Keep the registry: nodes, their registrations, and the lists of publishers that subscribers have received. No I/O, no
-clock.
+"""Keep the registry: nodes, and their registrations. No I/O, no clock.
 
 An *incarnation* is one life of a node: a name and an API URI that were registered from one host. Two endpoints and the
-relay ports represent the node. Every change of the registry returns the changes to save (`Durable`); `enactor` saves
-them.
+relay ports represent the node. The registry keeps the set of changed keys, also of changed grants; `Sinks` takes it.
 
 Invariants:
 
@@ -19,7 +17,7 @@ import enum
 import secrets
 from bisect import bisect_left, insort
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -97,7 +95,6 @@ class Incarnation:
     touched: float = 0.0  # monotonic seconds of its last registering call
     registrations: dict[tuple[Kind, str], NodeRegistration] = field(default_factory=dict)
     shelf: dict[tuple[Kind, str], NodeRegistration] = field(default_factory=dict)  # withdrawn by the policy
-    told_lists: dict[str, tuple[str, ...]] = field(default_factory=dict)
     more_relay_ports: tuple[int, ...] = ()
     calls: int = 0  # the number of registering calls of this incarnation that are under way
 
@@ -149,58 +146,24 @@ class Incarnation:
 
 
 class RegistrationKey(NamedTuple):
-    """A registration that a node has, had, or may have again."""
+    """A registration that a node has or had. `shelved`: a registration that the policy withdrew."""
 
     node: Incarnation
     kind: Kind
     resource: str
+    shelved: bool = False
 
 
 Change = Incarnation | RegistrationKey | PermissionRow
 """A node whose life may have changed, a registration of a node, or a grant."""
 
 
-@dataclass(frozen=True, slots=True)
-class SaveNode:
-    """Save an incarnation, because it is new, or because its `life` or ports have changed."""
-
-    node: Incarnation
-
-
-@dataclass(frozen=True, slots=True)
-class EraseNode:
-    """Erase an incarnation, with all its registrations."""
-
-    key: str
-
-
-@dataclass(frozen=True, slots=True)
-class SaveRegistration:
-    """Save a registration of the incarnation with this key. `shelved`: the policy withdrew the registration."""
-
-    key: str
-    registration: NodeRegistration
-    shelved: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class EraseRegistration:
-    """Erase a registration. `shelved`: the registration is one that the policy withdrew."""
-
-    key: str
-    kind: Kind
-    resource: str
-    shelved: bool = False
-
-
-Durable = SaveNode | EraseNode | SaveRegistration | EraseRegistration
-
-
 class Registry:
-    """All known incarnations, by key, by name and by topic."""
+    """All known incarnations, by key, by name and by topic. `woken` is called for the first of several changes."""
 
-    def __init__(self, nodes_of_host: int = 500) -> None:
+    def __init__(self, nodes_of_host: int = 500, *, woken: Callable[[], None] = lambda: None) -> None:
         self._most_of_host = nodes_of_host
+        self._woken = woken
         self._by_key: dict[str, Incarnation] = {}
         self._known: dict[tuple[str, Address, str], Incarnation] = {}
         self._live: dict[str, Incarnation] = {}
@@ -216,12 +179,15 @@ class Registry:
 
     def mark(self, change: Change) -> None:
         """Note a change for `take_changes`."""
+        if not self._changed:
+            self._woken()
         self._changed[change] = None
 
     def take_changes(self) -> list[Change]:
         """Return what has changed since the last call: first the nodes, then the rest in order."""
         changed, self._changed = self._changed, {}
-        return sorted(changed, key=lambda change: not isinstance(change, Incarnation))
+        nodes = [change for change in changed if isinstance(change, Incarnation)]
+        return [*nodes, *(change for change in changed if not isinstance(change, Incarnation))]
 
     # --- looking ---
 
@@ -342,13 +308,12 @@ class Registry:
 
     # --- changing ---
 
-    def add(self, incarnation: Incarnation) -> list[Durable]:
+    def add(self, incarnation: Incarnation) -> None:
         self.version += 1
         self._by_key[incarnation.key] = incarnation
         self._known[incarnation.name, incarnation.host, incarnation.api_text] = incarnation
         self._nodes_of[incarnation.host] += 1
         self.mark(incarnation)
-        return [SaveNode(incarnation)]
 
     def restore(self, incarnation: Incarnation) -> None:
         self.version += 1
@@ -364,11 +329,10 @@ class Registry:
             for registration in incarnation.registrations.values():
                 self._index(incarnation, registration)
 
-    def register(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> list[Durable]:
-        kept: list[Durable] = []
+    def register(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> None:
         self.version += 1
         if incarnation.life is Life.SHADOW:  # the node was lost while its call was under way
-            kept += self.revive(incarnation, incarnation.changed)
+            self.revive(incarnation, incarnation.changed)
         self._live[incarnation.name] = incarnation
         registration = incarnation.registrations.get((kind, resource))
         if registration is None or registration.detail != detail:
@@ -378,55 +342,46 @@ class Registry:
             registration = NodeRegistration(kind, resource, detail, order)
             incarnation.registrations[kind, resource] = registration
             self.mark(RegistrationKey(incarnation, kind, resource))
-            kept.append(SaveRegistration(incarnation.key, registration))
         self._index(incarnation, registration)
-        return kept + self.unshelve(incarnation, kind, resource)
+        self.unshelve(incarnation, kind, resource)
 
-    def shelve(self, incarnation: Incarnation, registration: NodeRegistration) -> list[Durable]:
+    def shelve(self, incarnation: Incarnation, registration: NodeRegistration) -> None:
         """Store a registration that the policy withdrew, because its node never registers again."""
         incarnation.shelf[registration.kind, registration.resource] = registration
-        self.mark(RegistrationKey(incarnation, registration.kind, registration.resource))
-        return [SaveRegistration(incarnation.key, registration, shelved=True)]
+        self.mark(RegistrationKey(incarnation, registration.kind, registration.resource, shelved=True))
 
-    def unshelve(self, incarnation: Incarnation, kind: Kind, resource: str) -> list[Durable]:
-        if incarnation.shelf.pop((kind, resource), None) is None:
-            return []
-        self.mark(RegistrationKey(incarnation, kind, resource))
-        return [EraseRegistration(incarnation.key, kind, resource, shelved=True)]
+    def unshelve(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
+        if incarnation.shelf.pop((kind, resource), None) is not None:
+            self.mark(RegistrationKey(incarnation, kind, resource, shelved=True))
 
-    def unregister(self, incarnation: Incarnation, kind: Kind, resource: str) -> list[Durable]:
+    def unregister(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
         if incarnation.registrations.pop((kind, resource), None) is None:
-            return []
+            return
         self.version += 1
         self._registrations_of[incarnation.host] -= 1
         self._unindex(incarnation, kind, resource)
         self.mark(RegistrationKey(incarnation, kind, resource))
-        return [EraseRegistration(incarnation.key, kind, resource)]
 
-    def replace(self, incarnation: Incarnation, when: float) -> list[Durable]:
+    def replace(self, incarnation: Incarnation, when: float) -> None:
         """Remove the registrations of an incarnation whose name another incarnation took."""
-        kept = [
-            kept
-            for kind, resource in list(incarnation.registrations)
-            for kept in self.unregister(incarnation, kind, resource)
-        ]
-        return kept + self._retire(incarnation, Life.REPLACED, when)
+        for kind, resource in list(incarnation.registrations):
+            self.unregister(incarnation, kind, resource)
+        self._retire(incarnation, Life.REPLACED, when)
 
-    def overshadow(self, incarnation: Incarnation, when: float) -> list[Durable]:
+    def overshadow(self, incarnation: Incarnation, when: float) -> None:
         for kind, resource in incarnation.registrations:
             self._unindex(incarnation, kind, resource)
-        return self._retire(incarnation, Life.SHADOW, when)
+        self._retire(incarnation, Life.SHADOW, when)
 
-    def revive(self, incarnation: Incarnation, when: float) -> list[Durable]:
+    def revive(self, incarnation: Incarnation, when: float) -> None:
         self.version += 1
         incarnation.life, incarnation.changed = Life.LIVE, when
         self._live[incarnation.name] = incarnation
         for registration in incarnation.registrations.values():
             self._index(incarnation, registration)
         self.mark(incarnation)
-        return [SaveNode(incarnation)]
 
-    def forget(self, incarnation: Incarnation) -> list[Durable]:
+    def forget(self, incarnation: Incarnation) -> None:
         self.version += 1
         for kind, resource in incarnation.registrations:
             self._unindex(incarnation, kind, resource)
@@ -440,16 +395,13 @@ class Registry:
             del self._known[identity]
         incarnation.life = Life.FORGOTTEN
         self.mark(incarnation)
-        return [EraseNode(incarnation.key)]
 
-    def _retire(self, incarnation: Incarnation, life: Life, when: float) -> list[Durable]:
+    def _retire(self, incarnation: Incarnation, life: Life, when: float) -> None:
         self.version += 1
         incarnation.life, incarnation.changed = life, when
-        incarnation.told_lists.clear()
         if self._live.get(incarnation.name) is incarnation:
             del self._live[incarnation.name]
         self.mark(incarnation)
-        return [SaveNode(incarnation)]
 
     def _index(self, incarnation: Incarnation, registration: NodeRegistration) -> None:
         holders = self._topics.setdefault((registration.kind, registration.resource), {})

@@ -4,12 +4,11 @@ Registrations that are no longer allowed are withdrawn and stored. If a later po
 rollback), they are registered again, because a ROS 1 node never registers twice.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 
-from appliance.master.graph.effects import Effect, Effects, UsePorts, WriteRecord
 from appliance.master.graph.grants import Grants
-from appliance.master.graph.graph import RosGraph, revocation
+from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.own_node import OWN, rosout_may_have
 from appliance.master.graph.registry import Incarnation, Kind, Life, NodeRegistration, Registry
 from appliance.policy.live_rights import LiveRight, live_by, may_keep
@@ -48,18 +47,17 @@ class Revocation:
             *(self._granted(row) for row in self.grants.all() if not self._is_own(row)),
         ]
 
-    def policy_changed(self, now: Policy) -> Effects:
-        """Return all effects of a new policy, which is already in force."""
-        return [UsePorts(now.ports), *self.redecide()]
+    def redecide(self) -> int:
+        """Revoke rights that the policy in force no longer allows, and restore registrations that it grants again.
 
-    def redecide(self) -> Effects:
-        """Revoke rights that the policy in force no longer allows, and restore registrations that it grants again."""
-        effects = self._redecide(self._registrations(), self.grants.all())
+        Return the number of revoked rights.
+        """
+        count = self._redecide(self._registrations(), self.grants.all())
         for incarnation in self.registry.live():
-            effects += self.returned(incarnation)
-        return effects
+            self.returned(incarnation)
+        return count
 
-    def redecide_for(self, host: Address, caller_id: str) -> Effects:
+    def redecide_for(self, host: Address, caller_id: str) -> int:
         """Revoke denied rights of a caller, if its call was decided before a policy change and carried out after it."""
         return self._redecide(
             [pair for pair in self._registrations() if (pair[0].host, pair[0].name) == (host, caller_id)],
@@ -68,41 +66,42 @@ class Revocation:
 
     def _redecide(
         self, registrations: list[tuple[Incarnation, NodeRegistration]], grants: list[PermissionRow]
-    ) -> Effects:
-        effects: Effects = []
+    ) -> int:
+        count = 0
         for incarnation, registration in registrations:
             decision = self._decide(incarnation, registration.kind, registration.resource)
             if not decision.allowed:
                 call = "" if incarnation.own else CALLS[registration.kind][0]
-                effects += self.graph.revoked(incarnation, registration, decision, call)
+                self.graph.revoked(incarnation, registration, decision, call)
+                count += 1
         for row in grants:
             decision = self._decide_grant(row)
             if not decision.allowed:
-                effects += self._revoke(row, decision, self._granted(row).call)
-        return effects
+                self._revoke(row, decision, self._granted(row).call)
+                count += 1
+        return count
 
-    def expel(self, host: Address, reason: str) -> Effects:
-        """Revoke all registrations and grants of a host, whatever the policy says."""
-        effects: Effects = []
-        decision = Decision(False, None, reason)
+    def expel(self, host: Address, reason: str) -> int:
+        """Revoke all registrations and grants of a host, whatever the policy says. Return their number."""
+        count, decision = 0, Decision(False, None, reason)
         for incarnation, registration in self._registrations():
             if incarnation.host == host and not incarnation.own:
-                effects += self.graph.revoked(incarnation, registration, decision, "")
+                self.graph.revoked(incarnation, registration, decision, "")
+                count += 1
         for row in self.grants.all():
             if row.host == str(host):
-                effects += self._revoke(row, decision, "")
-        return effects
+                self._revoke(row, decision, "")
+                count += 1
+        return count
 
-    def returned(self, incarnation: Incarnation) -> Effects:
+    def returned(self, incarnation: Incarnation) -> None:
         """Restore withdrawn registrations that are now granted, because a node never registers twice."""
         holder = self.registry.holder(incarnation.name)
         if holder is not None and holder is not incarnation:
-            return []
-        effects: Effects = []
+            return
         for registration in sorted(incarnation.shelf.values(), key=lambda registration: registration.order):
             if self.may_have(incarnation, registration.kind, registration.resource):
-                effects += self.graph.granted_again(incarnation, registration)
-        return effects
+                self.graph.granted_again(incarnation, registration)
 
     def _registrations(self) -> list[tuple[Incarnation, NodeRegistration]]:
         pairs = [
@@ -113,9 +112,9 @@ class Revocation:
         ]
         return sorted(pairs, key=lambda pair: pair[1].order)
 
-    def _revoke(self, row: PermissionRow, decision: Decision, call: str) -> Effects:
-        record = revocation(decision, row.host, row.caller_id, row.kind, row.resource, call=call)
-        return [*self.grants.take(row), record]
+    def _revoke(self, row: PermissionRow, decision: Decision, call: str) -> None:
+        self.grants.take(row)
+        self.graph.record_revocation(decision, row.host, row.caller_id, row.kind, row.resource, call=call)
 
     def may_have(self, incarnation: Incarnation, kind: Kind, resource: str) -> bool:
         return self._decide(incarnation, kind, resource).allowed
@@ -141,7 +140,3 @@ class Revocation:
     def _granted(self, row: PermissionRow) -> LiveRight:
         call = "requestTopic" if row.kind == TOPIC else "lookupService"
         return LiveRight(address_of(row.host), row.caller_id, call, row.resource)
-
-
-def revoked(effects: Iterable[Effect]) -> int:
-    return sum(isinstance(effect, WriteRecord) and effect.event == "revoked" for effect in effects)

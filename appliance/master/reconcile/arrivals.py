@@ -8,6 +8,7 @@ may name another one. multimaster_fkie registers the nodes of other machines, wh
 node whose URI names another host must have its port open, as every node has before it registers.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.base import clock
@@ -16,7 +17,6 @@ from appliance.master.endpoints.node_ports import AdvertisedAddresses, NodePorts
 from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Incarnation, Life, Registry, new_key
-from appliance.master.reconcile.enactor import Enactor
 from appliance.master.reconcile.liveness import Liveness
 from appliance.policy.model import Address
 
@@ -29,11 +29,11 @@ class NodeElsewhereError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Arrivals:
-    """Find or make the incarnations of callers."""
+    """Find or make the incarnations of callers. `flush` carries out the changes of the registry."""
 
     registry: Registry
     graph: RosGraph
-    enactor: Enactor
+    flush: Callable[[], None]
     liveness: Liveness
     places: NodePorts
     faces: ProxyEndpoints
@@ -60,14 +60,14 @@ class Arrivals:
                 self.liveness.revive(incarnation)  # before a check has found that the node is back
                 return incarnation
             # Another incarnation took the name in the meantime, so this node starts as a new incarnation.
-            self.enactor.carry_out(self.graph.forgotten(incarnation))
+            self.graph.forgotten(incarnation)
         incarnation = self._make(caller, api)
         try:
             with EvictionGuard(incarnation):
                 await self._check_place(caller, incarnation)
                 await self.faces.open(incarnation)
         except (NoPortError, NodeElsewhereError):
-            self.enactor.carry_out(self.graph.forgotten(incarnation))
+            self.graph.forgotten(incarnation)
             raise
         return incarnation
 
@@ -85,7 +85,7 @@ class Arrivals:
     def _make(self, caller: Caller, api: ApiUri) -> Incarnation:
         identity = (caller.caller_id, caller.peer.host, api.text)
         if not caller.own and (evicted := self.registry.room_for(*identity)) is not None:
-            self.enactor.carry_out(self.graph.forgotten(evicted))
+            self.graph.forgotten(evicted)
         outer_port, relay_port, *more = self._open_ports(caller.peer.host)
         incarnation = Incarnation(
             key=new_key(),
@@ -101,7 +101,7 @@ class Arrivals:
             changed=clock.now(),
             touched=clock.now(),
         )
-        self.enactor.carry_out(self.registry.add(incarnation))
+        self.registry.add(incarnation)
         return incarnation
 
     def _open_ports(self, host: Address) -> tuple[int, ...]:
@@ -113,7 +113,8 @@ class Arrivals:
                 evicted = self.registry.evictable_for(host)
                 if evicted is None:
                     raise
-                self.enactor.carry_out(self.graph.forgotten(evicted))
+                self.graph.forgotten(evicted)
+                self.flush()  # closes its ports
 
 
 class EvictionGuard:

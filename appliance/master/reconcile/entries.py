@@ -1,36 +1,46 @@
-"""Forward the changes of the registry to the hidden ROS master, in order, behind the answers to nodes.
+"""State the registrations to the hidden ROS master, behind the answers to nodes.
 
 A registering call is answered from the registry, once the change is stored. The ROS master gets the change afterwards,
 with the node's inner URI; services get a stand-in URI. Clients never get these URIs. Invariants:
 
 1. No answer to a node depends on a forwarded change. All reads of the graph are answered from the registry.
-2. The ROS master gets the changes in the order of the registry. One request is under way at a time.
-3. A round of the reconcile loop compares the ROS master with the registry. The changes that waited then are part of the
-   registry, so they are dropped (`start_round`). Later changes follow after the round.
-4. A change that fails is not repeated. It shuts the door, and the next round removes the difference. The same holds
-   after the death of control: its registry is stored.
-5. At most `MASTER_CHANGES` wait (`quotas.table`). Beyond that, registering calls of the host wait (`room`). Changes
-   that no node called for, such as a revocation, do not wait.
+2. `_stated` has the registrations that the ROS master has, or will have after the request under way. There is one
+   request at a time.
+3. `_differing` has the keys whose wanted and stated registrations differ, in the order in which they changed. A
+   registration that ends before it was stated is never sent. So the number of keys has the bounds of the registry, and
+   no call of a node waits.
+4. A request that fails is not repeated. It shuts the door, and the next round of the reconcile loop reads what the ROS
+   master has (`adopt`). The same holds after the death of control: its registry is stored.
+
+Subscriptions to parameters are not stated: the ROS master does not list them, and its updates are ignored.
 """
 
 import asyncio
-from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import NamedTuple
 
 import structlog
 
-from appliance.master.graph.registry import Incarnation, Kind, NodeRegistration, Registry
+from appliance.master.graph.registry import Change, Incarnation, Kind, RegistrationKey, Registry
 from appliance.master.graph.revocation import CALLS
 from appliance.master.rosmaster import LARGEST_MULTICALL, RosMaster, Wanted
-from appliance.policy.model import Address
-from appliance.quotas.table import MASTER_CHANGES
 from appliance.rpc.xmlrpc_client import CallFailedError
 from roswire.uris import service_uri
 
 NAME = "/master"
 _GATHER_SECONDS = 0.1  # gathered changes cost half the processor time
 
+EntryKey = tuple[Kind, str, str]
+"""The kind, the resource, and the name of the node."""
+
 _log = structlog.get_logger()
+
+
+class MasterEntry(NamedTuple):
+    """A registration at the ROS master: the URI of its node, and the type of the topic or the URI of the service."""
+
+    api: str
+    detail: str
 
 
 class MasterRegistrations:
@@ -45,67 +55,73 @@ class MasterRegistrations:
         self._rosmaster = rosmaster
         self._registry = registry
         self._inner_uri = inner_uri
-        self._waiting: deque[tuple[Address, Wanted]] = deque()  # each with the host of its node
-        self._waiting_of: Counter[Address] = Counter()
+        self._stated: dict[EntryKey, MasterEntry] = {}
+        self._differing: dict[EntryKey, None] = {}
         self._sending: asyncio.Task[None] | None = None
-        self._has_room = asyncio.Event()
         self.pid: int | None = None
 
-    def make(self, node: Incarnation, registration: NodeRegistration) -> None:
-        self._forward(node.host, self.call_to_make(node, registration))
-
-    def end(self, node: Incarnation, registration: NodeRegistration) -> None:
-        kind, resource = registration.kind, registration.resource
-        told = [resource, stand_in(node) if kind is Kind.SERVICE else self._inner_uri(node)]
-        if kind is Kind.PARAMETER:  # only this call has the reverse order
-            told.reverse()
-        self._forward(node.host, (CALLS[kind][1], (node.name, *told)))
-
-    async def room(self, host: Address) -> None:
-        """Wait until the queue has room for a change of a host. Raises `CallFailedError` after a long wait."""
-        if not self._is_full(host):
-            return
-        async with self._rosmaster.patience():
-            while self._is_full(host):
-                self._has_room.clear()
-                await self._has_room.wait()
-
-    def start_round(self) -> list[tuple[Incarnation, NodeRegistration]]:
-        """Return the registrations that the ROS master must have, in order; drop the changes that led to them."""
-        self._waiting.clear()
-        self._waiting_of.clear()
-        self._has_room.set()
-        return list(self._registry.in_order())
-
-    def call_to_make(self, node: Incarnation, registration: NodeRegistration) -> Wanted:
-        inner, resource = self._inner_uri(node), registration.resource
-        told = {
-            Kind.PUBLICATION: (resource, registration.detail, inner),
-            Kind.SUBSCRIPTION: (resource, registration.detail, inner),
-            Kind.SERVICE: (resource, stand_in(node), inner),
-            Kind.PARAMETER: (inner, resource),
-        }[registration.kind]
-        return CALLS[registration.kind][0], (node.name, *told)
-
-    def _is_full(self, host: Address) -> bool:
-        bounds = MASTER_CHANGES.bounds
-        return len(self._waiting) >= bounds.whole or self._waiting_of[host] >= bounds.host
-
-    def _forward(self, host: Address, call: Wanted) -> None:
-        self._waiting.append((host, call))
-        self._waiting_of[host] += 1
-        if self._sending is None or self._sending.done():
+    def flush(self, changed: Iterable[Change]) -> None:
+        """Note which of these changes the ROS master must get, and send them soon."""
+        for change in changed:
+            if isinstance(change, Incarnation):
+                for kind, resource in change.registrations:
+                    self._compare((kind, resource, change.name))
+            elif isinstance(change, RegistrationKey):
+                self._compare((change.kind, change.resource, change.node.name))
+        if self._differing and (self._sending is None or self._sending.done()):
             self._sending = asyncio.get_running_loop().create_task(self._send())
 
+    def adopt(self, seen: Mapping[EntryKey, MasterEntry]) -> int:
+        """Take over what the ROS master has. Return the number of registrations that it lacks or has differently."""
+        self._stated = dict(seen)
+        self._differing.clear()
+        for node, registration in self._registry.in_order():
+            self._compare((registration.kind, registration.resource, node.name))
+        missing = len(self._differing)
+        for key in sorted(seen):
+            self._compare(key)
+        return missing
+
+    @property
+    def differing(self) -> int:
+        return len(self._differing)
+
+    def take(self, most: int | None = None) -> list[Wanted]:
+        """Return the calls that state the next differences, in order, and count these as stated."""
+        calls: list[Wanted] = []
+        for key in list(self._differing):
+            if most is not None and len(calls) + 2 > most:
+                break
+            del self._differing[key]
+            wanted, stated = self.wanted(key), self._stated.pop(key, None)
+            calls += _calls(key, stated, wanted)
+            if wanted is not None:
+                self._stated[key] = wanted
+        return calls
+
+    def wanted(self, key: EntryKey) -> MasterEntry | None:
+        kind, resource, name = key
+        node = self._registry.holder(name)
+        registration = None if node is None else node.registrations.get((kind, resource))
+        if node is None or registration is None or kind is Kind.PARAMETER:
+            return None
+        service = kind is Kind.SERVICE
+        return MasterEntry(self._inner_uri(node), stand_in(node) if service else registration.detail)
+
+    def _compare(self, key: EntryKey) -> None:
+        if self.wanted(key) == self._stated.get(key):
+            self._differing.pop(key, None)
+        else:
+            self._differing[key] = None
+
     async def _send(self) -> None:
-        while self._waiting:
-            if len(self._waiting) < LARGEST_MULTICALL:
+        while self._differing:
+            if len(self._differing) < LARGEST_MULTICALL:
                 await asyncio.sleep(_GATHER_SECONDS)
             await self._rosmaster.opened()
-            taken = [self._waiting.popleft() for _ in range(min(len(self._waiting), LARGEST_MULTICALL))]
-            self._waiting_of -= Counter(host for host, _call in taken)  # removes hosts without changes
-            self._has_room.set()
-            part = [call for _host, call in taken]
+            part = self.take(LARGEST_MULTICALL)
+            if not part:  # the changes have cancelled one another, or a round has sent them
+                continue
             try:
                 answers = await self._rosmaster.call_once(part)
             except CallFailedError as error:
@@ -117,6 +133,15 @@ class MasterRegistrations:
                         "the ROS master rejected a change", call=method, of=params[:2], answer=str(answer)
                     )
                     self._rosmaster.doubtful.set()
+
+
+def _calls(key: EntryKey, stated: MasterEntry | None, wanted: MasterEntry | None) -> Iterator[Wanted]:
+    kind, resource, name = key
+    register, unregister = CALLS[kind]
+    if stated is not None and (wanted is None or wanted.api != stated.api):
+        yield unregister, (name, resource, stated.detail if kind is Kind.SERVICE else stated.api)
+    if wanted is not None:
+        yield register, (name, resource, wanted.detail, wanted.api)
 
 
 def stand_in(node: Incarnation) -> str:

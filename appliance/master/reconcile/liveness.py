@@ -17,13 +17,13 @@ import structlog
 
 from appliance.base import clock
 from appliance.configuration.settings import LivenessSection
+from appliance.master.endpoints.delivery import NodeCall
 from appliance.master.endpoints.node_api import NodeApiClient
 from appliance.master.endpoints.relay_control import RELAY_NAME
-from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.master.graph.revocation import Revocation
-from appliance.master.reconcile.enactor import Enactor
+from appliance.master.reconcile.subscribers import Subscribers
 from appliance.policy.model import Address
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import PROBES
@@ -139,7 +139,7 @@ class Liveness:
     registry: Registry
     graph: RosGraph
     revocation: Revocation
-    enactor: Enactor
+    subscribers: Subscribers
     watchlist: Watchlist
     _: KW_ONLY
     nodes: NodeApiClient
@@ -224,8 +224,8 @@ class Liveness:
         self._bring_back(incarnation)
 
     def _bring_back(self, incarnation: Incarnation) -> None:
-        self.enactor.carry_out(self.graph.returned(incarnation))
-        self.enactor.carry_out(self.revocation.returned(incarnation))
+        self.graph.returned(incarnation)
+        self.revocation.returned(incarnation)
         self.watchlist.returned(incarnation)
         # Its publishers may return with it, so the lists follow a little later.
         asyncio.get_running_loop().call_later(RECENTLY_LOST_SECONDS, self.look_at, incarnation)
@@ -258,11 +258,11 @@ class Liveness:
         missed = self.watchlist.to_make_up(incarnation)
         if missed is None:
             return
-        absent = {topic: publishers for _, topic, publishers in self.graph.absent([incarnation])}
+        absent = {topic: publishers for _, topic, publishers in self.subscribers.absent([incarnation])}
         for topic in sorted(missed.topics):
-            self.enactor.carry_out(self.graph.renew(incarnation, topic, absent.get(topic, ())))
+            self.subscribers.renew(incarnation, topic, absent.get(topic, ()))
         if missed.parameters:
-            self.enactor.carry_out(self.graph.tell_parameters(incarnation))
+            self.subscribers.tell_parameters(incarnation)
 
     async def _ask(self, incarnation: Incarnation) -> tuple[bool | None, str]:
         """Return whether a node answers (None: the node refuses connections), and the reason if it does not."""
@@ -303,7 +303,7 @@ class Liveness:
             if clock.now() - incarnation.touched > _IDLE_SECONDS:
                 self._forget(incarnation)
             return
-        self.enactor.carry_out(self.graph.lost(incarnation, why))
+        self.graph.lost(incarnation, why)
 
     def _look_at_retired(self, incarnation: Incarnation, *, answered: bool, refused: bool) -> None:
         age = clock.now() - incarnation.changed
@@ -316,4 +316,4 @@ class Liveness:
             self._bring_back(incarnation)
 
     def _forget(self, incarnation: Incarnation) -> None:
-        self.enactor.carry_out(self.graph.forgotten(incarnation))
+        self.graph.forgotten(incarnation)

@@ -17,7 +17,6 @@ from appliance.master.caller import Answer, ApiUri, Caller
 from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import PUBLISHER_PATH, Incarnation, Kind, Registry
-from appliance.master.reconcile.enactor import Enactor
 from appliance.rpc.server import Peer
 from appliance.rpc.xmlrpc_client import CallFailedError
 from roswire.uris import node_uri, parse_node_uri, parse_service_uri, service_uri
@@ -37,7 +36,6 @@ class OwnPublisher:
 
     registry: Registry
     graph: RosGraph
-    enactor: Enactor
     _: KW_ONLY
     name: str
     inner_port: int
@@ -77,7 +75,7 @@ class OwnPublisher:
         for incarnation in self._mine():
             for kind, resource in list(incarnation.registrations):
                 if incarnation.api_text != self._api.text or resource not in wanted.get(kind, ()):
-                    self.enactor.carry_out(self.graph.unregistered(incarnation, kind, resource))
+                    self.graph.unregistered(incarnation, kind, resource)
         for topic, type_name in published.items():
             answer = await self.register(self._caller(), topic, type_name, self._api)
             if answer[0] != 1:

@@ -2,10 +2,11 @@
 
 The same loop handles all failures: the ROS master died, control died, a call was interrupted.
 
-- A new ROS master gets everything again, in the original order. Calls wait at the door (`rosmaster.py`) until then.
+- A new ROS master has nothing, so it gets everything again, in the original order. Calls wait at the door
+  (`rosmaster.py`) until then.
 - A registration that is wanted but not seen is made again: it was answered, but not forwarded (`entries.py`).
-- A registration that is seen but not wanted is ended: its end was answered, but not forwarded. It is never adopted,
-  because the registry is stored before the ROS master gets a change.
+- A registration that is seen but not wanted is ended: its end was answered, but not forwarded. It is never added to the
+  registry, because the registry is stored before the ROS master gets a change.
 - After a rebuild, and after a relay starts, every subscriber gets each of its lists of publishers once. After a restart
   of control, every node gets the values of the parameters that it subscribed to.
 """
@@ -17,13 +18,10 @@ from typing import cast
 
 import structlog
 
-from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
-from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Kind, Registry
-from appliance.master.graph.revocation import CALLS
 from appliance.master.parameter_mirror import ParameterMirror
-from appliance.master.reconcile.enactor import Enactor
-from appliance.master.reconcile.entries import NAME, MasterRegistrations
+from appliance.master.reconcile.entries import NAME, EntryKey, MasterEntry, MasterRegistrations
+from appliance.master.reconcile.subscribers import Subscribers
 from appliance.master.rosmaster import RosMaster
 from appliance.rpc.xmlrpc_client import CallFailedError
 from appliance.telemetry.audit_trail import AuditTrail
@@ -32,7 +30,6 @@ from roswire.parameter_tree import Tree
 _log = structlog.get_logger()
 _RETRY_SECONDS = 0.1
 _ROUND_SECONDS = 30.0
-Seen = set[tuple[Kind, str, str]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,9 +39,7 @@ class Reconciler:
     rosmaster: RosMaster
     entries: MasterRegistrations
     registry: Registry
-    faces: ProxyEndpoints
-    graph: RosGraph
-    enactor: Enactor
+    subscribers: Subscribers
     parameters: ParameterMirror
     trail: AuditTrail
     own_parameters: Callable[[], Tree]
@@ -86,10 +81,9 @@ class Reconciler:
                 types = (await self.rosmaster.call_now("getTopicTypes", NAME))[2]
                 self.registry.adopt_types(cast(list[tuple[str, str]], types))
                 await self._compare()
-                for (
-                    node
-                ) in self.registry.live():  # an earlier control process may not have sent the last values
-                    self.enactor.carry_out(self.graph.tell_parameters(node))
+                # An earlier control process may not have sent the last values.
+                for node in self.registry.live():
+                    self.subscribers.tell_parameters(node)
             else:
                 await self._rebuild()
             self.entries.pid = cast(int, pid)
@@ -102,9 +96,9 @@ class Reconciler:
         await self.rosmaster.call_now("setParam", NAME, "/", tree)
         self.parameters.replace(tree)
         self.registry.forget_types()
-        wanted = self.entries.start_round()
-        made = len(await self.rosmaster.all_now([self.entries.call_to_make(*pair) for pair in wanted]))
-        self.enactor.carry_out(self.graph.tell_everybody())
+        made = self.entries.adopt({})
+        await self.rosmaster.all_now(self.entries.take())
+        self.subscribers.remind_all()
         if made:
             text = (
                 f"{made} registrations and {len(tree)} parameter namespaces were restored in a new ROS master"
@@ -114,39 +108,18 @@ class Reconciler:
     # --- the same ROS master ---
 
     async def _compare(self) -> None:
-        seen = await self._seen()
-        uris = await self._addresses("lookupNode", {name for _kind, _resource, name in seen})
-        wanted = {
-            (registration.kind, registration.resource, incarnation.name): (incarnation, registration)
-            for incarnation, registration in self.entries.start_round()
-            if registration.kind
-            is not Kind.PARAMETER  # the ROS master does not list subscribers to parameters
-        }
-        missing = [
-            self.entries.call_to_make(*pair)
-            for key, pair in wanted.items()
-            if key not in seen or uris.get(pair[0].name) != self.faces.inner_uri(pair[0])
-        ]
-        await self.rosmaster.all_now(missing)
-        extra = sorted(entry for entry in seen if entry not in wanted)
-        offered = await self._addresses(
-            "lookupService", {resource for kind, resource, _name in extra if kind is Kind.SERVICE}
-        )
-        await self.rosmaster.all_now(
-            [
-                (CALLS[kind][1], (name, resource, uri))
-                for kind, resource, name in extra
-                if (uri := offered.get(resource) if kind is Kind.SERVICE else uris.get(name)) is not None
-            ]
-        )
-        if missing or extra:
-            text = f"{len(missing)} registrations were made again, {len(extra)} removed"
-            self.trail.happened("reconciled", text, made=len(missing), settled=len(extra))
+        made = self.entries.adopt(await self._seen())
+        ended = self.entries.differing - made
+        await self.rosmaster.all_now(self.entries.take())
+        if made or ended:
+            text = f"{made} registrations were made again, {ended} removed"
+            self.trail.happened("reconciled", text, made=made, settled=ended)
 
-    async def _seen(self) -> Seen:
+    async def _seen(self) -> dict[EntryKey, MasterEntry]:
+        """Return the registrations of the ROS master, without those whose URI it no longer knows."""
         state = (await self.rosmaster.call_now("getSystemState", NAME))[2]
         publishers, subscribers, services = cast(list[list[tuple[str, list[str]]]], state)
-        return {
+        keys = [
             (kind, resource, name)
             for kind, rows in (
                 (Kind.PUBLICATION, publishers),
@@ -155,7 +128,23 @@ class Reconciler:
             )
             for resource, holders in rows
             for name in holders
+        ]
+        uris = await self._addresses("lookupNode", {name for _kind, _resource, name in keys})
+        offered = await self._addresses(
+            "lookupService", {resource for kind, resource, _name in keys if kind is Kind.SERVICE}
+        )
+        return {
+            key: self._entry(key, uris[key[2]], offered.get(key[1], ""))
+            for key in keys
+            if key[2] in uris and (key[0] is not Kind.SERVICE or key[1] in offered)
         }
+
+    def _entry(self, key: EntryKey, api: str, service: str) -> MasterEntry:
+        """Return a registration of the ROS master. It does not tell the type, which counts as the wanted type."""
+        wanted = self.entries.wanted(key)
+        return MasterEntry(
+            api, service if key[0] is Kind.SERVICE else wanted.detail if wanted is not None else ""
+        )
 
     async def _addresses(self, method: str, names: set[str]) -> dict[str, str]:
         asked = sorted(names)

@@ -19,9 +19,8 @@ from dataclasses import dataclass
 from appliance.base import clock
 from appliance.channel.messages import Message
 from appliance.master.endpoints.relay_control import RelayControl
-from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Registry
-from appliance.master.reconcile.enactor import Enactor
+from appliance.master.reconcile.subscribers import Subscribers
 from appliance.specifications.allocation import TOPIC, Move, Resource
 
 _GENTLE = 2  # the reminders before a subscriber must drop the publisher and connect again
@@ -41,10 +40,9 @@ class _Absence:
 class Reminders:
     """Check whether all subscribers are connected: always, and at shorter intervals after a relay was attached."""
 
-    def __init__(self, registry: Registry, graph: RosGraph, enactor: Enactor) -> None:
+    def __init__(self, registry: Registry, subscribers: Subscribers) -> None:
         self._registry = registry
-        self._graph = graph
-        self._enactor = enactor
+        self._subscribers = subscribers
         self.round: asyncio.Task[None] | None = None
         self._absences: dict[tuple[str, str], _Absence] = {}
 
@@ -55,14 +53,14 @@ class Reminders:
 
     def remind_lasting(self) -> None:
         before, self._absences, now = self._absences, {}, clock.now()
-        for subscriber, topic, publishers in list(self._graph.absent(self._registry.live())):
+        for subscriber, topic, publishers in list(self._subscribers.absent(self._registry.live())):
             absence = before.get((subscriber.key, topic)) or _Absence(
                 now + _LASTING_SECONDS, _LASTING_SECONDS
             )
             if now >= absence.due:
                 pause = min(2 * absence.pause, _LONGEST_SECONDS)
                 absence = _Absence(now + pause, pause)
-                self._enactor.carry_out(self._graph.renew(subscriber, topic, publishers))
+                self._subscribers.renew(subscriber, topic, publishers)
             self._absences[subscriber.key, topic] = absence
 
     def begin(self) -> None:
@@ -76,13 +74,11 @@ class Reminders:
     async def _remind(self) -> None:
         for number, pause in enumerate(_PAUSES):
             await asyncio.sleep(pause)
-            absent = list(self._graph.absent(self._registry.live()))
+            absent = list(self._subscribers.absent(self._registry.live()))
             if not absent:
                 return
             for subscriber, topic, publishers in absent:
-                self._enactor.carry_out(
-                    self._graph.renew(subscriber, topic, publishers if number >= _GENTLE else ())
-                )
+                self._subscribers.renew(subscriber, topic, publishers if number >= _GENTLE else ())
 
 
 class RelayMoves:
@@ -92,10 +88,9 @@ class RelayMoves:
     until its connections are made again.
     """
 
-    def __init__(self, relay: RelayControl, graph: RosGraph, enactor: Enactor, reminders: Reminders) -> None:
+    def __init__(self, relay: RelayControl, subscribers: Subscribers, reminders: Reminders) -> None:
         self._relay = relay
-        self._graph = graph
-        self._enactor = enactor
+        self._subscribers = subscribers
         self._reminders = reminders
 
     def send(self, message: Message, relay: int) -> bool:
@@ -115,6 +110,6 @@ class RelayMoves:
         self._relay.place_moved(moves)
         for move in moves:
             if move.kind == TOPIC:
-                self._enactor.carry_out(self._graph.renew_all(move.name))
+                self._subscribers.renew_all(move.name)
         if moves:
             self._reminders.begin()

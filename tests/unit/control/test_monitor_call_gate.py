@@ -39,7 +39,7 @@ class Control:
             registry.register(node, Kind.SERVICE, "/arm", "4001")
         compiled, own = compile_policy(policy, file="p.ini"), cast(Any, self)
         self.gate = MonitorCallGate(
-            registry, own, own, lambda: compiled, own, own, lambda *_: 4711, "/rosrv", host
+            registry, own, lambda: None, lambda: compiled, own, own, lambda *_: 4711, "/rosrv", host
         )
 
     def decided(self, asker: Any, method: str, _category: str, resource: str, decision: Any) -> str:
@@ -52,11 +52,8 @@ class Control:
     def carries_service(self, _service: str) -> bool:
         return self.carries
 
-    def service_granted(self, provider: Incarnation, service: str, host: object, caller_id: str) -> list[str]:
-        return [f"{provider.key} {host} {caller_id} {service}"]
-
-    def carry_out(self, effects: list[str]) -> None:
-        self.granted += effects
+    def service_granted(self, provider: Incarnation, service: str, host: object, caller_id: str) -> None:
+        self.granted.append(f"{provider.key} {host} {caller_id} {service}")
 
     def answer(self) -> MonitorCallAnswered:
         return asyncio.run(self.gate.answer(MonitorCallWanted(7, "/arm")))

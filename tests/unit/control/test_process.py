@@ -10,8 +10,8 @@ from appliance.control.process import _end_others, _restore
 from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
 from appliance.master.graph.grants import Grants
-from appliance.master.graph.registry import Durable, Incarnation, Kind, Registry
-from appliance.master.reconcile.enactor import Enactor, write
+from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.reconcile.sinks import save
 from appliance.store.state_file import StateStore
 from roswire.uris import parse_node_uri
 from tests.support.engines import InlineDatabase
@@ -29,8 +29,8 @@ def fail(reason: str) -> None:
 class Ports(idle_class(ProxyEndpoints)):  # type: ignore[misc]  # it is made
     """Ports that can all be bound again after a restart."""
 
-    async def reopen(self, _incarnation: Incarnation) -> list[Durable]:
-        return []
+    async def reopen(self, _incarnation: Incarnation) -> None:
+        """Act as `ProxyEndpoints`."""
 
 
 async def test_restored_nodes_follow_the_policy_in_force(tmp_path: Path) -> None:
@@ -38,9 +38,9 @@ async def test_restored_nodes_follow_the_policy_in_force(tmp_path: Path) -> None
     before = Registry()
     host = ipaddress.ip_address("10.0.0.5")
     node = Incarnation("key", "/n", host, parse_node_uri(URI), URI, "10.0.0.1", 19001, 19002)
-    kept = before.add(node) + before.register(node, Kind.PUBLICATION, "/secret", "std_msgs/String")
-    for effect in kept:
-        write(effect, store)
+    before.add(node)
+    before.register(node, Kind.PUBLICATION, "/secret", "std_msgs/String")
+    save(before.take_changes(), idle(Grants), store)
     await store.settled()
     registry = Registry()
     decided: list[tuple[object, list[str]]] = []
@@ -53,7 +53,6 @@ async def test_restored_nodes_follow_the_policy_in_force(tmp_path: Path) -> None
     parts = SimpleNamespace(
         core=SimpleNamespace(registry=registry, grants=idle(Grants)),
         endpoints=SimpleNamespace(
-            enactor=idle(Enactor),
             faces=Ports(),
             places=idle(NodePorts),
             enforcement=SimpleNamespace(policy_changed=changed),

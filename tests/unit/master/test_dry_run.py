@@ -100,7 +100,7 @@ async def taken(
             )
             nodes[host, name] = node
             world.registry.add(node)
-        world.enactor.carry_out(world.graph.registered(nodes[host, name], kind, resource, "4001"))
+        world.graph.registered(nodes[host, name], kind, resource, "4001")
     for host, name, kind, thing in grants:
         world.grants.give(PermissionRow("key", kind, thing, host, name))
     before = held(world)

@@ -2,7 +2,8 @@
 
 import ipaddress
 from dataclasses import replace
-from typing import get_args, get_type_hints
+from types import SimpleNamespace
+from typing import Any, cast, get_args, get_type_hints
 
 import msgspec
 import pytest
@@ -13,13 +14,17 @@ from appliance.channel.answers.policy_answers import PolicyKnown, Why
 from appliance.channel.messages.relay_link import Violation
 from appliance.features.policy_tools.denials import DENIALS, asks_policy, is_denial
 from appliance.features.policy_tools.explanations import explained, granted
-from appliance.master.graph.graph import revocation
+from appliance.master.graph.grants import Grants
+from appliance.master.graph.graph import RosGraph
+from appliance.master.graph.registry import Registry
 from appliance.policy.grant import UngrantableError
 from appliance.policy.live_rights import LiveRight, may_keep
+from appliance.policy.model import Decision
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_settings import AT_ONCE
 from appliance.telemetry.audit_trail import rule_reference
 from distribution.audit_events_page import uses
+from tests.support.idle import idle
 
 HOST = "10.0.0.9"
 CLOSED = "[Nodes]\ndefault = 10.0.0.1\n[Publishers]\n/x = 10.0.0.1\n[Parameters]\nread default = 10.0.0.1\n"
@@ -37,6 +42,15 @@ def known(text: str = CLOSED) -> PolicyKnown:
 def denied(event: str, reason: str = "because", **fields: object) -> AuditRecord:
     about = {"host": HOST, "caller_id": "/it", "category": "publish", "resource": "/x", "decision": "deny"}
     return AuditRecord(id="1", time=1, event=event, reason=reason, **(about | fields))  # type: ignore[arg-type]  # fields of it
+
+
+def revoked(decision: Decision, category: str, call: str) -> tuple[str, str, dict[str, Any]]:
+    """Return the event, reason and fields that a revocation records."""
+    made: list[tuple[str, str, dict[str, Any]]] = []
+    trail = SimpleNamespace(happened=lambda event, reason, **fields: made.append((event, reason, fields)))
+    graph = RosGraph(idle(Registry), idle(Grants), cast(Any, trail))
+    graph.record_revocation(decision, HOST, "/it", category, "/x", call=call)
+    return made[0]
 
 
 def why(record: AuditRecord, text: str = CLOSED) -> Why:
@@ -78,9 +92,9 @@ def test_every_denial_names_the_change_that_allows_it(event: str) -> None:
 def test_the_change_lets_a_revoked_grant_be_kept(call: str, category: str, *, namespace: bool) -> None:
     live = LiveRight(ipaddress.ip_address(HOST), "/it", call, "/x", namespace)
     decision = may_keep(compile_policy(CLOSED, file="p.ini"), live)
-    made = revocation(decision, HOST, "/it", category, "/x", call=call)
+    event, reason, fields = revoked(decision, category, call)
     record = denied(
-        made.event, made.reason, category=category, rule=rule_reference(made.rule), detail=dict(made.more)
+        event, reason, category=category, rule=rule_reference(fields["rule"]), detail=fields["more"]
     )
     text = CLOSED
     for _ in range(3):  # a parameter below a namespace may be denied next
@@ -98,7 +112,7 @@ def test_the_change_lets_a_revoked_grant_be_kept(call: str, category: str, *, na
 def test_denials_without_a_policy_are_not_blamed_on_it() -> None:
     live = LiveRight(ipaddress.ip_address(HOST), "/it", "registerPublisher", "/x")
     decision = may_keep(compile_policy(CLOSED, file="p.ini"), live)
-    assert not revocation(decision, HOST, "/it", "publication", "/x", call="").more
+    assert not revoked(decision, "publication", "")[2]["more"]
     found = why(denied("revoked", category="publication"))
     assert (allowing(found), "its recorded reason" in found.refusal) == ([], True)
 

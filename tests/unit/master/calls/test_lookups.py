@@ -28,7 +28,6 @@ class Site:
             "registry": self.registry,
             "mediation": SimpleNamespace(carries_service=lambda _name: True, stand_ins=True),
             "graph": self,
-            "enactor": SimpleNamespace(carry_out=lambda _effects: None),
             "relay": SimpleNamespace(port=lambda one, _kind, _name: one.relay_port),
             "addresses": SimpleNamespace(address_for=lambda _peer: "10.0.0.1"),
         }

@@ -49,7 +49,7 @@ async def test_each_connection_is_read_once() -> None:
     relay = SimpleNamespace(carried=carried)
     mediation = SimpleNamespace(carries_topic=lambda _name: True, carries_service=lambda _name: True)
     other: Any = None
-    parts = (registry, other, other, relay, mediation, other, other, other, other)
+    parts = (registry, other, relay, mediation, other, other, other, other)
     calls = cast(Any, NodeCalls)(*parts, port=11311)
     answer: Any = await calls.get_bus_stats(cast(Caller, SimpleNamespace(target=node)))
     sent, received, _services = answer[2]

@@ -112,12 +112,9 @@ class OrderedServer:
         self.requests: list[list[str]] = []
         self.parameters = there
         me = cast(Any, self)
-        self.calls = ParameterCalls(me, there, me, me, cast(Any, None), 1 << 20)
+        self.calls = ParameterCalls(me, there, me, cast(Any, None), 1 << 20)
         self.broken: Exception | None = None
         self.told: list[tuple[str, str | None]] = []
-
-    def carry_out(self, _effects: object) -> None:
-        """Act as `Enactor`."""
 
     def parameter_set(self, key: str, _value: Any, caller_id: str) -> None:
         self.told.append((key, caller_id))
@@ -263,7 +260,7 @@ async def test_the_loop_runs_while_thousands_of_names_are_decided() -> None:
     none: Any = None
     master = SimpleNamespace(reachable=True)
     rights = SimpleNamespace(to_find=lambda _caller, name: SimpleNamespace(allowed="hidden" not in name))
-    calls = ParameterCalls(cast(Any, master), there, none, none, cast(Any, rights), 1 << 30)
+    calls = ParameterCalls(cast(Any, master), there, none, cast(Any, rights), 1 << 30)
     turns = 0
 
     async def others() -> None:

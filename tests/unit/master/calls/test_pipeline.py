@@ -13,7 +13,7 @@ from appliance.master.calls import pipeline
 from appliance.master.calls.parameter_rights import ParameterRights
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.reconcile.enactor import Enactor
+from appliance.master.reconcile.subscribers import Subscribers
 from appliance.policy.model import Decision
 from appliance.policy.policy_compiler import compile_policy
 from appliance.rpc.server import HttpRequest, Peer
@@ -84,7 +84,8 @@ class Site:
             policy=lambda: self.policy,
             registry=self.registry,
             graph=idle(RosGraph),
-            enactor=idle(Enactor),
+            subscribers=idle(Subscribers),
+            flush=lambda: None,
             rosmaster=self,
             mirror=self.parameters,
             trail=self.trail,

@@ -4,8 +4,7 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.master.endpoints.delivery import Delivery
-from appliance.master.graph.effects import NodeCall
+from appliance.master.endpoints.delivery import Delivery, NodeCall
 from appliance.master.graph.registry import Incarnation
 from appliance.quotas.pool import Bounds, QuotaClass
 from appliance.quotas.table import NODE_CALLS_UNDER_WAY

@@ -3,8 +3,7 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.master.endpoints.delivery import Delivery
-from appliance.master.graph.effects import NodeCall
+from appliance.master.endpoints.delivery import Delivery, NodeCall
 from appliance.master.graph.registry import Incarnation, Kind, Life
 from appliance.quotas.pool import QuotaClass
 from roswire.xmlrpc import Value

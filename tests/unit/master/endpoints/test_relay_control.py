@@ -10,7 +10,6 @@ import pytest
 
 from appliance.channel import messages
 from appliance.channel.channel import Channel
-from appliance.master.endpoints.delivery import Delivery
 from appliance.master.endpoints.node_api import NodeApiClient
 from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.relay_control import RelayControl
@@ -18,14 +17,12 @@ from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.reconcile.enactor import Enactor
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import Bounds
 from appliance.quotas.table import GRANTS
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, AllocationPlan, Move
-from appliance.store.state_file import PermissionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 from roswire.uris import parse_node_uri
 from tests.support.stated import stated
@@ -40,19 +37,6 @@ class Ports:
 
     def socket(self, port: int) -> Any:
         return SimpleNamespace(fileno=lambda: port)
-
-
-class NoPermissions:
-    """A store that keeps no grants."""
-
-    def permissions(self) -> list[PermissionRow]:
-        return []
-
-    def save_permission(self, row: PermissionRow) -> None:
-        """Act as `StateStore`."""
-
-    def remove_permission(self, row: PermissionRow) -> None:
-        """Act as `StateStore`."""
 
 
 class NoDelivery:
@@ -117,23 +101,7 @@ class World:
             own_header=None,
             own_call=cast(Any, None),
         )
-        self.graph = RosGraph(
-            self.registry,
-            self.grants,
-            cast(Any, _UNUSED),
-            dict,
-            may_read_value=lambda _node, _key, _value: True,
-        )
-        self.enactor = Enactor(
-            self.graph,
-            cast(Any, _UNUSED),
-            store=cast(StateStore, NoPermissions()),
-            trail=cast(AuditTrail, self),
-            delivery=cast(Delivery, NoDelivery()),
-            relay=self.relay,
-            faces=cast(Any, _UNUSED),
-            places=cast(NodePorts, self.ports),
-        )
+        self.graph = RosGraph(self.registry, self.grants, cast(AuditTrail, self))
         uri = "http://10.0.0.5:4000/"
         self.node = Incarnation(
             "key", "/node", HOST, parse_node_uri(uri), uri, "10.0.0.1", 1, 2, more_relay_ports=(3,)
@@ -148,7 +116,7 @@ class World:
             (Kind.SERVICE, "/serve", "4001"),
         ):
             self.registry.register(self.node, kind, name, detail)
-        self.enactor.carry_out([])
+        self.flush()
 
     def statement(self, _relay: int) -> messages.SpecificationsStated:
         return stated(1, [], {}, {}, restarted=False)
@@ -161,7 +129,11 @@ class World:
         return ""
 
     def grant_topic(self, topic: str, host: Address, caller_id: str) -> None:
-        self.enactor.carry_out(self.graph.topic_granted(self.node, topic, host, caller_id))
+        self.graph.topic_granted(self.node, topic, host, caller_id)
+        self.flush()
+
+    def flush(self) -> None:
+        self.relay.flush(self.registry.take_changes())
 
     def use(self, now: Policy) -> None:
         self.policy = now
@@ -169,7 +141,7 @@ class World:
 
     def withdraw(self, kind: Kind, resource: str) -> None:
         self.registry.unregister(self.node, kind, resource)
-        self.enactor.carry_out([])
+        self.flush()
 
     def put(self, **topics: int) -> None:
         resources = {(TOPIC, f"/{name}"): relay for name, relay in topics.items()}
@@ -241,14 +213,15 @@ async def test_each_relay_receives_its_topics(world: World) -> None:
     world.withdraw(Kind.PUBLICATION, "/left")
     assert (first.heard(), again.heard()) == ([messages.PublicationWithdrawn("key", "/left")], [])
     world.registry.overshadow(node, 0.0)
-    world.enactor.carry_out([])
+    world.flush()
     assert first.heard() == again.heard() == [messages.NodeWithdrawn("key")]
 
 
 async def test_relays_know_which_hosts_the_policy_names(world: World) -> None:
     (first, second) = world.links
     world.grant_topic("/right", HOST, "/ear")
-    world.enactor.carry_out(world.graph.service_granted(world.node, "/serve", HOST, "/client"))
+    world.graph.service_granted(world.node, "/serve", HOST, "/client")
+    world.flush()
     for link in world.links:
         link.heard()
     world.use(policy(nodes="default = *"))
@@ -287,14 +260,16 @@ async def test_a_topic_moves_with_its_grants(world: World) -> None:
 
 async def test_a_grant_that_is_revoked_after_a_move_is_invalid_everywhere(world: World) -> None:
     relay, (first, second) = world.relay, world.links
-    world.enactor.carry_out(world.graph.service_granted(world.node, "/serve", HOST, "/c"))
+    world.graph.service_granted(world.node, "/serve", HOST, "/c")
+    world.flush()
     first.heard()
     away, back = [Move(SERVICE, "/serve", 0, 1)], [Move(SERVICE, "/serve", 1, 0)]
     relay.withdraw_moving(away)
     assert messages.ClientRevoked("key", "/serve", "10.0.0.5", "/c") in first.heard()
     world.allocation.adopt(AllocationPlan({}, {(SERVICE, "/serve"): 1}))
     relay.place_moved(away)
-    world.enactor.carry_out(world.grants.take(world.grants.all()[0]))
+    world.grants.take(world.grants.all()[0])
+    world.flush()
     assert second.heard()[-1] == messages.ClientRevoked("key", "/serve", "10.0.0.5", "/c")
     relay.withdraw_moving(back)
     world.put()

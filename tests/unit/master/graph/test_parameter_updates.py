@@ -127,6 +127,6 @@ async def test_an_update_of_the_whole_tree_needs_the_right_to_all_of_it() -> Non
     node = world.node("/n")
     await world.register(node, Kind.PARAMETER, "/", "")
     world.parameters.replace({"arm": 4711})
-    world.enactor.carry_out(world.graph.tell_parameters(node))
+    world.subscribers.tell_parameters(node)
     assert not [one for one in world.deliveries.told if one[1] == "paramUpdate"]
     assert ("deny", "/") in world.records.events

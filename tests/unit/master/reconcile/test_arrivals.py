@@ -47,7 +47,7 @@ async def world_with(faces: NoFaces | SlowFaces) -> ControlParts:
     arrivals = Arrivals(
         world.registry,
         world.graph,
-        world.enactor,
+        world.sinks.flush,
         world.liveness,
         places=cast(Any, FewPorts(world.registry)),
         faces=cast(Any, faces),

@@ -95,9 +95,14 @@ async def test_a_node_that_returns_during_its_removal_is_registered_again() -> N
     for topic in ("/a", "/b", "/c"):
         await world.register(node, Kind.PUBLICATION, topic)
     world.clients.silent = {"/n"}
+    world.hidden.go.clear()
     await world.liveness.look(node)
     assert node.life is Life.SHADOW
+    await asyncio.sleep(1.0)
+    world.clients.silent = set()
     world.liveness.revive(node)
+    await asyncio.sleep(1.0)
+    world.hidden.go.set()
     await world.settle()
     assert [call[0] for call in world.hidden.calls if call[0] == "unregisterPublisher"]
     assert [world.hidden.has(Kind.PUBLICATION, topic) for topic in ("/a", "/b", "/c")] == [["/n"]] * 3

@@ -16,6 +16,7 @@ async def test_a_parameter_that_was_set_when_control_died_is_sent() -> None:
     node = world.node("/n")
     for key in ("/speed", "/unset"):
         world.registry.register(node, Kind.PARAMETER, key, "")
+    world.registry.take_changes()  # an earlier control made them
     world.hidden.parameters["speed"] = 2
     await world.round()
     assert world.deliveries.told == [
@@ -32,7 +33,8 @@ async def test_a_new_master_is_complete_before_the_first_call() -> None:
     await world.register(other, Kind.PUBLICATION, "/u")
     world.rosmaster.shut()
     world.hidden.restart()
-    world.enactor.carry_out([*world.graph.lost(node, "away"), *world.graph.returned(node)])
+    world.graph.lost(node, "away")
+    world.graph.returned(node)
     assert not world.rosmaster.reachable
     await world.round()
     assert (world.rosmaster.reachable, world.entries.pid) == (True, world.hidden.pid)
@@ -58,7 +60,7 @@ async def test_a_new_master_is_rebuilt_with_few_requests() -> None:
     node = world.node("/n")
     names = [f"/t{number}" for number in range(400)]
     for name in reversed(names):
-        world.enactor.carry_out(world.graph.registered(node, Kind.PUBLICATION, name, "t"))
+        world.graph.registered(node, Kind.PUBLICATION, name, "t")
     world.hidden.restart()
     requests = _Requests(world)
     await world.round()

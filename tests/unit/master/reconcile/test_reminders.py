@@ -15,7 +15,7 @@ HOST = ipaddress.ip_address("10.0.0.5")
 
 
 class Told:
-    """A graph in which `/ear` is absent for a number of checks, and which carries out its effects."""
+    """Subscribers of which `/ear` is absent for a number of checks."""
 
     def __init__(self, absent_for: int) -> None:
         self.absent_for = absent_for
@@ -25,9 +25,6 @@ class Told:
         self.absent_for -= 1
         ear, _other, mouth = subscribers
         return [(ear, "/chatter", [mouth])] if self.absent_for >= 0 else []
-
-    def carry_out(self, _effects: object) -> None:
-        """Act as `Enactor`."""
 
     def renew(self, subscriber: Incarnation, topic: str, absent: list[Incarnation]) -> None:
         self.reminded.append((subscriber.name, topic, [one.key for one in absent]))
@@ -52,7 +49,7 @@ async def test_reminded_until_back(
     node(registry, "/other", Kind.SUBSCRIPTION)
     node(registry, "/mouth", Kind.PUBLICATION)
     told = Told(absent_for)
-    looks = Reminders(registry, cast(Any, told), cast(Any, told))
+    looks = Reminders(registry, cast(Any, told))
     looks.begin()
     assert looks.round is not None
     await looks.round
@@ -71,7 +68,7 @@ async def test_a_lasting_absence_ends_with_a_reminder() -> None:
     told, times = Told(10_000), list[float]()
     machine = VirtualClock()
     with clock.using(machine):
-        looks = Reminders(registry, cast(Any, told), cast(Any, told))
+        looks = Reminders(registry, cast(Any, told))
         for second in range(0, 3000, 5):
             before = len(told.reminded)
             looks.remind_lasting()

@@ -1,4 +1,4 @@
-"""The graph when incarnations of one name overlap, and after control died during a change."""
+"""Nodes get the lists that they lack: after control died during a change, and while they are not connected."""
 
 from typing import Any, cast
 
@@ -20,11 +20,11 @@ async def test_the_next_control_repeats_the_news_of_a_lost_topic() -> None:
     await world.register(node, Kind.SUBSCRIPTION, "/plain")
     world.reload(POLICY.format("", "/secret=\n"))
     world.deliveries.told.clear()
-    world.enactor.carry_out(world.graph.tell_everybody())
+    world.subscribers.remind_all()
     emptied: tuple[str, str, tuple[Value, ...]] = ("/ear", "publisherUpdate", ("/secret", []))
     assert emptied in world.deliveries.told
     world.deliveries.told.clear()
-    world.enactor.carry_out(world.graph.tell_everybody(lambda topic: topic == "/plain"))
+    world.subscribers.remind_all(lambda topic: topic == "/plain")
     assert [params[0] for _name, _method, params in world.deliveries.told] == ["/plain"]
 
 
@@ -36,8 +36,8 @@ async def test_subscribers_without_a_connection_are_absent() -> None:
         await world.register(node, Kind.SUBSCRIPTION, "/a")
     connected = PermissionRow(talker.key, "topic", "/a", str(HOST), "/other")
     world.grants.used = lambda: {connected}
-    assert list(world.graph.absent(world.registry.live())) == [(ear, "/a", [talker])]
-    assert list(world.graph.absent([other])) == []
+    assert list(world.subscribers.absent(world.registry.live())) == [(ear, "/a", [talker])]
+    assert list(world.subscribers.absent([other])) == []
 
 
 async def test_no_subscriber_is_absent_without_the_relay() -> None:
@@ -48,4 +48,4 @@ async def test_no_subscriber_is_absent_without_the_relay() -> None:
     await world.register(talker, Kind.PUBLICATION, "/a")
     for node in (ear, own):
         await world.register(node, Kind.SUBSCRIPTION, "/a")
-    assert list(world.graph.absent(world.registry.live())) == [(own, "/a", [talker])]
+    assert list(world.subscribers.absent(world.registry.live())) == [(own, "/a", [talker])]

@@ -1,0 +1,174 @@
+"""Make the store, the nodes, the ROS master and the relays agree with the registry, at the end of each turn.
+
+The registry keeps the set of changed keys: nodes, registrations and grants. `Sinks.flush` gives it to each sink, which
+compares the wanted state of each key with what it has stated, and states the difference. So the same code serves a
+change, a repetition, and a sink that starts again without any state. Invariants:
+
+1. A call is answered after its changes are flushed: they are stored, and the relay has them before a peer can use them.
+2. Whatever else changes the registry, `soon` flushes it before the event loop waits again.
+3. The ROS master gets its changes behind the answers (`entries.py`).
+
+After a restart, `restore` reads the registry from the store.
+"""
+
+import asyncio
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from appliance.base import clock
+from appliance.master.endpoints.node_ports import NodePorts
+from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
+from appliance.master.endpoints.relay_control import RelayControl
+from appliance.master.graph.grants import Grants
+from appliance.master.graph.registry import (
+    Change,
+    Incarnation,
+    Kind,
+    Life,
+    NodeRegistration,
+    RegistrationKey,
+    Registry,
+)
+from appliance.master.graph.revocation import Revocation
+from appliance.master.reconcile.entries import MasterRegistrations
+from appliance.master.reconcile.subscribers import Subscribers
+from appliance.policy.model import Address, address_of
+from appliance.policy.policy import Policy
+from appliance.store.state_file import IncarnationRow, PermissionRow, RegistrationRow, StateStore
+from roswire.uris import parse_node_uri
+
+_ENDED = (Life.REPLACED, Life.FORGOTTEN)
+
+
+@dataclass(frozen=True, slots=True)
+class Sinks:
+    """All sinks of the registry."""
+
+    registry: Registry
+    grants: Grants
+    store: StateStore
+    subscribers: Subscribers
+    entries: MasterRegistrations
+    relay: RelayControl
+    faces: ProxyEndpoints
+
+    def soon(self) -> None:
+        asyncio.get_running_loop().call_soon(self.flush)
+
+    def flush(self) -> None:
+        """State all that has changed. The endpoints of ended nodes close last, when no sink uses their ports."""
+        changed = self.registry.take_changes()
+        if not changed:
+            return
+        save(changed, self.grants, self.store)
+        self.subscribers.flush(changed)
+        self.entries.flush(changed)
+        try:
+            self.relay.flush(changed)
+        finally:
+            for node in changed:
+                if isinstance(node, Incarnation) and node.life in _ENDED:
+                    self.relay.carried.forgotten(node.key)
+                    self.faces.close(node)
+
+
+@dataclass(frozen=True, slots=True)
+class Enforcement:
+    """Revoke rights that are no longer allowed."""
+
+    revocation: Revocation
+    sinks: Sinks
+    places: NodePorts
+
+    def policy_changed(self, policy: Policy) -> int:
+        """Enforce a new policy, which is already in force. Return the number of revoked rights.
+
+        The policy may use another range of ports, and name hosts differently.
+        """
+        self.places.policy_changed(policy.ports)
+        count = self.revocation.redecide()
+        self.sinks.flush()
+        self.sinks.relay.compare()
+        return count
+
+    def expel(self, host: Address, reason: str) -> int:
+        count = self.revocation.expel(host, reason)
+        self.sinks.flush()
+        return count
+
+    def redecide_for(self, host: Address, caller_id: str) -> None:
+        self.revocation.redecide_for(host, caller_id)
+        self.sinks.flush()
+
+    async def carried_out(self) -> None:
+        await self.sinks.relay.carried_out()
+
+
+_SHELVED = "revoked "  # the prefix of the stored kind of a withdrawn registration
+
+
+def save(changed: Iterable[Change], grants: Grants, store: StateStore) -> None:
+    """Store the present state of what has changed."""
+    for change in changed:
+        match change:
+            case Incarnation(life=Life.FORGOTTEN):
+                store.forget_incarnation(change.key)  # with its registrations and grants
+            case Incarnation():
+                store.save_incarnation(
+                    IncarnationRow(
+                        change.key, change.name, str(change.host), change.api_text, change.told, change.outer_port,
+                        change.relay_port, change.own, change.life.value, change.changed, change.more_relay_ports,
+                    )
+                )  # fmt: skip
+            case RegistrationKey(node, kind, resource, shelved):
+                if node.life is not Life.FORGOTTEN:
+                    _save_registration(node, kind, resource, store, shelved=shelved)
+            case PermissionRow():
+                if change in grants.of(change.key):
+                    store.save_permission(change)
+                else:
+                    store.remove_permission(change)
+
+
+def _save_registration(
+    node: Incarnation, kind: Kind, resource: str, store: StateStore, *, shelved: bool
+) -> None:
+    rows, stored_kind = (
+        (node.shelf, f"{_SHELVED}{kind.value}") if shelved else (node.registrations, kind.value)
+    )
+    one = rows.get((kind, resource))
+    if one is None:
+        store.remove_registration(node.key, stored_kind, resource)
+    else:
+        store.save_registration(RegistrationRow(node.key, stored_kind, resource, one.detail, one.order))
+
+
+def restore(registry: Registry, store: StateStore) -> int:
+    """Fill `registry` from the store; return the number of incarnations."""
+    incarnations, registrations = store.load_registry()
+    by_key = {
+        row.key: Incarnation(
+            key=row.key,
+            name=row.name,
+            host=address_of(row.host),
+            api=parse_node_uri(row.api),
+            api_text=row.api,
+            told=row.told,
+            outer_port=row.outer_port,
+            relay_port=row.relay_port,
+            own=row.own,
+            life=Life(row.life),
+            changed=clock.now(),  # the stored time may be from before a restart of the machine
+            more_relay_ports=row.more_relay_ports,
+        )
+        for row in incarnations
+    }
+    for row in registrations:
+        owner = by_key.get(row.key)
+        if owner is not None:
+            kind = Kind(row.kind.removeprefix(_SHELVED))
+            place = owner.shelf if row.kind.startswith(_SHELVED) else owner.registrations
+            place[kind, row.resource] = NodeRegistration(kind, row.resource, row.detail, row.ordinal)
+    for incarnation in by_key.values():
+        registry.restore(incarnation)
+    return len(by_key)

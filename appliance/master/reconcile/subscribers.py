@@ -1,0 +1,209 @@
+"""Keep the nodes informed of the lists of publishers and of the values of parameters that they subscribed to.
+
+A list is stated like a fact to a relay: for each node and topic, `Subscribers` keeps the list that the node got last,
+in the answer to its registration or in a `publisherUpdate`. A change names the topics whose lists may differ. A node
+that returns, and each node after the ROS master or a relay started again, has no stated lists, and gets them all.
+
+Values of parameters are sent with each call that sets them, because a node may count the changes. A node gets the
+present value when its subscription is restored.
+
+Lists come from the registry. The calls of the ROS master's notification threads are ignored, because they can be
+outdated, wrong, or partial (while the ROS master is rebuilt).
+"""
+
+import sys
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass, field
+
+from appliance.master.endpoints.delivery import Delivery, NodeCall
+from appliance.master.graph.grants import Grants
+from appliance.master.graph.mediation import Mediation
+from appliance.master.graph.parameter_updates import settled, updates_of
+from appliance.master.graph.registry import Change, Incarnation, Kind, Life, RegistrationKey, Registry
+from appliance.rpc.bulk import weigh
+from appliance.specifications.allocation import TOPIC
+from appliance.store.state_file import PermissionRow
+from roswire.parameter_tree import Tree, standing_at
+from roswire.xmlrpc import Value
+
+_Stated = dict[tuple[Kind, str], tuple[str, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class Subscribers:
+    """The sink of nodes. `may_read_value(node, key, value)` returns whether a node may read a parameter's value.
+
+    `tree` returns the present parameters.
+    """
+
+    registry: Registry
+    grants: Grants
+    mediation: Mediation
+    delivery: Delivery
+    tree: Callable[[], Tree]
+    may_read_value: Callable[[Incarnation, str, Value], bool]
+    _stated: dict[Incarnation, _Stated] = field(default_factory=dict, init=False)
+    """The lists that each node has; for a parameter, the node has its value."""
+
+    def flush(self, changed: Iterable[Change]) -> None:
+        """Send the lists that these changes have changed. A replaced node is shut down, with the ROS master's text."""
+        topics: dict[str, None] = {}
+        for change in changed:
+            match change:
+                case Incarnation():
+                    topics |= dict.fromkeys(change.resources(Kind.PUBLICATION))
+                    self._state_node(change)
+                case RegistrationKey(_node, Kind.PUBLICATION, topic):
+                    topics[topic] = None
+                case RegistrationKey(node, kind, resource):
+                    self._state(node, kind, resource)
+        for topic in topics:
+            for subscriber in self.registry.registered(Kind.SUBSCRIPTION, topic):
+                self._state(subscriber, Kind.SUBSCRIPTION, topic)
+
+    def _state_node(self, node: Incarnation) -> None:
+        if node.life is Life.LIVE:
+            for kind, resource in (*node.registrations, *node.shelf):
+                self._state(node, kind, resource)
+            return
+        self._stated.pop(node, None)
+        if node.life is Life.REPLACED:
+            reason = f"[{node.name}] Reason: new node registered with same name"
+            self.delivery.push(node, NodeCall("shutdown", (reason,)))
+        else:
+            self.delivery.drop(node)
+
+    def _state(self, node: Incarnation, kind: Kind, resource: str) -> None:
+        """Send a node what it does not have yet about a topic or a parameter."""
+        if kind not in (Kind.SUBSCRIPTION, Kind.PARAMETER) or node.life is not Life.LIVE:
+            return
+        wanted = self._wanted(node, kind, resource)
+        stated = self._stated.setdefault(node, {})
+        if wanted is None:
+            stated.pop((kind, resource), None)
+        elif stated.get((kind, resource)) != wanted:
+            stated[kind, resource] = wanted
+            if kind is Kind.SUBSCRIPTION:
+                self.delivery.push(node, _list(resource, wanted))
+            else:
+                self._tell_parameter(node, resource)
+
+    def _wanted(self, node: Incarnation, kind: Kind, resource: str) -> tuple[str, ...] | None:
+        """Return the wanted list. It is empty if the policy withdrew the subscription.
+
+        Client libraries drop a publisher only if a list does not contain it.
+        """
+        if (kind, resource) in node.registrations:
+            return self._publishers_for(node, resource) if kind is Kind.SUBSCRIPTION else ()
+        return () if kind is Kind.SUBSCRIPTION and (kind, resource) in node.shelf else None
+
+    def _publishers_for(self, subscriber: Incarnation, topic: str) -> tuple[str, ...]:
+        hidden = self.mediation.hides_publishers(topic)
+        return self.registry.uris_for(subscriber, Kind.PUBLICATION, topic, hidden=hidden)
+
+    # --- lists of publishers ---
+
+    def list_for(self, subscriber: Incarnation, topic: str) -> tuple[str, ...]:
+        """Return the list for the answer to a registration; only later changes are sent."""
+        uris = self._publishers_for(subscriber, topic)
+        self._stated.setdefault(subscriber, {})[Kind.SUBSCRIPTION, topic] = uris
+        return uris
+
+    def remind_all(self, concerned: Callable[[str], bool] = lambda _topic: True) -> None:
+        """Send the lists of all `concerned` topics again: after a rebuild, for a new relay or control.
+
+        The list of a revoked topic is empty. It is sent again, because control may have died before it was delivered.
+        """
+        for node in self.registry.live():
+            for kind, topic in (*node.registrations, *node.shelf):
+                if kind is Kind.SUBSCRIPTION and concerned(topic):
+                    self.remind(node, topic)
+
+    def remind(self, subscriber: Incarnation, topic: str) -> None:
+        self._stated.get(subscriber, {}).pop((Kind.SUBSCRIPTION, topic), None)
+        self._state(subscriber, Kind.SUBSCRIPTION, topic)
+
+    def renew_all(self, topic: str) -> None:
+        """Have every subscriber of a topic drop its publishers and connect again, at their new ports."""
+        publishers = list(self.registry.registered(Kind.PUBLICATION, topic))
+        for subscriber in self.registry.registered(Kind.SUBSCRIPTION, topic):
+            self.renew(subscriber, topic, publishers)
+
+    def renew(self, subscriber: Incarnation, topic: str, absent: Collection[Incarnation]) -> None:
+        """Have a subscriber drop these publishers and connect again, because roscpp ignores an unchanged list."""
+        if absent:
+            gone = {publisher.outer_uri(subscriber.told) for publisher in absent}
+            without = [uri for uri in self._publishers_for(subscriber, topic) if uri not in gone]
+            self.delivery.push(subscriber, _list(topic, without))
+        self.remind(subscriber, topic)
+
+    def absent(
+        self, subscribers: Iterable[Incarnation]
+    ) -> Iterator[tuple[Incarnation, str, list[Incarnation]]]:
+        """Yield each relayed topic of these subscribers with the publishers that the subscriber is not connected to.
+
+        Grants do not matter: if one was withdrawn unnoticed, the subscriber asks again only after it drops the
+        publisher. So the result depends only on data that survive a restart.
+        """
+        used = self.grants.used()
+        for subscriber in subscribers:
+            for topic in subscriber.resources(Kind.SUBSCRIPTION):
+                publishers = [
+                    publisher
+                    for publisher in self.registry.registered(Kind.PUBLICATION, topic)
+                    if publisher is not subscriber
+                    and (publisher.own or subscriber.own or self.mediation.carries_topic(topic))
+                    and PermissionRow(publisher.key, TOPIC, topic, str(subscriber.host), subscriber.name)
+                    not in used
+                ]
+                if publishers:
+                    yield subscriber, topic, publishers
+
+    # --- values of parameters ---
+
+    def value_given(self, subscriber: Incarnation, key: str) -> None:
+        """Note that the answer to a subscription has the value of a parameter; only later changes are sent."""
+        self._stated.setdefault(subscriber, {})[Kind.PARAMETER, key] = ()
+
+    def parameter_set(self, key: str, value: Value, caller_id: str) -> None:
+        """Send a value that the ROS master accepted; the caller does not get exactly this key."""
+        self._tell_parameters(key, value, caller_id)
+
+    def parameter_deleted(self, key: str) -> None:
+        self._tell_parameters(key, {}, None)
+
+    def _tell_parameters(self, key: str, value: Value, caller_id: str | None) -> None:
+        if not self.registry.tells_parameters:
+            return
+        calls: dict[str, NodeCall] = {}
+        for update in updates_of(key, value, self.registry.subscribed_below(key)):
+            for subscriber in self.registry.registered(Kind.PARAMETER, update.subscribed):
+                if update.key == key and subscriber.name == caller_id:
+                    continue
+                if update.key not in calls:
+                    calls[update.key] = _param_update(update.key, settled(update.value))
+                if self.may_read_value(subscriber, update.key, update.value):
+                    self.delivery.push(subscriber, calls[update.key])
+
+    def tell_parameters(self, subscriber: Incarnation) -> None:
+        for key in subscriber.resources(Kind.PARAMETER):
+            self._tell_parameter(subscriber, key)
+
+    def _tell_parameter(self, subscriber: Incarnation, key: str) -> None:
+        """Send a node the present value of a parameter, if the node may read this value.
+
+        The subscription was decided by the keys that existed then, so the right to read is checked again.
+        """
+        present, _ = standing_at(self.tree(), key)
+        value = {} if present is None else settled(present)
+        if self.may_read_value(subscriber, key, value):
+            self.delivery.push(subscriber, _param_update(key, value))
+
+
+def _list(topic: str, uris: Iterable[str]) -> NodeCall:
+    return NodeCall("publisherUpdate", (topic, list(uris)))
+
+
+def _param_update(key: str, value: Value) -> NodeCall:
+    """Return the same call as the ROS master makes: the key ends with `/`, and the value of an unset key is `{}`."""
+    return NodeCall("paramUpdate", (f"{key.rstrip('/')}/", value), weigh(value, sys.maxsize))
