@@ -24,8 +24,8 @@ DOOR_BYTES = QuotaRow(
     at_limit="the oldest messages are dropped; a client with too large a frame, or that does not read its replies, is"
     " disconnected with the reason; values that take too much are refused in words",
     between="each client has 1/68 for itself (half of the whole, divided by `doors.connections` and two); beyond that,"
-    " a client gets at most as much as it leaves for all others. Two more count as clients: messages to other nodes, and"
-    " arguments of calls that wait for answers",
+    " a client gets at most as much as it leaves for all others. Two more count as clients: messages to other nodes,"
+    " and arguments of calls that wait for answers",
     counting="host: a client's connection",
     alarm="`rosrv_door_messages_dropped_total`",
     shown_by=("unit/features/doors/test_door_memory.py::test_greedy_clients_leave_memory_for_the_next_one",),
