@@ -1,10 +1,8 @@
 """Message and service types: definitions by name, with their md5sums, full texts and layouts.
 
-Definitions come as text: from ROS (`standard.py`), from `.msg` and `.srv` files, or from the `message_definition` of a
-publisher's connection header. Results are cached for each type.
-
-A type that contains itself, or nests deeper than `MAX_DEPTH`, is rejected. Work and memory are bounded by the size of
-the text, and by the limits of `message_text` and `message_layout`.
+Definitions come as text: from ROS (`standard.py`), from `.msg` and `.srv` files, or from the `message_definition` of
+a publisher's connection header. A type that contains itself, or nests deeper than `MAX_DEPTH`, is rejected. Work and
+memory are bounded by the size of the text, and by the limits of `message_text` and `message_layout`.
 """
 
 import difflib
@@ -27,7 +25,7 @@ from roswire.message_text import (
 )
 
 MAX_DEPTH = 64
-"""The maximum number of levels of nested messages."""
+"""Levels of nested messages."""
 
 _FILE = re.compile(r"([A-Za-z][A-Za-z0-9_]*+)/(?:(msg|srv)/)?([A-Za-z][A-Za-z0-9_]*+)\.(msg|srv)\Z")
 _TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*+/[A-Za-z][A-Za-z0-9_]*+\Z")
@@ -37,7 +35,7 @@ _Answer = TypeVar("_Answer")
 
 
 class Definitions:
-    """A set of message and service types that refer to each other; it never changes."""
+    """It never changes."""
 
     def __init__(
         self,
@@ -54,7 +52,7 @@ class Definitions:
 
     @classmethod
     def from_files(cls, files: Mapping[str, str]) -> Self:
-        """Parse files; `files` maps names (`pkg/T.msg`, `pkg/msg/T.msg`, `pkg/T.srv` or `pkg/srv/T.srv`) to texts.
+        """`files` maps names (`pkg/T.msg`, `pkg/msg/T.msg`, `pkg/T.srv` or `pkg/srv/T.srv`) to texts.
 
         Raises `DefinitionError` with the file and line.
         """
@@ -75,9 +73,9 @@ class Definitions:
 
     @classmethod
     def from_full_text(cls, name: str, text: str) -> Self:
-        """Parse the full text of the message type `name`, in the form used by connection headers.
+        """The text, in the form used by connection headers, must also define all nested types.
 
-        The text must also define all nested types. Raises `DefinitionError`.
+        Raises `DefinitionError`.
         """
         messages: dict[str, MessageDefinition] = {}
         for section, body, line in split_full_text(name, text):
@@ -91,15 +89,12 @@ class Definitions:
         return cls(messages)
 
     def extended(self, other: "Definitions") -> "Definitions":
-        """Return these types together with the types of `other`.
-
-        If both define a type, the definition of `other` is used.
-        """
+        """If both define a type, the definition of `other` is used."""
         return Definitions(self._messages | other._messages, self._services | other._services)
 
     @property
     def message_types(self) -> list[str]:
-        """Return the names of all message types, including requests and responses."""
+        """Requests and responses are included."""
         return sorted(self._messages)
 
     @property
@@ -107,24 +102,22 @@ class Definitions:
         return sorted(self._services)
 
     def message(self, name: str) -> MessageDefinition:
-        """Return a message type; raises `DefinitionError` with similar names if there is none."""
+        """Raises `DefinitionError` with similar names."""
         return _lookup(name, self._messages, "message")
 
     def service(self, name: str) -> ServiceDefinition:
-        """Return a service type; raises `DefinitionError` with similar names if there is none."""
+        """Raises `DefinitionError` with similar names."""
         return _lookup(name, self._services, "service")
 
     def md5sum(self, name: str) -> str:
-        """Return the md5sum by which ROS compares the message type `name` between nodes."""
         return self._md5sum(name, ())
 
     def service_md5sum(self, name: str) -> str:
-        """Return the md5sum by which ROS compares the service type `name` between nodes."""
         service = self.service(name)
         return _fingerprint(self._md5_text(service.request, ()) + self._md5_text(service.response, ()))
 
     def full_text(self, name: str) -> str:
-        """Return the text of a message type and of all its nested types, in the form used by connection headers."""
+        """The text has all nested types, in the form used by connection headers."""
         self.md5sum(name)  # raises if a type is missing or contains itself
         order: dict[str, MessageDefinition] = {}
         waiting = [name]
@@ -138,7 +131,7 @@ class Definitions:
         return "\n".join([own.text, *(f"{_RULE}\nMSG: {part.name}\n{part.text}" for part in parts)])
 
     def layout(self, name: str) -> MessageLayout:
-        """Return the layout of messages of the type `name`; raises `DefinitionError`."""
+        """Raises `DefinitionError`."""
         return self._layout(name, ())
 
     # `outer` always lists the types that contain this type, outermost first.
@@ -185,7 +178,7 @@ class Definitions:
         outer: tuple[str, ...],
         ask: Callable[[str, tuple[str, ...]], _Answer],
     ) -> _Answer | None:
-        """Return the result of `ask` for the type of a field; None for a built-in type."""
+        """None for a built-in type."""
         if field.type in BUILTINS:
             return None
         if field.type not in self._messages:

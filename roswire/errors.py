@@ -1,8 +1,4 @@
-"""Errors in ROS traffic, by the side that is at fault.
-
-A `PeerError` is the sender's fault. Its text names the fault, its position and the remedy, and may be sent back to the
-sender. An `EncodingError` is a fault of this side: ROS has no notation for the value.
-"""
+"""Errors in ROS traffic, by the side that is at fault."""
 
 
 class RosError(Exception):
@@ -10,11 +6,11 @@ class RosError(Exception):
 
 
 class EncodingError(RosError):
-    """A value that ROS cannot encode, such as a control character or a 64-bit integer."""
+    """ROS has no notation for the value, such as a control character or a 64-bit integer."""
 
 
 class PeerError(RosError):
-    """The sender's fault."""
+    """The sender's fault: the text names the fault, its position and the remedy, and may be sent back to the sender."""
 
 
 class InvalidNameError(PeerError):
@@ -30,14 +26,11 @@ class ProtocolError(PeerError):
 
 
 class LimitExceededError(ProtocolError):
-    """Data that exceeds a limit of size, depth or length. The part that was read is well-formed."""
+    """The part that was read is well-formed."""
 
 
 class DefinitionError(PeerError):
-    """A message or service definition that cannot be used.
-
-    `source` names the file or type, `line` counts from 1 (0: unknown).
-    """
+    """`source` names the file or type, `line` counts from 1 (0: unknown)."""
 
     def __init__(self, text: str, source: str, line: int = 0) -> None:
         super().__init__(f"{source}:{line}: {text}" if line else f"{source}: {text}")

@@ -114,4 +114,3 @@ MAVROS = {
         + "uint8 base_mode\nstring custom_mode\n---\nbool mode_sent\n"
     ),
 }
-"""The text of each definition, by file."""

@@ -12,18 +12,19 @@ from dataclasses import dataclass, field, replace
 from roswire.message_text import PRIMITIVES
 
 MAX_ITEMS = 20_000
-"""The maximum number of leaves, strings and arrays in one layout; nested definitions can need exponentially many."""
+"""Leaves, strings and arrays in one layout; nested definitions can need exponentially many."""
 
 MAX_SIZE = 1 << 32
-"""The maximum number of bytes of one fixed part or array of fixed length; a TCPROS message is never longer."""
+"""Bytes of one fixed part or array of fixed length; a TCPROS message is never longer."""
 
 
 @dataclass(frozen=True, slots=True)
 class FixedField:
-    """A value of fixed size in a `FixedPart`.
+    """`type` is primitive, or for arrays also a message type of fixed size, with its `layout`.
 
-    `type` is a primitive type. For arrays it may also be a message type of fixed size, with its `layout`. `count` is
-    the number of elements of a fixed array, or None for a scalar. `offset` and `size` are in bytes.
+    `count` is None for a scalar.
+
+    `offset` and `size` are in bytes.
     """
 
     path: str
@@ -36,7 +37,7 @@ class FixedField:
 
 @dataclass(frozen=True, slots=True)
 class FixedPart:
-    """Consecutive leaves; `size` is their total number of bytes."""
+    """`size` is the total number of bytes of the leaves."""
 
     size: int
     leaves: tuple[FixedField, ...]
@@ -69,7 +70,7 @@ Part = FixedPart | StringPart | ArrayPart
 
 @dataclass(frozen=True, slots=True)
 class FieldLocation:
-    """The location of a field: the index of its part, and the leaf, string or array."""
+    """`part` is the index of the part."""
 
     part: int
     item: FixedField | StringPart | ArrayPart
@@ -77,11 +78,10 @@ class FieldLocation:
 
 @dataclass(frozen=True, slots=True)
 class MessageLayout:
-    """The parts of a message in order.
+    """`size` is the number of bytes of every such message, or None if it varies; `minimum` is that of the shortest
+    message.
 
-    `size` is the number of bytes of every such message, or None if it varies. `minimum` is the number of bytes of the
-    shortest message. `places` finds the items by path (`pose.position.x`); the elements of an array are in the array's
-    layout.
+    `places` finds the items by path (`pose.position.x`); the elements of an array are in the array's layout.
     """
 
     parts: tuple[Part, ...]
@@ -95,7 +95,7 @@ class LayoutTooLargeError(Exception):
 
 
 class LayoutBuilder:
-    """A builder of layouts: takes the fields of a message in order; `finish` returns the layout."""
+    """Takes the fields of a message in order."""
 
     def __init__(self) -> None:
         self._parts: list[Part] = []
@@ -104,7 +104,7 @@ class LayoutBuilder:
         self._items = 0
 
     def add_primitive(self, path: str, type_name: str, count: int | None) -> None:
-        """Add a value of a primitive type, or a fixed array of `count` such values."""
+        """`count` makes a fixed array."""
         size = PRIMITIVES[type_name][1] * (1 if count is None else count)
         self._add_leaf(FixedField(path, type_name, self._offset, size, count))
 
@@ -121,7 +121,7 @@ class LayoutBuilder:
             self._add_part(ArrayPart(path, type_name, count, size, layout))
 
     def add_message(self, path: str, layout: MessageLayout) -> None:
-        """Add the items of a nested message, with `path` as a prefix of their paths."""
+        """`path` is a prefix of the paths of the nested items."""
         for part in layout.parts:
             if isinstance(part, FixedPart):
                 for leaf in part.leaves:

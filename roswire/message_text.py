@@ -50,7 +50,7 @@ _SEPARATOR = re.compile(r"={40,}+[ \t\r]*+\Z")
 
 @dataclass(frozen=True, slots=True)
 class Constant:
-    """A constant: its value, and the text of the value as written, from which md5sums are made."""
+    """Md5sums are made from `text`, the value as written."""
 
     type: str
     name: str
@@ -60,7 +60,7 @@ class Constant:
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A field: its element type (`float64`, `geometry_msgs/Point`), and whether it is an array.
+    """`type` is the element type (`float64`, `geometry_msgs/Point`).
 
     `length` is the number of elements of a fixed array; None for a scalar, and for an array of variable length.
     """
@@ -72,7 +72,7 @@ class Field:
 
     @property
     def notation(self) -> str:
-        """Return the type as it is written: `float64[36]`, `std_msgs/Header`."""
+        """As it is written: `float64[36]`, `std_msgs/Header`."""
         if not self.is_array:
             return self.type
         return f"{self.type}[{'' if self.length is None else self.length}]"
@@ -80,7 +80,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class MessageDefinition:
-    """A message type: `package/Type`, its fields and constants in order, and its source text."""
+    """`name` is `package/Type`; `text` is the source."""
 
     name: str
     fields: tuple[Field, ...]
@@ -99,9 +99,9 @@ class ServiceDefinition:
 
 
 def parse_message(name: str, text: str, source: str, first_line: int = 1) -> MessageDefinition:
-    """Parse the text of a `.msg` file for the type `name`.
+    """`source` and `first_line` give the position of the text for error messages.
 
-    `source` and `first_line` give the position of the text for error messages. Raises `DefinitionError`.
+    Raises `DefinitionError`.
     """
     fields: dict[str, Field] = {}
     constants: dict[str, Constant] = {}
@@ -125,7 +125,7 @@ def parse_message(name: str, text: str, source: str, first_line: int = 1) -> Mes
 
 
 def parse_service(name: str, text: str, source: str) -> ServiceDefinition:
-    """Parse the text of a `.srv` file for the type `name`; raises `DefinitionError`."""
+    """Raises `DefinitionError`."""
     lines = text.split("\n")
     breaks = [index for index, line in enumerate(lines) if line.startswith("---")]
     if len(breaks) != 1:
@@ -137,10 +137,11 @@ def parse_service(name: str, text: str, source: str) -> ServiceDefinition:
 
 
 def split_full_text(name: str, text: str) -> list[tuple[str, str, int]]:
-    """Split the full text of a type, in the form used by connection headers, into types.
+    """Returns (type, text, number of its first line) for `name`, then for each nested type.
 
-    Returns (type, text, number of its first line) for `name`, then for each nested type. In the text, each nested type
-    follows a line `===…` and a line `MSG: package/Type`. Raises `DefinitionError`.
+    In the text, each nested type follows a line `===…` and a line `MSG: package/Type`.
+
+    Raises `DefinitionError`.
     """
     lines = text.split("\n")
     starts = [index for index, line in enumerate(lines) if _SEPARATOR.match(line)]

@@ -75,7 +75,6 @@ class _Reader:
         return values
 
     def _pass_over(self, kind: str, count: int) -> None:
-        """Skip this many values of a type, to reach the next field."""
         size = self._size(kind)
         if size is not None:
             self._take(size * count)
@@ -86,7 +85,7 @@ class _Reader:
         self._left = left
 
     def _size(self, kind: str) -> int | None:
-        """Return the number of bytes of each value of a type; None if values differ in size."""
+        """None if values differ in size."""
         if kind in PRIMITIVES:
             return PRIMITIVES[kind][1]
         if kind == "string":
@@ -138,7 +137,7 @@ class _CutError(Exception):
 
 
 def read_bytes(data: bytes) -> str:
-    """Return the first bytes as hexadecimal digits, with the number of omitted bytes."""
+    """Hexadecimal digits, with the number of omitted bytes."""
     return data[:MOST_BYTES].hex() + _more(len(data) - MOST_BYTES)
 
 
@@ -147,7 +146,7 @@ def _more(count: int) -> str:
 
 
 def read_fields(definitions: Definitions, name: str, data: bytes) -> dict[str, Any] | None:
-    """Return the fields of a message of the type `name`, as far as `data` can be read; None if the type is unknown."""
+    """The fields that can be read; None if the type is unknown."""
     try:
         return _Reader(definitions, data).message(name)
     except _CutError as cut:
@@ -158,7 +157,7 @@ def read_fields(definitions: Definitions, name: str, data: bytes) -> dict[str, A
 
 
 class PublisherReader:
-    """A reader of one publisher's messages, by the definition in its connection header."""
+    """Uses the definition in the publisher's connection header."""
 
     def __init__(self, header: Mapping[str, str]) -> None:
         self.type = header.get("type", "")
@@ -170,10 +169,7 @@ class PublisherReader:
             self._why = f": {str(error)[:300]}"
 
     def read(self, data: bytes) -> tuple[dict[str, Any], str]:
-        """Return the fields of a message and an empty text.
-
-        If the definition cannot be used, return the first bytes of the message and the reason.
-        """
+        """Returns the fields and an empty text; if the definition cannot be used, the first bytes and the reason."""
         fields = read_fields(self._definitions, self.type, data) if self._definitions is not None else None
         if fields is not None:
             return fields, ""

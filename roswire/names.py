@@ -18,10 +18,7 @@ import re
 from roswire.errors import InvalidNameError, quoted
 
 MAX_NAME_LENGTH = 1024
-"""The maximum number of characters in one name.
-
-The longest names on robots have far less than a quarter of this number.
-"""
+"""The longest names on robots have far less than a quarter of this number."""
 
 _NAME = re.compile(r"[A-Za-z/~][A-Za-z0-9_/]*+\Z")
 _CANONICAL = re.compile(r"(?:/[A-Za-z0-9_]++){1,512}\Z")  # a name of MAX_NAME_LENGTH has at most 512 segments
@@ -34,11 +31,11 @@ _SLASHES = re.compile("/{2,}+")
 
 
 def resolve(name: str, caller_id: str) -> str:
-    """Return the canonical global name of the topic, service or node that `caller_id` calls `name`.
+    """`/a` is global, `~a` private to the caller, `a` relative to the caller's namespace. An empty `caller_id` is the
+    global namespace, as for `rosmaster`.
 
-    `/a` is global, `~a` private to the caller, `a` relative to the caller's namespace. An empty `caller_id` is the
-    global namespace, as for `rosmaster`. Raises `InvalidNameError` for a name outside the ROS grammar, for the global
-    namespace, and for a relative name if the caller's own name is invalid.
+    Raises `InvalidNameError` for a name outside the ROS grammar, for the global namespace, and for a relative name if
+    the caller's own name is invalid.
     """
     resolved = _resolve(name, caller_id, _NAME)
     if resolved == "/":
@@ -47,13 +44,12 @@ def resolve(name: str, caller_id: str) -> str:
 
 
 def resolve_namespace(name: str, caller_id: str) -> str:
-    """Resolve an argument that may be a whole namespace (`subgraph`). This is like `resolve`, but `/` is allowed."""
+    """Like `resolve`, but `/` is allowed."""
     return _resolve(name, caller_id, _NAME)
 
 
 def resolve_parameter(name: str, caller_id: str) -> str:
-    """Resolve a parameter key. This is like `resolve_namespace`, but segments may have any printable ASCII, as in YAML
-    keys.
+    """Like `resolve_namespace`, but segments may have any printable ASCII, as in YAML keys.
 
     These are still rejected: `~` (except as the first character), `*`, `?`, quotes, backslash, and spaces at the ends
     of a segment.
@@ -62,7 +58,7 @@ def resolve_parameter(name: str, caller_id: str) -> str:
 
 
 def canonical_caller_id(caller_id: str) -> str:
-    """Return the canonical form of a node's name (`/a/b` for `//a//b/`), as rospy and roscpp make it.
+    """`//a//b/` becomes `/a/b`, as with rospy and roscpp.
 
     Raises `InvalidNameError` for any other text, such as a relative name.
     """
@@ -70,34 +66,32 @@ def canonical_caller_id(caller_id: str) -> str:
 
 
 def canonical_tool_id(caller_id: str) -> str:
-    """Return the canonical name of a caller that need not be a node, such as `/rosparam-4711`."""
+    """The caller need not be a node, such as `/rosparam-4711`."""
     return _canonical_id(caller_id, _TOOL)
 
 
 def is_global_name(name: str) -> bool:
-    """Return whether `name` is a canonical global name (`/a/b`; not `/`, not `//a`, not `a`)."""
+    """`/a/b`; not `/`, not `//a`, not `a`."""
     return len(name) <= MAX_NAME_LENGTH and _CANONICAL.match(name) is not None
 
 
 def is_relative_member(name: str) -> bool:
-    """Whether a member `name` of a parameter namespace is below this namespace: not `/a`, not `~a`, and without empty
-    segments.
-    """
+    """Not `/a`, not `~a`, and without empty segments."""
     return not name.startswith("~") and all(name.split("/"))
 
 
 def is_valid_type_name(name: str) -> bool:
-    """Return whether `name` is a message or service type (`package/Type`) or `*`, any type."""
+    """`package/Type`, or `*` for any type."""
     return name == "*" or (len(name) <= MAX_NAME_LENGTH and _TYPE_NAME.match(name) is not None)
 
 
 def namespace(name: str) -> str:
-    """Return the namespace of a canonical name, with a trailing slash: `/a/` for `/a/b`, `/` for `/a`."""
+    """`/a/` for `/a/b`, `/` for `/a`."""
     return name[: name.rstrip("/").rfind("/") + 1] or "/"
 
 
 def searched(key: str, caller_id: str) -> list[str]:
-    """Return the parameters that `searchParam` tries, in order: in the caller's namespaces, from its own upwards."""
+    """In order: in the caller's namespaces, from its own upwards."""
     if key.startswith("/"):
         return [resolve_parameter(key, caller_id)]
     levels = [part for part in caller_id.split("/") if part]
@@ -106,7 +100,7 @@ def searched(key: str, caller_id: str) -> list[str]:
 
 
 def join(namespace: str, name: str) -> str:
-    """Return `name` in `namespace`. A global or private name stays unchanged."""
+    """A global or private name stays unchanged."""
     if name.startswith(("/", "~")) or not namespace:
         return name
     return f"{namespace}{name}" if namespace.endswith("/") else f"{namespace}/{name}"

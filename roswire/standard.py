@@ -93,7 +93,6 @@ _NOT_ROS_1 = "builtin_interfaces"  # has `time` and `duration` as ROS 2 messages
 
 
 def standard_definitions() -> Definitions:
-    """Return the definitions of ROS's own message packages and services."""
     store = get_typestore(Stores.ROS1_NOETIC)
     files = _ADDITIONAL | MAVROS | _messages_of_actions()
     for name in store.fielddefs:
@@ -106,7 +105,7 @@ def standard_definitions() -> Definitions:
 
 
 def _in_places(text: str, before: dict[str, int]) -> str:
-    """Return a definition with its constants in their places; constants without a place come last."""
+    """Constants without a place come last."""
     constants = iter([line for line in text.splitlines() if "=" in line])
     lines = []
     for line in [line for line in text.splitlines() if line and "=" not in line]:

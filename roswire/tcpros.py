@@ -20,27 +20,23 @@ from dataclasses import dataclass
 from roswire.errors import LimitExceededError, ProtocolError
 
 HEADER_LIMIT = 65536
-"""The maximum number of bytes in one connection header.
-
-The largest message definitions of MoveIt need about half of this.
-"""
+"""The largest message definitions of MoveIt need about half of this."""
 
 MESSAGE_LIMIT = 256 << 20
-"""The maximum number of bytes in one message, request or response."""
 
 _LENGTH = struct.Struct("<I")
 _ANY_BYTES = frozenset({"message_definition"})
 
 
 def encode_header(fields: Mapping[str, str]) -> bytes:
-    """Encode a connection header, including its length, with the fields in the given order."""
+    """With its length, and the fields in the given order."""
     lines = [f"{name}={value}".encode("utf-8", "surrogateescape") for name, value in fields.items()]
     body = b"".join([_LENGTH.pack(len(line)) + line for line in lines])
     return _LENGTH.pack(len(body)) + body
 
 
 def encode_frame(body: bytes | bytearray | memoryview) -> bytes:
-    """Encode one message, service request or response: its length, then its bytes."""
+    """The length, then the bytes."""
     return _LENGTH.pack(len(body)) + body
 
 
@@ -49,12 +45,15 @@ def encode_service_reply(body: bytes | bytearray | memoryview) -> bytes:
 
 
 def encode_service_error(text: str) -> bytes:
-    """Encode the reply to a service call that failed; the calling node shows `text`."""
+    """The calling node shows `text`."""
     return b"\x00" + encode_frame(text.encode("utf-8", "replace"))
 
 
 def decode_header(body: bytes) -> dict[str, str]:
-    """Parse the fields of a connection header without its length; raises `ProtocolError`."""
+    """`body` is without its length.
+
+    Raises `ProtocolError`.
+    """
     fields: dict[str, str] = {}
     position = 0
     while position < len(body):
@@ -78,10 +77,7 @@ def decode_header(body: bytes) -> dict[str, str]:
 
 
 class HeaderParser:
-    """A parser of one connection header, from bytes as they arrive. Bytes after the header are in `rest`.
-
-    `limit` is the maximum number of bytes of an accepted header.
-    """
+    """Bytes after the header are in `rest`."""
 
     def __init__(self, limit: int = HEADER_LIMIT) -> None:
         self.rest = b""
@@ -90,7 +86,7 @@ class HeaderParser:
         self._done = False
 
     def feed(self, data: bytes) -> dict[str, str] | None:
-        """Take `data`. Return the fields once the header is complete; before that, return None.
+        """None until the header is complete.
 
         Raises `LimitExceededError` as soon as the announced length exceeds the limit, `ProtocolError` for a malformed
         header, and RuntimeError if the header was already returned.
@@ -118,14 +114,17 @@ class HeaderParser:
 
 
 class FrameParser:
-    """A parser of frames (messages, service requests), from bytes as they arrive, each of at most `limit` bytes."""
+    """Each frame has at most `limit` bytes."""
 
     def __init__(self, limit: int = MESSAGE_LIMIT) -> None:
         self._limit = limit
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Take `data`, and return the bodies that are now complete. Raises `LimitExceededError`."""
+        """Returns the bodies that are now complete.
+
+        Raises `LimitExceededError`.
+        """
         buffer = self._buffer
         buffer += data
         frames = []
@@ -144,24 +143,24 @@ class FrameParser:
 
 @dataclass(frozen=True, slots=True)
 class ServiceReply:
-    """The reply of a service: the serialised response, or the text of the error if not `ok`."""
+    """`body` is the serialised response, or the text of the error."""
 
     ok: bool
     body: bytes
 
 
 class ServiceReplyParser:
-    """A parser of service replies, from bytes as they arrive, each of at most `limit` bytes."""
+    """Each reply has at most `limit` bytes."""
 
     def __init__(self, limit: int = MESSAGE_LIMIT) -> None:
         self._limit = limit
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[ServiceReply]:
-        """Take `data`, and return the replies that are now complete.
+        """Returns the replies that are now complete.
 
-        Raises `ProtocolError` if the first byte is neither 0 nor 1, and `LimitExceededError` if the length exceeds the
-        limit.
+        Raises `ProtocolError` if the first byte is neither 0 nor 1, and `LimitExceededError` if the length exceeds
+        the limit.
         """
         buffer = self._buffer
         buffer += data

@@ -13,7 +13,6 @@ from functools import lru_cache
 from roswire.errors import InvalidUriError, quoted
 
 MAX_URI_LENGTH = 1024
-"""The maximum number of characters in one URI."""
 
 _URI = re.compile(
     r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]*+)://"
@@ -25,7 +24,7 @@ _URI = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class NodeUri:
-    """The parts of a URI; `host` is without brackets, `path` starts with `/` (empty for a service)."""
+    """`host` is without brackets, `path` starts with `/` (empty for a service)."""
 
     scheme: str
     host: str
@@ -35,12 +34,15 @@ class NodeUri:
 
 @lru_cache(4096)  # a node sends its own URI with every call
 def parse_node_uri(text: str) -> NodeUri:
-    """Parse the URI of a node's XML-RPC API; raises `InvalidUriError`."""
+    """Raises `InvalidUriError`."""
     return _parse(text, "http", "node API", "http://host:port/")
 
 
 def parse_service_uri(text: str) -> NodeUri:
-    """Parse the URI of a service, whose path is empty; raises `InvalidUriError`."""
+    """The path must be empty.
+
+    Raises `InvalidUriError`.
+    """
     uri = _parse(text, "rosrpc", "service", "rosrpc://host:port")
     if uri.path not in ("", "/"):
         raise InvalidUriError(f"service URI {quoted(text)} has a path; write rosrpc://host:port")
@@ -48,12 +50,12 @@ def parse_service_uri(text: str) -> NodeUri:
 
 
 def node_uri(host: str, port: int, path: str = "/") -> str:
-    """Return the URI of a node's XML-RPC API. An IPv6 `host` gets brackets."""
+    """An IPv6 `host` gets brackets."""
     return f"http://{_bracketed(host)}:{port}{path}"
 
 
 def service_uri(host: str, port: int) -> str:
-    """Return the URI of a service. An IPv6 `host` gets brackets."""
+    """An IPv6 `host` gets brackets."""
     return f"rosrpc://{_bracketed(host)}:{port}"
 
 

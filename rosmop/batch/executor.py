@@ -1,7 +1,6 @@
 """Define the interface of executors, and the loop that submits jobs and retries those whose worker died.
 
-A job and its result are bytes; `work` of `rosmop.batch.jobs` turns one into the other and depends on nothing else but
-the recording. So the result is the same everywhere.
+`work` of `rosmop.batch.jobs` depends on nothing but the job and the recording, so the result is the same everywhere.
 """
 
 from collections import deque
@@ -10,33 +9,30 @@ from dataclasses import dataclass
 from typing import Protocol
 
 ATTEMPTS = 3
-"""The number of times that a job is tried if its worker dies."""
 
 Work = Callable[[bytes], bytes]
 
 
 @dataclass(frozen=True)
 class WorkerDeath:
-    """The worker of a job ended without a result, with the reason."""
+    """The worker of a job ended without a result."""
 
     reason: str
 
 
 class Executor(Protocol):
-    """An executor of several jobs at the same time."""
+    """Executes several jobs at the same time."""
 
     @property
     def capacity(self) -> int:
         """Return the number of jobs to submit before the first result."""
 
-    def submit(self, number: int, job: bytes) -> None:
-        """Begin a job; the number names it."""
+    def submit(self, number: int, job: bytes) -> None: ...
 
     def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:
         """Wait until at least one submitted job has ended, and return those that have."""
 
-    def close(self) -> None:
-        """End all workers, with their jobs."""
+    def close(self) -> None: ...
 
 
 class ThisProcess:

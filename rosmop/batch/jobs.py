@@ -1,4 +1,4 @@
-"""Jobs on one recording, and `work`, the pure function that executes them on any machine.
+"""Jobs on one recording, and `work`, the pure function that executes them.
 
 A job has all that its result depends on, except the messages. Results are bounded: their size does not depend on the
 recording's length.
@@ -102,7 +102,7 @@ def unpacked(result: bytes) -> Result | Failure:
 
 
 def work(job: bytes) -> bytes:
-    """Execute a job. Every error becomes a `Failure`, so one recording never ends the work on others."""
+    """Every error becomes a `Failure`, so one recording never ends the work on others."""
     result: Result | Failure
     try:
         envelope = msgspec.msgpack.decode(job, type=_Envelope)
@@ -209,5 +209,4 @@ def _version() -> str:
 
 
 def _text(text: str) -> str:
-    """Return a text without surrogates, which have no encoding."""
     return text.encode("utf-8", "backslashreplace").decode("utf-8")

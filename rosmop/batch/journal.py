@@ -1,8 +1,8 @@
 """Keep the results of finished jobs in a file, so that an interrupted command can continue, or only temporarily.
 
-The key of a result is the hash of its job. A job contains the specifications, the options, the version, and the
-recording's name, size and time of change: if one of them differs, the job runs again. It also runs again if its result
-is damaged, because each line has a checksum. A line that was cut off by a crash is removed.
+The key of a result is the hash of its job, which contains the specifications, the options, the version, and the
+recording's name, size and time of change: if one of them differs, the job runs again. It also runs again if its
+result is damaged; each line has a checksum. A line that was cut off by a crash is removed.
 """
 
 import base64
@@ -24,7 +24,7 @@ _DIGEST = 64  # characters
 
 
 class JournalError(Exception):
-    """The journal cannot be used, with the reason."""
+    """The journal cannot be used."""
 
 
 class ResumeJournal:
@@ -63,7 +63,6 @@ class ResumeJournal:
         self._file.close()
 
     def result(self, job: bytes) -> bytes | None:
-        """Return the result of a job, or None if it is missing or damaged."""
         place = self._places.get(_digest(job))
         if place is None:
             return None
@@ -104,7 +103,7 @@ class ResumeJournal:
 
 
 def append(descriptor: int, data: bytes) -> None:
-    """Write all data, which one system call may not do. Raises `OSError`."""
+    """Write all data, which may take several system calls. Raises `OSError`."""
     left = memoryview(data)
     while left:
         left = left[os.write(descriptor, left) :]
@@ -127,7 +126,6 @@ class TemporaryStore:
         self._file.close()
 
     def append(self, data: bytes) -> tuple[int, int]:
-        """Write data, and return its place for `read`."""
         with self._errors():
             append(self._file.fileno(), data)
         self.size += len(data)
@@ -138,7 +136,6 @@ class TemporaryStore:
             return os.pread(self._file.fileno(), place[1], place[0])
 
     def whole(self) -> bytes | mmap:
-        """Return all data, without reading it into memory."""
         return mmap(self._file.fileno(), self.size, access=ACCESS_READ) if self.size else b""
 
     @staticmethod

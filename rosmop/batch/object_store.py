@@ -1,6 +1,6 @@
 """Read recordings from S3, or from a server with its interface (`AWS_ENDPOINT_URL`), with boto3.
 
-Credentials, region and endpoint are those of boto3: environment, profile, or the role of the machine.
+Boto3 finds credentials, region and endpoint: in the environment, a profile, or the role of the machine.
 """
 
 import shutil
@@ -17,7 +17,7 @@ _PIECE = 1 << 20
 
 
 def listed(prefix: str) -> Iterator[tuple[str, int, str]]:
-    """Yield URI, size and hash of each object with a prefix, in the order of their names. Raises `RecordingError`."""
+    """Yield URI, size and hash of each object, in the order of their names. Raises `RecordingError`."""
     bucket, key = _parts(prefix)
     with _errors(prefix):
         pages = _client().get_paginator("list_objects_v2").paginate(Bucket=bucket, Prefix=key)

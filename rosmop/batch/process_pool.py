@@ -17,7 +17,7 @@ _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of prctl
 
 
 class ProcessPool:
-    """At most `capacity` processes, which are started as they are needed."""
+    """Starts its processes as they are needed."""
 
     def __init__(self, work: Work, capacity: int) -> None:
         self.capacity = capacity
@@ -27,7 +27,6 @@ class ProcessPool:
         self._running: dict[Connection, tuple[BaseProcess, int]] = {}
 
     def submit(self, number: int, job: bytes) -> None:
-        """Give a job to an idle process, or to a new one."""
         while True:
             is_new = not self._idle
             process, pipe = self._start() if is_new else self._idle.pop()

@@ -15,7 +15,7 @@ _AHEAD = 2  # jobs for each processor, so that none waits for the next job
 
 
 class ClusterError(Exception):
-    """The cluster cannot be used, with the reason."""
+    """The cluster cannot be used."""
 
 
 class RayCluster:
@@ -51,7 +51,6 @@ class RayCluster:
         self._running[self._task.remote(job)] = number
 
     def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:
-        """Wait for the result of a task, or for the death of its worker or node."""
         (ready,), _others = self._ray.wait(list(self._running), num_returns=1)
         number = self._running.pop(ready)
         try:
@@ -68,7 +67,6 @@ def _print_to_stderr(data: dict[str, Any], **_options: object) -> None:
 
 
 def _reason(error: Exception) -> str:
-    """Return the first line of a message, with the line that it announces: the next one, or the end of a traceback."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     if "Traceback (most recent call last):" in lines:
         lines = [lines[0], lines[-1]]

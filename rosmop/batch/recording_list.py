@@ -26,7 +26,7 @@ class RecordingName(msgspec.Struct, frozen=True):
 
 
 def recordings_of(files: Sequence[Path], sets: Sequence[str]) -> list[RecordingName]:
-    """Return the recordings, each once: the files, then those of each set in the order of their names.
+    """Return each recording once: the files, then those of each set in the order of their names.
 
     A set is a folder (with its folders), a pattern or an S3 prefix. Raises `RecordingError` for a set without
     recordings.
@@ -69,7 +69,6 @@ def _unreadable(error: OSError) -> None:
 
 
 def local_recording(path: Path) -> RecordingName:
-    """Return a file as it is now."""
     uri, place = os.fsencode(path).decode("utf-8", "backslashreplace"), os.fsencode(path.absolute())
     try:
         status = path.stat()

@@ -1,4 +1,4 @@
-"""Run specifications on one recording, and summarize the effects that they had."""
+"""Run specifications on one recording, and summarize their effects."""
 
 from collections.abc import Iterator
 from contextlib import closing
@@ -70,7 +70,7 @@ class ReplayJob(msgspec.Struct, frozen=True, tag=True):
 
 
 class Effect(msgspec.Struct, frozen=True):
-    """How often a monitor had an effect of a kind on a topic or timer, with the first and last time in nanoseconds."""
+    """How often a monitor had an effect of a kind on a topic or timer; times are in nanoseconds."""
 
     monitor: str
     kind: str

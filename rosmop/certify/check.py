@@ -26,10 +26,7 @@ from rosmop.certify.words import ExpressionDerivatives
 MOST_STEPS = 200_000
 """The maximum number of (pair, event) combinations for one property."""
 MOST_WORK = 400_000
-"""The maximum number of clauses, or of parts of expressions, for one formula.
-
-Reaching either limit takes some tenths of a second.
-"""
+"""The maximum number of clauses, or of parts of expressions, for one formula."""
 
 S = TypeVar("S", bound=Hashable)
 Verdicts = tuple[str, ...]
@@ -48,10 +45,11 @@ class AutomatonTables:
 
 @dataclass(frozen=True)
 class Certificate:
-    """The result for one property.
+    """The result for one property. If it is neither `proved` nor `wrong`, the property was not certified, and `text`
+    gives the reason.
 
-    `proved`: every trace's verdict is that of the definition; `text` describes the check. `wrong`: some trace's verdict
-    differs; `text` gives such a trace. Neither: the property was not certified; `text` gives the reason.
+    `proved`: every trace's verdict is that of the definition; `text` describes the check. `wrong`: some trace's
+    verdict differs; `text` gives such a trace.
     """
 
     proved: bool
@@ -60,11 +58,11 @@ class Certificate:
 
 
 class _WrongError(Exception):
-    """The automaton differs from the definition."""
+    pass
 
 
 def certify(logic: str, formula: str, events: Sequence[str], tables: AutomatonTables | None) -> Certificate:
-    """Hold the automaton of a property (None: it has none) against its formula."""
+    """Compare the automaton of a property, if it has one, with its formula."""
     check = _CHECKS.get(logic)
     if check is None or tables is None:
         known = "it has no automaton" if tables is None else "the certifier does not know this logic"
@@ -82,8 +80,8 @@ def certify(logic: str, formula: str, events: Sequence[str], tables: AutomatonTa
 
 
 def _look_at_form(logic: str, events: Sequence[str], tables: AutomatonTables) -> None:
-    """Raise an error for tables that are not an automaton. A negative state is invalid, because Python would index it
-    from the end.
+    """Reject tables that are not an automaton. A negative state is invalid, because Python would index it from the
+    end.
 
     Only `tfsm` has time limits.
     """
@@ -187,7 +185,6 @@ def _check_past(
 
 
 def _check_words(formula: str, events: Sequence[str], tables: AutomatonTables) -> int:
-    """Check that the verdict is `fail` once no continuation matches: no later derivative contains the empty word."""
     words = ExpressionDerivatives(formula_reader.expression(formula, events), MOST_WORK)
     dead: dict[int, bool] = {}
 
@@ -203,7 +200,6 @@ def _check_words(formula: str, events: Sequence[str], tables: AutomatonTables) -
 
 
 def _dead(words: ExpressionDerivatives, start: int, events: Sequence[str]) -> dict[int, bool]:
-    """Return, for each reachable derivative, whether no continuation can match."""
     leading: dict[int, set[int]] = {start: set()}
     waiting = [start]
     for state in waiting:
@@ -239,9 +235,6 @@ _SILENCE = "(silence)"
 def _check_endless(
     formula: formula_reader.Node, events: Sequence[str], letters: Sequence[str], tables: AutomatonTables
 ) -> int:
-    """Check for `violation` once no endless continuation makes the formula true, and for `validation` once none makes
-    it false.
-    """
     guesses = PastGuesses(formula, letters)
     future = FutureFollower(guesses.count, MOST_WORK)
     sides = (guesses.formula, ("not", guesses.formula))

@@ -32,7 +32,6 @@ class StepCase:
     counted: int = -1
     until: int = NEVER
     beside: tuple[int, int] | None = None
-    """The number and the state of another property."""
 
 
 @dataclass
@@ -43,7 +42,6 @@ class ExpectedResult:
     position: int = 0
     effects: list[tuple[int, int]] = field(default_factory=list)
     calls: list[tuple[int, int]] = field(default_factory=list)
-    """The numbers of the called functions, and the frame of each call."""
     happened: list[int] = field(default_factory=list)
     dropped: list[int] = field(default_factory=list)
     verdicts: list[int] = field(default_factory=list)
@@ -52,7 +50,7 @@ class ExpectedResult:
 
     @property
     def answer(self) -> int:
-        """Return the expected answer, without the positions of frames."""
+        """The expected answer, without the positions of frames."""
         flags = TOLD * bool(self.verdicts) | SOONER * self.sooner | LEFT * self.left
         return len(self.effects) << 32 | flags
 
@@ -63,7 +61,7 @@ class LeftToEngineError(Exception):
 
 @dataclass(frozen=True)
 class ExpectedHandler:
-    """A handler: its category, its verdict (None: not compiled) and function in the walk, and whether it may drop."""
+    """A handler: its verdict is None if it is not compiled."""
 
     category: str
     verdict: int | None
@@ -73,7 +71,7 @@ class ExpectedHandler:
 
 @dataclass(frozen=True)
 class PropertyStep:
-    """A property that an event steps: its number (None if it is not in the module), its automaton and its handlers."""
+    """A property that an event steps; its number is None if it is not in the module."""
 
     number: int | None
     compiled: CompiledProperty
@@ -88,7 +86,7 @@ class PropertyStep:
 
 
 class ExpectedTopic:
-    """The events of a topic and their properties, as specified; `walk` computes the expected result."""
+    """The events of a topic and their properties, as specified."""
 
     def __init__(
         self,
@@ -180,7 +178,6 @@ class ExpectedTopic:
     def _step(
         self, one: PropertyStep, states: States, case: StepCase, frame: int, result: ExpectedResult
     ) -> bool:
-        """Step a property and run its handlers. Return whether a handler dropped the message."""
         if one.number is None:
             raise LeftToEngineError
         if isinstance(one.compiled, ClockedProperty):

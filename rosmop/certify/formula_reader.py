@@ -18,11 +18,11 @@ _TOKEN = re.compile(
 
 
 class UnsupportedFormulaError(Exception):
-    """The certifier does not know a part of the formula."""
+    """The formula has a part that the certifier does not know."""
 
 
 class WorkLimitError(Exception):
-    """The check needs more work than its limit."""
+    """The check exceeds its limit."""
 
 
 _NANOSECONDS = {"ns": 0, "us": 3, "ms": 6, "s": 9}
@@ -40,7 +40,7 @@ class WordReader:
         self.take()
 
     def take(self) -> str:
-        """Return the next word and advance; return an empty string at the end."""
+        """Return the next word, or an empty string at the end."""
         before = self.word
         match = _TOKEN.match(self._text, self._at)
         if match is None:  # the pattern matches any text
@@ -58,7 +58,7 @@ class WordReader:
         return before
 
     def _fits(self, sign: str, at: int) -> bool:
-        """Return whether the sign is next. A sign that ends with a letter must be a whole word."""
+        """A sign that ends with a letter must be a whole word."""
         end = at + len(sign)
         if not self._text.startswith(sign, at):
             return False
@@ -71,7 +71,6 @@ class WordReader:
         return True
 
     def expect(self, word: str) -> None:
-        """Take this word; raises `UnsupportedFormulaError` if a different word is next."""
         if not self.accept(word):
             raise UnsupportedFormulaError(f"{self.word!r} where {word!r} is expected")
 
@@ -83,7 +82,6 @@ class WordReader:
         return int((number * (_SECONDS[self.take()] if self.word in _SECONDS else 1)).scaleb(9))
 
     def end(self) -> None:
-        """Raise `UnsupportedFormulaError` unless the whole text was read."""
         if self.word:
             raise UnsupportedFormulaError(f"{self.word!r} after the end")
 
@@ -115,7 +113,7 @@ Grammar = tuple[Mapping[str, str], Sequence[Mapping[str, str]]]
 
 
 def formula(text: str, events: Sequence[str], grammar: Grammar) -> Node:
-    """Return a formula of temporal logic. Raises `UnsupportedFormulaError`."""
+    """Parse a formula of temporal logic. Raises `UnsupportedFormulaError`."""
     unary, levels = grammar
     signs = {"(", ")", "[", "]", ",", *unary, *(sign for level in levels for sign in level)}
     words = WordReader(text, [sign for sign in signs if not sign.isidentifier()])
@@ -156,7 +154,7 @@ def _operand(words: WordReader, events: Sequence[str], grammar: Grammar, depth: 
 
 
 def _unbounded(words: WordReader, grammar: Grammar) -> None:
-    """Take the bounds of an mtl operator if they have no effect."""
+    """Skip the bounds of an mtl operator if they have no effect."""
     if grammar is MTL and words.accept("["):
         if words.duration() != 0:
             raise UnsupportedFormulaError("a bound of time")

@@ -1,10 +1,9 @@
-"""Formulas about the future, over endless traces. The module computes the remaining obligation after an event, and
-whether it can be met.
+"""Formulas about the future, over endless traces. A state is the remaining obligation after an event: a set of
+*clauses*, of which one must come true.
 
-A state is the remaining obligation: a set of *clauses*, of which one must come true. A clause is a set of parts of the
-formula, each beginning with a temporal operator; all of them must come true. A clause that requires more than another
-clause is left out, so there are finitely many states. The remainder of a part after an event follows from the
-definition: `x U y` is `y`, or else `x` now and `x U y` at the next event.
+A clause is a set of parts of the formula, each beginning with a temporal operator; all of them must come true. A
+clause that requires more than another clause is left out, so there are finitely many states. The remainder of a part
+after an event follows from the definition: `x U y` is `y`, or else `x` now and `x U y` at the next event.
 
 A clause can come true if its paths from event to event reach a cycle on which no `until` is postponed at every step.
 """
@@ -23,10 +22,7 @@ FALSE: State = frozenset()
 
 
 class FutureFollower:
-    """Follow a formula over `letters` numbered letters; exactly one happens at each position.
-
-    `work` is the maximum number of clauses; beyond it, `WorkLimitError` is raised.
-    """
+    """Follow a formula over numbered letters, one at each position. More than `work` clauses raise `WorkLimitError`."""
 
     def __init__(self, letters: int, work: int) -> None:
         self._letters = range(letters)
@@ -121,7 +117,6 @@ class FutureFollower:
         return self._known[clause]
 
     def _explore(self, start: Clause) -> None:
-        """Find all clauses that `start` leads to, and which of them can come true."""
         ways: dict[Clause, set[Way]] = {}
         waiting = [start]
         while waiting:
@@ -172,13 +167,12 @@ class FutureFollower:
 
 
 def _fulfils(group: set[Clause], ways: dict[Clause, set[Way]]) -> bool:
-    """Return whether a trace can stay in these clauses for ever and fulfil every `until`."""
+    """Return whether a trace can stay in these clauses forever and fulfil every `until`."""
     inside = [off for clause in group for after, off in ways[clause] if after in group]
     return bool(inside) and not frozenset.intersection(*inside)
 
 
 def _circles(ways: dict[Clause, set[Way]]) -> list[set[Clause]]:
-    """Return the strongly connected components (Kosaraju)."""
     order: list[Clause] = []
     seen: set[Clause] = set()
     for root in ways:

@@ -48,7 +48,6 @@ class PastGuesses:
         return reduce(lambda left, right: ("and", left, right), self.rules, formula)
 
     def _over(self, node: Node) -> Node:
-        """Return the formula over letters, with guesses in place of past operators."""
         if node in self._guessed:
             bit = 1 << self._guessed[node]
             return ("one of", sum(1 << letter for letter in range(self.count) if letter & bit))

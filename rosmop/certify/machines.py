@@ -64,7 +64,6 @@ class StateMachineFollower:
         return self._moves.get(state, {}).get(event, self._default.get(state, FAIL))
 
     def timeout(self, state: str) -> tuple[int, str] | None:
-        """Return the nanoseconds without an event after which the machine leaves a state, and the next state."""
         return self._timeouts.get(state)
 
     def verdicts(self, state: str) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Formulas about the past, by their definition: the value of each part at an event follows from the previous values."""
+"""Formulas about the past, by their definition."""
 
 from collections.abc import Callable, Mapping
 
@@ -8,7 +8,7 @@ State = tuple[bool, ...]
 
 
 class PastFollower:
-    """Follow a past formula; a state has, for each operator that looks back, its memory of the previous event."""
+    """Follow a past formula. A state is the memory of each operator that looks back."""
 
     def __init__(self, formula: Node) -> None:
         self._parts: dict[Node, int] = {}
@@ -22,7 +22,7 @@ class PastFollower:
         )
 
     def _file(self, node: Node) -> int:
-        """Return the number of a part. Its operands have smaller numbers."""
+        """Return the number of a part, which is greater than those of its operands."""
         for operand in node[1:]:
             if isinstance(operand, tuple):
                 self._file(operand)
@@ -33,7 +33,6 @@ class PastFollower:
         return self._parts[node]
 
     def step(self, state: State, event: str) -> tuple[State, bool]:
-        """Return the memory after an event, and whether the formula holds at the event."""
         before = {node: state[place] for node, place in self._looking}
         now: dict[Node, bool] = {}
         for node in self._order:

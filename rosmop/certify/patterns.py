@@ -1,6 +1,6 @@
 """Translate patterns without a time bound to equivalent formulas about the future (after Dwyer; HPL).
 
-`W` is "until, or for ever". These formulas hold inside a scope that `q` closes (`false` if no event closes it), from
+`W` is "until, or forever". These formulas hold inside a scope that `q` closes (`false` if no event closes it), from
 its first event on:
 
     no c            not c  W  q

@@ -1,6 +1,5 @@
-"""Certify the compiled properties of specifications.
-
-This is the only module that passes results of the logics' compilers to the certifier.
+"""Certify the compiled properties of specifications; only this module connects the logics' compilers to the
+certifier.
 """
 
 from collections.abc import Iterable
@@ -26,7 +25,7 @@ def certificate_of(compiled: CompiledProperty) -> Certificate:
 def certificates_of(
     specifications: Iterable[SpecificationCode],
 ) -> tuple[dict[str, list[str]], list[Diagnostic]]:
-    """Return a line for each property of each specification, and an error for each wrong automaton."""
+    """Return a line for each property, by specification, and an error for each wrong automaton."""
     lines: dict[str, list[str]] = {}
     wrong: list[Diagnostic] = []
     for specification in specifications:

@@ -3,11 +3,10 @@
 The walks of topics and the data, tables included, stay byte for byte the same. The script is stored after the frames:
 the notes of calls, the state to restore before each try, and the result of each function.
 
-The encoders and decoders in this file share no code with the writer of modules (`fast/wasm.py`). So an error in
-the writer's encoding of a number or section is not repeated here. The file shares only facts about the module
-(`WasmModule`) with the writer: the names of the walks, and the addresses of frames and effects. If the writer records a
-wrong address, the module traps or the comparison in `steps.py` fails, unless the writer uses the same wrong address
-everywhere.
+The encoders and decoders in this file share no code with the writer of modules (`fast/wasm.py`). So an error in the
+writer's encoding of a number or section is not repeated here. The file shares only facts about the module
+(`WasmModule`) with the writer. If the writer records a wrong address, the module traps or the comparison in
+`steps.py` fails, unless the writer uses the same wrong address everywhere.
 """
 
 import struct
@@ -31,10 +30,7 @@ _COPY_MEMORY = b"\xfc\x0a\x00\x00"
 
 
 def scripted(module: WasmModule) -> bytes:
-    """Return the module with stubs.
-
-    For each walk it gets a function that tries a range of states (`try` and the walk's name).
-    """
+    """Return the module with stubs, and for each walk a function `try…` that tries a range of states."""
     sections = sections_of(module.code)
     types, chosen = list(_types(sections[1])), list(_chosen(sections[3]))
     exports = _exports(sections[7])
@@ -57,7 +53,6 @@ def scripted(module: WasmModule) -> bytes:
 
 
 def _stub(module: WasmModule, number: int, kind: bytes) -> bytes:
-    """Return a stub: it notes its number and first two arguments, and returns its result from the script."""
     end, result = module.frames + TELL, kind[-1:]
     code = b""
     if kind[1] >= 2 and kind[2:4] == _I32 + _I32:  # two addresses: an event or a handler
@@ -101,7 +96,7 @@ def _leb(value: int) -> bytes:
 
 
 def _i32(value: int) -> bytes:
-    """Encode the constant of an address or small number in five bytes, so that its sign bit is clear."""
+    """Encode a number in five bytes, with its sign bit clear."""
     return b"\x41" + bytes(value >> shift & 0x7F | 0x80 for shift in (0, 7, 14, 21)) + bytes((value >> 28,))
 
 
@@ -132,7 +127,6 @@ def _function(code: bytes, locals_: Iterable[bytes] = ()) -> bytes:
 
 
 def _read_leb(data: bytes, at: int) -> tuple[int, int]:
-    """Return the number at `at`, and the position after it."""
     value = shift = 0
     while True:
         byte = data[at]
@@ -143,7 +137,6 @@ def _read_leb(data: bytes, at: int) -> tuple[int, int]:
 
 
 def sections_of(code: bytes) -> dict[int, bytes]:
-    """Return the sections of a module by their numbers, in order."""
     at, found = 8, {}
     while at < len(code):
         size, begin = _read_leb(code, at + 1)

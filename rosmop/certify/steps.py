@@ -89,10 +89,7 @@ def check_steps(compiled: Compiled, module: WasmModule) -> int:
 
 
 def _cases(topic: ExpectedTopic) -> Iterator[tuple[StepCase, int | None, bool]]:
-    """Yield the cases.
-
-    Each has the property whose states are tried (or None), and whether all of its states are tried.
-    """
+    """Yield cases, each with the property whose states are tried (or None), and whether all of them are tried."""
     for event, function in enumerate(topic.functions):
         happens = {function: HAPPENED}
         rows = [one for one in topic.steps[event] if one.number is not None]
@@ -127,7 +124,6 @@ def _cases(topic: ExpectedTopic) -> Iterator[tuple[StepCase, int | None, bool]]:
 
 
 def _pairs(topic: ExpectedTopic) -> Iterator[tuple[StepCase, int | None, bool]]:
-    """Yield the cases of two events on one message: both happen, and the second drops the message if it may."""
     for first, second in combinations(range(len(topic.functions)), 2):
         one, other = topic.functions[first], topic.functions[second]
         numbers = dict.fromkeys(each.number for event in (first, second) for each in topic.steps[event])
@@ -146,7 +142,7 @@ def _pairs(topic: ExpectedTopic) -> Iterator[tuple[StepCase, int | None, bool]]:
 
 
 def _handling(one: PropertyStep) -> tuple[int, int] | None:
-    """Return the property, and a state from which its event leads to a handler; None if no state does."""
+    """Return a state from which the event leads to a handler, with the number of the property."""
     if one.number is None or not isinstance(one.compiled, FiniteProperty):
         return None
     handled, automaton = {each.category for each in one.handlers}, one.compiled.automaton
@@ -157,7 +153,7 @@ def _handling(one: PropertyStep) -> tuple[int, int] | None:
 
 
 def _answers(one: PropertyStep, bits: int) -> dict[int, int]:
-    """Return the results of a property's handlers. A handler that may not drop gets no drop."""
+    """A handler that may not drop gets no drop."""
     bits |= HAPPENED | CHANGED
     return {
         each.function: bits if each.drops else bits & ~DROPPED
@@ -174,8 +170,6 @@ def _times(one: PropertyStep) -> Sequence[int]:
 
 
 class _Bench:
-    """A topic's walk in the module with stubs."""
-
     def __init__(
         self, machine: WasmInstance, module: WasmModule, cells: Cells, topic: ExpectedTopic, name: str
     ) -> None:
@@ -197,7 +191,7 @@ class _Bench:
             self._memory[at : at + 20] = struct.pack("<I", len(_FRAME)) + _FRAME
 
     def run(self, case: StepCase, number: int | None, *, everywhere: bool) -> int:
-        """Run a case and compare the results; return the number of tried states. Raises `StepDiffersError`."""
+        """Return the number of tried states. Raises `StepDiffersError`."""
         one = None if number is None else self._topic.properties[number]
         states = 1 if one is None else one.states if everywhere else min(one.states, _FEW)
         for first in range(0, states, self._most):
@@ -232,7 +226,7 @@ class _Bench:
         self._count(case, one, expected)
 
     def _waits_no_more(self, number: int, state: Any, case: StepCase) -> bool:
-        """Return whether the deadline of a property would have passed before the message."""
+        """Return whether the property's deadline would have passed before the message."""
         tables = self._topic.properties[number].compiled
         if not isinstance(tables, ClockedProperty) or tables.waits[state[0]] is None:
             return False
@@ -268,7 +262,7 @@ class _Bench:
         given: tuple[int, ...],
         expected: ExpectedResult,
     ) -> int:
-        """Compare the results of one try; return the position where the notes of the next try begin."""
+        """Return the position where the notes of the next try begin."""
         answer, who, what, cell, end, at = given
         notes = list(NOTE.iter_unpack(self._memory[at:end]))
         begins = [self._frames + 20 * frame for frame in range(4)]
@@ -293,7 +287,6 @@ class _Bench:
         return () if address is None else struct.unpack_from("<2q", self._memory, address)
 
     def _count(self, case: StepCase, one: PropertyStep | None, expected: Sequence[ExpectedResult]) -> None:
-        """Compare how often events happened, dropped a message, and led to verdicts."""
         rows = [
             [0] * len(self._feed.functions),
             [0] * len(self._feed.functions),

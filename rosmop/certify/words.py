@@ -9,16 +9,13 @@ from collections.abc import Iterable
 from rosmop.certify.formula_reader import Node, UnsupportedFormulaError, WorkLimitError
 
 LONGEST = 5_000
-"""The maximum number of symbols of an expression after its powers are written out."""
+"""The maximum number of symbols after powers are written out."""
 
 Parts = tuple[object, ...] | frozenset[int]
 
 
 class ExpressionDerivatives:
-    """The derivatives of an expression.
-
-    A state is an expression's number. `work` limits the parts of all derivatives together.
-    """
+    """A state is an expression's number. `work` limits the parts of all derivatives together."""
 
     def __init__(self, expression: Node, work: int) -> None:
         self._work = work
@@ -103,7 +100,7 @@ class ExpressionDerivatives:
         return self._number(kind, frozenset(flat), matches=quantor(self._matching[part] for part in flat))
 
     def _read(self, node: Node) -> tuple[int, int]:
-        """Return the number of an expression, and the number of its symbols after its powers are written out."""
+        """Return the number of an expression, and its number of symbols after powers are written out."""
         kind = str(node[0])
         if kind == "event":
             return self._number("event", (node[1],), matches=False), 1

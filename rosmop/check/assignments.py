@@ -20,7 +20,7 @@ from rosmop.types import value_types
 
 
 def require_place(target: Value, what: str) -> Lvalue:
-    """Return the place of an assigned value; rejects constants and values without a place."""
+    """Rejects constants and values without a place."""
     if target.place is None:
         raise SpecificationError.at(target.position, f"{what} needs a variable, a field or an element")
     variable = root(target)
@@ -41,7 +41,6 @@ def require_original(target: Value) -> None:
 
 
 def note_copy(target: Value, value: Value) -> None:
-    """Remember that a `char *` was assigned the characters of another."""
     variable = root(target)
     if (
         variable is not None
@@ -52,7 +51,7 @@ def note_copy(target: Value, value: Value) -> None:
 
 
 def store(scope: FunctionScope, target: Value, value: nodes.Expression) -> nodes.Expression:
-    """Return an expression that assigns `value` to `target`; its result is the assigned value."""
+    """Return an expression that assigns `value`; its result is the assigned value."""
     stored = _store(scope, require_place(target, "an assignment"), value)
     return marked(mark(scope, target), stored)
 
@@ -66,7 +65,7 @@ def write_store(scope: FunctionScope, target: Value, value: nodes.Expression) ->
 
 
 def marked(flag: str | None, change: nodes.Expression) -> nodes.Expression:
-    """Return `change`. If there is a `flag`, first set it."""
+    """If there is a `flag`, set it before the change."""
     if flag is None:
         return change
     assigned = nodes.Assign(value_types.BOOL, flag, nodes.Literal(value_types.BOOL, True))
@@ -74,7 +73,7 @@ def marked(flag: str | None, change: nodes.Expression) -> nodes.Expression:
 
 
 def mark(scope: FunctionScope, target: Value) -> str | None:
-    """Note that this place, or a part of it, changes; return the flag to set at the change, or None."""
+    """Note that this place changes. Return the flag to set at the change, if any."""
     variable = root(target)
     scope.changes = True
     if variable is None:
@@ -102,7 +101,7 @@ def _store(scope: FunctionScope, place: Lvalue, value: nodes.Expression) -> node
 
 
 def _store_part(scope: FunctionScope, place: Lvalue, value: nodes.Expression) -> nodes.Expression:
-    """Store a changed string or time as a whole, because neither changes in place."""
+    """Strings and times do not change in place, so a changed part stores the whole."""
     assert isinstance(place, CharacterLvalue | TimePartLvalue)  # the remaining kinds of places
     inner, base = require_place(place.base, "an assignment"), place.base.form
     if isinstance(place, TimePartLvalue):

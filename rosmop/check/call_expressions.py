@@ -1,4 +1,4 @@
-"""Calls: macros of rosconsole, the library, helper functions, member functions, constructors."""
+"""Compile calls: macros of rosconsole, the library, helper functions, member functions, constructors."""
 
 import math
 import re
@@ -25,7 +25,6 @@ _MACRO = re.compile(r"ROS_(DEBUG|INFO|WARN|ERROR|FATAL)(_STREAM)?(_COND|_ONCE|_T
 
 
 def call(scope: FunctionScope, node: tree.CallExpression) -> Value:
-    """Compile a call of any function, macro, member or type."""
     callee = node.callee
     if isinstance(callee, tree.MemberAccess):
         base = scope.value_of(callee.base)
@@ -61,7 +60,6 @@ def _named(scope: FunctionScope, node: tree.CallExpression, parts: tuple[str, ..
 
 
 def _known(scope: FunctionScope, node: tree.CallExpression, parts: tuple[str, ...]) -> Value | None:
-    """Compile a call of a predefined function; return None for any other name."""
     if len(parts) == 1 and parts[0] in event_facts.FUNCTIONS:
         return event_facts.fact(scope, node, parts[0])
     if parts[-2:] == ("Time", "now"):
@@ -147,7 +145,7 @@ def _helper(scope: FunctionScope, node: tree.CallExpression, function: HelperFun
 
 
 def _check_references(scope: FunctionScope, function: HelperFunction, values: Sequence[Value]) -> None:
-    """Reject references that a copy cannot replace; note shared variables passed as constant references."""
+    """Reject references that a copy cannot replace, and note shared variables passed as constant references."""
     handed: list[tuple[Value, bool]] = []
     for parameter, value in zip(function.parameters, values, strict=True):
         changes = parameter in function.references
@@ -236,7 +234,7 @@ def _line(scope: FunctionScope, node: tree.CallExpression) -> Value:
 
 
 def stream_of(node: tree.Expression) -> str | None:
-    """Return the level of a statement `std::cout << …` or `std::cerr << …`; None for other expressions."""
+    """Return the level of output to `std::cout` or `std::cerr`, or None for another expression."""
     if not isinstance(node, tree.BinaryExpression):
         return None
     while isinstance(node, tree.BinaryExpression) and node.operator == "<<":
@@ -338,7 +336,7 @@ def _moment(kind: value_types.Type, values: Sequence[Value], site: int) -> nodes
 
 
 def limits_of(kind: value_types.Type) -> Mapping[str, int | float]:
-    """Return the value of `std::numeric_limits<type>::name()`."""
+    """Return the members of `std::numeric_limits`."""
     if isinstance(kind, value_types.IntegerType):
         return {"min": kind.least, "max": kind.most, "lowest": kind.least}
     if isinstance(kind, value_types.FloatingType):

@@ -9,10 +9,7 @@ from rosmop.types.value_types import Type
 
 
 def convert(scope: FunctionScope, value: Value, target: Type, site: int | None = None) -> nodes.Expression:
-    """Return a value converted to the target type; rejects impossible conversions.
-
-    Nothing else refers to the result.
-    """
+    """Rejects impossible conversions. Nothing else refers to the result."""
     check_convertible(value, target)
     if value_types.is_number(target):
         return number(value.form, target)
@@ -33,13 +30,12 @@ def convert(scope: FunctionScope, value: Value, target: Type, site: int | None =
 
 
 def check_convertible(value: Value, target: Type) -> None:
-    """Reject a value that cannot be converted to the target type."""
     if not value_types.convertible(value.type, target):
         raise SpecificationError.at(value.position, refusal(value.type, target))
 
 
 def refusal(source: Type, target: Type) -> str:
-    """Return the error for a type that cannot be converted to another: the reason, and the text to write instead."""
+    """Return the error for an impossible conversion: the reason, and the text to write instead."""
     text, moment = (
         (value_types.StringType, value_types.CharactersType),
         (value_types.TimeType, value_types.DurationType),

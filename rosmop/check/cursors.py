@@ -15,11 +15,10 @@ from rosmop.form.findings import Position, SpecificationError
 from rosmop.types import value_types
 
 ALGORITHMS = frozenset({"sort", "reverse", "accumulate"})
-"""Functions of `<algorithm>` and `<numeric>` that take the range of a vector."""
 
 
 def moved(operator: str, left: Value, right: Value, position: Position) -> Value | None:
-    """Compile `begin + n`, `end - n` or `end - begin`; None for other operands."""
+    """Compile `begin + n`, `end - n` or `end - begin`; return None for other operands."""
     if left.vector is None or operator not in ("+", "-"):
         return None
     if value_types.is_number(right.type):
@@ -56,7 +55,6 @@ def insert(scope: FunctionScope, base: Value, arguments: Sequence[Value], at: tu
 
 
 def algorithm(scope: FunctionScope, name: str, values: Sequence[Value], at: tuple[Position, int]) -> Value:
-    """Compile one of `ALGORITHMS`, such as `std::sort(first, last)`."""
     position, site = at
     if len(values) < 2 or values[0].vector is None:
         raise SpecificationError.at(position, f"`{name}` goes from `v.begin()` to `v.end()`")

@@ -1,9 +1,9 @@
 """Compile `age(event)`, `seen(event)`, `host(event)` and `caller(event)`.
 
-Variables of the specification keep the time when the event last happened, and its sender. So they have the life of
-other variables: they are saved, restored and undone, and each slice has its own time. The time is -1 before the event
-has happened. The event's function assigns them after the action, unless the action dropped the message or faulted. In
-the action itself, `host` and `caller` are the sender of its message.
+Variables of the specification keep the time when the event last happened, and its sender, so they are saved, restored
+and undone, and each slice has its own. The time is -1 before the event has happened. The event's function assigns
+them after the action, unless the action dropped the message or faulted. In the action itself, `host` and `caller` are
+the sender of its message.
 """
 
 import math
@@ -24,7 +24,6 @@ FUNCTIONS = frozenset({"age", "seen", *SENDER})
 def declare_facts(
     shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
 ) -> None:
-    """Declare a variable for each fact about an event that the specification uses."""
     events = {
         event.name: event for event in specification.events if isinstance(event.trigger, tree.MessageTrigger)
     }
@@ -39,7 +38,6 @@ def declare_facts(
 
 
 def first_facts(names: SpecificationNames) -> Iterator[nodes.Assign]:
-    """Yield the assignments of all these variables before the first message."""
     for event in names.events:
         for variable in _variables(names, event):
             never: nodes.Expression = (
@@ -124,7 +122,6 @@ def _asked(specification: tree.Specification) -> Iterator[tuple[str, str]]:
 
 
 def _argument(node: tree.CallExpression) -> str:
-    """Return the only argument if it is a name; otherwise nothing."""
     match node.arguments:
         case (tree.Name(parts=(name,)),):
             return name

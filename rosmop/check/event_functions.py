@@ -71,9 +71,8 @@ def _key(
     trigger: tree.MessageTrigger,
     kind: str,
 ) -> str:
-    """Write the function that returns the values that an event binds.
-
-    It returns False if the message does not match. Otherwise it returns True alone, or a list of True and the values.
+    """Write the function that returns the values that an event binds: False if the message does not match, otherwise
+    True alone, or a list of True and the values.
     """
     scope = FunctionScope(shared, names, "action")
     scope.message_type = kind
@@ -172,9 +171,10 @@ def _bind(
 def _binds_nothing(
     scope: FunctionScope, binding: tree.Binding, parameters: dict[str, tree.ParameterDeclaration], kind: str
 ) -> bool:
-    """Whether a variable of a pattern is not a parameter of the event. ROSMOP accepts this, so it is only a warning.
+    """Return whether a variable of a pattern is not a parameter of the event. ROSMOP accepts this, so it is only a
+    warning.
 
-    Raises SpecificationError if the message has no such field.
+    Raises `SpecificationError` if the message has no such field.
     """
     name = binding.variable or ""
     if name in parameters or name in scope.names.parameters:
@@ -232,7 +232,7 @@ def constant_of_field(scope: FunctionScope, binding: tree.Binding, field: Type) 
 
 
 def _held(constant: bool | int | float | bytes, field: Type) -> bool | int | float | bytes | None:
-    """Return the constant as the field holds it; None if the field cannot hold it."""
+    """Return None if the field cannot hold the constant."""
     if isinstance(field, value_types.StringType):
         return constant if isinstance(constant, bytes) else None
     if isinstance(constant, bytes) or not value_types.is_number(field):
@@ -254,7 +254,7 @@ def _held(constant: bool | int | float | bytes, field: Type) -> bool | int | flo
 def _body(
     scope: FunctionScope, event: tree.EventDefinition, trigger: tree.MessageTrigger
 ) -> tuple[list[nodes.Statement], list[nodes.Statement], list[nodes.Statement]]:
-    """Compile the `when`, the action and what follows it: first, because they determine which fields are needed."""
+    """Compile the `when`, the action and the rest first, because they determine which fields are needed."""
     when = trigger.when
     with scope.nested() as conditions:
         if when is not None:
@@ -280,10 +280,7 @@ def _assemble(
     bound: list[PatternField],
     body: tuple[list[nodes.Statement], list[nodes.Statement], list[nodes.Statement]],
 ) -> tuple[int, bool]:
-    """Write all statements of the function.
-
-    Return the number of statements before the action, and whether facts about the event are kept.
-    """
+    """Return the number of statements before the action, and whether facts about the event are kept."""
     conditions, action, after = body
     read_fields(scope, bound)  # at a site without parameters, because they have no values yet
     site = scope.lines.site = scope.site(event)

@@ -35,7 +35,7 @@ _MAX_DIGITS = 400
 
 
 def value_of(scope: FunctionScope, node: tree.Expression) -> Value:
-    """Compile an expression; rejects an expression that has no meaning."""
+    """Rejects an expression that has no meaning."""
     return _KINDS[type(node)](scope, node)
 
 
@@ -52,7 +52,6 @@ def literal_number(scope: FunctionScope, node: tree.NumberLiteral) -> Value:
 
 
 def _is_beyond_long(node: tree.NumberLiteral) -> bool:
-    """Return whether the literal is a decimal integer without suffix that `long` cannot hold."""
     return bool(_DECIMAL.fullmatch(node.text)) and int(node.text) > value_types.LONG.most
 
 
@@ -96,7 +95,7 @@ def _integer(scope: FunctionScope, node: tree.NumberLiteral, text: str, suffix: 
 
 
 def folded(operands: tuple[Value, ...], make: Callable[..., Value]) -> Value:
-    """Return the result of `make` for the operands, as a constant if all operands are constant numbers."""
+    """Return a constant if all operands are constant numbers."""
     if not all(isinstance(operand.constant, int | float) for operand in operands):
         return make(*operands)
     known = [
@@ -227,7 +226,7 @@ def _assign(scope: FunctionScope, node: tree.Assignment) -> Value:
 
 
 def assignment(scope: FunctionScope, node: tree.Assignment) -> tuple[order.First, Value, nodes.Expression]:
-    """Return the target and the value of an assignment, and the statements to evaluate before it."""
+    """Return the statements to evaluate first, the target and the value."""
     whole = node.target
     while isinstance(whole, tree.MemberAccess | tree.IndexExpression):
         whole = whole.base
@@ -253,7 +252,7 @@ def assignment(scope: FunctionScope, node: tree.Assignment) -> tuple[order.First
 
 
 def _assigned(scope: FunctionScope, target: Value, value: Value, site: int) -> nodes.Expression:
-    """Return the value to assign to a place. As in C++, a string can be assigned a character."""
+    """As in C++, a string can be assigned a character."""
     if isinstance(target.type, value_types.StringType) and value.type == value_types.CHAR:
         return nodes.Call(value_types.STRING, "t_byte", (value.form,))
     assignments.note_copy(target, value)

@@ -79,10 +79,7 @@ def _known(
     kind: value_types.Type,
     value_of: Callable[[FunctionScope, tree.TypeName, tree.Declarator, value_types.Type], _T | None],
 ) -> _T | None:
-    """Return the value of a constant, or None if the value is not known yet.
-
-    Compiling the constant reports its errors.
-    """
+    """Return None if the value is not known yet. Compiling it reports its errors."""
     try:
         return value_of(scope, declaration.type, declarator, kind)
     except SpecificationError:
@@ -120,7 +117,7 @@ def _start_scope(shared: CompilationContext, names: SpecificationNames) -> Funct
 def _constants(
     shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
 ) -> FunctionScope:
-    """Write the static initialisation of C++: constants that are literals, and zero for other variables."""
+    """Write the static initialisation of C++: literals for constants, and zero for other variables."""
     scope = _start_scope(shared, names)
     for parameter in names.parameters.values():
         scope.written.add(parameter.code)
@@ -142,7 +139,7 @@ def _constants(
 
 
 def _constant(scope: FunctionScope, declarator: tree.Declarator) -> Value | None:
-    """Return the constant that a variable starts with, or None. Compiling the first value reports its errors."""
+    """Compiling the first value reports its errors."""
     if declarator.is_array or declarator.value is None or isinstance(declarator.value, tree.InitializerList):
         return None
     try:
@@ -204,7 +201,7 @@ def _calls(names: SpecificationNames) -> dict[str, set[str]]:
 
 
 def topics_of(names: SpecificationNames, function: str) -> list[str]:
-    """Return the topics that are published by a function, or by the functions that it calls."""
+    """Return the topics that a function, or one that it calls, publishes."""
     reached = _reached({function}, _calls(names))
     found = (node for name in reached for node in tree.walk(names.functions[name].node.body))
     return sorted({node.topic for node in found if isinstance(node, tree.PublishStatement)})
@@ -238,7 +235,6 @@ def _signature(
 
 
 def _reached(first: Set[str], called: Mapping[str, Set[str]]) -> set[str]:
-    """Return these functions and all functions that they call, directly or indirectly."""
     seen = set(first)
     waiting = list(first)
     while waiting:
@@ -264,7 +260,6 @@ def _free_names(function: tree.FunctionDefinition) -> set[str]:
 
 
 def compile_library(shared: CompilationContext, names: SpecificationNames) -> None:
-    """Write the functions of the library that a specification calls, and those that they call."""
     inside = SpecificationNames(names.name, names.context, instances=names.instances, is_library=True)
     written = 0
     while written < len(names.instances):

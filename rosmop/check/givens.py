@@ -100,7 +100,7 @@ def _renamed(node: Any, topics: Mapping[str, str]) -> Any:
 def given_topics(
     shared: CompilationContext, specification: tree.Specification, given: Mapping[str, str]
 ) -> tuple[GivenTopic, ...]:
-    """Return the topics of a specification that a load may replace, and report invalid ones."""
+    """Return the topics that a load may replace, and report invalid ones."""
     found: dict[str, GivenTopic] = {}
     for node in specification.givens:
         if isinstance(node, tree.TopicDeclaration):
@@ -117,7 +117,7 @@ def given_topics(
 
 
 def with_given(identity: bytes, topics: tuple[GivenTopic, ...]) -> bytes:
-    """Return the identity of a specification: its state belongs to its text and to the topics that replace defaults."""
+    """The state of a specification belongs to its text and to the topics that replace defaults."""
     changed = [(one.name, one.topic) for one in topics if one.topic != one.default]
     return sha256(identity + repr(changed).encode()).digest() if changed else identity
 
@@ -125,7 +125,7 @@ def with_given(identity: bytes, topics: tuple[GivenTopic, ...]) -> bytes:
 def read_at_start(
     shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
 ) -> Iterator[Diagnostic]:
-    """Yield an error for each first value, and for `init`, that reads a given constant, also in called functions."""
+    """Report first values and `init` that read a given constant, even in called functions."""
 
     def is_given(name: str) -> bool:
         if name in names.variables:

@@ -1,4 +1,4 @@
-"""Compile initial and assigned values: an expression that converts, or `{a, b, c}` for a vector."""
+"""Compile initial and assigned values: converted expressions, or `{a, b, c}` for a vector."""
 
 from rosmop.check.conversion import convert
 from rosmop.check.scope import FunctionScope
@@ -16,7 +16,6 @@ def converted(scope: FunctionScope, node: tree.Expression, target: Type) -> node
 
 
 def elements(scope: FunctionScope, node: tree.InitializerList, target: Type) -> nodes.Expression:
-    """Compile `{a, b, c}` as a vector."""
     if not isinstance(target, value_types.VectorType):
         if len(node.items) == 1:
             return converted(scope, node.items[0], target)

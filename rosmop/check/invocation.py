@@ -1,4 +1,4 @@
-"""Compile a call of a member function: its base, its arguments, and its possible results."""
+"""Compile calls of member functions."""
 
 from collections.abc import Callable, Sequence
 
@@ -12,7 +12,7 @@ from rosmop.types import value_types
 
 
 class MemberCall:
-    """A call of a member function while it is compiled."""
+    """A call of a member function during compilation."""
 
     def __init__(
         self,
@@ -29,7 +29,6 @@ class MemberCall:
         self.position, self.site = at
 
     def count(self, least: int, most: int | None = None) -> int:
-        """Check and return the number of arguments."""
         number_of = len(self.arguments)
         if not least <= number_of <= (least if most is None else most):
             wanted = str(least) if most in (None, least) else f"{least} to {most}"
@@ -47,7 +46,7 @@ class MemberCall:
         return number(value.form, value_types.ULONG)
 
     def text(self, position: int) -> nodes.Expression:
-        """Return an argument as a string; a character becomes a string of length 1."""
+        """A character becomes a string of length 1."""
         value = self.arguments[position]
         if value.type == value_types.CHAR:
             return nodes.Call(value_types.STRING, "t_byte", (value.form,))
@@ -60,7 +59,7 @@ class MemberCall:
         return Value(self.called(kind, function, *arguments), self.position)
 
     def changes(self, value: nodes.Expression) -> Value:
-        """Assign the base a new value; return the call's value, which is void."""
+        """Assign the base a new value; the call itself is void."""
         require_place(self.base, f"`{self.name}`")
         stored = store(self.scope, self.base, value)
         return Value(nodes.Discard(stored), self.position)

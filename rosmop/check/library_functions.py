@@ -1,8 +1,7 @@
 """The functions of the library that are written in the language itself.
 
 Interpreter, module and proof take them like helper functions, so they give the same bits. Each specification has its
-own copy of the functions that it calls, one for each type of the `auto` parameters. `docs/reference/rv-language.md`
-describes the functions.
+own copy of the functions that it calls, one for each type of the `auto` parameters.
 """
 
 from collections.abc import Sequence
@@ -171,7 +170,9 @@ def is_quaternion(kind: Type) -> bool:
 
 
 def invoke(scope: FunctionScope, name: str, values: Sequence[Value]) -> nodes.Expression:
-    """Return the call of a function of the library. Arguments of its other parameters have the right types."""
+    """Return the call of a function of the library. Arguments for parameters that are not `auto` must already have
+    the right types.
+    """
     function = _instance(scope, functions()[name], [value.type for value in values])
     given = [
         number(value.form, parameter.type) if value_types.is_number(parameter.type) else value.form
@@ -181,7 +182,6 @@ def invoke(scope: FunctionScope, name: str, values: Sequence[Value]) -> nodes.Ex
 
 
 def all_finite(scope: FunctionScope, value: Value) -> nodes.Expression:
-    """Return whether all floating-point numbers in a value are finite."""
     kind = value.type
     if isinstance(kind, value_types.FloatingType):
         return nodes.Call(value_types.BOOL, "h_isfinite", (value.form,))
@@ -207,7 +207,7 @@ def _has_floats(scope: FunctionScope, kind: Type) -> bool:
 
 
 def _instance(scope: FunctionScope, node: tree.FunctionDefinition, kinds: Sequence[Type]) -> HelperFunction:
-    """Return the function for these types. Its body is compiled with the specification."""
+    """The body of the function for these types is compiled with the specification."""
     is_any = [parameter.type.name == ("auto",) for parameter in node.parameters]
     key = (node.name, *(kind for kind, any_type in zip(kinds, is_any, strict=True) if any_type))
     instances = scope.names.instances
@@ -235,7 +235,6 @@ def _instance(scope: FunctionScope, node: tree.FunctionDefinition, kinds: Sequen
 
 
 def check_polygon(value: Value) -> None:
-    """Reject a polygon whose known length is not a number of corners."""
     assert isinstance(value.type, value_types.VectorType)  # the caller checks this
     length = value.type.length
     if length is not None and (length < 6 or length % 2):

@@ -18,7 +18,7 @@ _PARTS_OF_TIME = {"sec": 0, "nsec": 4}
 
 
 def type_of_path(messages: MessageTypes, record: str, path: tuple[tree.PathStep, ...]) -> Type:
-    """Return the type of the field at a path; the error for an invalid path suggests the nearest name."""
+    """The error for an invalid path suggests the nearest name."""
     kind: Type = value_types.RecordType(record)
     for step in path:
         kind = _step(messages, kind, step)
@@ -48,7 +48,7 @@ def _step(messages: MessageTypes, kind: Type, step: tree.PathStep) -> Type:
 
 
 class MessageCursor:
-    """A cursor in a message or in an array element, with the known start positions of its parts."""
+    """A position in a message or an array element, with the known start positions of its parts."""
 
     def __init__(self, locator: "FieldLocator", layout: MessageLayout, start: Spot) -> None:
         self._locator = locator
@@ -57,7 +57,7 @@ class MessageCursor:
         self._elements: dict[tuple[int, int], MessageCursor | Spot] = {}
 
     def start_of(self, part: int) -> Spot:
-        """Return the start of a part; write the statements that find the preceding parts."""
+        """Write the statements that find the preceding parts."""
         while len(self._starts) <= part:
             index = len(self._starts) - 1
             self._starts.append(self._locator.behind(self._layout.parts[index], self._starts[index]))
@@ -67,7 +67,7 @@ class MessageCursor:
         return self.start_of(len(self._layout.parts))
 
     def find(self, path: tuple[tree.PathStep, ...]) -> Spot | None:
-        """Return the start of a field, or None for a message without fields; write the checks of indices."""
+        """Write the checks of indices. Return None for a message without fields."""
         names = []
         for position, step in enumerate(path):
             names.append(step.name)
@@ -113,7 +113,7 @@ class MessageCursor:
 
 
 class FieldLocator:
-    """Writes the statements that find fields to `found`; `inner`: for a skipped element."""
+    """Writes the statements that find fields to `found`; `inner` is for a skipped element."""
 
     def __init__(
         self, symbols: Symbols, found: list[nodes.Statement], site: int, *, inner: bool = False
@@ -125,7 +125,6 @@ class FieldLocator:
         self._skippers: dict[int, nodes.Skipper] = {}
 
     def behind(self, part: Part, start: Spot) -> Spot:
-        """Return the end of a part that begins at `start`."""
         if isinstance(part, FixedPart):
             return start.plus(part.size)
         end = self._symbols.fresh("p")
@@ -145,7 +144,7 @@ class FieldLocator:
         return Spot(end, 0)
 
     def element(self, item: FixedField | ArrayPart, start: Spot, step: tree.PathStep) -> Spot:
-        """Return the start of an array element. If the element does not exist, the event does not happen."""
+        """If the element does not exist, the event does not happen."""
         index = step.index or 0
         if isinstance(item, FixedField):
             return start.plus(index * (item.size // (item.count or 1)))

@@ -16,10 +16,10 @@ from rosmop.types.resolve import resolve
 from rosmop.types.value_types import Type
 
 Write = Callable[[FunctionScope, tree.Statement], None]
-"""A function that writes a statement. Loops take it as a parameter because statements and loops contain each other."""
+"""Writes a statement. Loops take it as a parameter because statements and loops contain each other."""
 
 MAX_NESTED = 15
-"""The maximum depth of nested loops; Python allows 20."""
+"""Python allows 20 nested loops."""
 
 
 def charge(scope: FunctionScope, node: tree.SyntaxNode) -> None:
@@ -112,7 +112,6 @@ def _by_value(
 
 
 def _first_index(scope: FunctionScope, node: tree.RangeForStatement, values: Value, kind: Type) -> str:
-    """Return the name of a new index variable, which starts before the first element."""
     if not isinstance(values.type, value_types.VectorType) or values.place is None:
         raise SpecificationError.at(
             node.values.position, "a reference needs a vector variable to iterate over; leave out the `&`"
@@ -140,7 +139,7 @@ def _by_reference(
 
 
 def write_switch(scope: FunctionScope, node: tree.SwitchStatement, write: Write) -> None:
-    """Write a `switch`: the index of the first case, then every block from there on until a `break`."""
+    """A `switch` becomes the index of the first case, then every block from there on until a `break`."""
     value = scope.value_of(node.value)
     kind = value_types.promoted(value.type)
     if not isinstance(kind, value_types.IntegerType):
@@ -200,7 +199,6 @@ def _cases(
 
 
 def write_continue(scope: FunctionScope, position: Position) -> None:
-    """Write a `continue`: the step of the innermost loop, then its next iteration."""
     if all(loop.flag is not None for loop in scope.loops):
         raise SpecificationError.at(position, "`continue` is only allowed in a loop")
     loop = scope.loops[-1]

@@ -1,9 +1,9 @@
 """Note how close comparisons of numbers came: the values of both sides when they were nearest, while true and while
 false.
 
-The comparison is replaced by an expression that also notes both sides. This expression has the same value, compares the
-sides in the same type as C++, and charges nothing. Comparisons in `when`, first values and `init` are not noted. Nor
-are loop conditions, because a counter's distance from its end means nothing.
+The comparison is replaced by an expression that also notes both sides. This expression has the same value, compares
+the sides in the same type as C++, and charges nothing. Comparisons in `when`, first values and `init` are not noted,
+nor are loop conditions, because a counter's distance from its end means nothing.
 """
 
 from dataclasses import replace
@@ -19,7 +19,7 @@ from rosmop.text import tree
 from rosmop.types import value_types
 
 MOST_NOTED = 32
-"""The maximum number of noted comparisons of a specification; later comparisons are not noted."""
+"""Later comparisons of the specification are not noted."""
 
 _COMPARED = frozenset({"<", "<=", ">", ">="})
 _TRUE, _FALSE = (nodes.Literal(value_types.BOOL, truth) for truth in (True, False))
@@ -28,7 +28,7 @@ _TRUE, _FALSE = (nodes.Literal(value_types.BOOL, truth) for truth in (True, Fals
 def noted(
     scope: FunctionScope, node: tree.BinaryExpression, left: Value, right: Value, value: Value
 ) -> Value:
-    """Return `value`, noted if it is a comparison of numbers that are not both constant."""
+    """Note a comparison of numbers that are not both constant."""
     compare = value.form
     if (
         not scope.notes
@@ -63,7 +63,7 @@ def noted(
 
 
 def _note(now: list[nodes.Expression], variables: tuple[str, str]) -> nodes.Expression:
-    """Return an expression that stores both sides if they are nearer to each other than the stored ones."""
+    """Store both sides if they are nearer to each other than the stored ones."""
     before = [nodes.Read(value_types.DOUBLE, name) for name in variables]
     nearer = nodes.Compare("<", _distance(*now), _distance(*before), -1)
     kept = (nodes.Assign(value_types.DOUBLE, name, side) for name, side in zip(variables, now, strict=True))

@@ -38,7 +38,6 @@ def field(scope: FunctionScope, base: Value, name: str, position: Position, site
 
 
 def constant(scope: FunctionScope, message_type: str, name: str, position: Position) -> Value:
-    """Compile `package::Type::NAME` or `variable.NAME`."""
     try:
         found = scope.messages.constant(message_type, name)
     except UnknownNameError as error:
@@ -51,7 +50,6 @@ def constant(scope: FunctionScope, message_type: str, name: str, position: Posit
 
 
 def call(invocation: MemberCall) -> Value:
-    """Compile `base.name(arguments)`."""
     methods = methods_of(invocation.base.type)
     method = methods.get(invocation.name)
     if method is None:

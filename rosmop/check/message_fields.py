@@ -33,7 +33,6 @@ class PatternField:
 
 
 def writes(scope: FunctionScope, written: list[PatternField]) -> tuple[nodes.Write, ...]:
-    """Return the fields that the action assigns."""
     found = []
     for field in written:
         variable = field.variable
@@ -50,7 +49,7 @@ def writes(scope: FunctionScope, written: list[PatternField]) -> tuple[nodes.Wri
 
 
 def _slots(scope: FunctionScope, field: PatternField) -> list[int | str]:
-    """Return the path of a field as list indices; the parts of a time keep their names (`sec`, `nsec`)."""
+    """The parts of a time keep their names (`sec`, `nsec`); other path steps are indices."""
     kind: Type = value_types.RecordType(scope.message_type or "")
     path: list[int | str] = []
     for step in field.binding.path:
@@ -124,7 +123,6 @@ def _read_together(scope: FunctionScope, together: list[PatternField]) -> None:
 
 
 def _take(scope: FunctionScope, field: PatternField) -> None:
-    """Write the comparison of a field with its constant, or the assignment to its variable."""
     site, read = scope.lines.site, nodes.Read(field.type, field.read)
     if field.constant is not None:
         constant = nodes.Literal(field.type, field.constant)
@@ -149,10 +147,7 @@ def check_overlaps(bound: list[PatternField], written: list[PatternField]) -> No
 
 
 def _overlap(one: tree.Binding, other: tree.Binding) -> bool:
-    """Return whether one binding is the same as the other, or a part of it.
-
-    An array without an index means all its elements.
-    """
+    """An array without an index means all its elements."""
     return all(
         step.name == beside.name and (step.index == beside.index or None in (step.index, beside.index))
         for step, beside in zip(one.path, other.path, strict=False)

@@ -16,7 +16,7 @@ _MOMENTS = (value_types.TimeType, value_types.DurationType)
 
 
 class Operands:
-    """Two operands, the position of the operation, and the site of its faults."""
+    """Two operands, with the position and the site of the operation."""
 
     def __init__(
         self, scope: FunctionScope, position: Position, left: Value, right: Value, site: int
@@ -113,7 +113,7 @@ def _texts(operator: str, operands: Operands) -> Value:
 
 
 def extended(operands: Operands) -> Value:
-    """Compile `left += right` for a string, which replaces the bytes of `left`."""
+    """`+=` on a string replaces the bytes of `left`."""
     return _put_together("o_extend", operands)
 
 

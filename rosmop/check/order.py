@@ -23,7 +23,6 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 First = list[nodes.Expression]
-"""Statements to evaluate first, in order."""
 
 
 def after(first: Sequence[nodes.Expression], value: Value) -> Value:
@@ -35,7 +34,7 @@ def after(first: Sequence[nodes.Expression], value: Value) -> Value:
 
 
 def kept(scope: FunctionScope, value: nodes.Expression) -> tuple[First, nodes.Expression]:
-    """Return the statements that store a value in a new variable, and the value read from it."""
+    """Store a value in a new variable, and return the value read from it."""
     if isinstance(value, nodes.Literal):
         return [], value
     name = scope.temporary()
@@ -43,10 +42,7 @@ def kept(scope: FunctionScope, value: nodes.Expression) -> tuple[First, nodes.Ex
 
 
 def settled(scope: FunctionScope, value: Value) -> tuple[First, Value]:
-    """Return the statements that fix the indices of a place, and the place.
-
-    For a temporary, return its value instead.
-    """
+    """Fix the indices of a place. A temporary is replaced by its value."""
     place = value.place
     if place is None:
         first, read = kept(scope, value.form)
@@ -78,7 +74,7 @@ def _read(kind: Type, place: Lvalue) -> nodes.Expression:
 
 
 def arguments(scope: FunctionScope, values: Sequence[Value]) -> tuple[First, list[Value]]:
-    """Return the statements that evaluate arguments with effects, in order, and the arguments."""
+    """Evaluate arguments that have effects in order."""
     if sum(not isinstance(value.form, nodes.Literal) for value in values) < 2:
         return [], list(values)
     return _in_turn(scope, values)
@@ -90,7 +86,6 @@ def _in_turn(scope: FunctionScope, values: Sequence[Value]) -> tuple[First, list
 
 
 def of_member(scope: FunctionScope, base: Value, values: Sequence[Value]) -> tuple[First, Value, list[Value]]:
-    """Return the base and the arguments of a member function, or the base and the index of an element."""
     if all(value.pure for value in values) and (base.pure or base.place is None):
         return [], base, list(values)
     first, base = ([], base) if base.pure and base.place is None else settled(scope, base)
@@ -103,7 +98,7 @@ def _is_variable(target: Value) -> bool:
 
 
 def of_change(scope: FunctionScope, target: Value, value: Value) -> tuple[First, Value, Value]:
-    """Return the target and the value of an operator such as `+=`; both are read after all indices are known."""
+    """Both are read after all indices are known."""
     if target.pure and value.pure:
         return [], target, value
     if value_types.is_number(value.type):  # for a class, only the place is evaluated first

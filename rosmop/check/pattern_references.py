@@ -29,7 +29,7 @@ _SHAPE = "`globally: a as A forbids b {x < @A.x}`, or `b as B requires a {x < @B
 
 
 def with_references(specification: tree.Specification) -> tree.Specification:
-    """Return the specification without references in patterns. Raises `SpecificationError`."""
+    """Raises `SpecificationError`."""
     for number, node in enumerate(specification.properties, 1):
         if _refers(node):
             specification = _Rewriting(specification, node, number).done()
@@ -37,7 +37,6 @@ def with_references(specification: tree.Specification) -> tree.Specification:
 
 
 def without_references(specification: tree.Specification) -> tree.Specification:
-    """Return the specification without the patterns that refer to a message."""
     return replace(
         specification, properties=tuple(node for node in specification.properties if not _refers(node))
     )
@@ -48,8 +47,6 @@ def _refers(node: tree.Property) -> bool:
 
 
 class _Rewriting:
-    """The rewriting of one property."""
-
     def __init__(self, specification: tree.Specification, node: tree.Property, number: int) -> None:
         self._specification, self._node = specification, node
         found = _FORM.fullmatch(node.formula)
@@ -165,7 +162,6 @@ class _Rewriting:
         )
 
     def _sides(self) -> tuple[str, tree.Expression, tree.Expression]:
-        """Return the operator of `late operator early`, and both sides."""
         condition = self._condition
         for alias, _ in _REFERENCE.findall(condition):
             if alias != self._alias:
@@ -231,7 +227,7 @@ def _is_reference(node: tree.SyntaxNode) -> bool:
 
 
 def _mapped(node: Any, change: Any) -> Any:
-    """Return a part of a tree with each node replaced by `change(node)`, children first."""
+    """Replace each node by `change(node)`, children first."""
     if isinstance(node, tuple):
         return tuple(_mapped(part, change) for part in node)
     if not isinstance(node, tree.SyntaxNode):

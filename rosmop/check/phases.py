@@ -12,11 +12,11 @@ from rosmop.text import tree
 from rosmop.types.messages import nearest, shown
 
 Phases = frozenset[tuple[str, str]]
-"""Pairs of specifications of which `order` statements put the first before the second, directly or indirectly."""
+"""Pairs of specifications: the first comes before the second, directly or indirectly."""
 
 
 def phases_of(orders: Sequence[tree.OrderStatement]) -> Phases:
-    """Return all pairs that the statements order. Raises `SpecificationError` for a circle."""
+    """Return all pairs that the statements order. Raises `SpecificationError` for a cycle."""
     behind: dict[str, set[str]] = {}
     for order in orders:
         names = [name.parts[0] for name in order.names]
@@ -42,7 +42,7 @@ def _reached(behind: dict[str, set[str]], name: str) -> set[str]:
 
 
 def ordered(names: Sequence[str], phases: Phases) -> list[int]:
-    """Return the places of specifications in their order; each is the first of the rest that comes behind no other."""
+    """Each is the first of the rest that no remaining one must precede."""
     places: dict[str, list[int]] = {}
     for place, name in enumerate(names):
         places.setdefault(name, []).append(place)
@@ -65,7 +65,6 @@ def ordered(names: Sequence[str], phases: Phases) -> list[int]:
 
 
 def unknown_phases(orders: Sequence[tree.OrderStatement], names: Sequence[str]) -> Iterator[Diagnostic]:
-    """Yield a warning for each name in an `order` statement that no specification has."""
     for order in orders:
         for name in order.names:
             if name.parts[0] not in names:

@@ -22,7 +22,7 @@ _TEXTS = (value_types.StringType, value_types.CharactersType)
 
 
 def formatted(scope: FunctionScope, template: Value, arguments: Sequence[Value]) -> nodes.Expression:
-    """Return a formatted text; rejects conversions that do not fit their arguments."""
+    """Rejects conversions that do not fit their arguments."""
     if not isinstance(template.constant, bytes):
         if arguments or not isinstance(template.type, _TEXTS):
             raise SpecificationError.at(
@@ -65,7 +65,7 @@ def formatted(scope: FunctionScope, template: Value, arguments: Sequence[Value])
 
 
 def _with_widths(found: re.Match[bytes], waiting: list[Value]) -> re.Match[bytes]:
-    """Replace `*` in a conversion with its arguments, as in C, and take those arguments."""
+    """Replace `*` in a conversion with its arguments, as in C."""
     flags, width, precision, size, letter = (part or b"" for part in found.groups())
     if width == b"*" and (number := _literal_width(waiting)) is not None:
         flags, width = (flags, b"%d" % number) if number >= 0 else (flags + b"-", b"%d" % -number)
@@ -77,14 +77,13 @@ def _with_widths(found: re.Match[bytes], waiting: list[Value]) -> re.Match[bytes
 
 
 def _literal_width(waiting: list[Value]) -> int | None:
-    """Take the next argument if it is a constant integer; otherwise return None."""
+    """Return the next argument if it is a constant integer."""
     if not waiting or type(waiting[0].constant) is not int:
         return None
     return waiting.pop(0).constant  # type: ignore[return-value] # checked above
 
 
 def _longest(found: re.Match[bytes]) -> int:
-    """Return the maximum length of the text of a conversion, without strings."""
     return max(int(found[2] or 0), int(found[3] or 0) + (400 if found[5] in _FLOATING else 20))
 
 
@@ -128,10 +127,7 @@ def _conversion(
 
 
 def _integer(letter: bytes, size: bytes | None, value: Value) -> nodes.Expression:
-    """Return the number that an integer conversion prints, with the width and sign of its letters.
-
-    Without a size the number has the width of the value. A floating-point value is truncated.
-    """
+    """Without a size the number has the width of the value. A floating-point value is truncated."""
     kind = value_types.promoted(value.type)
     bits = kind.bits if isinstance(kind, value_types.IntegerType) else 64
     bits = {b"hh": 8, b"h": 16, None: bits}.get(size, 64)
@@ -144,10 +140,7 @@ def _integer(letter: bytes, size: bytes | None, value: Value) -> nodes.Expressio
 def _integer_head(
     flags: bytes, width: bytes, precision: bytes | None, letter: bytes, value: nodes.Expression
 ) -> tuple[bytes, nodes.Expression]:
-    """Return the Python format and the argument of an integer conversion.
-
-    Where C differs from Python, return C's text.
-    """
+    """Return the Python format and the argument. Where C differs from Python, format the text as C does."""
     if letter in _UNSIGNED:
         flags = flags.replace(b"+", b"").replace(b" ", b"")
     if precision is not None:
@@ -163,7 +156,7 @@ def _integer_head(
 
 
 class OutputStream:
-    """The state of `<<` in one statement: `std::fixed` and `std::setprecision`."""
+    """The manipulators of one statement with `<<`: `std::fixed` and `std::setprecision`."""
 
     def __init__(self, scope: FunctionScope, site: int) -> None:
         self._scope = scope
@@ -172,7 +165,7 @@ class OutputStream:
         self._precision: nodes.Expression | None = None
 
     def manipulated(self, node: tree.Expression, value: Value | None) -> bool:
-        """Apply a manipulator; return whether it is one. `value` is the argument of `setprecision`."""
+        """Return whether the node is a manipulator; `value` is the argument of `setprecision`."""
         parts = node.parts if isinstance(node, tree.Name) else ()
         name = parts[-1] if parts and parts[:-1] in ((), ("std",)) else ""
         if name in ("fixed", "defaultfloat", "scientific"):

@@ -15,7 +15,6 @@ def bypassing(
     publications: Sequence[Publication],
     functions: Mapping[str, nodes.Function],
 ) -> Iterator[Diagnostic]:
-    """Yield a warning for each publication that bypasses an earlier specification that acts on its topic."""
     places = {one.name: place for place, one in enumerate(specifications)}
     seen: set[tuple[str, str, str]] = set()
     for publication in publications:

@@ -2,7 +2,7 @@
 
 The state of a specification survives a change of definitions only if these types are unchanged.
 
-The result includes every type in use. It may also include an unused type, if a string equals the name of a type.
+The result may include an unused type, if a string equals the name of a type.
 """
 
 from collections.abc import Iterator
@@ -15,7 +15,6 @@ from roswire.definitions import Definitions
 
 
 def reached(node: tree.Specification, definitions: Definitions) -> frozenset[str]:
-    """Return the message types that a specification names, and their nested types."""
     messages, services = set(definitions.message_types), set(definitions.service_types)
     waiting: list[str] = []
     for name in set(_names(node)):
@@ -49,7 +48,7 @@ def _plain(node: Any) -> object:
 
 
 def _names(root: object) -> Iterator[str]:
-    """Yield every string of a tree that may name a type: `pkg/T`, `pkg::T`, or both parts as separate strings."""
+    """A name of a type is `pkg/T`, `pkg::T`, or two separate strings."""
     waiting = [root]
     while waiting:
         node = waiting.pop()

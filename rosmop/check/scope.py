@@ -1,4 +1,4 @@
-"""The context of a function under compilation: variables by name, and the statements written so far."""
+"""The context of a function during compilation: its variables by name, and the statements written so far."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -38,7 +38,6 @@ class HelperFunction:
     recursive: bool = False
     names: frozenset[str] = frozenset()
     changes: frozenset[str] = frozenset()
-    """The code's names of the shared variables that this function assigns."""
     calls: frozenset[str] = frozenset()
 
 
@@ -54,31 +53,28 @@ class ConstantReference:
 
 @dataclass(eq=False)
 class SpecificationNames:
-    """The names that one specification declares, and the code's name for its context."""
+    """The names that one specification declares."""
 
     name: str
     context: str
     variables: dict[str, Variable] = field(default_factory=dict)
     functions: dict[str, HelperFunction] = field(default_factory=dict)
     parameters: dict[str, Variable] = field(default_factory=dict)
-    """The parameters of the specification, in order; they are also variables."""
+    """These are also variables."""
     misdeclared: set[str] = field(default_factory=set)
     """Names of variables and functions with rejected declarations; using them is not reported again."""
     events: list[str] = field(default_factory=list)
     uses: set[str] = field(default_factory=set)
-    """The other specifications whose variables are used."""
     comparisons: dict[tree.BinaryExpression, Comparison] = field(default_factory=dict)
     lent: list[ConstantReference] = field(default_factory=list)
     givens: dict[str, Given] = field(default_factory=dict)
-    """The constants that operators may set."""
     safes: dict[str, nodes.SafeMessage] = field(default_factory=dict)
     instances: dict[tuple[object, ...], HelperFunction] = field(default_factory=dict)
     """The functions of the library that are called (`library_functions.py`), by name and types."""
     is_library: bool = False
-    """Whether these are the names that functions of the library see."""
 
     def changed_by(self, name: str) -> frozenset[str]:
-        """Return the code's names of the shared variables that a function, or one that it calls, assigns."""
+        """Include the variables that called functions assign."""
         waiting, seen, found = [name], {name}, frozenset[str]()
         while waiting:
             function = self.functions[waiting.pop()]
@@ -90,9 +86,8 @@ class SpecificationNames:
 
 @dataclass(eq=False)
 class LoopScope:
-    """A loop or switch around the current statement, and the step that a `continue` runs first.
-
-    `blocks` are the names visible to the step: the names around the loop, not the names around the `continue`.
+    """A loop or switch around the current statement. `step` runs before a `continue`, and sees the names of `blocks`,
+    not those at the `continue`.
     """
 
     step: Callable[[], None] | None
@@ -110,7 +105,7 @@ class StatementList:
 
 
 class CompilationContext:
-    """The state that all functions of all specifications share during compilation."""
+    """The state that all functions share during compilation."""
 
     def __init__(self, messages: MessageTypes, value_of: ValueOf, *, margins: bool = False) -> None:
         self.symbols = Symbols()
@@ -161,7 +156,7 @@ class CompilationContext:
 
 
 class FunctionScope:
-    """A function under compilation."""
+    """A function during compilation."""
 
     def __init__(self, shared: CompilationContext, names: SpecificationNames, role: Role) -> None:
         self.shared = shared
@@ -194,7 +189,6 @@ class FunctionScope:
 
     @contextmanager
     def block(self) -> Iterator[dict[str, Variable]]:
-        """Open a block with names of its own; yield them."""
         names: dict[str, Variable] = {}
         self._blocks.append(names)
         try:
@@ -230,9 +224,7 @@ class FunctionScope:
         return variable
 
     def find(self, name: str, position: Position) -> Variable | None:
-        """Return the variable of this name (local, of this specification, or of another specification), and note its
-        use.
-        """
+        """Note the use of the variable, which may belong to another specification."""
         variable, owner = self._known(name, position)
         if owner is not None:
             self.names.uses.add(owner)
@@ -276,7 +268,7 @@ class FunctionScope:
 
     @contextmanager
     def at(self, node: tree.SyntaxNode) -> Iterator[None]:
-        """Attribute the statements written inside to this node."""
+        """Attribute the statements written in the block to this node."""
         before = self.lines.site
         self.lines.site = self.site(node)
         try:
@@ -286,7 +278,7 @@ class FunctionScope:
 
     @contextmanager
     def looking(self) -> Iterator[None]:
-        """Do not note comparisons written inside."""
+        """Do not note comparisons written in the block."""
         before, self.notes = self.notes, False
         try:
             yield
@@ -301,7 +293,7 @@ class FunctionScope:
 
     @contextmanager
     def nested(self) -> Iterator[list[nodes.Statement]]:
-        """Collect the statements written inside in a separate list."""
+        """Collect the statements written in the block separately."""
         outer, self.lines.found = self.lines.found, []
         try:
             yield self.lines.found
@@ -334,7 +326,7 @@ class FunctionScope:
 
 
 def names_in(node: object) -> Iterator[str]:
-    """Yield the simple names in an expression, or in a statement's own expressions (not in nested statements)."""
+    """Names in nested statements are not included."""
     waiting = [node]
     while waiting:
         current = waiting.pop()

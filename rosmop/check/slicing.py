@@ -1,7 +1,7 @@
 """Compile parametric specifications: their parameters as variables, and the parameters that each event binds.
 
 An event binds a parameter of the specification if the event has a parameter of the same name and type. A second
-function of the event returns the bound values. It reads nothing else of the message.
+function of the event returns the bound values, and reads nothing else of the message.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,7 +27,7 @@ _ACTS = (nodes.Log, nodes.Throttle, nodes.Drop, nodes.StopMessage, nodes.Publish
 def declare_parameters(
     shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
 ) -> None:
-    """Declare the parameters as constant variables with a value for each slice."""
+    """Parameters are constant variables with a value for each slice."""
     for parameter in specification.parameters:
         try:
             kind = resolve(parameter.type, shared.messages)
@@ -57,7 +57,7 @@ def declare_parameters(
 
 
 def check_own(names: SpecificationNames, variable: Variable) -> None:
-    """Reject a slice variable that is not a number or a time, because only the number of slices bounds their memory."""
+    """Reject slice variables that are not numbers or times, because only the number of slices bounds their memory."""
     if variable.sliced and not (
         value_types.is_number(variable.type)
         or isinstance(variable.type, value_types.TimeType | value_types.DurationType)
@@ -75,7 +75,6 @@ def slicing_of(
     events: Iterable[EventCode],
     properties: Iterable[PropertyCode],
 ) -> Slicing | None:
-    """Return the parameters that distinguish the slices of a specification; None without parameters."""
     if not names.parameters:
         return None
     own = (
@@ -93,7 +92,6 @@ def slicing_of(
 
 
 def _enforces(shared: CompilationContext, functions: Sequence[str]) -> bool:
-    """Return whether these functions, or the functions that they call, drop, change or publish a message."""
     waiting, seen = [*functions], {*functions}
     while waiting:
         function = shared.functions.get(waiting.pop())
@@ -114,7 +112,7 @@ def binds(names: SpecificationNames, event: tree.EventDefinition) -> tuple[int, 
 
 
 def creates(specification: tree.Specification, event: tree.EventDefinition) -> bool:
-    """Whether a slice may begin with an event. If no event is a `creation event`, a slice may begin with any event."""
+    """Without a `creation event`, a slice may begin with any event."""
 
     def marked(event: tree.EventDefinition) -> bool:
         return any(modifier.parts == ("creation",) for modifier in event.modifiers)
@@ -123,7 +121,7 @@ def creates(specification: tree.Specification, event: tree.EventDefinition) -> b
 
 
 def acts(function: nodes.Function, shared: CompilationContext) -> bool:
-    """Return whether the action of an event does more than change the slice's own variables."""
+    """Return whether the action does more than change the slice's own variables."""
     if not shared.unsliced.isdisjoint(function.shared):
         return True
     return any(
@@ -135,7 +133,7 @@ def acts(function: nodes.Function, shared: CompilationContext) -> bool:
 
 
 def unsliceable(compiled: CompiledProperty) -> str | None:
-    """Return why slices cannot run a property; None if they can."""
+    """Return why slices cannot run a property, or None if they can."""
     if isinstance(compiled, PastProperty) and compiled.timed:
         return (
             "a formula with several time bounds, or with one that neither begins at 0 nor ends at `inf`, cannot be "
@@ -154,7 +152,6 @@ def unsliceable(compiled: CompiledProperty) -> str | None:
 def check_parameters(
     shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
 ) -> None:
-    """Report each parameter that no event binds."""
     bound = {number for event in specification.events for number in binds(names, event)}
     for number, (name, variable) in enumerate(names.parameters.items()):
         if number not in bound:

@@ -21,10 +21,9 @@ def compiled_from(
     without_code: Collection[str] = (),
     topics: Topics = MappingProxyType({}),
 ) -> Compiled:
-    """Compile files (name to text) in this order; raises `SpecificationError` with all errors.
+    """Compile files (name to text) in this order. Raises `SpecificationError` with all errors.
 
-    `topics` replace the topics given in the files. The specifications of files in `without_code` keep only their names,
-    topics and services, and do nothing.
+    The specifications of files in `without_code` keep only their names, topics and services, and do nothing.
     """
     files: list[tree.SpecificationFile] = []
     findings: list[Diagnostic] = []

@@ -1,6 +1,6 @@
 """Compile a set of files with specifications.
 
-Specifications of one set see each other's variables. One pass finds all errors of the whole set.
+Specifications of one set see each other's variables. One pass finds all errors.
 """
 
 import dataclasses
@@ -59,7 +59,7 @@ _T = TypeVar("_T")
 _TAKEN = "revisions"
 MODIFIERS = frozenset({"hold", "begin"})
 IGNORED_MODIFIERS = frozenset({"unsynchronized", "decentralized", "perthread", "suffix", "creation"})
-"""Modifiers of MOP that control how a monitor is generated; here they have no effect."""
+"""Modifiers of MOP that control how a monitor is generated. They have no effect here."""
 
 
 def compile_files(
@@ -69,9 +69,9 @@ def compile_files(
     margins: bool = False,
     topics: Topics = MappingProxyType({}),
 ) -> Compiled:
-    """Compile a set of files; raises `SpecificationError` with all errors.
+    """Raises `SpecificationError` with all errors.
 
-    `margins`: note comparisons of numbers (`margins.py`). `topics` replace the topics given in the files.
+    With `margins`, comparisons of numbers are noted (`margins.py`). `topics` replace the topics in the files.
     """
     shared = CompilationContext(MessageTypes(definitions), value_of, margins=margins)
     pairs = [(file, specification) for file in files for specification in file.specifications]
@@ -144,7 +144,7 @@ def _compile_all(
 
 
 def _rewritten(shared: CompilationContext, specification: tree.Specification) -> tree.Specification:
-    """Return the specification without references in patterns; if one is not valid, without these patterns."""
+    """A specification with an invalid reference loses all such patterns."""
     rewritten = _noted(shared, partial(with_references, specification))
     return without_references(specification) if rewritten is None else rewritten
 
@@ -176,7 +176,7 @@ def _check_names(shared: CompilationContext, specifications: Sequence[tree.Speci
 
 
 def _same_names(specifications: Sequence[SpecificationNames]) -> Iterator[Diagnostic]:
-    """Yield warnings about variables of the same name in specifications that use variables of each other."""
+    """Warn about equal names only in specifications that use each other's variables."""
     places = {names.name: place for place, names in enumerate(specifications)}
     pairs = {
         tuple(sorted((place, places[used])))
@@ -252,9 +252,7 @@ def _compile(
 
 
 def _seen_changes(names: SpecificationNames) -> Iterator[Diagnostic]:
-    """Yield errors for constant references to variables that the called function changes, because here the reference
-    would keep the old value.
-    """
+    """Reject a constant reference to a variable that the called function changes: here it would keep the old value."""
     for loan in names.lent:
         if loan.variable.code in names.changed_by(loan.function):
             text = (
@@ -265,7 +263,7 @@ def _seen_changes(names: SpecificationNames) -> Iterator[Diagnostic]:
 
 
 def _noted(shared: CompilationContext, action: Callable[[], _T]) -> _T | None:
-    """Return the result of `action`. If it raises an error, add the error to the findings and return None."""
+    """Add an error of `action` to the findings, and return None."""
     try:
         return action()
     except SpecificationError as error:
@@ -371,7 +369,6 @@ def _handler_refused(
 
 
 def _check_types(shared: CompilationContext, compiled: Sequence[SpecificationCode]) -> None:
-    """Report each topic that events or publications use with different types."""
     types: dict[tuple[str, str | None], tuple[str, object]] = {}
     for specification in compiled:
         for event in specification.events:

@@ -21,7 +21,7 @@ _WITHOUT_UNIT = re.compile(
     r"\b((?:within|timeout)\s+(\d+(?:\.\d+)?))(?![\d.]|\s*[num]?s\b|\s*(?:m|h|min|us)\b)"
 )
 _BOUND_WITHOUT_UNIT = re.compile(r"[\[,]\s*((\d+(?:\.\d+)?))(?=\s*[,\]])")
-"""A bound of time of `mtl`, such as that of `once[0,500]`."""
+"""A bound of time of `mtl`, such as in `once[0,500]`."""
 _WORD = re.compile(r"[A-Za-z_][A-Za-z_0-9]*+")
 
 
@@ -31,7 +31,7 @@ class _HasProperty(Protocol):
 
 
 def lint_size(size: int, position: Position) -> Iterator[Diagnostic]:
-    """Report variables of `size` bytes that are not kept, or that no specification may have."""
+    """Report variables that are not kept, or whose size in bytes is not allowed."""
     if size > MAX_BYTES:
         text = f"the variables take {size} bytes; a specification may hold {MAX_BYTES >> 20} MiB"
         yield Diagnostic(position, "error", text)
@@ -63,7 +63,7 @@ def lint_property(compiled: CompiledProperty, node: tree.Property) -> list[Diagn
 def kept_slices(
     name: str, events: Sequence[EventCode], properties: Sequence[PropertyCode], nodes: Sequence[tree.Property]
 ) -> list[Diagnostic]:
-    """Return warnings about timers and properties that keep slices of a specification for ever."""
+    """Warn about timers and properties that keep slices forever."""
     found = [
         Diagnostic(
             event.position,
@@ -111,10 +111,7 @@ def _for_good(compiled: CompiledProperty) -> set[str]:
 
 
 def unused_events(specification: tree.Specification, properties: Sequence[_HasProperty]) -> list[Diagnostic]:
-    """Return warnings about events that no property names, if there are properties.
-
-    The word `default` counts as a use of every event.
-    """
+    """`default` counts as a use of every event. Without properties nothing is reported."""
     if not properties:
         return []
     named = {word for code in properties for word in _WORD.findall(code.property.formula)}
@@ -131,7 +128,7 @@ def unused_events(specification: tree.Specification, properties: Sequence[_HasPr
 
 
 def lint_statements(specification: tree.Specification) -> Iterator[Diagnostic]:
-    """Yield warnings about statements that C++ allows but that are probably mistakes: `if (v = 0.8)`, `x == 1;`."""
+    """Warn about valid C++ that is probably a mistake: `if (v = 0.8)`, `x == 1;`."""
     for node in tree.walk(specification):
         if (
             isinstance(
@@ -161,7 +158,7 @@ def _assigned(condition: tree.Expression) -> Iterator[Diagnostic]:
 
 
 def _acts(expression: tree.Expression) -> bool:
-    """Return whether an expression may have an effect; each call may."""
+    """Each call may have an effect."""
     acting = (tree.Assignment, tree.IncrementExpression, tree.CallExpression, tree.NewExpression)
     return stream_of(expression) is not None or any(
         isinstance(node, acting) for node in tree.walk(expression)

@@ -17,7 +17,7 @@ from rosmop.types import value_types
 
 
 class Arguments:
-    """The arguments of a call, its position and its name."""
+    """The arguments of a call."""
 
     def __init__(
         self,
@@ -55,7 +55,7 @@ Function = Callable[[Arguments], Value]
 
 
 def find_function(parts: tuple[str, ...], *, is_library: bool = False) -> Function | None:
-    """Return the library function of this name, with or without `std::`. `is_library`: it is called by another one."""
+    """The name may begin with `std::`. `is_library`: the call is in a library function."""
     if parts[0] == "std" and len(parts) == 2:
         parts = parts[1:]
     if len(parts) != 1:
@@ -89,7 +89,6 @@ def _elementary(name: str) -> Function:
 
 
 def _math_of_floats(name: str, count: int) -> Function:
-    """Return the compiler of a function such as `sqrtf`."""
     function = _math(name, count)
 
     def of_floats(call: Arguments) -> Value:
@@ -114,7 +113,7 @@ def _rounded(name: str) -> Function:
 
 
 def _absolute_of_long(call: Arguments) -> Value:
-    """Compile `labs`, which takes any number and returns an integer."""
+    """`labs` takes any number here."""
     for value in call.values:
         require_number(value, "`labs`")
     call.values = [Value(number(value.form, value_types.LONG), value.position) for value in call.values]
@@ -166,7 +165,7 @@ def _finite(call: Arguments) -> Value:
 
 
 def _of_library(name: str, *wanted: str) -> Function:
-    """Return the compiler of a function of the library. `wanted` describes each argument, as in `_FITS`."""
+    """Compile a library function. `wanted` describes each argument, as in `_FITS`."""
 
     def function(call: Arguments) -> Value:
         call.count(len(wanted))
@@ -196,7 +195,6 @@ _FITS: Mapping[str, Callable[[value_types.Type], bool]] = MappingProxyType(
 
 
 def _nearest(call: Arguments) -> Value:
-    """Compile `nearest(ranges, from, to)`."""
     call.count(3)
     if not library_functions.is_polygon(call.values[0].type):
         raise SpecificationError.at(
@@ -306,7 +304,7 @@ def _prints_at_most(call: Arguments) -> Value:
 def _printed(
     call: Arguments, target: Value, function: str, text: nodes.Expression, *arguments: nodes.Expression
 ) -> Value:
-    """Return the length of the text that a function of the form writes to a buffer."""
+    """Return the length of the text that is written to the buffer."""
     made = nodes.Read(value_types.STRING, call.scope.temporary())
     filled = _stored(call, target, function, made, *arguments)
     length = nodes.Call(value_types.INT, "h_len", (made,))
@@ -396,7 +394,6 @@ _LIMITED: Mapping[str, value_types.IntegerType] = MappingProxyType(
         "SIZE": value_types.ULONG,
     }
 )
-"""The types whose limits have names, such as `INT_MAX`."""
 
 CONSTANTS: Mapping[tuple[str, ...], tuple[value_types.Type, bool | int | float]] = MappingProxyType(
     {

@@ -27,7 +27,7 @@ from roswire import names
 from roswire.errors import DefinitionError
 
 LARGE = 4096
-"""The size in bytes from which a local variable is charged at its declaration."""
+"""A local variable of this many bytes is charged at its declaration."""
 
 MOST_TABLE = 64 << 10
 """The maximum number of bytes of a `const` array whose elements are part of the code."""
@@ -81,7 +81,7 @@ def _is_copy(scope: FunctionScope, declarator: tree.Declarator, kind: value_type
 def table(
     scope: FunctionScope, name: tree.TypeName, declarator: tree.Declarator, kind: value_types.Type
 ) -> bytes | None:
-    """Return the elements of a `const` array of constant numbers, as in a message; None for other variables."""
+    """Return the elements of a `const` array of constant numbers as in a message, or None for other variables."""
     given = declarator.value
     if not (
         name.constant and isinstance(kind, value_types.VectorType) and isinstance(given, tree.InitializerList)
@@ -102,10 +102,7 @@ def table(
 def known(
     scope: FunctionScope, name: tree.TypeName, declarator: tree.Declarator, kind: value_types.Type
 ) -> bool | int | float | None:
-    """Return the value of a `const` number that is a literal, for array sizes and cases.
-
-    Return None for other variables.
-    """
+    """Array sizes and cases need the value. Return None unless it is a `const` literal."""
     if not name.constant or not value_types.is_number(kind) or declarator.is_array:
         return None
     node = declarator.value
@@ -132,7 +129,6 @@ def _rounded(value: float, kind: value_types.FloatingType) -> float:
 def initial(
     scope: FunctionScope, name: tree.TypeName, declarator: tree.Declarator
 ) -> tuple[value_types.Type, nodes.Expression]:
-    """Return the type and the first value of a declared variable."""
     if name.name == ("auto",):
         return _deduced(scope, declarator)
     kind = resolve(name, scope.messages)
@@ -343,7 +339,7 @@ def _call_service(scope: FunctionScope, node: tree.CallStatement) -> None:
 
 
 def check_topic(topic: str, position: Position) -> None:
-    """Reject a topic or service name that is not global and canonical."""
+    """Reject names that are not global and canonical."""
     if not names.is_global_name(topic):
         hint = f"; write `/{topic}`" if names.is_global_name("/" + topic) else "; write for example `/a/b`"
         raise SpecificationError.at(position, f"{shown(topic)} is not a global name{hint}")

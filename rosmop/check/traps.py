@@ -1,4 +1,4 @@
-"""Warn of valid code that lets an unsafe message pass, or stops a safe one, against its author's likely intention."""
+"""Warn of valid code that passes an unsafe message, or stops a safe one, against its author's likely intention."""
 
 from collections.abc import Iterator, Sequence
 from ipaddress import ip_address
@@ -17,7 +17,6 @@ _UNORDERED = frozenset({"<", "<=", ">", ">="})
 
 
 def traps(specification: tree.Specification) -> Iterator[Diagnostic]:
-    """Yield warnings about the events of a specification."""
     yield from _unlike_a_sender(specification)
     tests = {node.parts[-1] for node in tree.walk(specification) if isinstance(node, tree.Name)}
     for event in specification.events:
@@ -57,7 +56,7 @@ def _unlike_a_sender(specification: tree.Specification) -> Iterator[Diagnostic]:
 
 
 def _wrong_sender(function: str, text: str) -> str:
-    """Return why a text is not the host or the name of any sender; empty if it may be."""
+    """Return why no sender can have this host or name, or an empty string."""
     if function == "caller" and text and not text.startswith("/"):
         return f"the name of a node begins with `/`, so this is never equal; write {shown('/' + text)}"
     if function != "host" or not text:
@@ -89,7 +88,6 @@ def _always_dropped(event: tree.EventDefinition) -> Iterator[Diagnostic]:
 
 
 def _ends(statement: tree.Statement | None) -> bool:
-    """Return whether each path through a statement drops the message."""
     match statement:
         case tree.ReturnStatement():
             return True
@@ -127,7 +125,6 @@ def _lost_changes(event: tree.EventDefinition) -> Iterator[Diagnostic]:
 
 
 def _assigned(statement: tree.ExpressionStatement) -> str:
-    """Return the first name of the target of an assignment; empty for another statement."""
     target = statement.expression
     if not isinstance(target, tree.Assignment):
         return ""
@@ -162,7 +159,6 @@ def _passed_nan(event: tree.EventDefinition) -> Iterator[Diagnostic]:
 def _bounds(
     condition: tree.Expression, yes: tree.Statement, numbers: frozenset[str] | set[str]
 ) -> Iterator[Diagnostic]:
-    """Yield warnings about comparisons that drop a message or change a field, but not for NaN."""
     changed = numbers if _acts(yes) else numbers & _assigned_in(yes)
     for bound in _unordered(condition, changed):
         name = next(name for name in sorted(changed) if name in {_operand(bound.left), _operand(bound.right)})
@@ -172,7 +168,7 @@ def _bounds(
 def _unordered(
     condition: tree.Expression, names: frozenset[str] | set[str]
 ) -> Iterator[tree.BinaryExpression]:
-    """Yield the comparisons of these variables that decide a condition, unless it has a negation, which finds NaN."""
+    """Skip conditions with a negation, which finds NaN."""
     parts = [node for node in tree.walk(condition) if isinstance(node, tree.Expression)]
     if any(isinstance(node, tree.UnaryExpression) and node.operator == "!" for node in parts):
         return
@@ -193,7 +189,6 @@ def _nan_passes(name: str, bound: tree.BinaryExpression) -> Diagnostic:
 
 
 def _operand(node: tree.Expression) -> str:
-    """Return the variable whose value or absolute value is compared; empty for another expression."""
     match node:
         case tree.CallExpression(callee=tree.Name(parts=parts), arguments=(argument,)) if (
             parts[-1] in _ABSOLUTE
@@ -211,9 +206,8 @@ def _assigned_in(statement: tree.Statement) -> set[str]:
 
 
 def rival_changes(specifications: Sequence[tree.Specification], phases: Phases) -> Iterator[Diagnostic]:
-    """Yield warnings about two specifications that change the same field of a topic: the later one decides.
-
-    Those that `order` statements put in order (`phases`) are not reported.
+    """Warn about two specifications that change the same field: the later one decides. Pairs in `phases` are
+    intended.
     """
     changed = [
         (specification, topic, field, binding)

@@ -15,7 +15,6 @@ from rosmop.types.messages import shown
 def withholdings(
     shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
 ) -> tuple[Withholding, ...]:
-    """Return the topics that a specification withholds, and report invalid declarations."""
     found = []
     for node in specification.withholds:
         try:

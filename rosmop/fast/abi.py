@@ -22,7 +22,7 @@ on.
 """
 
 MOST_KEPT = 1024
-"""The maximum number of bytes of a string that a variable of the module keeps."""
+"""The maximum bytes of a string in a variable of the module."""
 
 MOST_KEPT_ARRAY = 16 << 10
 
@@ -31,7 +31,7 @@ BEYOND = 0xFFFFFFFF
 
 
 def kept_size(kind: Type) -> int:
-    """Return the size of each element of a string, or of an array of numbers; 0 for values of other types."""
+    """Return the size of each element of a string, or of an array of numbers, or 0 for other types."""
     if isinstance(kind, value_types.StringType):
         return 1
     code = struct_code(kind.element) if isinstance(kind, value_types.VectorType) else None
@@ -39,12 +39,11 @@ def kept_size(kind: Type) -> int:
 
 
 def most_kept(kind: Type) -> int:
-    """Return the maximum number of elements of a string or array that a variable of the module keeps."""
     return MOST_KEPT if isinstance(kind, value_types.StringType) else MOST_KEPT_ARRAY // kept_size(kind)
 
 
 SENDER = 16 + 2 * MOST_KEPT
-"""The size of the sender of messages: address and length of its host and caller, and then their bytes."""
+"""The size of a sender: address and length of its host and caller, and then their bytes."""
 
 AREA = 512 << 10
 """The bytes of frames in one batch; one read takes the same number."""
@@ -57,8 +56,8 @@ LOUD = 1 << 63
 
 @dataclass
 class Cells:
-    """Addresses of the state of specifications that share topics or variables: 8 bytes for each property's state, then
-    8 bytes for each variable in use. Variables that are only `noted` are not undone.
+    """Addresses of the state of specifications that share topics or variables: 8 bytes for each property, then 8
+    bytes for each variable. Variables that are only `noted` are not undone.
     """
 
     base: int
@@ -75,12 +74,11 @@ class Cells:
     until: int = 0
     """Address of the time (i64) when Python's next timer is due. The module reports earlier deadlines."""
     variables: dict[str, tuple[int, Type]] = field(default_factory=dict)
-    """Address and type of each variable, in the order of addresses."""
     texts: dict[int, int] = field(default_factory=dict)
     """By the address of a variable: where its elements are stored while the number (i32) at `generation` is 0."""
     generation: int = 0
     settle: int = 0
-    """The number of the function that copies strings and arrays to these addresses."""
+    """The function that copies strings and arrays to these addresses."""
 
     @property
     def kept(self) -> Sequence[int]:
@@ -109,15 +107,14 @@ class TopicCode:
     functions: Sequence[int]
     says: bool
     settle: str
-    """The export to call after a message that was left is undone; empty if there is no such export."""
+    """The export to call after a message that was left is undone, or empty."""
 
 
 @dataclass(frozen=True)
 class CompiledModule:
-    """A module: its machine code (`translated`), the size of its memory, the addresses of frames and effects, its
-    topics, and the state of each component.
+    """A module and data about it.
 
-    `throttles` has, by context and site, the address of the time (i64, ns) when output at the site was last due.
+    `throttles` has, by context and site, the address of the time (i64, ns) when output is due.
     """
 
     code: bytes
@@ -129,14 +126,14 @@ class CompiledModule:
     throttles: Mapping[tuple[str, int], int]
     lines: Sequence[OutputLine]
     said: int
-    """Address of the lines of output. Each is stored by its index in `lines`."""
+    """Address of the lines of output, each stored by its index in `lines`."""
     senders: Mapping[str, int]
     """By context: the address of the sender of messages (`SENDER`)."""
 
 
 @dataclass(frozen=True, eq=False)
 class SetPart:
-    """The specifications of a set that one process runs, and the module for those that are not in shadow mode."""
+    """The part of a set that one process runs; the module has those that are not in shadow mode."""
 
     compiled: Compiled
     module: CompiledModule

@@ -1,4 +1,4 @@
-"""Code that calculates with numbers, booleans and times."""
+"""Generate code for numbers, booleans and times."""
 
 from math import inf
 
@@ -189,7 +189,6 @@ class ArithmeticCodegen(FunctionBuilder):
         return self._value(node.test) + if_result(kind) + yes + ELSE + no + END
 
     def _question(self, argument: nodes.Expression, operator: str) -> bytes:
-        """Compare the absolute value of a number with infinity."""
         machine = machine_type(argument.type)
         if machine not in (F32, F64):
             raise NotCompiledError.of(argument.type)
@@ -198,10 +197,7 @@ class ArithmeticCodegen(FunctionBuilder):
         return compared + (I32_EQZ if operator.startswith("!") else b"")
 
     def _least(self, node: nodes.Call) -> bytes:
-        """Return code that selects the same argument as `std::min` or `std::max`.
-
-        For `fmin` and `fmax`, also choose the second value if the first is NaN.
-        """
+        """Select the same argument as `std::min` or `std::max`; `fmin` and `fmax` also prefer a number to NaN."""
         machine = machine_type(node.type)
         one, other = (f"{side} {machine} {len(self._locals)}" for side in ("first", "second"))
         code = b"".join(
@@ -228,7 +224,7 @@ class ArithmeticCodegen(FunctionBuilder):
         )
 
     def _of_parts(self, seconds: bytes, nanoseconds: bytes) -> bytes:
-        """Combine seconds and nanoseconds (64 bits); leave the message to the interpreter if the sum may be inexact."""
+        """Leave the message to the interpreter if the sum may be inexact."""
         code, names = b"", [f"{part} {len(self._locals)}" for part in ("seconds", "nanoseconds")]
         for name, value, most in zip(names, (seconds, nanoseconds), (1 << 32, 1 << 61), strict=True):
             code += value + self._set(name, I64)
@@ -238,7 +234,7 @@ class ArithmeticCodegen(FunctionBuilder):
         return code + self._get(names[1], I64) + I64_ADD
 
     def _limited(self, kind: Type, code: bytes) -> bytes:
-        """Leave the message to the interpreter if a time or duration is out of range."""
+        """Leave the message to the interpreter if the value is out of range."""
         least, most = (
             (0, times.MAX_TIME) if kind == value_types.TIME else (times.MIN_DURATION, times.MAX_DURATION)
         )
@@ -260,7 +256,7 @@ class ArithmeticCodegen(FunctionBuilder):
         return self._limited(node.type, self._of_parts(old + self._seconds(), value))
 
     def _nanoseconds(self) -> bytes:
-        """Push the nanoseconds part of a time, which is never negative."""
+        """Nanoseconds are never negative."""
         code, value = self._set("moment", I64), self._get("moment", I64)
         whole = self._get("whole", I64)
         code += value + constant(I64, BILLION) + I64_REM_S + self._set("whole", I64)
@@ -303,14 +299,13 @@ class ArithmeticCodegen(FunctionBuilder):
 
 
 def to_floating(source: int, target: int, *, signed: bool) -> bytes:
-    """Return the instruction that converts a number to floating point."""
     if source in (F32, F64):
         return b"" if source == target else F32_DEMOTE_F64 if target == F32 else F64_PROMOTE_F32
     return _CONVERT[target, source, signed]
 
 
 def _narrowed(target: value_types.IntegerType) -> bytes:
-    """Return code that wraps a 32-bit number to the width of a narrower type; empty if the type is not narrower."""
+    """Wrap a 32-bit number; the code is empty if the type is not narrower."""
     if target.bits >= 32:
         return b""
     if target.signed:

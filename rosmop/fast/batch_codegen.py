@@ -129,7 +129,6 @@ MAX_TABLES = 8 << 20
 """The maximum number of bytes for the tables of all properties of a set."""
 
 PAGE = 1 << 16
-"""Bytes of a page of memory."""
 
 _SLACK = 16  # bytes after the frames that may be read
 
@@ -141,15 +140,14 @@ class WasmModule(CompiledModule):
     budgets: Mapping[str, int]
     strings: Mapping[bytes, int]
     references: Sequence[range]
-    """Addresses of memory for the values of references that functions return."""
+    """Memory for the values of references that functions return."""
     handlers: Mapping[str, Sequence[int]]
     """Numbers of the handlers of each topic's verdicts (`TopicCode.verdicts`)."""
     functions: int
-    """The number of functions that are not exported for topics."""
     refused: Mapping[str, NotCompiledError]
-    """Topics that are not in the module, with the reason."""
+    """The reasons for topics that are not in the module."""
     left: Mapping[str, Sequence[NotCompiledError]]
-    """By function: the places at which it leaves a message to the interpreter."""
+    """By function: the nodes at which it leaves a message to the interpreter."""
 
 
 def written(
@@ -235,9 +233,7 @@ def _assembled(
     constants: Mapping[bytes, int],
     memory: int,
 ) -> bytes:
-    """Assemble a module from functions (parameter types, result type, code), exports by name, constant bytes by
-    address, and the size of its memory.
-    """
+    """Functions are given by parameter types, result type and code; constants by address."""
     types = [function_type(given, result) for given, result, _ in functions]
     exported = [text(name) + EXPORTED_FUNCTION + unsigned(number) for name, number in exports.items()]
     pages = unsigned(memory // PAGE)
@@ -256,7 +252,7 @@ def _assembled(
 
 
 class _Tables:
-    """Allocates the tables of properties: 2 bytes for each state, 8 bytes for each time."""
+    """Allocates tables: 2 bytes for each state, 8 bytes for each time."""
 
     def __init__(self, writer: ModuleCodegen) -> None:
         self._writer = writer
@@ -284,7 +280,7 @@ def _set(local: int, value: bytes) -> bytes:
 
 
 class TopicCodegen:
-    """Writes the code for one topic. Raises `NotCompiledError` if it would leave every message.
+    """Writes the code for one topic. Raises `NotCompiledError` if every message would be left.
 
     Without `topic`, it leaves the messages that a safe message replaces.
     """
@@ -385,9 +381,8 @@ class TopicCodegen:
         return any(written.drops for written in (self._written[number], *run))
 
     def _table(self, number: int, place: int) -> int | None:
-        """Return the address of the table of a step.
-
-        Return None if the step does nothing. In the table, -1 marks a handler that is not compiled.
+        """Return the address of a step's table, or None if the step does nothing. An entry of -1 marks a handler that
+        is not compiled.
         """
         advance = self._events[number].advances[place]
         left: set[int] = set()
@@ -412,7 +407,6 @@ class TopicCodegen:
         return None if idle else self._known_tables.address(table)
 
     def _handled(self, advance: nodes.Advance) -> dict[tuple[int, WasmFunction], frozenset[int]]:
-        """Return the verdicts of a step with their compiled handlers, and the states of each."""
         found = {}
         for index, handled in enumerate(advance.handlers):
             verdict, written = self._handlers.get((advance.property, index), (0, None))
@@ -459,7 +453,7 @@ class TopicCodegen:
         return self._cells.base + 8 * number
 
     def _clock_cells(self) -> Iterator[tuple[int, int, int]]:
-        """Yield the properties with clocks, with local variable and address of start, time and number of steps."""
+        """Yield each property with a clock, the local variable of its start, and the addresses of time and steps."""
         for number, local in self._clocks.items():
             clock = self._cells.clocks[number]
             for place, at in enumerate((clock, clock + 8, self._cells.exits[number])):
@@ -475,7 +469,6 @@ class TopicCodegen:
         return code + b"".join(store(I64, kept, load(I64, address)) for address, kept in self._undo)
 
     def _frame(self) -> bytes:
-        """Leave unless there is a whole frame, and memory for an effect."""
         room = local_get(_END) + local_get(_AT) + I32_SUB
         stop = br_if(1)
         code = room + constant(I32, 4) + I32_LT_U + stop
@@ -489,7 +482,7 @@ class TopicCodegen:
         return code + b"".join(_set(_FIRST + number, constant(I32, 0)) for number in range(len(self._events)))
 
     def _event(self, number: int) -> bytes:
-        """Run an event. Blocks from here: the `if`, dropped (1), done (2), the loop (3), out (4), left (5)."""
+        """Blocks from here: the `if`, dropped (1), done (2), the loop (3), out (4), left (5)."""
         event, written, bits = self._events[number], self._written[number], _FIRST + number
         left = br_if(5)
         enabled = local_get(_ENABLED) + constant(I64, 1 << event.specification) + I64_AND
@@ -588,7 +581,7 @@ class TopicCodegen:
         return code + again + END
 
     def _advance_clock(self, number: int, clock: nodes.PropertyClock, event: int, table: int) -> bytes:
-        """Step a property with a clock, as `ClockedRun` and `ClockedSteps` do."""
+        """`ClockedRun` and `ClockedSteps` define the steps."""
         state, (since, now, count) = (
             self._states[number],
             range(self._clocks[number], self._clocks[number] + 3),
@@ -633,9 +626,9 @@ class TopicCodegen:
         return store(I64, address, load(I64, address) + more + I64_EXTEND_I32_U + I64_ADD)
 
     def _changed(self) -> bytes:
-        """Note the events that changed the message. (Blocks: dropped, done, the loop, out, left.)
+        """Note the events that changed the message. Blocks: dropped, done, the loop, out, left.
 
-        After several changes the bytes may again be the original bytes. The message is then left to the engine, unless
+        After several changes the bytes may again be the original ones, so the message is left to the engine unless
         the first changed word differs.
         """
         entry = self._log
@@ -658,7 +651,6 @@ class TopicCodegen:
         return more + store(I32, EFFECT, local_get(_LAST))
 
     def _dropped(self) -> bytes:
-        """Note the dropped bytes, and restore the states of the properties that suppress dropped messages."""
         last = local_get(_LAST)
         same = last + i64_load(0) + constant(I64, -1) + I64_EQ
         same += last + i32_load(12) + local_get(_AT) + I32_EQ + I32_AND

@@ -1,4 +1,4 @@
-"""Build sets: certify the properties, serialize a set, and translate its modules to machine code."""
+"""Build sets: certify, serialize, and translate to machine code."""
 
 from collections.abc import Collection, Iterable, Iterator
 from functools import lru_cache
@@ -18,14 +18,14 @@ from rosmop.run.engine import MonitorSet
 
 
 class CertifiedSet(NamedTuple):
-    """A set whose properties are certified: for each specification a line for each property, and the set as bytes."""
+    """A set whose properties are certified, as bytes, with a line for each property by specification."""
 
     certificates: dict[str, list[str]]
     data: bytes
 
 
 def certified(compiled: Compiled) -> CertifiedSet:
-    """Certify the properties of a set, and serialize it; equal sets give equal bytes.
+    """Equal sets give equal bytes.
 
     Raises `SpecificationError` if an automaton differs from its formula, which is a defect.
     """
@@ -36,7 +36,7 @@ def certified(compiled: Compiled) -> CertifiedSet:
 
 
 def require_loadable(data: bytes) -> None:
-    """Build the module of a whole certified set, and load it as a relay does. Raises the errors of `parts_of`."""
+    """Build and load the module as a relay does. Raises the errors of `parts_of`."""
     names = tuple(one.name for one in _set(data).specifications)
     for part in parts_of(data, [(names, ())]):
         compiled, fast = loaded(part)
@@ -46,8 +46,8 @@ def require_loadable(data: bytes) -> None:
 def parts_of(data: bytes, wanted: Iterable[tuple[Collection[str], Collection[str]]]) -> Iterator[bytes]:
     """Yield the parts of a certified set as bytes: for each, the specifications in it, and those in shadow mode.
 
-    Each part is independent of the rest; `rosmop.fast.load` loads it. Raises `SpecificationError` if its module cannot
-    be built, which is a defect, and `msgspec.ValidationError` if `data` is not a set.
+    Each part is independent of the rest. Raises `SpecificationError` if its module cannot be built, which is a
+    defect, and `msgspec.ValidationError` if `data` is not a set.
     """
     whole = _set(data)
     for names, shadows in wanted:
@@ -66,7 +66,6 @@ def _part(data: bytes, names: tuple[str, ...], shadows: tuple[str, ...]) -> byte
 
 
 def _defects(whole: Compiled, names: Collection[str]) -> list[Diagnostic]:
-    """Return an error for each group of specifications whose module alone cannot be built."""
     found = []
     for group in whole.groups(names):
         try:
@@ -83,7 +82,7 @@ def _defect(whole: Compiled, names: Collection[str], error: Exception) -> list[D
 
 
 def part_of(compiled: Compiled, names: Collection[str], shadows: Collection[str]) -> SetPart:
-    """Return the part of a set with these specifications, independent of the rest. `shadows` are in shadow mode.
+    """Return the specifications `names` as an independent part, with `shadows` in shadow mode.
 
     Raises `StepDiffersError` if the steps of the module differ from the automata, and `WasmError` if the module is
     invalid; both are defects.

@@ -1,14 +1,13 @@
 """Translate functions of the intermediate form (`form/nodes.py`) to WebAssembly.
 
-The translation includes numbers, conditions, loops, message fields and drops. Strings, vectors and messages within the
-current message are read in place if all of their parts have a fixed size (`codegen_access.py`). Variables can hold
-strings (`strings_codegen.py`). `ModuleCodegen` writes the functions of events and handlers, and the functions that they
-call. `batch_codegen.py` writes the loop over the frames that were received together.
+The translation includes numbers, conditions, loops, message fields and drops. Strings, vectors and messages within
+the current message are read in place if their parts have a fixed size (`codegen_access.py`), and variables can hold
+strings (`strings_codegen.py`). `batch_codegen.py` writes the loop over the frames that were received together.
 
-- The function of an event or handler takes the address of the message and its size (i32, i32), and returns flags (i32):
-  `HAPPENED` (the event happened), `DROPPED` (the message is dropped), `CHANGED` (bytes of the message were changed),
-  `ELSEWHERE` (the interpreter must process the message), `RESET` (the handler restarts the property), `REPLACED` (the
-  safe message has taken the place of the message).
+- The function of an event or handler takes the address of the message and its size (i32, i32), and returns flags
+  (i32): `HAPPENED` (the event happened), `DROPPED` (the message is dropped), `CHANGED` (bytes of the message were
+  changed), `ELSEWHERE` (the interpreter must process the message), `RESET` (the handler restarts the property),
+  `REPLACED` (the safe message has taken the place of the message).
 - `ELSEWHERE` is returned at each fault and at each node that is not compiled. The effects of the message are undone,
   and the interpreter processes the message. Functions that events and handlers call trap instead of returning
   `ELSEWHERE`. An event is not compiled at all if every message would reach such a node; `NotCompiledError` gives the
@@ -17,8 +16,8 @@ call. `batch_codegen.py` writes the loop over the frames that were received toge
   (`deferred_output.py`).
 - Before a field is written, the old bytes are appended to a log; `UNDO` holds the end of this log. An entry takes 16
   bytes: address (i32), size (i32) and the old bytes (i64).
-- The charges of the intermediate form (`nodes.Charge`, `nodes.Allocate`) are taken from the specification's budget, as
-  in the interpreter.
+- The charges of the intermediate form (`nodes.Charge`, `nodes.Allocate`) are taken from the specification's budget,
+  as in the interpreter.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -111,7 +110,6 @@ from rosmop.types.value_types import Type
 _MOVES = {
     8: (i64_load, i64_store), 4: (i32_load, i32_store), 2: (i32_load16_u, i32_store16), 1: (i32_load8_u, i32_store8),
 }  # fmt: skip
-"""Instructions that load and store a number of bytes unchanged."""
 
 HAPPENED, DROPPED, CHANGED, RESET, REPLACED = 1, 2, 4, 16, 32
 
@@ -119,12 +117,12 @@ EARLY = 16
 """The first bytes of a message, in which the fields of a header begin."""
 
 MOST_SAFE = 1024
-"""The maximum number of bytes of a safe message that the module sends."""
+"""The maximum size in bytes of a safe message in the module."""
 
 
 @dataclass(frozen=True)
 class WasmFunction:
-    """A function of the module: types, code, the variables that it assigns, its writes to fields, and whether it drops.
+    """A function of the module.
 
     `brief`: it has no loops. `passes`: conditions may end it early for some messages. `says`: it may print lines.
     `early`: it may write to the first bytes of the message, where a header is. `changes_elements`: it may change an
@@ -149,7 +147,7 @@ class WasmFunction:
 
 
 class ModuleCodegen(MemoryLayout):
-    """Writes the functions of a module, in the order of their numbers, and lays out its memory."""
+    """Writes the functions of a module, and lays out its memory."""
 
     def __init__(
         self, functions: Mapping[str, nodes.Function], shared: Mapping[str, Cells], values: ValueCodec
@@ -164,12 +162,11 @@ class ModuleCodegen(MemoryLayout):
         self.left.setdefault(function, []).append(error)
 
     def event(self, name: str, channel: str = "") -> WasmFunction:
-        """Return the function of an event on a topic, or of a handler. Raises `NotCompiledError`."""
+        """Raises `NotCompiledError`."""
         function = self.functions[name]
         return self.function(function, {"at": I32, "size": I32}, I32, function.context, channel=channel)
 
     def stops(self, event: nodes.Event) -> bool:
-        """Return whether the action of an event may send the safe message."""
         return any(
             isinstance(one, nodes.StopMessage) for one in nodes.walk(self.functions[event.function].body)
         )
@@ -183,7 +180,7 @@ class ModuleCodegen(MemoryLayout):
         *,
         channel: str = "",
     ) -> WasmFunction:
-        """Return a function, which is written on first use. `context` names the budget that pays for it."""
+        """Write a function on first use. `context` names the budget that pays for it."""
         key = (function.name, tuple(parameters), result, context, channel)
         if key not in self._numbers:
             written = _FunctionCodegen(self, function, parameters, result, context, channel=channel).written()
@@ -192,21 +189,18 @@ class ModuleCodegen(MemoryLayout):
         return self._numbers[key]
 
     def routine(self, key: tuple[object, ...], parameters: int, write: Callable[[], bytes]) -> int:
-        """Return the number of a function that takes this number of addresses. The function is written only once."""
+        """Write a function of this number of addresses once."""
         if key not in self._numbers:
             self._numbers[key] = self._added((I32,) * parameters, write())
         return self._numbers[key].number
 
     def settling(self, cells: Cells) -> int:
-        """Return the number of the function that copies the strings of variables.
-
-        All variables must be known before.
-        """
+        """Return the function that copies the strings of variables, all of which must be known before."""
         cells.settle = self._added((), settling(self, cells)).number
         return cells.settle
 
     def _added(self, parameters: tuple[int, ...], code: bytes) -> WasmFunction:
-        """Add a function that the intermediate form does not contain; its result has 32 bits."""
+        """Add a function that is not in the intermediate form; its result has 32 bits."""
         written = WasmFunction(
             len(self.written), parameters, I32, code, frozenset(), 0,
             drops=False, brief=True, passes=True, says=False, early=False, changes_elements=False,
@@ -216,8 +210,6 @@ class ModuleCodegen(MemoryLayout):
 
 
 class _FunctionCodegen(StringCodegen):
-    """Writes one function."""
-
     def __init__(
         self,
         writer: ModuleCodegen,
@@ -256,7 +248,7 @@ class _FunctionCodegen(StringCodegen):
             self._local(name, I32)
 
     def written(self) -> WasmFunction:
-        """Return the function. Raises `NotCompiledError`."""
+        """Raises `NotCompiledError`."""
         body = self._block(self._function.body)
         if isinstance(self._function, nodes.Skipper):
             body += self._position(self._function.end) + RETURN
@@ -379,7 +371,7 @@ class _FunctionCodegen(StringCodegen):
         return self._when(many, lambda: self._allocated(self._length()))
 
     def _pending(self, _node: nodes.Pending) -> bytes:
-        """Do nothing: only `Whole` uses this list, and `Whole` is not compiled."""
+        """Only `Whole` uses this list, and it is not compiled."""
         return b""
 
     def _drop(self, _node: nodes.Drop) -> bytes:
@@ -387,7 +379,7 @@ class _FunctionCodegen(StringCodegen):
         return constant(I32, 1) + self._set("dropped")
 
     def _stop(self, node: nodes.StopMessage) -> bytes:
-        """Note that the safe message takes the place of the message. A frame keeps its size."""
+        """A frame keeps its size."""
         safe = next((one for one in node.safes if one.topic == self._channel), None)
         if safe is None:
             raise NotCompiledError("publishes safe messages")
@@ -398,7 +390,7 @@ class _FunctionCodegen(StringCodegen):
         return self._when(differs, self._elsewhere) + constant(I32, 1) + self._set("replaced")
 
     def _put_safe(self, safe: nodes.SafeMessage, site: int) -> bytes:
-        """Write the safe message over the message, except for `seq` and `stamp`."""
+        """Keep `seq` and `stamp` of the message."""
         code, offset = b"", safe_messages.HEAD if safe.stamped else 0
         self._early = self._early or offset < EARLY
         while offset < len(safe.data):
@@ -454,7 +446,7 @@ class _FunctionCodegen(StringCodegen):
         return code
 
     def _put_field(self, write: nodes.Write, site: int) -> bytes:
-        """Write a number if its bits differ. NaNs, strings and arrays are left to Python."""
+        """Write only a number whose bits differ. NaNs, strings and arrays are left to Python."""
         try:
             return self._put_number(write)
         except NotCompiledError as error:
@@ -483,7 +475,6 @@ class _FunctionCodegen(StringCodegen):
         return code + self._put_bits(self._get("at") + base, write.at.offset, size, value)
 
     def _put_bits(self, place: bytes, offset: int, size: int, bits: bytes) -> bytes:
-        """Write bytes if they differ, and log the old bytes."""
         whole = I64 if size == 8 else I32
         get, overwrite = (instruction(offset) for instruction in _MOVES[size])
         new, mask = f"new {whole}", constant(I32, (1 << 8 * size) - 1) + I32_AND if size < 4 else b""
@@ -532,7 +523,7 @@ class _FunctionCodegen(StringCodegen):
         return store(machine, self._writer.variable(node.name, node.type), value)
 
     def _named_in_place(self, node: nodes.Assign) -> bytes:
-        """Let a local variable name a vector or message within the current message; nothing is copied."""
+        """A local variable names a vector or message within the current message; nothing is copied."""
         source, shared = root_of(node.value), self._writer.shared
         if not source or source in shared or node.name in shared:
             raise NotCompiledError.of(node.type)
@@ -547,7 +538,6 @@ class _FunctionCodegen(StringCodegen):
         return self._assigned_to(node) + self._read(nodes.Read(node.type, node.name))
 
     def _log(self, node: nodes.Log) -> bytes:
-        """Store the number and the values of a line of output."""
         line, number = OutputLine(self._context, node), len(self._locals)
         code, cost, stores = b"", constant(I64, line.cost), b""
         for place, value in enumerate(line.values):
@@ -557,7 +547,7 @@ class _FunctionCodegen(StringCodegen):
         return code + self._noted_line(line, cost) + stores + constant(I32, 0)
 
     def _noted_line(self, line: OutputLine, cost: bytes) -> bytes:
-        """Charge for a line of output, and store its head; the local variable `line` is its address."""
+        """The local variable `line` is the address of the stored head."""
         known = self._layout.lines
         code = load(I32, SAID) + self._set("line")
         end = self._get("line") + constant(I32, line.size) + I32_ADD
@@ -569,9 +559,7 @@ class _FunctionCodegen(StringCodegen):
         return code
 
     def _slot(self, node: nodes.Expression, name: str, at: int) -> tuple[bytes, bytes, bytes]:
-        """Return code to run first, code that stores a value in the line (for a string: address and length), and the
-        value's cost.
-        """
+        """Return code to run first, code that stores a value in the line, and the value's cost."""
         line = self._get("line")
         if is_text(node):
             first, place, count = self._elements(node)
@@ -589,7 +577,7 @@ class _FunctionCodegen(StringCodegen):
         return first, line + value + wide + i64_store(at), b""
 
     def _throttle(self, node: nodes.Throttle) -> bytes:
-        """Skip output that is not due yet. For output that is due, leave the message to Python."""
+        """Leave the message to Python if its output is due."""
         seconds = self._value(node.seconds) + to_floating(
             machine_type(node.seconds.type), F64, signed=is_signed(node.seconds.type)
         )
@@ -628,7 +616,7 @@ class _FunctionCodegen(StringCodegen):
         return code + self._get(total, machine_type(node.type))
 
     def _nearest(self, node: nodes.Call) -> bytes:
-        """Scan the elements between two indices, or those from the first to the end and from the start to the last."""
+        """Scan between two indices, or from the first to the end and from the start to the last."""
         vector, number = node.arguments[0], len(self._locals)
         first, last, least = (f"{what} {number}" for what in ("first", "last", "least"))
         code, place, count = self._elements(vector)
@@ -651,7 +639,6 @@ class _FunctionCodegen(StringCodegen):
     def _scanned(
         self, vector: nodes.Expression, place: bytes, limits: tuple[bytes, bytes], least: str
     ) -> bytes:
-        """Lower a local variable to the smallest element between two indices."""
         kind, size = self._writer.element(vector.type)
         at, left, each = (f"{what} {len(self._locals)}" for what in ("element", "left", "each"))
         code = place + limits[0] + I32_WRAP_I64 + constant(I32, size) + I32_MUL + I32_ADD + self._set(at)
@@ -709,9 +696,8 @@ class _FunctionCodegen(StringCodegen):
         return self._called(node)[0]
 
     def _called(self, node: nodes.Invoke) -> tuple[bytes, tuple[tuple[str, int], ...]]:
-        """Return the code of a call, and the address of each reference parameter's value after the call.
-
-        The code returns a string or vector as address (32 bits) and length.
+        """Return the code, and the address of each reference's value after the call. A string or vector is returned
+        as address (32 bits) and length.
         """
         if node.depth is not None:
             raise NotCompiledError("calls a recursive function")
@@ -766,7 +752,7 @@ class _FunctionCodegen(StringCodegen):
         return code + answer + RETURN
 
     def _handed(self, name: str, node: nodes.Expression) -> bytes:
-        """Call a function with references. Numbered local variables get its value and the values of the references."""
+        """Numbered local variables get the value of the call and the values of the references."""
         if not isinstance(node, nodes.Invoke):
             raise NotCompiledError.of(node.type)
         code, references = self._called(node)

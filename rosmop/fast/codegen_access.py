@@ -45,7 +45,7 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 MOST_TEXTS = 256
-"""The maximum number of strings in an array. A message with more strings is left to the interpreter."""
+"""A message with more strings in an array is left to the interpreter."""
 
 _LOADS = {
     "?": i32_load8_u, "b": i32_load8_s, "B": i32_load8_u, "h": i32_load16_s, "H": i32_load16_u,
@@ -65,7 +65,6 @@ class MessageAccess(ArithmeticCodegen):
         return self._get("size") + I64_EXTEND_I32_U + load(I64, REST) + I64_ADD
 
     def _within(self, at: nodes.Spot, size: int) -> bytes:
-        """Leave the message unless it has this many bytes at the position."""
         short = self._get("size") + I64_EXTEND_I32_U + self._position(at.plus(size)) + I64_LT_U
         return self._when(short, self._elsewhere)
 
@@ -80,7 +79,7 @@ class MessageAccess(ArithmeticCodegen):
         return self._within(node.at, 4) + end + self._set(node.name, I64)
 
     def _count(self, node: nodes.Count) -> bytes:
-        """Store the number of elements (64 bits). Leave a message that is too short for them to the interpreter."""
+        """Store the number of elements (64 bits). A message that is too short for them is left to the interpreter."""
         code = self._within(node.at, 4) + self._length_at(node.at)
         number = self._get(node.name, I64)
         room = self._get("size") + I64_EXTEND_I32_U + self._position(node.at.plus(4)) + I64_SUB
@@ -143,14 +142,13 @@ class MessageAccess(ArithmeticCodegen):
         return code + self._times(left, each) + table + self._set(f"place of {node.name}")
 
     def _text_at(self, entry: bytes) -> tuple[bytes, bytes, bytes]:
-        """Do the same as `_elements` for the string whose address is in an entry of a table."""
         name = f"text {len(self._locals)}"
         first = entry + i32_load(0) + self._set(name)
         length = self._get(name) + i32_load(0) + I64_EXTEND_I32_U
         return first, self._get(name) + constant(I32, 4) + I32_ADD, length
 
     def _elements(self, node: nodes.Expression) -> tuple[bytes, bytes, bytes]:
-        """Return code to run first, the address of the first element of a string or vector, and their number (i64)."""
+        """Return code to run first, the address of the first element, and the number of elements (i64)."""
         if isinstance(node, nodes.Copy):
             first, place, count = self._elements(node.value)
             element, size = self._layout.element(node.type)
@@ -174,7 +172,6 @@ class MessageAccess(ArithmeticCodegen):
         return b"", self._get(f"place of {node.name}"), self._get(f"count of {node.name}", I64)
 
     def _place(self, node: nodes.Expression) -> tuple[bytes, bytes]:
-        """Return code to run first, and the address of a nested message, or of an array of fixed length."""
         if isinstance(node, nodes.Copy):
             self._layout.copied(node.type)
             return self._place(node.value)
@@ -190,7 +187,7 @@ class MessageAccess(ArithmeticCodegen):
 
     @contextmanager
     def _apart(self, *looked_at: nodes.Expression) -> Iterator[None]:
-        """Raise `NotCompiledError` if code that is written in the `with` block changes the values that are read."""
+        """Raise `NotCompiledError` if code written in the block changes the values that are read."""
         names = {
             root_of(node)
             for node in looked_at
@@ -225,7 +222,6 @@ class MessageAccess(ArithmeticCodegen):
 
 
 def loaded(place: bytes, offset: int, kind: Type) -> bytes:
-    """Load a number or time at an offset from an address."""
     codes = struct_code(kind) or ""
     if len(codes) == 2:
         extend = I64_EXTEND_I32_U if codes[0] == "I" else I64_EXTEND_I32_S
@@ -236,7 +232,7 @@ def loaded(place: bytes, offset: int, kind: Type) -> bytes:
 
 
 def root_of(node: nodes.Expression) -> str:
-    """Return the variable whose value, part or copy `node` is; empty if unknown."""
+    """Return the variable that `node` is, or is a part or copy of; empty if unknown."""
     while not isinstance(node, nodes.Read | nodes.Assign):
         if isinstance(node, nodes.Copy):
             node = node.value

@@ -18,7 +18,6 @@ from rosmop.runtime.formatting import MAX_PRECISION
 from rosmop.types import value_types
 
 HEAD = struct.Struct("<II")
-"""The number of a line and the address of its frame."""
 
 BYTES = BYTES_PER_INSTRUCTION // 4
 """The number of bytes of a string that cost one instruction."""
@@ -30,7 +29,7 @@ _Make = Callable[[Sequence[object]], object]
 
 
 class OutputLine(msgspec.Struct, tag=True, array_like=True, dict=True):
-    """A line that can be serialized: its `values`, and the maximum number of its bytes besides strings (`longest`)."""
+    """A line that can be serialized. `longest` is the maximum number of its bytes besides strings."""
 
     context: str
     node: nodes.Log
@@ -45,7 +44,7 @@ class OutputLine(msgspec.Struct, tag=True, array_like=True, dict=True):
 
     @property
     def cost(self) -> int:
-        """Return the cost in instructions without strings.
+        """The cost in instructions without strings.
 
         Plus one instruction for each `BYTES_PER_INSTRUCTION` bytes of its strings, it is at least the cost that the
         form charges.
@@ -53,7 +52,6 @@ class OutputLine(msgspec.Struct, tag=True, array_like=True, dict=True):
         return OUTPUT_COST + 3 * (self.longest // BYTES_PER_INSTRUCTION + 1)  # formatting, joining, output
 
     def put_out(self, memory: memoryview, at: int, monitor: str) -> LogLine:
-        """Return the line that is stored at an address."""
         values: list[Any] = [*self._slots.unpack_from(memory, at + HEAD.size)]
         for place in self._texts:
             where, length = values[place] & _ADDRESS, values[place] >> 32
@@ -89,7 +87,7 @@ def is_text(node: nodes.Expression) -> bool:
 
 
 def _goes_on(node: nodes.Call) -> bool:
-    """Return whether formatting cannot fault: the precision is a constant within bounds."""
+    """Formatting cannot fault if the precision is a constant within bounds."""
     if node.function not in FAULTING:
         return True
     digits = node.arguments[1]

@@ -1,4 +1,4 @@
-"""The parts of each function of a module: local variables, branches, loops, charges."""
+"""Write the parts that all functions have: local variables, branches, loops, charges."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -37,10 +37,7 @@ ELSEWHERE = 8
 
 
 class FunctionBuilder(ABC):
-    """Writes one function.
-
-    `context` names the budget that pays for it. `answers`: the function is an event or handler.
-    """
+    """`context` names the budget that pays for it. `answers`: the function is an event or handler."""
 
     def __init__(
         self, layout: MemoryLayout, parameters: Mapping[str, int], context: str, *, answers: bool
@@ -55,16 +52,15 @@ class FunctionBuilder(ABC):
         self._brief = True
 
     @abstractmethod
-    def _block(self, statements: Sequence[nodes.Statement]) -> bytes:
-        """Return the code of statements."""
+    def _block(self, statements: Sequence[nodes.Statement]) -> bytes: ...
 
     @abstractmethod
     def _value(self, node: nodes.Expression) -> bytes:
-        """Push the value of an expression of numbers. Raises `NotCompiledError` for any other expression."""
+        """Push the value. Raises `NotCompiledError` unless it is a number."""
 
     @abstractmethod
     def _routine(self, parameters: int, write: Callable[..., bytes], *given: Any) -> bytes:
-        """Call a function that takes this number of addresses (i32). `write` writes it from the arguments `given`."""
+        """Call a function of addresses (i32), which `write` writes from the arguments `given`."""
 
     def _local(self, name: str, machine: int) -> int:
         number, known = self._locals.setdefault(name, (len(self._locals), machine))
@@ -102,13 +98,12 @@ class FunctionBuilder(ABC):
         return self._when(many, self._elsewhere) + self._spend(spent)
 
     def _times(self, left: str, each: bytes, body: Sequence[nodes.Statement] = ()) -> bytes:
-        """Write a loop that counts a local variable down to zero."""
         over = self._get(left, I64) + I64_EQZ + br_if(1)
         less = self._get(left, I64) + constant(I64, 1) + I64_SUB + self._set(left, I64)
         return self._repeated(over + less + each, body)
 
     def _repeated(self, before: bytes, body: Sequence[nodes.Statement]) -> bytes:
-        """Write an endless loop; `before` may leave the outer of the two blocks."""
+        """In an endless loop, `before` may leave the outer of the two blocks."""
         self._depth += 2
         self._loops.append(self._depth)
         code = before + self._block(body)

@@ -8,12 +8,12 @@ from rosmop.form.compiled import Compiled
 
 
 def prepare() -> None:
-    """Load the WebAssembly library, which takes time; otherwise the first part does it. Raises `WasmError`."""
+    """Load the WebAssembly library, which takes time. Raises `WasmError`."""
     load()
 
 
 def loaded(data: bytes) -> tuple[Compiled, WasmFastPath]:
-    """Return the specifications of a part and its fast path, for `MonitorSet.of`; without data, return an empty set.
+    """Return the specifications of a part and its fast path. Without data, the set is empty.
 
     Raises `ValueError` if the data are not a part.
     """

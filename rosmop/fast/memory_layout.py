@@ -1,4 +1,4 @@
-"""The layout of a module's memory, and the sizes of the values of each type there. See `abi.py`."""
+"""The layout of a module's memory (see `abi.py`), and the sizes of values there."""
 
 from collections.abc import Mapping
 
@@ -11,14 +11,11 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 LINES = 64 << 10
-"""The number of bytes for lines of output. A message whose line does not fit is left."""
+"""A message whose line of output does not fit in these bytes is left."""
 
 
 class NotCompiledError(Exception):
-    """A function, or a place in it, cannot be compiled.
-
-    The error gives the reason and the site (-1: the whole function).
-    """
+    """A function or a node cannot be compiled. The site is -1 for the whole function."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -30,20 +27,18 @@ class NotCompiledError(Exception):
         return cls(f"makes, keeps, compares or changes a value of type {kind}")
 
     def place(self, site: int) -> None:
-        """Set the site unless it is known."""
         if self.site < 0:
             self.site = site
 
 
 def reason_of(error: NotCompiledError | RecursionError) -> NotCompiledError:
-    """Return an error that names the reason why something cannot be compiled."""
     return (
         error if isinstance(error, NotCompiledError) else NotCompiledError("has expressions nested too deep")
     )
 
 
 def machine_type(kind: Type) -> int:
-    """Return the machine type for a type of the language. Raises `NotCompiledError`."""
+    """Raises `NotCompiledError`."""
     if isinstance(kind, value_types.BoolType) or (
         isinstance(kind, value_types.IntegerType) and kind.bits <= 32
     ):
@@ -93,7 +88,7 @@ class MemoryLayout:
         return cells.variables.setdefault(name, (place, kind))[0]
 
     def size(self, kind: Type) -> int:
-        """Return the size of each value of a type in a message. Raises `NotCompiledError` if sizes differ."""
+        """Raises `NotCompiledError` if the values of a type have different sizes in a message."""
         code = struct_code(kind)
         if code is not None:
             return struct_size(code)
@@ -104,16 +99,14 @@ class MemoryLayout:
         raise NotCompiledError.of(kind)
 
     def offset(self, kind: Type, number: int) -> int:
-        """Return the offset of a field in a message. Raises `NotCompiledError` if offsets differ."""
+        """Raises `NotCompiledError` if a field has different offsets."""
         if not isinstance(kind, value_types.RecordType):
             raise NotCompiledError.of(kind)
         return sum(map(self.size, self._values.fields(kind)[:number]))
 
     def element(self, kind: Type) -> tuple[Type, int]:
-        """Return the type of the elements of a string or vector, and their distance in bytes. For strings, the distance
-        is that in the table.
-
-        Raises `NotCompiledError`.
+        """Return the type of the elements, and their distance in bytes: for strings, in the table. Raises
+        `NotCompiledError`.
         """
         if isinstance(kind, value_types.StringType):
             return value_types.UINT8, 1
@@ -153,13 +146,11 @@ class MemoryLayout:
         return self.budgets[context]
 
     def sender(self, context: str) -> int:
-        """Return where the sender of messages is stored for a specification (`abi.SENDER`)."""
         if context not in self.senders:
             self.senders[context] = self.take(SENDER)
         return self.senders[context]
 
     def throttle(self, context: str, site: int) -> int:
-        """Return the address of the time when output at a site was last due."""
         if (context, site) not in self.throttles:
             self.throttles[context, site] = self.take(8)
         return self.throttles[context, site]

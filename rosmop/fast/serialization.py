@@ -1,6 +1,6 @@
-"""Serializes a compiled set: one process compiles it, and another runs it.
+"""Serialize a compiled set: one process compiles it, and another runs it.
 
-Reading is strict: only valid sets are accepted. Only message definitions in use are included.
+Reading accepts only valid sets. Only message definitions in use are included.
 """
 
 from typing import Any, get_type_hints
@@ -25,7 +25,7 @@ _MADE_OF = {kind: _parts(kind) for logic in LOGICS.values() for kind in logic.pr
 
 
 class _Used(msgspec.Struct):
-    """Collects the definitions that a set uses."""
+    """Collects the message definitions that a set uses."""
 
     messages: dict[str, MessageDefinition]
     services: dict[str, ServiceDefinition]
@@ -58,7 +58,7 @@ _DECODER = msgspec.msgpack.Decoder(Compiled, dec_hook=_made)
 
 
 def encoded(compiled: Compiled) -> bytes:
-    """Serialize a set; equal sets give equal bytes."""
+    """Equal sets give equal bytes."""
     definitions = compiled.messages.definitions
     reached = {name for one in compiled.specifications for name in one.reached}
     reached |= {one.type for one in compiled.publications}
@@ -78,16 +78,16 @@ def encoded(compiled: Compiled) -> bytes:
 
 
 def decoded(data: bytes) -> Compiled:
-    """Deserialize a set. Raises `msgspec.ValidationError`."""
+    """Raises `msgspec.ValidationError`."""
     return _DECODER.decode(data)
 
 
 def encoded_part(part: SetPart) -> bytes:
-    """Serialize the part of a set that one process runs; equal parts give equal bytes."""
+    """Equal parts give equal bytes."""
     return msgspec.msgpack.encode((msgspec.Raw(encoded(part.compiled)), part.module))
 
 
 def decoded_part(data: bytes) -> SetPart:
-    """Deserialize the part of a set that one process runs. Raises `msgspec.ValidationError`."""
+    """Raises `msgspec.ValidationError`."""
     compiled, module = _PARTS.decode(data)
     return SetPart(_DECODER.decode(compiled), module)

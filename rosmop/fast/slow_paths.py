@@ -1,4 +1,4 @@
-"""Lists the messages that the module of a set leaves to the interpreter, and why (`rosmop check --why-slow`)."""
+"""List the messages that a module leaves to the interpreter, and why (`rosmop check --why-slow`)."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,9 +15,8 @@ from rosmop.logics.interface import ClockedProperty, FiniteProperty
 class SlowPath:
     """Messages that the interpreter processes.
 
-    `topic` is a topic, or a service with `request` or `response`. `code` is the event or handler that leaves the
-    messages. It is empty if no message of the topic is compiled. `position` is the place in the text that cannot be
-    compiled.
+    `topic` may be a service with `request` or `response`. `code` is the event or handler, or empty if no message of
+    the topic is compiled. `position` is the code that cannot be compiled.
     """
 
     topic: str
@@ -27,10 +26,7 @@ class SlowPath:
 
 
 def slow_paths(compiled: Compiled) -> list[SlowPath]:
-    """Return the messages that a set leaves to the interpreter, by topic.
-
-    Messages with a fault or with due output are always left.
-    """
+    """Messages with a fault or with due output are always left, and not listed."""
     module = written_of(compiled)
     found: dict[SlowPath, None] = {}
     channels = dict.fromkeys(
@@ -58,7 +54,6 @@ def _partly(
     channel: str,
     specification: SpecificationCode,
 ) -> Iterator[SlowPath]:
-    """Yield the messages of a compiled topic that one specification leaves to the interpreter."""
     codes = [
         (f"event {specification.name}.{event.name}", event.function)
         for event in specification.events
@@ -90,7 +85,7 @@ def _of_property(code: PropertyCode) -> str:
 
 
 def _called(compiled: Compiled, function: str) -> list[str]:
-    """Return the names of a function, of the functions that it calls, and of the skippers that it uses."""
+    """Include the functions that it calls, and the skippers that it uses."""
     names = [function]
     for name in names:
         body = compiled.functions[name].body if name in compiled.functions else ()

@@ -62,7 +62,6 @@ from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION
 from rosmop.types import value_types
 
 _LOADS = {1: (I32, i32_load8_u), 2: (I32, i32_load16_u), 4: (I32, i32_load), 8: (I64, i64_load)}
-"""The type and the load instruction for a number of bytes."""
 
 
 class StringCodegen(MessageAccess):
@@ -86,7 +85,7 @@ class StringCodegen(MessageAccess):
         return super()._elements(node)
 
     def _address_of_span(self, node: nodes.Expression) -> int | None:
-        """Return where address and length are stored: of a variable of the set, or of the sender of the message."""
+        """Return where address and length are stored, or None."""
         if isinstance(node, nodes.SenderName):
             return self._layout.sender(self._context) + 8 * (node.part == "caller")
         if isinstance(node, nodes.Read) and node.name in self._layout.shared and kept_size(node.type):
@@ -102,7 +101,7 @@ class StringCodegen(MessageAccess):
         return b"", constant(I32, self._layout.constant(raw)), constant(I64, len(raw) // size)
 
     def _noted(self, span: bytes, most: int | None = None) -> tuple[bytes, bytes, bytes]:
-        """Pop address and length into local variables; a length above `most` leaves the message to the interpreter."""
+        """Pop address and length. A length above `most` leaves the message to the interpreter."""
         place, count = (f"{what} {len(self._locals)}" for what in ("place", "count"))
         code = span + self._set(count, I64) + self._set(place)
         if most is not None:
@@ -110,7 +109,7 @@ class StringCodegen(MessageAccess):
         return code, self._get(place), self._get(count, I64)
 
     def _chosen(self, node: nodes.Conditional) -> tuple[bytes, bytes, bytes]:
-        """Choose one of two strings; the other is not evaluated."""
+        """The other string is not evaluated."""
         test = self._value(node.test)
         place, count = (f"{what} {len(self._locals)}" for what in ("place", "count"))
         self._local(place, I32)
@@ -171,7 +170,6 @@ class StringCodegen(MessageAccess):
         )
 
     def _is_constant(self, given: nodes.Expression, known: nodes.Literal) -> bytes:
-        """Compare a string with a short constant: length and bytes."""
         assert isinstance(known.value, bytes)  # noqa: S101  a constant of strings
         first, place, count = self._elements(given)
         if len(known.value) > nodes.SHORT:
@@ -189,12 +187,12 @@ class StringCodegen(MessageAccess):
 
 
 def turns(leave: bytes, *turn: bytes) -> bytes:
-    """Write a loop that ends when `leave` is true, or when an iteration leaves its block."""
+    """The loop ends when `leave` is true, or when an iteration leaves its block."""
     return BLOCK + LOOP + leave + br_if(1) + b"".join(turn) + br(0) + END + END
 
 
 def mismatch() -> bytes:
-    """Write a function of two addresses and a length (i32) that returns the offset of the first difference."""
+    """Return the offset of the first difference of two addresses with a length (i32)."""
     one, other, size, at = (local_get(local) for local in range(4))
 
     def compared(read: bytes, differs: bytes) -> bytes:
@@ -210,10 +208,10 @@ def mismatch() -> bytes:
 
 
 def settling(layout: MemoryLayout, cells: Cells) -> bytes:
-    """Write a function that copies the strings and arrays of all variables to one of their two buffers, in turn.
+    """Copy the strings and arrays of all variables to one of their two buffers, in turn.
 
-    The number of the current buffer is stored last. If the function is stopped, it runs again after the current message
-    is undone. It returns 0 (i32).
+    The number of the current buffer is stored last. A stopped function runs again after the current message is
+    undone. It returns 0 (i32).
     """
     cells.generation = layout.take(8)
     kept = {at: kind for at, kind in cells.variables.values() if kept_size(kind)}

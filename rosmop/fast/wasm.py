@@ -1,7 +1,7 @@
 """Encode a WebAssembly module as bytes: numbers, names, rows, and instructions.
 
-This is the only file of the writer with opcodes. Instructions have the names of the specification. Instructions without
-an operand are constants; the others are functions of their operand.
+Only this file of the writer has opcodes. Instructions have the names of the specification. Instructions without an
+operand are constants; others are functions.
 """
 
 import struct
@@ -14,11 +14,9 @@ HEADER = b"\0asm\x01\0\0\0"
 FUNCTION_TYPE = b"\x60"
 EXPORTED_FUNCTION = b"\x00"
 EXPORTED_MEMORY = b"\x02\x00"
-"""The only memory of a module."""
 LIMITED = b"\x01"
 """A memory with a maximum size."""
 ACTIVE = b"\x00"
-"""A data segment that is copied to memory 0 at the start."""
 
 NOTHING = b"\x40"
 IF, ELSE, END, RETURN, DROP, SELECT = b"\x04", b"\x05", b"\x0b", b"\x0f", b"\x1a", b"\x1b"
@@ -63,7 +61,6 @@ MEMORY_COPY = b"\xfc\x0a\x00\x00"
 
 
 def unsigned(value: int) -> bytes:
-    """Encode a number as unsigned LEB128."""
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)
@@ -72,7 +69,6 @@ def unsigned(value: int) -> bytes:
 
 
 def signed(value: int) -> bytes:
-    """Encode a number as signed LEB128."""
     out = bytearray()
     while not -64 <= value < 64:
         out.append(value & 0x7F | 0x80)
@@ -97,7 +93,7 @@ def function_type(parameters: Sequence[int], result: int) -> bytes:
 
 
 def function(made: Sequence[tuple[int, int]], code: bytes) -> bytes:
-    """Encode a function: groups of local variables (number and type), and its instructions without the last `END`."""
+    """Locals are pairs of number and type; `code` has no final `END`."""
     whole = row([unsigned(count) + bytes((machine,)) for count, machine in made]) + code + END
     return unsigned(len(whole)) + whole
 
@@ -132,7 +128,7 @@ def if_result(machine: int) -> bytes:
 
 
 def constant(machine: int, value: float) -> bytes:
-    """Push a number of this type; integers wrap."""
+    """Integers wrap."""
     if machine in (I32, I64):
         bits = 32 if machine == I32 else 64
         whole = int(value) & (1 << bits) - 1

@@ -26,10 +26,9 @@ from pathlib import Path
 from typing import Any
 
 PAGE = 1 << 16
-"""Memory grows in steps of this size."""
 
 VERSION = "50."
-"""The first part of the version numbers of wasmtime that have these functions and layouts."""
+"""The versions of wasmtime that have these functions and layouts."""
 
 _FUEL_AT_START = 1_000_000
 _TABLE_ELEMENTS = 10_000
@@ -42,18 +41,15 @@ _OFF = ("component_model", "custom_page_sizes", "exceptions", "function_referenc
         "relaxed_simd", "simd", "stack_switching", "tail_call", "threads", "wide_arithmetic")  # fmt: skip
 
 Call = Callable[..., int | None]
-"""A function of integers. It uses the remaining fuel (`WasmInstance.refuel`)."""
+"""Uses the remaining fuel (`WasmInstance.refuel`)."""
 
 
 class WasmError(Exception):
-    """An instance or function cannot be created; the text says why."""
+    """An instance or function cannot be created."""
 
 
 class WasmTrap(Exception):  # noqa: N818  its name in WebAssembly
-    """A call was stopped. Its writes to memory stay.
-
-    `reason` says why ("integer division by zero", "out of fuel").
-    """
+    """A call was stopped, with the reason ("out of fuel"). Its writes to memory stay."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -103,10 +99,7 @@ class WasmInstance:
 
     @property
     def memory(self) -> memoryview:
-        """Return the whole memory, writable.
-
-        Call this again after the memory has grown. Raises `WasmError` if closed.
-        """
+        """Writable. Read it again after the memory has grown. Raises `WasmError` if closed."""
         asked = self._asked()
         size = load().wasmtime_memory_data_size(*asked)
         if size != len(self._view):
@@ -125,7 +118,7 @@ class WasmInstance:
         )
 
     def call(self, name: str | int, *arguments: int, fuel: int) -> int | None:
-        """Call an exported function of integers (signed) by its name or number, and return the result.
+        """Call an exported function of integers by its name or number.
 
         Each argument is a signed 64-bit integer; a 32-bit parameter gets its low bits. Raises `WasmTrap`. Raises
         `WasmError` if the function does not exist or the instance is closed. Raises `struct.error` for a wrong number
@@ -136,7 +129,7 @@ class WasmInstance:
         return function(*arguments)
 
     def function(self, name: str | int) -> Call:
-        """Return an exported function of integers, for frequent calls; see `call`."""
+        """For frequent calls; see `call`."""
         try:
             return self._functions[name]
         except KeyError:
@@ -151,11 +144,11 @@ class WasmInstance:
         return self._natives[name]
 
     def refuel(self, fuel: int) -> None:
-        """Set the remaining fuel. Raises `WasmError` if closed."""
+        """Raises `WasmError` if closed."""
         _check(load().wasmtime_context_set_fuel(self._asked()[0], fuel))
 
     def close(self) -> None:
-        """Free the module. Its memory is freed with the last view of the memory."""
+        """The memory is freed with its last view."""
         self._functions, self._view, self._store = {}, memoryview(b""), None
 
     def _asked(self) -> tuple[int, Any]:
@@ -256,7 +249,7 @@ def _bits(limit: int) -> int:
 
 @cache
 def _engine(bits: int) -> int:
-    """Return the engine for all instances with a limit of up to 2**bits bytes."""
+    """An engine serves all instances with a limit of up to 2**bits bytes."""
     settings = {
         **dict.fromkeys((f"wasm_{feature}" for feature in _OFF), 0),
         "shared_memory": 0,
@@ -276,7 +269,7 @@ def _engine(bits: int) -> int:
 
 
 def _bound(store: _Store, export: _Export) -> Call | None:
-    """Wrap a function for Python. Return None if it has arguments or results other than integers.
+    """Return None if the function has arguments or results other than integers.
 
     Arguments and result are in slots of 16 bytes. The wrapper must free a returned trap or error.
     """
@@ -324,7 +317,7 @@ def _addresses(store: _Store, export: _Export) -> tuple[int, int, int, object]:
 
 
 def failure(error: int, trap: int) -> Exception:
-    """Return the exception for an error or a trap of a native call, and free it (0: there was no error, no trap)."""
+    """Return the exception, and free the error or trap (0: none)."""
     try:
         _check(error or None)
     except WasmError as found:
@@ -333,7 +326,7 @@ def failure(error: int, trap: int) -> Exception:
 
 
 def _kinds(vector: Any) -> list[Any]:
-    """Return the kinds of values; None for a kind that is not an integer."""
+    """A kind that is not an integer becomes None."""
     found = vector.contents
     return [_KINDS.get(load().wasm_valtype_kind(found.data[number])) for number in range(found.size)]
 

@@ -1,17 +1,17 @@
-"""Run the compiled module of a set of specifications: decide when the module may process a topic, or a
-part of a service (the *lane* of the topic or part), and process batches of messages.
+"""Run the compiled module of a set: decide when it may process a topic or a part of a service (a *lane*), and process
+batches of messages.
 
 Invariants:
 
 - A batch ends before the first message that the module leaves to the engine; nothing of that message has happened.
 - The earlier messages have the same effect as if `MonitorSet.process` had processed each message at the time of the
   batch: bytes, variables, states of properties, events.
-- The state of specifications that share topics or variables is in one place at a time. From the first batch on it is in
-  the module's memory (`ModuleState.prepare`). Before that, and whenever Python reads it, it is in Python
+- The state of specifications that share topics or variables is in one place at a time. From the first batch on it is
+  in the module's memory (`ModuleState.prepare`). Before that, and whenever Python reads it, it is in Python
   (`ModuleState.leave`).
-- Frames that were received into the module's memory (`Lanes.area`) are read and changed in place. The beginning of any
-  other frame is copied to the module, and copied back if it was changed. Code that reads further leaves the message to
-  the engine.
+- Frames that were received into the module's memory (`Lanes.area`) are read and changed in place. The beginning of
+  any other frame is copied to the module, and copied back if it was changed. Code that reads further leaves the
+  message to the engine.
 """
 
 import struct
@@ -97,7 +97,7 @@ class ModuleState:
 
         `senders` has the addresses of senders of messages (`abi.SENDER`).
 
-        `properties` has the properties of `running` by monitor and number, `known` the variables by monitor and name.
+        `properties` and `known` have their keys by monitor.
         """
         self.machine = machine
         self._memory = machine.memory
@@ -147,7 +147,7 @@ class ModuleState:
             _SPANS.pack_into(self._memory, address, *words)
 
     def _unprepare(self) -> None:
-        """Forget the options: memory then differs from the `packed` form of all options."""
+        """The memory differs from the `packed` form of all options."""
         self.prepared = None
         _PREPARED.pack_into(self._memory, self._source, *[-1] * 4)
 
@@ -181,7 +181,7 @@ class ModuleState:
 
     @property
     def parts(self) -> list[tuple[int, int]] | None:
-        """Return address and size of each part of the state; None if it is more than numbers."""
+        """Address and size of each part, or None if the state is more than numbers."""
         if not self.size:
             return None if self._strings else []
         return [(self._base, self._cells.size), *((address, _CLOCK.size) for address in self._clocked)]
@@ -191,7 +191,7 @@ class ModuleState:
         return self._source
 
     def hasten(self) -> None:
-        """Compute the time of the next timer again, because there is an earlier deadline."""
+        """There is an earlier deadline, so compute the next one again."""
         self.leave()
         self._due(anew=True)
 
@@ -210,7 +210,6 @@ class ModuleState:
         return bool(self._values[name])
 
     def show(self) -> None:
-        """Copy the state from the module's memory to Python."""
         if not self._inside:
             return
         values = self._cells.unpack_from(self._memory, self._base)
@@ -232,7 +231,7 @@ def packed(prepared: BatchOptions) -> bytes:
 
 
 def _entered(memory: memoryview, value: Any, buffer: int, kind: Type) -> int:
-    """Write a string or array to memory; return its address, with the length from bit 32 on."""
+    """Return the address, with the length from bit 32 on."""
     if len(value) > most_kept(kind):
         return BEYOND << 32
     if isinstance(kind, value_types.VectorType):
@@ -243,9 +242,8 @@ def _entered(memory: memoryview, value: Any, buffer: int, kind: Type) -> int:
 
 
 def _left(memory: memoryview, word: int, before: Any, kind: Type) -> Any:
-    """Read the string or array whose address and length are in `word`.
-
-    Return `before` if the module does not keep it.
+    """Read the string or array whose address and length are in `word`, or return `before` if the module does not keep
+    it.
     """
     at, count = word & _ADDRESS, word >> 32
     if count == BEYOND:
@@ -256,7 +254,6 @@ def _left(memory: memoryview, word: int, before: Any, kind: Type) -> Any:
 
 
 def _cell(kind: Type) -> str:
-    """Return the `struct` code of a variable in the module's memory, 8 bytes."""
     if kept_size(kind):
         return "Q"
     if isinstance(kind, value_types.BoolType):
@@ -268,7 +265,7 @@ def _cell(kind: Type) -> str:
 
 
 class WasmLane:
-    """Runs the module for one topic, or part of a service; implements `FastLane`."""
+    """Runs the module for one topic, or part of a service."""
 
     def __init__(
         self,
@@ -498,7 +495,7 @@ class WasmLane:
     def _process_beginning(
         self, frame: memoryview, shown: int, time_ns: int, prepared: BatchOptions
     ) -> BatchResult | None:
-        """Process one frame; the module gets only its first `shown` bytes."""
+        """The module gets only the first `shown` bytes."""
         size, before = min(len(frame), shown), prepared.changed.copy()
         area = self._memory[self._frames : self._frames + size]
         area[4:] = frame[4:size]
@@ -521,8 +518,7 @@ class WasmLane:
             at += line.size
 
     def _stopped(self, *call: int) -> int:
-        """Return the result that the module would have returned at the point where it was stopped: the current message
-        is left.
+        """Return the result of a stopped call: the current message is left.
 
         If no message had begun, earlier calls have used up the fuel, so the module is called again.
         """
@@ -549,7 +545,7 @@ class WasmLane:
             self._settle()
 
     def _counted(self) -> tuple[Sequence[int], Sequence[int]]:
-        """Return the messages dropped by each event, and the number of each verdict, since the last call."""
+        """Return the drops of each event and the number of each verdict since the last call."""
         counts = self._later.unpack_from(self._memory, self._feed.counters + self._counts.size)
         before, self._before = self._before, counts
         more = [now - then for now, then in zip(counts, before, strict=True)]
@@ -567,7 +563,7 @@ def _verdict(monitor: MonitorInstance, place: int, handler: int) -> Verdict:
 
 
 class WasmFastPath:
-    """Runs the module of a set; implements `FastPath`."""
+    """Runs the module of a set."""
 
     def __init__(self, module: CompiledModule) -> None:
         self._module = module
@@ -575,7 +571,7 @@ class WasmFastPath:
     def lanes(
         self, compiled: Compiled, interpreter: Interpreter, monitors: Sequence[MonitorInstance], due: NextDue
     ) -> Lanes:
-        """Instantiate the module and return a lane for each topic that it takes; set `home` of its monitors."""
+        """Instantiate the module, and set `home` of its monitors."""
         module = self._module
         if not module.feeds:
             return Lanes()

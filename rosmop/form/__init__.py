@@ -1,1 +1,1 @@
-"""The intermediate form: typed expressions, statements and functions; a compiled set of specifications as data."""
+"""The intermediate form: typed expressions, statements and functions."""

@@ -17,9 +17,8 @@ from rosmop.types.value_types import Type
 
 @dataclass(frozen=True)
 class EventCode:
-    """A compiled event: the name of its function, and its trigger.
-
-    `type` is the type of the message, request or response. `service_type` is the type of the service.
+    """A compiled event: its function and its trigger. `service_type` is that of the service; `type` is that of the
+    message, request or response.
     """
 
     name: str
@@ -31,25 +30,25 @@ class EventCode:
     service_type: str | None = None
     period_ns: int | None = None
     binds: tuple[int, ...] = ()
-    """Numbers of the specification's parameters that the event binds."""
+    """Numbers of the specification's parameters."""
     key: str = ""
-    """The function that returns the values of these parameters; only for an event on messages."""
+    """The function that returns the values of these parameters, for an event on messages."""
     creates: bool = False
-    """Whether the event may begin a slice."""
+    """A slice may begin with it."""
     plain: bool = False
-    """Whether the event has neither an action nor a `when`, so its key alone decides."""
+    """The event has neither an action nor a `when`, so its key alone decides."""
     acts: bool = False
-    """Whether the action does more than change the slice's own variables."""
+    """The action does more than change the slice's own variables."""
 
     @property
     def channel(self) -> str | None:
-        """Return the topic of the messages, or their part of a service (see `channel_of`); None for a timer."""
+        """The topic, or the part of a service (see `channel_of`), or None for a timer."""
         return self.topic if self.topic is None or self.part is None else channel_of(self.topic, self.part)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A comparison of a specification. `when_true` and `when_false` each name the variables (double) for its two sides.
+    """A comparison. `when_true` and `when_false` each name the variables (double) for its two sides.
 
     The left variable is infinite until the comparison is evaluated. `threshold` is the constant side (0: left, 1:
     right), or None.
@@ -90,9 +89,7 @@ class Publication:
 
 @dataclass(frozen=True)
 class Given:
-    """A constant of a specification that operators may set: its names in the text and in the form, its type, unit and
-    default, and its bounds (None: a `bool`).
-    """
+    """A constant that operators may set. `code` is its name in the form; a `bool` has no bounds."""
 
     name: str
     code: str
@@ -102,7 +99,6 @@ class Given:
     bounds: tuple[int | float, int | float] | None
 
     def holds(self, value: object) -> bool:
-        """Return whether a value has the type, and lies within the bounds."""
         if self.bounds is None or isinstance(value, bool):
             return self.bounds is None and isinstance(value, bool)
         fits = isinstance(value, int) or (
@@ -118,7 +114,7 @@ class Given:
 
 @dataclass(frozen=True)
 class GivenTopic:
-    """A topic of a specification that a load may replace: its name in the text, the topic, and the default."""
+    """A topic that a load may replace; `name` is the one in the text."""
 
     name: str
     topic: str
@@ -127,7 +123,7 @@ class GivenTopic:
 
 @dataclass(frozen=True)
 class Slicing:
-    """The parameters of slices (name in the text, name in the code, type), and the slices' own variables.
+    """The parameters of slices (name in the text, name in the code, type), and their own variables.
 
     `enforces`: the specification drops, changes or publishes messages.
     """
@@ -139,9 +135,9 @@ class Slicing:
 
 @dataclass(frozen=True)
 class PropertyCode:
-    """A compiled property: its monitor, and the name of the handler's function for each handled category.
+    """A compiled property, and the function of the handler for each handled category.
 
-    `enforcement` says whether and how a violation can be prevented.
+    `enforcement` describes how a violation can be prevented.
     """
 
     property: CompiledProperty
@@ -152,17 +148,15 @@ class PropertyCode:
 
 @dataclass(frozen=True)
 class SpecificationCode:
-    """A compiled specification. `variables` maps its shared variables to their names in the code.
-
-    `start` lists the functions that initialise the specification: constants and zeros, first values, `init`.
+    """A compiled specification. `variables` maps shared variables to their names in the code; `start` lists the
+    functions that initialise it: constants and zeros, first values, `init`.
     """
 
     name: str
     position: Position
     identity: bytes
-    """A hash of the specification that ignores positions."""
+    """A hash of the text that ignores positions."""
     reached: frozenset[str]
-    """The message types that it names, with their nested types."""
     file: str
     hold: bool
     start: tuple[str, ...]
@@ -172,35 +166,32 @@ class SpecificationCode:
     variables: Mapping[str, str]
     uses: frozenset[str]
     comparisons: tuple[Comparison, ...] = ()
-    """Comparisons whose margins are noted, in the order of the text."""
+    """Comparisons whose margins are noted."""
     slicing: Slicing | None = None
-    """Parameters and own variables of slices; None without parameters."""
     begins: bool = False
-    """Whether it is declared `begin`: if its state is lost, it restarts instead of holding its topics."""
+    """If its state is lost, it restarts instead of holding its topics."""
     safes: tuple[nodes.SafeMessage, ...] = ()
     givens: tuple[Given, ...] = ()
     given_topics: tuple[GivenTopic, ...] = ()
     ordered: bool = False
-    """Whether an `order` statement names it."""
     withholdings: tuple[Withholding, ...] = ()
 
 
 @dataclass(eq=False)
 class Compiled:
-    """A set of specifications, with their functions in the intermediate form, by name."""
+    """A set of specifications; functions and types of variables are by name."""
 
     specifications: tuple[SpecificationCode, ...]
     warnings: tuple[Diagnostic, ...]
     functions: Mapping[str, nodes.Function]
     sites: Sequence[Site]
     types: Mapping[str, Type]
-    """Types of variables, by their names in the form."""
     messages: MessageTypes
     publications: tuple[Publication, ...]
     calls: tuple[Publication, ...] = ()
 
     def alone(self, names: Collection[str]) -> "Compiled":
-        """Return `part` without the data of other specifications, so that the result does not depend on them."""
+        """Like `part`, but the result does not depend on other specifications."""
         part = self.part(names)
         functions = {name: each for name, each in self.functions.items() if Symbols.owner(name) in names}
         safes = tuple(one.safes for one in part.specifications)
@@ -219,20 +210,17 @@ class Compiled:
         )
 
     def groups(self, names: Collection[str]) -> list[set[str]]:
-        """Return the groups of specifications that share variables, directly or indirectly, with one of `names`."""
+        """Return the groups that share variables, directly or indirectly, with one of `names`."""
         uses = {one.name: one.uses for one in self.specifications}
         return [group for group in sharing(uses) if not group.isdisjoint(names)]
 
     def without(self, names: Collection[str]) -> "Compiled":
-        """Return the set without `names` and without the specifications that share variables with them."""
+        """Also remove the specifications that share variables with `names`."""
         gone = {name for group in self.groups(names) for name in group}
         return self.part({one.name for one in self.specifications} - gone)
 
     def part(self, names: Collection[str]) -> "Compiled":
-        """Return the set with only `names`.
-
-        They must include every specification that shares variables with one of `names`.
-        """
+        """Return the set with only `names`, which must include all that share variables with one of them."""
         return replace(
             self,
             specifications=tuple(one for one in self.specifications if one.name in names),
@@ -246,7 +234,7 @@ class Compiled:
 
     @property
     def stamped(self) -> frozenset[str]:
-        """Return the topics whose messages begin with a `std_msgs/Header`."""
+        """The topics whose messages begin with a `std_msgs/Header`."""
         events = [
             event
             for specification in self.specifications

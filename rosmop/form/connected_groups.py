@@ -15,7 +15,7 @@ def sharing(uses: Mapping[str, Collection[str]]) -> list[set[str]]:
 
 
 def connected(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
-    """Return groups of indices, in order, whose items share keys, directly or indirectly."""
+    """Return groups of indices whose items share keys, directly or indirectly."""
     owners: dict[object, int] = {}
     chief = list(range(len(keys)))
 
@@ -34,8 +34,7 @@ def connected(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
 
 
 def channel_of(service: str, part: str) -> str:
-    """Return the name that replaces a topic for the `request` or `response` of a service.
-
-    The name contains a blank, as no topic does.
+    """The name of the `request` or `response` of a service, in place of a topic; it contains a blank, as no topic
+    does.
     """
     return f"{service} {part}"

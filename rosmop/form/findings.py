@@ -20,7 +20,6 @@ class Position:
     column: int
 
     def within(self, text: str, offset: int) -> "Position":
-        """Return the position of character ``offset`` of a ``text`` that begins here."""
         lines = text.count("\n", 0, offset)
         if not lines:
             return Position(self.file, self.line, self.column + offset)
@@ -31,14 +30,14 @@ class Position:
 
 
 def line_of(text: str, number: int) -> str:
-    """Return a line of a specification, counted from 1, without its comment."""
+    """Lines count from 1; the comment is removed."""
     lines = text.splitlines()[number - 1 : number]
     return lines[0].partition("//")[0].strip() if lines else ""
 
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """An error or warning for the author of a specification; the text says what to write instead."""
+    """A finding for the author of a specification; the text says what to write instead."""
 
     position: Position
     severity: Severity
@@ -49,7 +48,7 @@ class Diagnostic:
 
 
 class SpecificationError(Exception):
-    """A rejected file: all its errors, in the order of the text."""
+    """A rejected file, with all errors in the order of the text."""
 
     def __init__(self, findings: Iterable[Diagnostic]) -> None:
         self.findings = tuple(sorted(findings, key=lambda finding: finding.position))

@@ -34,7 +34,7 @@ SHORT = 64
 
 
 class FormNode(msgspec.Struct, frozen=True, tag=True, tag_field="node", array_like=True):
-    """A node of the form. It can be serialised."""
+    """A node that can be serialised."""
 
 
 # Expressions
@@ -58,7 +58,7 @@ class Read(FormNode, frozen=True):
 
 
 class Assign(FormNode, frozen=True):
-    """Assign a value to a variable; the result is the value."""
+    """The result is the value."""
 
     type: Type
     name: str
@@ -127,8 +127,8 @@ class Compare(FormNode, frozen=True):
 class CompareTexts(FormNode, frozen=True):
     """Compare strings.
 
-    The left string is charged by its length. It is free if either string is known to be `short`, or if the right string
-    is a variable with few bytes.
+    The left string is charged by its length, unless either string is `short` or the right one is a variable with few
+    bytes.
     """
 
     operator: str
@@ -140,7 +140,7 @@ class CompareTexts(FormNode, frozen=True):
 
 
 class Logical(FormNode, frozen=True):
-    """`and`, `or`: the right operand is evaluated only if the left one does not decide the result."""
+    """The right operand is evaluated only if the left one does not decide the result."""
 
     operator: str
     left: "Expression"
@@ -165,7 +165,7 @@ class Conditional(FormNode, frozen=True):
 
 
 class Sequence(FormNode, frozen=True):
-    """Evaluate all items in order; the result is the value of the chosen one."""
+    """Evaluates all items in order; the result is the value of the chosen one."""
 
     type: Type
     items: "tuple[Expression, ...]"
@@ -173,7 +173,7 @@ class Sequence(FormNode, frozen=True):
 
 
 class Discard(FormNode, frozen=True):
-    """Evaluate an expression for its effect only."""
+    """Evaluates an expression for its effect only."""
 
     value: "Expression"
     type: Type = value_types.VOID
@@ -292,7 +292,7 @@ class Log(FormNode, frozen=True):
 
 
 class Throttle(FormNode, frozen=True):
-    """A test whether output at this site is due: the last output was at least `seconds` ago."""
+    """Whether output at this site is due: the last output was at least `seconds` ago."""
 
     seconds: "Expression"
     site: int
@@ -331,7 +331,7 @@ Expression = (
 
 
 class Evaluate(FormNode, frozen=True):
-    """Evaluate an expression for its effect."""
+    """An expression that is evaluated for its effect."""
 
     site: int
     value: Expression
@@ -369,7 +369,7 @@ class Break(FormNode, frozen=True):
 
 
 class Continue(FormNode, frozen=True):
-    """Go on with the next iteration of the innermost loop."""
+    """Goes on with the innermost loop."""
 
     site: int
 
@@ -400,7 +400,7 @@ class Leave(FormNode, frozen=True):
 
 
 class Charge(FormNode, frozen=True):
-    """Take a number of instructions from the budget."""
+    """Takes from the budget."""
 
     site: int
     instructions: int
@@ -414,14 +414,14 @@ class Allocate(FormNode, frozen=True):
 
 
 class LimitDepth(FormNode, frozen=True):
-    """Fault if the recursion is too deep."""
+    """Faults if the recursion is too deep."""
 
     site: int
     name: str
 
 
 class Drop(FormNode, frozen=True):
-    """Drop the message; a deadline has no message."""
+    """Drops the message. A deadline has no message to drop."""
 
     site: int
 
@@ -522,7 +522,7 @@ class Skip(FormNode, frozen=True):
 
 
 class NotPast(FormNode, frozen=True):
-    """Unless there are more elements than `index`, the event does not happen, and this is reported."""
+    """The event does not happen, and this is reported, unless there are more elements than `index`."""
 
     site: int
     count: str
@@ -605,11 +605,11 @@ class Skipper(FormNode, frozen=True):
 
 
 class Function(FormNode, frozen=True):
-    """A function: an event, a handler, a timer, a helper function, or a stage of the start. An event has happened from
-    the statement with the number `happens` on.
+    """A function of any kind. An event has happened from the statement with the number `happens` on.
 
     `context` names the specification whose budget is charged. `shared` are the shared variables that the function
-    assigns. `same_as` is a function of `runtime/builtin_functions.py` with the same results, which is faster in Python.
+    assigns. `same_as` is a function of `runtime/builtin_functions.py` with the same results, which is faster in
+    Python.
     """
 
     name: str
@@ -635,7 +635,7 @@ class PropertyClock(FormNode, frozen=True):
 
 
 class HandledCategory(FormNode, frozen=True):
-    """The handler of a category, and the states that run it whenever they are entered, even from themselves."""
+    """The handler of a category. It runs whenever one of `states` is entered, even from itself."""
 
     category: str
     function: str
@@ -661,9 +661,8 @@ class Advance(FormNode, frozen=True):
 
 
 class Event(FormNode, frozen=True):
-    """An event on a topic: its function, and the steps of its specification's properties after it has happened.
-
-    `specification` is its index among the specifications of the topic.
+    """An event on a topic, and the steps of properties after it. `specification` is an index among the specifications
+    of the topic.
     """
 
     function: str
@@ -675,7 +674,7 @@ class Component(FormNode, frozen=True):
     """Specifications that share topics or variables only with each other: their variables, the number of properties
     with tables, and their topics (also requests and responses of services) with the events on each, in order.
 
-    `noted` are variables that serve only explanations; processing a message twice leaves them as after the first time.
+    `noted` are variables that serve only explanations; processing a message again does not change them.
     """
 
     variables: tuple[str, ...]
@@ -696,7 +695,6 @@ def walk(root: object) -> Iterator[msgspec.Struct]:
 
 
 _SITE = "site"
-"""The name of the field that is the number of a node's site, in every kind of node that has one."""
 
 
 def sites_of(root: object) -> set[int]:
@@ -718,7 +716,7 @@ PURE = "lib"
 
 
 def acts(root: Expression) -> bool:
-    """Return whether evaluating the expression has an effect."""
+    """Return whether evaluation has an effect."""
     return any(
         isinstance(node, Assign | Log | Throttle)
         or (isinstance(node, Invoke) and not node.function.startswith(PURE))
@@ -730,6 +728,6 @@ def acts(root: Expression) -> bool:
 
 
 class Left(NamedTuple):
-    """A back end's row for a kind of node that it leaves to the interpreter, with the reason."""
+    """Marks a kind of node that a back end leaves to the interpreter."""
 
     reason: str

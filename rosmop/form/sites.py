@@ -1,4 +1,4 @@
-"""Sites: positions in specifications that explain faults and decisions, with the values of variables."""
+"""Sites: the positions that reports of faults and decisions name, with variables whose values explain them."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from rosmop.types.value_types import Type
 
 @dataclass(frozen=True, slots=True)
 class SiteVariable:
-    """A variable: its names in the text and in the form. `steady`: its value never changes in place."""
+    """`code` is the name in the form. The value of a `steady` variable never changes in place."""
 
     name: str
     code: str
@@ -29,12 +29,12 @@ class Site:
 
     @property
     def compared(self) -> list[SiteVariable]:
-        """Return the variables of a condition that can explain it later: their values do not change in place."""
+        """The variables of a condition that can explain it later, because their values do not change in place."""
         return [variable for variable in self.variables if variable.steady]
 
 
 class Symbols:
-    """Makes the names of variables and functions, and the sites, of a set during its compilation.
+    """Makes names and sites during compilation.
 
     The names of a specification do not depend on the rest of the set.
     """
@@ -61,7 +61,7 @@ class Symbols:
 
 
 def showing(kind: Type) -> Callable[[Any], object]:
-    """Return a function that converts a value of a type to JSON for a report of a fault."""
+    """Values are shown in reports of faults as JSON."""
     if isinstance(kind, value_types.StringType | value_types.CharactersType):
         return lambda value: _short(value[:200].split(b"\0")[0].decode("utf-8", "replace"))
     if isinstance(kind, value_types.TimeType | value_types.DurationType):

@@ -12,10 +12,10 @@ from rosmop.logics.interface import ClockedProperty, FiniteProperty
 @dataclass(frozen=True)
 class SpecificationGroup:
     """A component, with the indices of its specifications, of its properties with tables, and of the events on each
-    channel.
+    channel (a topic or a part of a service).
 
-    A property is a pair (specification, property), an event a pair (specification, event). A channel is a topic or a
-    part of a service. Topics of parametric specifications have no events here: the engine processes their messages.
+    A property is a pair (specification, property), an event a pair (specification, event). Topics of parametric
+    specifications have no events here: the engine processes their messages.
     """
 
     component: nodes.Component
@@ -89,7 +89,6 @@ def event_of(
     index: int,
     place: int,
 ) -> nodes.Event:
-    """Return the form of one event of a specification, with the steps of its properties."""
     advances = []
     for property_index, code in enumerate(specifications[number].properties):
         compiled, handlers = code.property, set(code.order)

@@ -1,1 +1,1 @@
-"""Learn monitors from recordings of normal operation, and write the observed regularities as specifications."""
+"""Learn monitors from recordings of normal operation."""

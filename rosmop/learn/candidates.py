@@ -18,7 +18,7 @@ from rosmop.learn.topics import TopicContent, TopicRhythm
 
 QUIET_HOURS = 10.0
 MOST = {"range": 10, "constant": 12, "values": 6, "rate": 6, "unchanged": 6, "moves": 2, "order": 2}
-"""The limit for one topic and kind. Other kinds have one condition for each field, or only one condition."""
+"""The limit for one topic and kind. Other kinds have at most one condition for each field."""
 
 _FEWEST = 20  # the minimum number of messages for a statement about all messages
 _FEWEST_SET = 10
@@ -39,10 +39,9 @@ class CandidateSupport:
 class Candidate:
     """One condition that held in all recordings.
 
-    `says` begins the warning; no other candidate has the same text. `condition` is the condition of the alarm in the
-    language. In it, `{v}` stands for the field's value, `{n}` for a name made of the field's path, and `{t}` for a
-    prefix of the topic's own. It needs the declarations `state`, and the statements `first` before and `then` after all
-    conditions. A candidate may have a `formula` instead.
+    `says` begins the warning, and is unique. In `condition`, `{v}` stands for the field's value, `{n}` for a name
+    made of the field's path, and `{t}` for a prefix of the topic's own. `condition` needs the declarations `state`,
+    and the statements `first` before and `then` after all conditions. A candidate may have a `formula` instead.
     """
 
     topic: str
@@ -61,9 +60,9 @@ class Candidate:
     then: tuple[str, ...] = ()
     formula: str = ""
     events: Mapping[str, tuple[str, str]] = field(default_factory=dict)
-    """For an order of topics: the topics and patterns of its events."""
+    """For an order of topics: topic and pattern of each event."""
     alarms: int = 0
-    """The number of alarms on the held-out recordings."""
+    """On the held-out recordings."""
     widened: str = ""
 
     @property
@@ -85,18 +84,18 @@ class LearntFacts:
 
     types: Mapping[str, str]
     fields: Mapping[str, Mapping[str, str]]
-    """By topic: the types of the fields that are read, in the order of the definition."""
+    """By topic: the types of the fields that are read."""
     rhythms: Mapping[str, TopicRhythm]
     contents: Mapping[str, TopicContent]
     orders: TopicOrders
     seconds: float
     windows: int
     trimmed: Counter[str] = field(default_factory=Counter)
-    """By topic: the number of conditions that `candidates` left out because there were more than `MOST`."""
+    """By topic: the number of conditions beyond `MOST`, which `candidates` left out."""
 
     @property
     def short(self) -> Mapping[str, str]:
-        """Return a short unique name for each topic, made of its last words."""
+        """A unique name for each topic, made of its last words."""
         paths = {topic: identifier(topic).replace("_", ".") for topic in self.contents}
         names = short_names(paths.values())
         return {topic: names[path] for topic, path in paths.items()}
@@ -118,7 +117,7 @@ class LearntFacts:
 
 
 _WHOLE_NUMBERS = (-(1 << 63), (1 << 63) - 1), (-(1 << 63), (1 << 64) - 1)
-"""The least and greatest bound of a signed and of an unsigned field."""
+"""Least and greatest bound of signed and unsigned fields."""
 
 # Path, element and length of an array, and the statistics of its values
 _Place = tuple[str, int | None, int | None, Series]
@@ -247,7 +246,7 @@ class _Proposer:
     def _moves(
         self, topic: str, content: TopicContent, path: str, values: ValueSeries, support: CandidateSupport
     ) -> Iterator[Candidate]:
-        """Yield the automaton of a field's values, if some value never followed another and changes are frequent."""
+        """Propose the automaton of a field's values if some value never followed another and changes are frequent."""
         moves = content.moves.get(path, {})
         ordered = values.ordered
         count = len(ordered)

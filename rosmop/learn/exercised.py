@@ -1,8 +1,8 @@
 """Measure how often recordings exercise events, branches, handlers, functions, states and transitions.
 
-The specifications are compiled with a counter before each action, branch and handler. Counters are added to the syntax
-tree, not to the text, so line numbers stay the same. The runs of state machines are observed from outside. Otherwise
-the monitors behave as usual, and no messages are stored.
+The specifications are compiled with a counter before each action, branch and handler. Counters are added to the
+syntax tree, not to the text, so line numbers stay the same. The runs of state machines are observed from outside, and
+no messages are stored.
 """
 
 import re
@@ -28,9 +28,7 @@ from roswire.definitions import Definitions
 
 @dataclass(frozen=True)
 class CoverageItem:
-    """A part that a recording may exercise: its kind (`event`, `branch`, `state`, …), its description and its
-    position.
-    """
+    """A part that a recording may exercise (`event`, `branch`, `state`, …)."""
 
     specification: str
     kind: str
@@ -39,12 +37,12 @@ class CoverageItem:
 
 
 def items_of(texts: Mapping[str, str]) -> list[CoverageItem]:
-    """Return the items of these specifications, in the order of the text. Raises `SpecificationError`."""
+    """Return items in the order of the text. Raises `SpecificationError`."""
     return _items(_marked(texts))
 
 
 def covered(texts: Mapping[str, str], definitions: Definitions, recording: RecordingSource) -> list[int]:
-    """Return how often a recording exercised each item of `items_of`.
+    """Return the counts in the order of `items_of`.
 
     The number for a state is how often an event entered it or stayed in it. Raises `SpecificationError`.
     """
@@ -68,7 +66,7 @@ def covered(texts: Mapping[str, str], definitions: Definitions, recording: Recor
 
 
 def merged(one: Sequence[int], other: Sequence[int]) -> list[int]:
-    """Return the counts of two recordings together; the order of recordings makes no difference."""
+    """The order of recordings makes no difference."""
     return [a + b for a, b in zip(one, other, strict=True)]
 
 
@@ -85,7 +83,7 @@ def _items(marked: "_Marked") -> list[CoverageItem]:
 
 
 class _Marked:
-    """Files with a counter before each item; `items` has the items by the names of their counters."""
+    """Files with a counter before each item; `items` has the names of the counters as keys."""
 
     def __init__(self, files: Sequence[tree.SpecificationFile]) -> None:
         self.items: dict[str, CoverageItem] = {}
@@ -187,8 +185,6 @@ def _watch(monitors: MonitorSet) -> list["_Watch"]:
 
 
 class _Watch(CompiledProperty):
-    """A state machine whose runs count their transitions."""
-
     def __init__(self, specification: str, machine: CompiledProperty) -> None:
         super().__init__(machine.source, machine.categories)
         self.expiry = machine.expiry
@@ -214,8 +210,6 @@ class _Watch(CompiledProperty):
 
 
 class _Run:
-    """A run that reports its earlier state."""
-
     def __init__(self, watch: _Watch, run: Run, state: str) -> None:
         self._watch = watch
         self._run = run
@@ -230,7 +224,7 @@ class _Run:
 
     @property
     def as_new(self) -> bool:
-        """Return False, so that no watched run is stepped as a test."""
+        """False, so that no watched run is stepped as a test."""
         return False
 
     def step(self, event: int, time_ns: int) -> Categories:
@@ -248,8 +242,7 @@ class _Run:
     def saved(self) -> tuple[Any, ...]:
         return ()
 
-    def restore(self, saved: tuple[Any, ...]) -> None:
-        """Restore nothing."""
+    def restore(self, saved: tuple[Any, ...]) -> None: ...
 
 
 def _target(state: StateText, event: str) -> str:

@@ -24,8 +24,7 @@ _EULER = 0.5772156649015329
 
 
 def upper(highs: Iterable[float], windows: float, *, stops: bool = False) -> float | None:
-    """Return the level that the maximum of a window exceeds once in `windows` windows; None if there is too little
-    data.
+    """Return the level that the maximum of a window exceeds once in `windows` windows, or None with too little data.
 
     `stops`: the quantity may have a stop. Calculated quantities have no stops, because differences of rounded numbers
     can be equal by chance.

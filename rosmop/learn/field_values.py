@@ -39,7 +39,7 @@ class Fields:
         """
 
     def read(self, data: bytes) -> dict[str, Value]:
-        """Return the values by path. Raises `MessageError`."""
+        """Raises `MessageError`."""
         values: dict[str, Value] = {}
         position = 0
         try:

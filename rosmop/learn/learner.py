@@ -44,32 +44,25 @@ _WINDOWS = 24  # the minimum number for all recordings together
 
 @dataclass(frozen=True)
 class LearningResult:
-    """The result of learning.
-
-    `alarms` counts the alarms of the text on the held-out recordings, as given in its comments.
-    """
+    """The result of learning. `alarms` are those on the held-out recordings."""
 
     text: str
     candidates: tuple[Candidate, ...]
     left_out: tuple[Candidate, ...]
     names: dict[tuple[str, str, str, int | None], str]
-    """The specification of each candidate, by its key."""
     types: Mapping[str, str]
     trained: tuple[LearnedSpan, ...]
     held_out: tuple[LearnedSpan, ...]
     skipped: tuple[str, ...]
     """Topics whose type cannot be read, with the reason."""
     failed: Mapping[int, str]
-    """By number: the reasons why recordings were not, or only partly, learnt from."""
+    """By number: why recordings were not, or only partly, learnt from."""
 
 
 def learn(
     recordings: Sequence[RecordingFacts], definitions: Definitions, held_out: float, run: Run
 ) -> LearningResult:
-    """Learn from recordings, but hold out the fraction `held_out`; `run` executes the passes.
-
-    Raises `LearningError`.
-    """
+    """Hold out the fraction `held_out`; `run` executes the passes. Raises `LearningError`."""
     return _Learner(recordings, definitions, held_out, run).learnt()
 
 
@@ -177,7 +170,7 @@ class _Learner:
         return part.number, part.began, part.ended, place * self._each, self._each, chosen
 
     def _pass(self, steps: Sequence[AnyStep], nothing: Facts) -> tuple[Any, Any]:
-        """Return the merged facts of the training recordings, and of all. Raises `LearningError` if all failed."""
+        """Return the facts of the training recordings, and of all. Raises `LearningError` if all recordings failed."""
         trained: Any = nothing  # of the kind of the pass
         held_out: Any = nothing
         waiting = [step for step in steps if step.recording not in self._failed]

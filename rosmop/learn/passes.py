@@ -1,4 +1,4 @@
-"""The passes of learning over one recording, as pure functions, and the merging of their results.
+"""The passes of learning over one recording, and the merging of their results.
 
 A step is the input of a pass, besides the messages and their definitions. Merging is associative and commutative, so
 the recordings may be read in any order, and anywhere.
@@ -22,7 +22,7 @@ from roswire.definitions import Definitions
 class LearningStep(msgspec.Struct, frozen=True, tag=True):
     """The part of a recording from `began` to `ended` (nanoseconds), and the topics to read.
 
-    `recording` is its number. It has `windows` windows, of which the first has the number `first_window`.
+    It has `windows` windows; the first has the number `first_window`.
     """
 
     recording: int
@@ -40,13 +40,13 @@ class LearningStep(msgspec.Struct, frozen=True, tag=True):
 
 
 class TimeStep(LearningStep, frozen=True):
-    """Reads only times; keeps at most `gaps` of each topic for the median."""
+    """Reads only times, and keeps at most `gaps` of each topic for the median."""
 
     gaps: int
 
 
 class ContentStep(LearningStep, frozen=True):
-    """Reads the fields of each message. `rhythms` has the period and the interval of each topic."""
+    """Reads fields. `rhythms` has the period and the interval of each topic, in seconds."""
 
     rhythms: dict[str, tuple[float, float]]
     ordered: list[str]
@@ -69,7 +69,7 @@ class TimeFacts(msgspec.Struct, frozen=True, tag=True):
 
 
 class ContentFacts(msgspec.Struct, frozen=True, tag=True):
-    """The fields of each topic, and the order of topics."""
+    """The fields and the order of topics."""
 
     contents: dict[str, TopicContent] = {}
     pairs: dict[tuple[str, str], TopicPair] = {}
@@ -82,7 +82,7 @@ class ContentFacts(msgspec.Struct, frozen=True, tag=True):
 
 
 class AlarmFacts(msgspec.Struct, frozen=True, tag=True):
-    """The number of alarms of each candidate that has some."""
+    """By candidate, if it has alarms."""
 
     alarms: dict[int, int] = {}
 
@@ -95,7 +95,7 @@ AnyStep = TimeStep | ContentStep | AlarmStep
 
 
 def facts_of(step: AnyStep, source: RecordingSource, definitions: Definitions) -> Facts:
-    """Return the facts of a pass over one recording. Raises `LearningError`."""
+    """Raises `LearningError`."""
     if isinstance(step, TimeStep):
         return _times(step, source)
     if isinstance(step, ContentStep):
@@ -165,4 +165,4 @@ def run_here(sources: Sequence[RecordingSource], definitions: Definitions) -> "R
 
 
 Run = Callable[[list[AnyStep]], Iterator[tuple[int, Facts | LearningError]]]
-"""Executes steps, and yields the number and the facts of each in any order, or the reason why it failed."""
+"""Executes steps, and yields each number with the facts, or with the reason of the failure, in any order."""

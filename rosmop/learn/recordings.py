@@ -8,39 +8,36 @@ Received = tuple[str, int, bytes]  # topic, nanoseconds, the bytes of the fields
 
 
 class LearningError(Exception):
-    """Nothing can be learnt from these recordings; the text names them and the reason."""
+    """Nothing can be learnt; the text names the recordings and the reason."""
 
 
 class RecordingFacts(Protocol):
-    """Some topics of a recording from `began` to `ended`, in nanoseconds."""
+    """Some topics of a recording from `began` to `ended`, in nanoseconds. `topics` have their message types."""
 
     @property
     def name(self) -> str:
-        """Return the name of the recording for messages to the user."""
+        """For messages to the user."""
 
     @property
-    def began(self) -> int:
-        """Return the time of its first message."""
+    def began(self) -> int: ...
 
     @property
-    def ended(self) -> int:
-        """Return the time of its last message."""
+    def ended(self) -> int: ...
 
     @property
-    def topics(self) -> Mapping[str, str]:
-        """Return the message types of its topics."""
+    def topics(self) -> Mapping[str, str]: ...
 
 
 class RecordingSource(RecordingFacts, Protocol):
     """A recording with its messages."""
 
     def messages(self) -> Iterator[Received]:
-        """Yield all messages in order of time; each call starts again."""
+        """Yield messages in order of time; each call starts again."""
 
 
 @dataclass(frozen=True)
 class LearnedSpan:
-    """The recording of a number, or the part of it between two times (both included)."""
+    """A recording by number, or the part of it between two times (both included)."""
 
     number: int
     name: str
@@ -55,7 +52,7 @@ class LearnedSpan:
 def split(
     recordings: Sequence[RecordingFacts], held_out: float
 ) -> tuple[list[LearnedSpan], list[LearnedSpan]]:
-    """Return the training part and the held-out part: whole recordings, spread evenly, or the end of a single one.
+    """Hold out whole recordings, spread evenly, or the end of a single one.
 
     If there is only one recording and it is too short to split, nothing is held out.
     """

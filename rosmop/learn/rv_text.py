@@ -1,4 +1,4 @@
-"""Pieces of `.rv` text: numbers, strings, names and conditions as the language writes them."""
+"""Write numbers, strings, names and conditions of `.rv` text."""
 
 import math
 import re
@@ -13,13 +13,11 @@ CPP = {
     "float32": "float", "float64": "double", "byte": "int8_t", "char": "uint8_t", "string": "std::string",
     "bool": "bool", **{f"{sign}int{size}": f"{sign}int{size}_t" for sign in ("", "u") for size in (8, 16, 32, 64)},
 }  # fmt: skip
-"""The language's type for each type of message fields."""
 WORDS = frozenset(FORBIDDEN) | RESERVED
-"""The words of the language that cannot be names."""
 
 
 def rounded_up(value: float, width: float) -> str:
-    """Return a number that is not below the value, rounded to about a hundredth of the width."""
+    """Return a number not below the value, rounded to about a hundredth of the width."""
     if not width > 0:
         return number(value)
     quantum = Decimal(1).scaleb(math.floor(math.log10(width / 100)))
@@ -27,12 +25,12 @@ def rounded_up(value: float, width: float) -> str:
 
 
 def rounded_down(value: float, width: float) -> str:
-    """Return a number that is not above the value, rounded likewise."""
+    """Return a number not above the value, rounded likewise."""
     return number(-float(rounded_up(-value, width)))
 
 
 def number(value: float) -> str:
-    """Return a number as the language reads it. An integer stays an integer."""
+    """An integer stays an integer."""
     text = repr(value)
     if isinstance(value, int) and value >= 1 << 63:
         return f"{text}u"  # only an unsigned type holds it
@@ -40,7 +38,7 @@ def number(value: float) -> str:
 
 
 def literal(value: object) -> str | None:
-    """Return the literal of a bool, number or string; None if the language cannot write the value."""
+    """Return None if the language cannot write the value."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
@@ -53,7 +51,7 @@ def quoted(text: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """Return text for a comment: spaces instead of line ends, and other control characters escaped."""
+    """Spaces replace line ends, and other control characters are escaped."""
     words = " ".join(text.split())
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in words)
 
@@ -68,7 +66,7 @@ def identifier(text: str) -> str:
 
 
 def short_names(paths: Iterable[str]) -> dict[str, str]:
-    """Return for each path its shortest unique end, as a name that is free in the language."""
+    """Return each path's shortest unique end, as a name that is free in the language."""
     paths = list(paths)
     names: dict[str, str] = {}
     for path in paths:

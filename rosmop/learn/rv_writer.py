@@ -1,4 +1,4 @@
-"""Candidates as `.rv` text that a person reads and edits: a specification for each topic, one for each order."""
+"""Write candidates as `.rv` text that a person edits: a specification for each topic, one for each order."""
 
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,7 +14,7 @@ _WIDTH = 104  # the maximum number of columns of a statement
 def specifications(
     candidates: Sequence[Candidate], known: LearntFacts
 ) -> Iterator[tuple[str, str, list[Candidate]]]:
-    """Yield name, text and candidates of each specification."""
+    """Yield name, text and candidates."""
     taken: set[str] = set()
     own = [candidate for candidate in candidates if not candidate.events]
     for topic, group in groupby(own, key=lambda candidate: candidate.topic):
@@ -143,10 +143,7 @@ def _once(pieces: Iterable[str]) -> list[str]:
 
 
 def _filled(row: Candidate, texts: Iterable[str], names: Mapping[str, str]) -> list[str]:
-    """Return the texts with the field's expression and name.
-
-    Statements about an array element run only if the element exists.
-    """
+    """Statements about an array element run only if the element exists."""
     value = _short(row, names)
     name = value
     if row.element is not None:

@@ -14,7 +14,6 @@ Statistic = TypeVar("Statistic")
 _Key = TypeVar("_Key")
 
 MOST_VALUES = 8
-"""A field with more distinct values is not an enumeration."""
 
 
 def merged_rows(
@@ -34,7 +33,7 @@ class HighestValues(msgspec.Struct):
     of: dict[int, float] = {}
 
     def add(self, value: float, window: int) -> None:
-        """Add a number that is not NaN."""
+        """The value must not be NaN."""
         if value > self.of.get(window, -math.inf):
             self.of[window] = value
 
@@ -82,14 +81,12 @@ class ValueSeries(msgspec.Struct):
 
     @property
     def closed(self) -> bool:
-        """Whether a further value is unlikely, because no value was seen in only one window (Good and Turing's
-        estimate).
-        """
+        """A new value is unlikely, because no value was seen in only one window (Good and Turing's estimate)."""
         return bool(self.windows) and min(self.windows.values()) > 1
 
 
 class Series(msgspec.Struct):
-    """A numeric field, or a numeric array folded into one value: its values, and how they changed.
+    """The statistics of a numeric field, or of a numeric array folded into one value.
 
     `period` is the usual time between two messages in seconds. Closer messages count as one period apart, because
     otherwise network delays would determine their rate.
@@ -106,17 +103,17 @@ class Series(msgspec.Struct):
     rates: HighestValues = msgspec.field(default_factory=HighestValues)
     stays: HighestValues = msgspec.field(default_factory=HighestValues)
     last: float | None = None
-    """This value, its time and the time since which it is the same are reset at the end of a recording."""
+    """Reset at the end of a recording, like its time and the time since which it is the same."""
     time: float = 0.0
     since: float = 0.0
 
     def end(self) -> None:
-        """End a recording: the values of the next one are independent of its values."""
+        """The values of the next recording are independent of these."""
         self.last, self.time, self.since = None, 0.0, 0.0
         self.values.end()
 
     def merged(self, other: "Series") -> "Series":
-        """Return the statistics of both, which have ended."""
+        """Both must have ended."""
         return Series(
             self.period, self.count + other.count, self.changed + other.changed, self.nan or other.nan,
             self.infinite or other.infinite, self.highs.merged(other.highs), self.lows.merged(other.lows),
@@ -124,7 +121,7 @@ class Series(msgspec.Struct):
         )  # fmt: skip
 
     def add(self, value: float | int, seconds: float, window: int) -> None:
-        """Add a value and its time. Only whole numbers may be an enumeration."""
+        """Only whole numbers may be an enumeration."""
         self.count += 1
         if not self.values.many and not isinstance(value, float):
             self.values.add(value, window)
@@ -148,7 +145,7 @@ class Series(msgspec.Struct):
             self.infinite = True
 
     def add_array(self, low: float, high: float, nan: bool, infinite: bool, window: int) -> None:
-        """Add the extremes of an array's finite elements, and whether it has NaNs or infinite elements."""
+        """The extremes are those of the finite elements."""
         self.count += 1
         self.nan |= nan
         self.infinite |= infinite

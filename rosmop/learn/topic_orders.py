@@ -13,7 +13,7 @@ import msgspec
 from rosmop.learn.series import HighestValues, merged_rows
 
 MOST_TOPICS = 24
-"""The maximum number of topics that are compared with each other. The topics with the fewest messages are used."""
+"""Topics with more messages are preferred."""
 
 _SURE = 1e-6  # the probability that any of all pairs looks like an order by chance
 _FEWEST = 20  # the minimum number of messages for an order
@@ -28,7 +28,7 @@ class TopicPair(msgspec.Struct):
     requires: bool = True
     turns: bool = True
     first: int | None = None
-    """The first message that no second-topic message has followed; like the next ones, until the recording ends."""
+    """The first message without a later second-topic message; like the next ones, until the recording ends."""
     last: int | None = None
     seconds: int = 0
     """Second-topic messages since the last first-topic message."""
@@ -80,7 +80,8 @@ class TopicOrders:
         self.pairs = merged_rows(self.pairs, pairs, TopicPair.merged)
 
     def by_chance(self, bound: float, rate: float, count: int) -> bool:
-        """Return whether chance alone would place `count` messages within `bound` seconds of another topic's messages.
+        """Return whether `count` messages would be within `bound` seconds of another topic's messages by chance
+        alone.
 
         `rate` is the other topic's rate (1/s).
         """

@@ -1,4 +1,4 @@
-"""Statistics of one topic: the intervals of its messages, and a series for each field; merged as in `series`."""
+"""Statistics of one topic: the intervals of its messages, and a series for each field."""
 
 import math
 import statistics
@@ -10,10 +10,10 @@ from rosmop.learn.field_values import Fields
 from rosmop.learn.series import HighestValues, Series, ValueSeries, merged_rows
 
 MOST_SINGLE = 6
-"""Arrays that always have the same length, up to this maximum, have a series for each element."""
+"""Arrays that always have the same length, up to this one, have a series for each element."""
 
 MOST_GAPS = 5000
-"""The number of gaps that the median of all recordings is calculated from."""
+"""The median of all recordings is calculated from this number of gaps."""
 
 _IN_STEP = 60.0  # seconds from a stamp to its reception; longer times mean clocks of different robots
 
@@ -25,7 +25,7 @@ class TopicRhythm(msgspec.Struct):
     recordings: set[int] = set()
     gaps: HighestValues = msgspec.field(default_factory=HighestValues)
     some: dict[int, list[int]] = {}
-    """By the first window of each part of a recording: its first gaps in nanoseconds, for the median."""
+    """By the first window of each part of a recording: gaps in nanoseconds, for the median."""
     last: int | None = None
     """The time of the last message, until the recording ends."""
 
@@ -34,7 +34,7 @@ class TopicRhythm(msgspec.Struct):
         self.some[first_window] = []
 
     def add(self, time: int, window: int, most: int) -> None:
-        """Add the time of a message, and its gap if there are not yet `most`."""
+        """Add a time, and its gap if there are not yet `most`."""
         self.count += 1
         if self.last is not None:
             gap = time - self.last
@@ -48,7 +48,7 @@ class TopicRhythm(msgspec.Struct):
         self.last = None
 
     def merged(self, other: "TopicRhythm") -> "TopicRhythm":
-        """Return the rhythm of both, which have ended and are of different parts."""
+        """Both must have ended and be of different parts."""
         return TopicRhythm(
             self.count + other.count, self.recordings | other.recordings, self.gaps.merged(other.gaps),
             {**self.some, **other.some},
@@ -56,13 +56,13 @@ class TopicRhythm(msgspec.Struct):
 
     @property
     def period(self) -> float:
-        """Return the usual interval in seconds; a nanosecond if the interval is unknown."""
+        """The usual interval in seconds; a nanosecond if it is unknown."""
         gaps = [gap for some in self.some.values() for gap in some]
         return max(statistics.median(gaps) if gaps else 0.0, 1.0) / 10**9
 
     @property
     def interval(self) -> float:
-        """Return the length in seconds of the intervals in which messages are counted."""
+        """The seconds in which messages are counted."""
         return float(max(1, round(5 * self.period)))
 
 
@@ -71,16 +71,16 @@ class TopicContent(msgspec.Struct):
 
     numbers: dict[str, Series] = {}
     elements: dict[str, list[Series]] = {}
-    """The series of each element of arrays that always have the same, small length."""
+    """Only for arrays that always have the same, small length."""
     sets: dict[str, ValueSeries] = {}
     lengths: dict[str, ValueSeries] = {}
     moves: dict[str, dict[tuple[Any, Any], int]] = {}
-    """For fields with few values: the number of windows in which a value was followed by another value."""
+    """For fields with few values: the number of windows in which one value followed another."""
     ages: HighestValues = msgspec.field(default_factory=HighestValues)
     leads: HighestValues = msgspec.field(default_factory=HighestValues)
     counts: HighestValues = msgspec.field(default_factory=HighestValues)
     backward: bool = False
-    """Whether some message had an earlier stamp than the previous message."""
+    """Some message had an earlier stamp than the previous one."""
 
     def merged(self, other: "TopicContent") -> "TopicContent":
         result = TopicContent(
@@ -118,7 +118,7 @@ def _merged_moves(
 
 
 class TopicContentReader:
-    """Reads the messages of a topic in one recording. `period` and `interval` are those of the topic's rhythm."""
+    """Reads the messages of a topic in one recording. `period` and `interval` are those of its rhythm."""
 
     def __init__(self, fields: Fields, period: float, interval: float) -> None:
         self.content = TopicContent()
@@ -132,7 +132,6 @@ class TopicContentReader:
         self._opened, self._counted = 0.0, 0
 
     def ended(self) -> TopicContent:
-        """End the recording, and return its statistics."""
         content = self.content
         for series in [
             *content.numbers.values(),
@@ -145,7 +144,7 @@ class TopicContentReader:
         return content
 
     def add(self, data: bytes, time: int, window: int) -> None:
-        """Add a message. Raises `MessageError`."""
+        """Raises `MessageError`."""
         seconds = time / 10**9
         for path, value in self._fields.read(data).items():
             kind = self._types[path]

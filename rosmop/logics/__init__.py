@@ -1,5 +1,1 @@
-"""The logics of ``.rv`` properties: each logic compiles a formula and the events of its specification to a monitor.
-
-``catalogue.compile_property`` is the entry point; ``interface`` defines what every logic offers. Each logic has its own
-file.
-"""
+"""The logics of ``.rv`` properties: each file compiles the formulas of a logic to monitors."""

@@ -10,15 +10,14 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 MAX_STATES = 10_000
-"""The maximum number of states before minimisation."""
 MAX_TRANSITIONS = 500_000
-"""The maximum number of transitions; minimising takes about 300 bytes per transition."""
+"""Minimising takes about 300 bytes per transition."""
 
 State = TypeVar("State", bound=Hashable)
 
 
 class TooManyStatesError(Exception):
-    """An error for an automaton that exceeds its limit."""
+    """The automaton exceeds its limit."""
 
     def __init__(self, limit: int, what: str = "states") -> None:
         super().__init__(f"more than {limit} {what}")
@@ -27,7 +26,7 @@ class TooManyStatesError(Exception):
 
 @dataclass(frozen=True)
 class Automaton:
-    """A complete deterministic automaton with outputs. ``names`` are labels of the states for people."""
+    """A complete deterministic automaton with outputs. ``names`` are labels for people."""
 
     initial: int
     table: tuple[tuple[int, ...], ...]
@@ -48,7 +47,7 @@ def explore(
     verdict: Callable[[State], tuple[str, ...]],
     limit: int = MAX_STATES,
 ) -> Automaton:
-    """Return the automaton of all states reachable from ``initial``, minimised. Raises TooManyStatesError."""
+    """Return the minimised automaton of all states reachable from ``initial``. Raises `TooManyStatesError`."""
     numbers: dict[State, int] = {initial: 0}
     states = [initial]
     table: list[tuple[int, ...]] = []
@@ -91,7 +90,7 @@ def minimise(automaton: Automaton) -> Automaton:
 
 
 def _coarsest_partition(automaton: Automaton) -> list[int]:
-    """Return for each state the number of its block of equivalent states (Hopcroft's algorithm)."""
+    """Return the block of equivalent states of each state (Hopcroft's algorithm)."""
     size, letters = len(automaton), len(automaton.table[0])
     sources: list[list[list[int]]] = [[[] for _ in range(size)] for _ in range(letters)]
     for state, row in enumerate(automaton.table):
@@ -170,6 +169,5 @@ def letter_classes(events: Sequence[str], named: Sequence[str]) -> tuple[list[in
 
 
 def spread(automaton: Automaton, of_event: Sequence[int]) -> Automaton:
-    """Return the automaton over events that corresponds to an automaton over classes of events."""
     table = tuple(tuple(row[letter] for letter in of_event) for row in automaton.table)
     return Automaton(automaton.initial, table, automaton.verdicts, automaton.names)

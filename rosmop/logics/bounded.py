@@ -1,24 +1,24 @@
 """Monitors for mtl formulas about a bounded future (`past_monitors.py` implements the part about the past).
 
-The formula is evaluated at every event. Its value at an event is reported once it is certain: after an event, or when a
-bound passes. `x or y` is certain once either operand is true. `x until[l,h] y` is certain once `y` came in time and `x`
-held until then, once `x` failed, or once the time is over.
+The formula is evaluated at every event. Its value at an event is reported once it is certain: after an event, or when
+a bound passes. `x or y` is certain once either operand is true. `x until[l,h] y` is certain once `y` came in time and
+`x` held until then, once `x` failed, or once the time is over.
 
-Theory of operation. A `PastProgram` lists the distinct subformulas. The subformulas that only look back are computed at
-their event (`FoldedProgram`). For each other subformula, a *cell* is its value at one event while the value is open. A
-decided cell notifies its *users*. Cells exist only where needed: for `fire => eventually[0,1s] safe`, only the waiting
-`fire` events are kept.
+Theory of operation. A `PastProgram` lists the distinct subformulas; those that only look back are computed at their
+event (`FoldedProgram`). For each other subformula, a *cell* is its value at one event while the value is open. A
+decided cell notifies its *users*. Cells exist only where needed: for `fire => eventually[0,1s] safe`, only the
+waiting `fire` events are kept.
 
 - `until` over operands known at once keeps the waiting events in order and decides the oldest first. So the cost of a
   step does not depend on their number.
-- `until` and `since` over open operands keep *rows*, one for each relevant event. A result is certain if it is the same
-  whether all open operands fail or all hold (both operators are monotonic). When an operand is decided, `until` visits
-  only the rows that the operand may decide; `since` visits all rows.
+- `until` and `since` over open operands keep *rows*, one for each relevant event. A result is certain if it is the
+  same whether all open operands fail or all hold (both operators are monotonic). When an operand is decided, `until`
+  visits only the rows that the operand may decide; `since` visits all rows.
 
 A run waits for at most `MOST_OPEN` events; a step beyond that is a fault, and its event is ignored.
 
-To undo a step, `BoundedRun.mark` copies the operators' rows, and `FormulaCell.touch` copies each cell before its first
-change. Rows do not change after their step.
+To undo a step, `BoundedRun.mark` copies the operators' rows, and `FormulaCell.touch` copies each cell before its
+first change. Rows do not change after their step.
 """
 
 from abc import ABC, abstractmethod
@@ -36,7 +36,7 @@ from rosmop.logics.past_monitors import FOREVER, VERDICTS, PastInstruction, Past
 MOST_OPEN = 10_000
 
 MOST_OPEN_IN_SLICE = 1_000
-"""The same limit for each slice of a parametric specification; there may be many slices."""
+"""There may be many slices of a parametric specification."""
 
 _LATER = ("until", "next")
 
@@ -60,7 +60,7 @@ class FormulaCell:
         self.operands: tuple[Value, ...] = ()
 
     def touch(self) -> None:
-        """Save the content in the journal before a change, unless it is already saved."""
+        """Save the content before a change, unless it is already saved."""
         if self not in self.journal:
             self.journal[self] = self.saved()
 
@@ -80,7 +80,7 @@ class FormulaCell:
         return self.value is None and bool(self.tells or self.users)
 
     def hear(self, value: bool) -> bool | None:
-        """Return the value after one more operand is known, or None if the value is still open."""
+        """Return None if the value is still open."""
         self.touch()
         self.missing -= 1
         if self.kind == "not":
@@ -100,7 +100,7 @@ def _known(value: Value) -> bool | None:
 
 
 def _use(value: Value, user: "FormulaCell | _Operator") -> bool:
-    """Register a user to be notified of an open value; return whether the value is open."""
+    """Return whether the value is open; then notify the user when it is known."""
     if isinstance(value, FormulaCell) and value.value is None:
         value.touch()
         value.users.append(user)
@@ -130,7 +130,7 @@ def _together(kind: str, operands: tuple[Value, ...]) -> bool:
 
 @dataclass(eq=False, slots=True)
 class _Row:
-    """An event that an operator keeps: its time, the operands' values, and the cell if the value was requested."""
+    """An event that an operator keeps. `cell` is set if the value was requested."""
 
     place: int
     time: int
@@ -146,7 +146,7 @@ class _Row:
 
 
 class _Operator(ABC):
-    """An operator in a run. For each event, `ask` comes before `take`; `pass_by` comes between events."""
+    """For each event, `ask` comes before `take`; `pass_by` comes between events."""
 
     def __init__(self, run: "BoundedRun", number: int, instruction: PastInstruction) -> None:
         self.run, self.number = run, number
@@ -159,14 +159,13 @@ class _Operator(ABC):
         return self.rows[-1].cell or False
 
     @abstractmethod
-    def take(self, now: int) -> None:
-        """Process the current event."""
+    def take(self, now: int) -> None: ...
 
     def settle(self) -> None:  # noqa: B027  only two operators have open operands
-        """Decide the rows that have become certain, now that operands are decided."""
+        """Decide the rows that have become certain."""
 
     def hear(self, cell: FormulaCell) -> None:
-        """Note that an open operand has a value now. One call of `settle` follows for all such operands."""
+        """Note that an open operand has a value. One call of `settle` follows for all such operands."""
         del cell
 
     def pass_by(self, time: int) -> None:
@@ -184,7 +183,7 @@ class _Operator(ABC):
 
 
 class _Until(_Operator):
-    """The operator `until` over known values."""
+    """`until` over known values."""
 
     def take(self, now: int) -> None:
         rows = self.rows
@@ -237,7 +236,7 @@ class _Rows(_Operator):
 
 
 class _OpenUntil(_Rows):
-    """The operator `until` over values that may be open. Bounds up to the time `passed` have expired.
+    """`until` over values that may be open. Bounds up to the time `passed` have expired.
 
     `pending` are the undecided rows. They are decided from sorted lists of marks: the events where the right operand
     holds (`holds`) or may hold (`hopes`), and where the left operand fails (`fails`) or may fail (`doubts`). A new
@@ -316,7 +315,7 @@ class _OpenUntil(_Rows):
             self._look(begins, [(best[0] - self.low + 1, 0), (time, place + 1)])
 
     def _look(self, begins: list[_Mark], ends: list[_Mark]) -> None:
-        """Decide the pending rows that are certain, from the latest of `begins` to the earliest of `ends`."""
+        """Decide the certain rows from the latest of `begins` to the earliest of `ends`."""
         begin = bisect_left(self.pending, max(begins))
         end = max(begin, bisect_left(self.pending, min(ends)))
         self.pending[begin:end] = [entry for entry in self.pending[begin:end] if not self._decided(entry[2])]
@@ -334,7 +333,7 @@ class _OpenUntil(_Rows):
         return True
 
     def _value(self, row: _Row, goods: _Marks, bads: _Marks) -> bool:
-        """Return whether some mark of `goods` is within the row's bounds, and not after the first mark of `bads`."""
+        """Return whether a mark of `goods` is within the bounds, and not after the first of `bads`."""
         good = _first(goods, (row.time + self.low, row.place))
         if good is None or good[0] > row.time + self.high:
             return False
@@ -398,7 +397,7 @@ def _supposed(value: Value | None, *, hopeful: bool) -> bool:
 
 
 class _OpenSince(_Rows):
-    """The operator `since` over values that may be open; `window` is its state before the rows.
+    """`since` over values that may be open; `window` is its state before the rows.
 
     `least` is its state after the newest row if all open values fail, `most` its state if all open values hold.
     """
@@ -442,7 +441,7 @@ class _OpenSince(_Rows):
 
 
 class _OpenPreviously(_Operator):
-    """The operator `previously` of a value that may be open."""
+    """`previously` of a value that may be open."""
 
     before: Value = False
     time = -FOREVER
@@ -463,7 +462,7 @@ class _OpenPreviously(_Operator):
 
 
 class _Next(_Operator):
-    """The operator `next`. `before` has the rows of the previous event, `rows` the rows of the current event."""
+    """`before` has the rows of the previous event, `rows` the rows of the current event."""
 
     def __init__(self, run: "BoundedRun", number: int, instruction: PastInstruction) -> None:
         super().__init__(run, number, instruction)
@@ -497,11 +496,10 @@ class _Next(_Operator):
 
 
 class BoundedProperty(CompiledProperty):
-    """A property for a formula of mtl about the future, and perhaps the past."""
+    """A property for an mtl formula about the future, and perhaps the past."""
 
     timed = True
     most = MOST_OPEN
-    """The maximum number of waiting events of a run."""
 
     def __init__(self, source: Source, formula: Formula) -> None:
         super().__init__(source, VERDICTS)
@@ -526,7 +524,7 @@ class BoundedProperty(CompiledProperty):
         return BoundedRun(self, time_ns)
 
     def operators(self, run: "BoundedRun") -> dict[int, _Operator]:
-        """Return new operators of a run for values that may be decided later, the outermost first."""
+        """Return new operators for values that may be decided later, the outermost first."""
         found: dict[int, _Operator] = {}
         for number in sorted(self.later, reverse=True):
             instruction = self.program.instructions[number]
@@ -538,10 +536,7 @@ class BoundedProperty(CompiledProperty):
         return found
 
     def _decided_late(self) -> set[str]:
-        """Return the verdicts that are possible when a bound expires, so that an `until` or `next` fails.
-
-        The failure causes `violation` if the operator is positive in the formula, and `validation` if it is negated.
-        """
+        """An `until` or `next` fails when its bound expires: that is `violation`, or `validation` if it is negated."""
         signs: dict[int, set[bool]] = {self.program.result: {False}}
         for number in sorted(self.later, reverse=True):
             instruction = self.program.instructions[number]
@@ -555,7 +550,7 @@ class BoundedProperty(CompiledProperty):
         return {VERDICTS[sign] for signs_of in found for sign in signs_of}
 
     def blocking_refused(self, category: str) -> str | None:
-        """Return why a handler cannot drop the message: a deadline may decide the category without a message."""
+        """A deadline may decide the category without a message."""
         super().blocking_refused(category)
         if category not in self._failing:
             return None
@@ -563,7 +558,7 @@ class BoundedProperty(CompiledProperty):
 
 
 _CONTAINERS = (deque, list, dict, SinceWindow)
-"""The attributes of operators that a step changes in place."""
+"""The attributes that a step changes in place."""
 
 _KINDS: dict[str, type[_Operator]] = {
     "until": _OpenUntil,
@@ -574,7 +569,7 @@ _KINDS: dict[str, type[_Operator]] = {
 
 
 _FORWARD = (_Until, _OpenUntil, _Next)
-"""Operators that keep nothing but waiting events (`rows`)."""
+"""They keep nothing but waiting events (`rows`)."""
 
 
 class BoundedRun:
@@ -597,13 +592,13 @@ class BoundedRun:
 
     @property
     def deadline(self) -> int | None:
-        """Return the time of the first bound on which a verdict depends."""
+        """The first bound on which a verdict depends."""
         found = (operator.deadline for operator in self.operators.values())
         return min((deadline for deadline in found if deadline is not None), default=None)
 
     @property
     def as_new(self) -> bool:
-        """Whether no event waits, and the part about the past is in its initial state."""
+        """No event waits, and the part about the past is in its initial state."""
         operators = self.operators.values()
         return (
             all(type(operator) in _FORWARD and not operator.rows for operator in operators)
@@ -647,7 +642,6 @@ class BoundedRun:
         return self._tell()
 
     def mark(self) -> tuple[Any, ...]:
-        """Return a copy of the place, of the values that look back, and of the operators' rows."""
         self.journal.clear()
         operators = [
             tuple(copy(value) if isinstance(value, _CONTAINERS) else value for value in operator.saved())
@@ -671,7 +665,7 @@ class BoundedRun:
         self._at_once, self.place, self._now, self._told, self._about = saved
 
     def value(self, number: int) -> Value:
-        """Return the value of an instruction at the current event, or a cell while the value is open."""
+        """Return the value of an instruction at the current event, or a cell while it is open."""
         index = self._compiled.at_once.get(number)
         if index is not None:
             return bool(self._at_once[self._places[index]])
@@ -698,14 +692,13 @@ class BoundedRun:
         return cell if cell.missing else _together(kind, cell.operands)
 
     def decide(self, cell: FormulaCell | None, value: bool) -> None:
-        """Set the value of a cell. None stands for an unused cell."""
+        """A cell is None if it is unused."""
         if cell is not None and cell.value is None:
             cell.touch()
             cell.value = value
             self._decided.append(cell)
 
     def _tell(self) -> Categories:
-        """Notify all users of decided values; return the verdicts."""
         while self._decided or self.changed:
             while self._decided:
                 self._pass_on(self._decided.pop())
@@ -718,7 +711,7 @@ class BoundedRun:
         return _CATEGORIES[False in told, True in told]
 
     def about(self, category: str) -> int:
-        """Return the number of the event, from 1, that the last verdict is about."""
+        """Return the number, from 1, of the event that the last verdict is about."""
         return self._about[category == VERDICTS[True]]
 
     def _pass_on(self, cell: FormulaCell) -> None:
@@ -747,4 +740,4 @@ _CATEGORIES: dict[tuple[bool, bool], Categories] = {
 }
 
 PARTS: Mapping[str, type] = {"cell": FormulaCell, "row": _Row, "window": SinceWindow}
-"""The classes in the state of these runs, besides plain values, by their names in `state_of_runs.py`."""
+"""The classes in the state of these runs, by their names in `state_of_runs.py`."""

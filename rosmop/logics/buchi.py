@@ -9,7 +9,8 @@ Invariants:
   discharged the until with the same obligations left.
 - An infinite run is accepting if its transitions fulfil each until infinitely often.
 - ``live`` keeps exactly the states from which some infinite word is accepted. ``after`` and ``live`` drop a set that
-  includes another set, because there only the union of languages counts. The search for accepting runs keeps such sets.
+  includes another set, because there only the union of languages counts. The search for accepting runs keeps such
+  sets.
 """
 
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
@@ -19,7 +20,6 @@ from rosmop.logics.formula import Formula
 from rosmop.logics.ltl_nodes import FormulaNodes, FormulaTranslation
 
 Obligations = int
-"""A set of nodes, as a bit set of their numbers."""
 
 Sets = frozenset[Obligations]
 """A union of obligation sets: the possible states of a nondeterministic automaton."""
@@ -28,15 +28,15 @@ _Node = TypeVar("_Node", bound=Hashable)
 
 MAX_OBLIGATION_SETS = 20_000
 MAX_WORK = 1_500_000
-"""The maximum number of obligation sets in total, including dropped sets."""
+"""The limit of all obligation sets together, including dropped ones."""
 
 
 class TooLargeError(Exception):
-    """An error for a formula whose automaton exceeds its limits."""
+    """The automaton exceeds its limits."""
 
 
 class Automata:
-    """The nodes, their transitions and the automata made of them, over letters ``0 … letters-1``."""
+    """The nodes, their transitions and automata, over letters ``0 … letters-1``."""
 
     def __init__(self, letters: int) -> None:
         self._nodes = FormulaNodes(letters)
@@ -48,11 +48,11 @@ class Automata:
         self._work = 0
 
     def translate(self, formula: Formula, atoms: Mapping[str, int]) -> Sets:
-        """Return the initial states for a formula. ``atoms``: the letters of each event."""
+        """Return the initial states. ``atoms`` are the letters of each event."""
         return self._choices(FormulaTranslation(self._nodes, atoms).node(formula, True))
 
     def _choices(self, node: int) -> Sets:
-        """Return the ways to satisfy a node, as obligation sets without conjunctions and disjunctions."""
+        """Return obligation sets without conjunctions and disjunctions."""
         known = self._chosen.get(node)
         if known is None:
             known = self._chosen[node] = self._find_choices(node)
@@ -111,7 +111,7 @@ class Automata:
         return self._product((right, frozenset((*left, *stay))))
 
     def _transitions(self, state: Obligations, letter: int) -> Sets:
-        """Return all targets, including larger sets, because acceptance needs them."""
+        """Keep larger sets, because acceptance needs them."""
         known = self._steps.get((state, letter))
         if known is None:
             targets: set[Obligations] = {0}
@@ -131,7 +131,7 @@ class Automata:
         return found
 
     def live(self, states: Sets) -> Sets:
-        """Return the states that accept some word, without sets that include another of them."""
+        """Return the states that accept some word, without sets that include another one."""
         fresh = [state for state in states if state not in self._live]
         if fresh:
             self._decide_live(fresh)
@@ -173,7 +173,7 @@ class Automata:
                 self._live[state] = verdict
 
     def after(self, states: Sets, letters: int) -> Sets:
-        """Return the states after one of the letters (a bit set); only states that accept some word."""
+        """``letters`` is a bit set. Return only states that accept some word."""
         return self._smallest(
             target
             for state in states
@@ -182,7 +182,7 @@ class Automata:
         )
 
     def _possible(self, state: Obligations) -> int:
-        """Return as a bit set the letters that no single node excludes."""
+        """Return a bit set of the letters that no single node excludes."""
         letters = self._nodes.everything
         for node in _members(state):
             kind, parts = self._nodes[node]
@@ -212,7 +212,7 @@ def _members(bits: int) -> list[int]:
 def strong_components(
     nodes: Iterable[_Node], successors: Callable[[_Node], Iterable[_Node]]
 ) -> list[list[_Node]]:
-    """Return the strongly connected components of a graph, each after the components that it leads to (Tarjan)."""
+    """Each component comes after those that it leads to (Tarjan)."""
     index: dict[_Node, int] = {}
     low: dict[_Node, int] = {}
     open_nodes: dict[_Node, None] = {}

@@ -1,4 +1,4 @@
-"""Map names to logics. A new logic needs a file, a row here, and its rows in the tests."""
+"""Map names to logics."""
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -50,11 +50,10 @@ _REFUSED = {
 def compile_property(
     logic: str, formula: str, events: Sequence[str], origin: Position, logic_position: Position | None = None
 ) -> CompiledProperty:
-    """Compile the formula of a property.
+    """Raises `FormulaError`.
 
-    The case of ``logic`` does not matter. ``events`` are in source order, each name once. ``origin`` is the position of
-    the formula, and ``logic_position`` is the position of the logic's name (default: ``origin``). Raises
-    `FormulaError`.
+    The case of ``logic`` does not matter. ``events`` are in source order, each name once. ``origin`` is the position
+    of the formula, and ``logic_position`` is the position of the logic's name (default: ``origin``).
     """
     found = LOGICS.get(logic.lower())
     if found is None:

@@ -1,8 +1,7 @@
 """``cfg``: context-free grammars over the events, as MOP's CFG plugin reads them.
 
-``S -> a S b | epsilon``; the first left side is the start symbol. Any grammar is accepted, even if it is ambiguous or
-derives the empty word. The verdict's category is ``match`` while the trace so far is in the language, and ``fail`` once
-no continuation can be in it.
+``S -> a S b | epsilon``. Any grammar is accepted, even if it is ambiguous or derives the empty word. The verdict's
+category is ``match`` while the trace so far is in the language, and ``fail`` once no continuation can be in it.
 
 If the recogniser has few states, as for a regular language, the grammar becomes a table.
 """
@@ -28,7 +27,7 @@ FAIL: Categories = ("fail",)
 UNDECIDED: Categories = ()
 
 MAX_TABLE_FRAMES = 500
-"""The maximum number of frames explored in search of a finite table."""
+"""Limits the search for a finite table."""
 
 
 class GrammarProperty(CompiledProperty):
@@ -43,7 +42,7 @@ class GrammarProperty(CompiledProperty):
 
 
 class GrammarRun(UntimedRun):
-    """A run: the current frame, or None after a failure."""
+    """The frame is None after a failure."""
 
     __slots__ = ("_step", "frame")
 
@@ -52,7 +51,7 @@ class GrammarRun(UntimedRun):
         self.frame: EarleySet | None = recogniser.initial
 
     def step(self, event: int, _time_ns: int) -> Categories:
-        """Take the event; the time does not matter. If it raises RunFaultError, the run is unchanged."""
+        """If it raises `RunFaultError`, the run is unchanged."""
         if self.frame is None:
             return FAIL
         after = self._step(self.frame, event)
@@ -70,7 +69,7 @@ class GrammarRun(UntimedRun):
 
 
 def compile_cfg(source: Source) -> CompiledProperty:
-    """Compile a ``cfg`` formula. Raises FormulaError."""
+    """Raises `FormulaError`."""
     grammar = prepare(read_grammar(source))
     automaton = _table(EarleyRecogniser(grammar), len(source.events))
     if automaton is not None:
@@ -79,7 +78,7 @@ def compile_cfg(source: Source) -> CompiledProperty:
 
 
 def _table(recogniser: EarleyRecogniser, events: int) -> Automaton | None:
-    """Return the recogniser as an automaton if it can reach only a few frames. Frames are compared by content."""
+    """Return the recogniser as an automaton if it reaches few frames, which are compared by content."""
     frames: dict[object, EarleySet] = {}
 
     def held(frame: EarleySet) -> object:

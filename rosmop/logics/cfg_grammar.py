@@ -13,14 +13,14 @@ from rosmop.logics.interface import Source
 from rosmop.logics.lexer import FormulaToken, TokenReader, describe, suggestion
 
 MAX_SYMBOLS = 20_000
-"""The maximum number of symbols on all right sides together."""
+"""The limit of all right sides together."""
 
 Rule = tuple[int, tuple[int, ...]]
 
 
 @dataclass(frozen=True)
 class Grammar:
-    """Rules without duplicates. ``start`` is None if the language is empty."""
+    """Rules without duplicates; ``start`` is None if the language is empty."""
 
     terminals: int
     start: int | None
@@ -28,7 +28,7 @@ class Grammar:
 
 
 def read_grammar(source: Source) -> Grammar:
-    """Parse the text of a grammar. Raises FormulaError."""
+    """Raises `FormulaError`."""
     return _GrammarReader(source).grammar()
 
 
@@ -146,11 +146,11 @@ class _GrammarReader:
 
 
 def prepare(grammar: Grammar) -> Grammar:
-    """Return an equivalent grammar that has only useful symbols, each of which derives more than the empty word.
+    """Keep only useful symbols, each of which derives more than the empty word.
 
-    ``A -> A x A`` becomes ``A -> A x B``, where ``B`` has the other rules of ``A``. Both mean "B, any number of times,
-    with x between", but only the second form is unambiguous. The start symbol may still derive the empty word. If the
-    start symbol derives nothing else, no rule remains.
+    ``A -> A x A`` becomes ``A -> A x B``, where ``B`` has the other rules of ``A``. Both mean "B, any number of
+    times, with x between", but only the second form is unambiguous. The start symbol may still derive the empty word.
+    If the start symbol derives nothing else, no rule remains.
     """
     rules = _flat_repetitions(grammar)
     productive = _closure(rules, grammar.terminals)
@@ -193,7 +193,7 @@ def _flat_repetitions(grammar: Grammar) -> list[Rule]:
 
 
 def _closure(rules: list[Rule], terminals: int) -> set[int]:
-    """Return the nonterminals that derive some word of terminals."""
+    """Return the nonterminals that derive some word."""
     found: set[int] = set()
     users: dict[int, list[int]] = {}
     missing = []
@@ -218,7 +218,7 @@ def _closure(rules: list[Rule], terminals: int) -> set[int]:
 
 
 def _substantial(rules: list[Rule], terminals: int) -> set[int]:
-    """Return the nonterminals that derive more than the empty word. All rules must be productive."""
+    """All rules must be productive."""
     users: dict[int, list[int]] = {}
     waiting = []
     for head, body in rules:

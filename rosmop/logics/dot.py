@@ -10,7 +10,7 @@ from rosmop.logics.tfsm import TimedStateMachine
 
 @dataclass(frozen=True)
 class Box:
-    """A drawn state: its name and its other categories. `double`: it has a double border."""
+    """A drawn state; `double` is its border."""
 
     name: str
     other_categories: str
@@ -19,7 +19,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Diagram:
-    """A graph: the reachable states by number, and all events that lead from one state to another."""
+    """The reachable states by number, with the events that lead from one to another."""
 
     initial: int
     states: dict[int, Box]
@@ -27,7 +27,7 @@ class Diagram:
 
 
 def diagram_of(compiled: CompiledProperty) -> Diagram | None:
-    """Return the graph of a property; None if its monitor is not finite."""
+    """Return None if the monitor is not finite."""
     graph = graph_of(compiled)
     if graph is None:
         return None
@@ -44,7 +44,7 @@ def diagram_of(compiled: CompiledProperty) -> Diagram | None:
 
 
 def to_dot(compiled: CompiledProperty) -> str | None:
-    """Return the automaton as a ``digraph``; None if the monitor is not finite."""
+    """Return a ``digraph``, or None if the monitor is not finite."""
     diagram = diagram_of(compiled)
     if diagram is None:
         return None

@@ -17,13 +17,13 @@ from rosmop.logics.interface import FiniteProperty, Source
 from rosmop.logics.lexer import TokenReader
 
 MAX_SYMBOLS = 5_000
-"""The maximum number of symbols of an expression after its powers are expanded."""
+"""The limit after powers are expanded."""
 MAX_WORK = 8_000_000
-"""The maximum number of operands of all derivatives together."""
+"""The limit of the operands of all derivatives together."""
 
 
 class TooMuchWorkError(Exception):
-    """An error for an expression whose derivatives exceed their limit."""
+    """The derivatives exceed their limit."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class RegularExpression:
 
 
 class ExpressionTable:
-    """A table of expressions, each stored once, and of their derivatives."""
+    """Stores each expression once, with its derivatives."""
 
     def __init__(self) -> None:
         self._numbers: dict[tuple[str, tuple[int, ...]], int] = {}
@@ -95,7 +95,6 @@ class ExpressionTable:
         )
 
     def join(self, kind: str, operands: list[int]) -> int:
-        """Return the expression for the traces of any operand (`union`), or of all operands (`intersection`)."""
         neutral, absorbing, quantor = self.empty, self.anything, any
         if kind == "intersection":
             neutral, absorbing, quantor = self.anything, self.empty, all
@@ -141,7 +140,7 @@ class ExpressionTable:
 
 
 def compile_ere(source: Source) -> FiniteProperty:
-    """Compile an ``ere`` formula. Raises FormulaError."""
+    """Raises `FormulaError`."""
     reader = _ExpressionReader(source)
     automaton = _match_automaton(source, reader)
     return FiniteProperty(source, ("match", "fail"), with_fail(automaton))
@@ -172,7 +171,7 @@ def _match_automaton(source: Source, reader: "_ExpressionReader") -> Automaton:
 
 
 def with_fail(automaton: Automaton) -> Automaton:
-    """Add ``fail`` to the state of a minimal automaton from which nothing can match, if there is such a state."""
+    """Add ``fail`` to the state of a minimal automaton from which nothing can match, if there is one."""
     verdicts = tuple(
         ("fail",) if not verdict and all(target == state for target in row) else verdict
         for state, (row, verdict) in enumerate(zip(automaton.table, automaton.verdicts, strict=True))
@@ -181,7 +180,7 @@ def with_fail(automaton: Automaton) -> Automaton:
 
 
 class _ExpressionReader:
-    """Parses an expression into a table; letters are the events that the expression names."""
+    """Letters are the events that the expression names."""
 
     def __init__(self, source: Source) -> None:
         self._tokens = TokenReader(source, ("|", "&", "~", "*", "+", "^", "(", ")", "?", "||", "&&", "!"))

@@ -1,7 +1,7 @@
-"""Parse temporal formulas: one parser for ltl, ptltl and mtl, with a table of operators for each logic.
+"""Parse temporal formulas of ltl, ptltl and mtl, with a table of operators for each logic.
 
-A ``Syntax`` names the unary operators, which bind tightest, and the levels of binary operators from tightest
-to loosest. Nesting is bounded, so no walk over a formula can exhaust the stack.
+A ``Syntax`` names the unary operators, which bind tightest, and the levels of binary operators from tightest to
+loosest. Nesting is bounded, so no walk over a formula can exhaust the stack.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,7 +14,7 @@ from rosmop.logics.lexer import FormulaToken, TokenReader, describe
 MAX_NESTING = 100
 
 Bounds = tuple[int, int | None]
-"""A closed interval in nanoseconds; None: no upper bound."""
+"""A closed interval in nanoseconds; None means no upper bound."""
 
 AND = {"and": "and", "&&": "and", "/\\": "and"}
 OR = {"or": "or", "||": "or", "\\/": "or"}
@@ -26,7 +26,7 @@ BOOLEAN_SIGNS = ("(", ")", "!", "&&", "/\\", "||", "\\/", "++", "^", "=>", "->",
 
 @dataclass(frozen=True)
 class Formula:
-    """A node: ``operator`` with operands. An ``event`` has a ``name``, a timed operator ``bounds``."""
+    """An ``event`` has a ``name``, a timed operator ``bounds``."""
 
     operator: str
     operands: tuple["Formula", ...] = ()
@@ -39,7 +39,7 @@ class Formula:
 class Level:
     """Binary operators of equal precedence.
 
-    ``flat`` operators associate, ``left`` operators group leftwards, and ``once`` operators do not chain.
+    ``flat`` operators associate, ``left`` ones group leftwards, and ``once`` ones do not chain.
     """
 
     operators: Mapping[str, str]
@@ -48,7 +48,7 @@ class Level:
 
 @dataclass(frozen=True)
 class Syntax:
-    """The operators of a temporal logic: spelling to operator.
+    """The operators of a temporal logic by their spelling.
 
     ``bounded`` operators may be followed by ``[from,to]``.
     """
@@ -67,7 +67,7 @@ class Syntax:
 
 
 def read_formula(source: Source, syntax: Syntax) -> Formula:
-    """Parse a whole formula. Raises FormulaError."""
+    """Raises `FormulaError`."""
     reader = _FormulaReader(source, syntax)
     formula = reader.formula(0)
     reader.end()
@@ -104,7 +104,7 @@ class _FormulaReader:
         return self._expression(len(self._syntax.levels) - 1, depth)
 
     def _expression(self, limit: int, depth: int) -> Formula:
-        """Read operands joined by operators that bind at least as tightly as level ``limit``."""
+        """Read operands joined by operators that bind at least as tightly as ``limit``."""
         left = self._unary(depth)
         joined = -1
         while (strength := self._strength.get(self._tokens.token.text, limit + 1)) <= limit:
@@ -191,5 +191,5 @@ class _FormulaReader:
 
 
 def boolean_levels(temporal: Sequence[Level]) -> tuple[Level, ...]:
-    """Return the levels: ``temporal`` operators, then and, xor, or, then implications, which do not chain."""
+    """Implications do not chain."""
     return (*temporal, Level(AND, "flat"), Level(XOR, "flat"), Level(OR, "flat"), Level(IMPLIES, "once"))

@@ -17,7 +17,7 @@ TIMEOUT = "timeout"
 
 @dataclass
 class StateText:
-    """A state as written: the target of each event, the default, and the timeout (tfsm)."""
+    """A state as written. Only tfsm has timeouts."""
 
     moves: dict[str, FormulaToken] = field(default_factory=dict)
     default: FormulaToken | None = None
@@ -26,7 +26,7 @@ class StateText:
 
 @dataclass
 class StateMachineText:
-    """A state machine as written; ``order`` are the states in source order."""
+    """``order`` are the states in source order."""
 
     states: dict[str, StateText]
     aliases: dict[str, list[str]]
@@ -36,7 +36,7 @@ class StateMachineText:
         return [*self.states, FAIL]
 
     def verdict(self, state: str) -> tuple[str, ...]:
-        """Return the categories of a state: itself, then its aliases in source order."""
+        """Return the state itself, then its aliases in source order."""
         return (state, *(alias for alias, members in self.aliases.items() if state in members))
 
     def categories(self) -> list[str]:
@@ -44,13 +44,13 @@ class StateMachineText:
 
 
 def compile_fsm(source: Source) -> FiniteProperty:
-    """Compile an ``fsm`` formula. Raises FormulaError."""
+    """Raises `FormulaError`."""
     machine = read_state_machine(source, timed=False)
     return FiniteProperty(source, machine.categories(), machine_automaton(source, machine))
 
 
 def machine_automaton(source: Source, machine: StateMachineText) -> Automaton:
-    """Return the automaton of the transitions on events; state ``i`` is ``machine.order[i]``."""
+    """State ``i`` is ``machine.order[i]``."""
     order = machine.order
     number = {name: index for index, name in enumerate(order)}
     fail = number[FAIL]
@@ -64,7 +64,7 @@ def machine_automaton(source: Source, machine: StateMachineText) -> Automaton:
 
 
 def read_state_machine(source: Source, *, timed: bool) -> StateMachineText:
-    """Parse a state machine and check its names. Raises FormulaError with all errors."""
+    """Raises `FormulaError` with all errors."""
     reader = TokenReader(source, ("->", "[", "]", "=", ","))
     machine = StateMachineText({}, {})
     used: list[FormulaToken] = []
@@ -158,7 +158,7 @@ def _read_alias(reader: TokenReader, machine: StateMachineText, used: list[Formu
 
 
 def _more_members(reader: TokenReader) -> bool:
-    """Read a list of states. Commas are optional, as in MOP; the next alias or a misplaced state ends the list."""
+    """Commas are optional, as in MOP; the next alias or a misplaced state ends the list."""
     return reader.token.kind == "name" and reader.token.text != "alias" and reader.ahead(1).kind != "["
 
 

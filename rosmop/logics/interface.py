@@ -1,8 +1,7 @@
 """The interface of every logic to the compiler of ``.rv`` files and to the relay.
 
-A logic turns a formula and the events of its specification into a ``CompiledProperty``. The property names
-the *categories* that may have handlers, and starts *runs*. A run takes one event after the other, and each step
-returns the categories of the property, whose handlers the caller runs.
+A logic compiles a formula to a ``CompiledProperty``, which names the *categories* that may have handlers, and starts
+*runs*. Each step of a run takes an event and returns categories, whose handlers the caller runs.
 
 Contract for the caller of a run:
 
@@ -32,7 +31,7 @@ Categories = tuple[str, ...]
 
 
 class FormulaError(Exception):
-    """An error for a rejected formula: the reasons, their positions, and what to write instead."""
+    """A rejected formula: the reasons, their positions, and what to write instead."""
 
     def __init__(self, findings: Sequence[Diagnostic]) -> None:
         super().__init__("; ".join(str(finding) for finding in findings))
@@ -40,28 +39,27 @@ class FormulaError(Exception):
 
 
 class RunFaultError(Exception):
-    """An error for a trace that needs more memory than a run may have."""
+    """A trace needs more memory than a run may have."""
 
 
 class Run(Protocol):
-    """One run of a property over a trace; the head of this module has the contract.
+    """One run of a property; the head of this module has the contract.
 
     A copy (`copy.copy`) is an independent run, except that of a `BoundedRun`.
     """
 
     @property
     def as_new(self) -> bool:
-        """Whether the run will behave like a fresh run; False if this is not known."""
+        """The run will behave like a fresh run; False if this is not known."""
 
     @property
     def deadline(self) -> int | None:
-        """Return the last instant (ns) at which an event is in time, or None if the run waits for nothing."""
+        """The last time (ns) at which an event is in time, or None if the run waits for nothing."""
 
-    def step(self, event: int, time_ns: int) -> Categories:
-        """Take the event with this index, received at ``time_ns``; return the property's categories."""
+    def step(self, event: int, time_ns: int) -> Categories: ...
 
     def expire(self) -> Categories:
-        """Let the deadline pass, and return the resulting categories. Call this only while ``deadline`` is not None."""
+        """Let the deadline pass. Call this only while ``deadline`` is not None."""
 
     def saved(self) -> tuple[Any, ...]:
         """Return the values that change (`state_of_runs.py`)."""
@@ -71,28 +69,27 @@ class Run(Protocol):
 
 
 class FormulaRun(Run, Protocol):
-    """A run of a property that `suppresses`, whose steps can be undone."""
+    """A run of a property that `suppresses`."""
 
     def mark(self) -> Any:
-        """Return the data that `take_back` needs to undo later steps; earlier marks become invalid."""
+        """Return the data that `take_back` needs; earlier marks become invalid."""
 
     def take_back(self, mark: Any) -> None:
-        """Undo the steps since the mark, but keep the time. Each mark can be used once."""
+        """Undo the steps since the mark, but keep the time. A mark can be used once."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A formula as written, and its alphabet: the events in the order of the specification."""
+    """A formula as written, and its events in the order of the specification."""
 
     logic: str
     text: str
     events: tuple[str, ...]
     origin: Position
     suppresses: bool = False
-    """Whether a dropped message does not count for the property (`Logic.suppresses`)."""
+    """A dropped message does not count (`Logic.suppresses`)."""
 
     def finding(self, offset: int, text: str) -> Diagnostic:
-        """Return an error at the given character of the formula."""
         return Diagnostic(self.origin.within(self.text, min(offset, len(self.text))), "error", text)
 
     def error(self, offset: int, text: str) -> FormulaError:
@@ -100,24 +97,24 @@ class Source:
 
 
 class CompiledProperty(ABC):
-    """A property ready to run. ``categories`` are the names that may have handlers."""
+    """``categories`` are the names that may have handlers."""
 
     timed = False
-    """Whether verdicts depend on the time of events. Without this, no run has a deadline."""
+    """Without this, no run has a deadline."""
 
     expiry = "deadline"
     """The name of a passed deadline in records (``timeout`` for machines)."""
 
     made_of: tuple[Any, ...]
-    """The arguments that another process needs to make the same property."""
+    """Another process makes the same property from these arguments."""
 
     @property
     def suppresses(self) -> bool:
-        """Whether a dropped message does not count: its steps are undone."""
+        """A dropped message does not count: its steps are undone."""
         return self.source.suppresses
 
     remedy: str | None = None
-    """The function of the specification that publishes the due message at a deadline (`enforced by`)."""
+    """The function that publishes the due message at a deadline (`enforced by`)."""
 
     def __new__(cls, *made_of: Any) -> Self:
         made = super().__new__(cls)
@@ -132,25 +129,24 @@ class CompiledProperty(ABC):
         self.categories: Categories = tuple(categories)
 
     @abstractmethod
-    def start(self, time_ns: int) -> Run:
-        """Return a fresh run that begins at ``time_ns``."""
+    def start(self, time_ns: int) -> Run: ...
 
     def categories_after(self, event: int) -> frozenset[str]:
-        """Return all categories that a step with this event can lead to. The result may include other categories."""
+        """Return all categories that this event can lead to, and perhaps more."""
         return frozenset(self.categories) if 0 <= event < len(self.events) else frozenset()
 
     def blocking_refused(self, category: str) -> str | None:
-        """Return why a handler of this category may not drop the message, or None if it may."""
+        """Return why a handler may not drop the message, or None if it may."""
         if category not in self.categories:
             raise KeyError(category)
         return None
 
 
 class FiniteProperty(CompiledProperty):
-    """A property whose monitor is a finite automaton.
+    """Its monitor is a finite automaton.
 
-    ``automaton.table[state][event]`` is the next state. ``automaton.verdicts[state]`` are the categories after a step
-    into ``state``. ``automaton.initial`` is the state of a fresh run.
+    ``automaton.verdicts[state]`` are the categories after a step into ``state``; a fresh run is in
+    ``automaton.initial``.
     """
 
     def __init__(self, source: Source, categories: Sequence[str], automaton: Automaton) -> None:
@@ -166,7 +162,7 @@ class FiniteProperty(CompiledProperty):
 
 
 class UntimedRun:
-    """The base class of runs without deadlines."""
+    """A run without deadlines."""
 
     __slots__ = ()
 
@@ -174,16 +170,15 @@ class UntimedRun:
 
     @property
     def as_new(self) -> bool:
-        """Return False: whether the run behaves like a fresh run is not known here."""
+        """False: this is not known here."""
         return False
 
     def expire(self) -> Categories:
-        """Raise an error: there is no deadline."""
         raise ValueError("this run has no deadline")
 
 
 class FiniteRun(UntimedRun):
-    """A run over the tables of an automaton."""
+    """Walks the tables of an automaton."""
 
     __slots__ = ("_automaton", "state")
 
@@ -222,7 +217,7 @@ Move = tuple[int, bool]
 
 
 class Wait(NamedTuple):
-    """The wait of a state: its length (ns) after the clock's start, and the move and categories at its end."""
+    """After ``after`` nanoseconds on the clock, the move and the categories."""
 
     after: int
     move: Move
@@ -230,11 +225,10 @@ class Wait(NamedTuple):
 
 
 class ClockedProperty(CompiledProperty):
-    """A property whose monitor is an automaton with one clock.
+    """Its monitor is an automaton with one clock.
 
     ``moves[state][event]`` is the move at an event. ``late`` has the same table for events more than ``within`` ns
-    after the clock started. ``verdicts`` are the categories after an event that leads to a state, ``waits`` the wait of
-    each state.
+    after the clock started. ``verdicts`` are the categories after an event that leads to a state.
     """
 
     timed = True
@@ -250,7 +244,7 @@ class ClockedProperty(CompiledProperty):
 
 
 class ClockedRun:
-    """A run of a `ClockedProperty`: the state, the start of its clock, and the time."""
+    """A run of a `ClockedProperty`."""
 
     __slots__ = ("_tables", "now", "since", "state")
 
@@ -271,7 +265,7 @@ class ClockedRun:
 
     @property
     def as_new(self) -> bool:
-        """Whether the run is in the initial state, and the clock does not matter there."""
+        """The clock does not matter in the initial state."""
         state, tables = self.state, self._tables
         return (
             state == tables.initial
@@ -321,19 +315,19 @@ Compiler = Callable[[Source], CompiledProperty]
 
 @dataclass(frozen=True)
 class Logic:
-    """A logic: its compiler, and its properties that other parts of the language need."""
+    """A logic, with facts that other parts of the language need."""
 
     compile: Compiler
     properties: tuple[type[CompiledProperty], ...] = (FiniteProperty,)
-    """The classes of the compiled properties. The arguments of their constructors can be serialised."""
+    """The arguments of their constructors can be serialised."""
     suppresses: bool = False
-    """Whether a dropped message does not count. Other logics count each event whose action passes the message."""
+    """Does a dropped message not count? Other logics count each event whose action passes the message."""
     failure: str | None = None
-    """The category that means failure.
+    """The category of failure.
 
-    `check` warns about a property that fails at the first event, whatever the event is.
+    `check` warns about a property that always fails at the first event.
     """
     has_states: bool = False
-    """Whether formulas name states, which coverage counts, and may write `default` for all events."""
+    """Coverage counts states, and formulas may write `default` for all events."""
     implicit_events: tuple[str, ...] = ()
     """Events that a property uses although its formula does not name them."""

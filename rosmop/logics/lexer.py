@@ -1,7 +1,5 @@
-"""Split a formula into tokens, and read durations.
-
-Each logic defines its signs; names, numbers, white space and C comments are the same in all logics. A formula
-longer than ``MAX_CHARACTERS`` is rejected first.
+"""Split a formula into tokens. Each logic has its signs; names, numbers, white space and C comments are common. A
+formula longer than ``MAX_CHARACTERS`` is rejected first.
 """
 
 import re
@@ -31,7 +29,7 @@ UNITS_NS = {
 
 @dataclass(frozen=True)
 class FormulaToken:
-    """A token: its kind (the sign, ``name``, ``number`` or ``end``), its text, and its offset."""
+    """Its kind is the sign, ``name``, ``number`` or ``end``."""
 
     kind: str
     text: str
@@ -39,7 +37,7 @@ class FormulaToken:
 
 
 def tokenize(source: Source, signs: Sequence[str]) -> list[FormulaToken]:
-    """Return the tokens of a formula, followed by a token of kind ``end``. The longest matching sign is taken."""
+    """The longest matching sign is taken; the last token is ``end``."""
     if len(source.text) > MAX_CHARACTERS:
         raise source.error(
             0, f"a formula of more than {MAX_CHARACTERS} characters; split it into several properties"
@@ -71,7 +69,7 @@ def tokenize(source: Source, signs: Sequence[str]) -> list[FormulaToken]:
 
 
 def _sign_pattern(sign: str) -> str:
-    """Return the pattern of a sign. A sign that ends with a letter (``~o``) must end where the word ends."""
+    """A sign that ends with a letter (``~o``) must end where the word ends."""
     return re.escape(sign) + (r"(?![A-Za-z_0-9])" if sign[-1].isalnum() else "")
 
 
@@ -97,7 +95,7 @@ def suggestion(name: str, known: Sequence[str]) -> str:
 
 
 class TokenReader:
-    """Walks over the tokens of a formula; collects findings that do not stop the reading."""
+    """Walks over tokens, and collects findings that do not stop the reading."""
 
     def __init__(self, source: Source, signs: Sequence[str]) -> None:
         self.source = source
@@ -113,7 +111,7 @@ class TokenReader:
         return self._tokens[min(self._next + count, len(self._tokens) - 1)]
 
     def take(self) -> FormulaToken:
-        """Read the next token. The end can be read repeatedly."""
+        """The end can be read repeatedly."""
         token = self._tokens[self._next]
         if token.kind != "end":
             self._next += 1
@@ -126,7 +124,7 @@ class TokenReader:
         return False
 
     def expect(self, kind: str, what: str) -> FormulaToken:
-        """Read a token of this kind, or reject the formula; the error says that ``what`` was expected."""
+        """Read a token of this kind, or reject the formula: ``what`` was expected."""
         if self.token.kind != kind:
             raise self.unexpected(what)
         return self.take()
@@ -135,7 +133,7 @@ class TokenReader:
         return self.source.error(self.token.offset, f"expected {what}, found {describe(self.token)}")
 
     def note(self, token: FormulaToken, text: str) -> None:
-        """Note an error without stopping, so that one pass finds as many errors as possible."""
+        """One pass finds as many errors as possible."""
         if len(self.findings) < 20:
             self.findings.append(self.source.finding(token.offset, text))
 
@@ -149,7 +147,7 @@ class TokenReader:
             self.note(token, f"`{token.text}` is not an event of this specification{hint}")
 
     def duration(self, what: str) -> int:
-        """Read a duration such as ``100ms``, ``0.5 s`` or ``2`` (seconds); return nanoseconds."""
+        """Return the nanoseconds of a duration such as ``100ms``, ``0.5 s`` or ``2`` (seconds)."""
         number = self.expect("number", f"{what} such as `100ms`, `0.5s` or `2m`")
         if len(number.text) > MAX_NUMBER_DIGITS:
             raise self.source.error(

@@ -48,11 +48,11 @@ _PAST = {"previously", "dual previously", "historically", "once", "since", "dual
 _FUTURE = {"next", "always", "eventually", "until", "release"}
 VERDICTS = ("violation", "validation")
 MOST_LETTERS = 1024
-"""The maximum number of letters: classes of events, doubled by each operator about the past."""
+"""Each operator about the past doubles the classes of events."""
 
 
 def compile_ltl(source: Source) -> FiniteProperty:
-    """Compile an ``ltl`` formula. Raises FormulaError."""
+    """Raises `FormulaError`."""
     formula = read_formula(source, SYNTAX)
     _refuse_past_alone(source, formula)
     named = event_names(formula)
@@ -87,7 +87,7 @@ def compile_ltl(source: Source) -> FiniteProperty:
 
 
 def _settled(for_it: Sets, against_it: Sets) -> tuple[Sets, Sets]:
-    """Return a pair of states. Once the verdict is certain, the other side gets a common placeholder as its state."""
+    """Once the verdict is certain, the other side gets a common placeholder."""
     if not for_it:
         return frozenset(), _SOMETHING
     if not against_it:
@@ -99,14 +99,13 @@ _SOMETHING: Sets = frozenset((0,))
 
 
 class _Past:
-    """Replaces past operators in a formula; `right` collects the constraints on the guesses."""
+    """Replaces past operators; `right` collects the constraints on the guesses."""
 
     def __init__(self) -> None:
         self.propositions: dict[Formula, str] = {}
         self.right: list[Formula] = []
 
     def replaced(self, formula: Formula) -> Formula:
-        """Return the formula with propositions instead of its operators about the past."""
         operator = formula.operator
         operands = tuple(self.replaced(operand) for operand in formula.operands)
         if operator == "once":
@@ -120,7 +119,7 @@ class _Past:
         return Formula(operator, operands, formula.name)
 
     def _proposition(self, operator: str, operands: tuple[Formula, ...]) -> Formula:
-        """Return the proposition for `previously x` or `x since y`, and add its constraint to `right`."""
+        """Replace `previously x` or `x since y`, and constrain the proposition."""
         formula = Formula(operator, operands)
         if formula in self.propositions:
             return Formula("event", name=self.propositions[formula])

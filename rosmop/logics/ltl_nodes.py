@@ -19,7 +19,7 @@ class FormulaNodes:
         self._nodes: list[tuple[str, tuple[int, ...]]] = []
 
     def __getitem__(self, node: int) -> tuple[str, tuple[int, ...]]:
-        """Return the kind of a node, and its operands; for a ``letters`` node, the bit set."""
+        """The second item is a bit set for a ``letters`` node, otherwise the operands."""
         return self._nodes[node]
 
     def _intern(self, kind: str, parts: tuple[int, ...]) -> int:
@@ -36,7 +36,7 @@ class FormulaNodes:
         return parts[0] if kind == "letters" else None
 
     def join(self, kind: str, operands: Iterable[int]) -> int:
-        """Return a conjunction or disjunction, flat, with its letters merged into one operand."""
+        """Flatten, and merge letters into one operand."""
         mask = self.everything if kind == "and" else 0
         absorbing = 0 if kind == "and" else self.everything
         parts: set[int] = set()
@@ -60,20 +60,20 @@ class FormulaNodes:
         return operand if self._mask(operand) in (0, self.everything) else self._intern("next", (operand,))
 
     def until(self, left: int, right: int) -> int:
-        """Return the node for ``right`` at some position and ``left`` at all positions before it."""
+        """``right`` holds at some position, and ``left`` at all positions before it."""
         if self._mask(right) in (0, self.everything) or self._mask(left) == 0 or left == right:
             return right
         return self._intern("until", (left, right))
 
     def release(self, left: int, right: int) -> int:
-        """Return the node for ``right`` up to and including the first position of ``left``, or always."""
+        """``right`` holds up to and including the first position of ``left``, or always."""
         if self._mask(right) in (0, self.everything) or self._mask(left) == self.everything or left == right:
             return right
         return self._intern("release", (left, right))
 
 
 class FormulaTranslation:
-    """A translation of formulas to shared nodes, with negations pushed down to the letters."""
+    """Translates formulas to shared nodes, with negations pushed down to the letters."""
 
     def __init__(self, nodes: FormulaNodes, atoms: Mapping[str, int]) -> None:
         self._nodes = nodes
@@ -109,7 +109,7 @@ class FormulaTranslation:
         return self._nodes.letters(mask if positive else everything & ~mask)
 
     def _temporal(self, operator: str, parts: list[int], positive: bool) -> int:
-        """Return a temporal operator, or its dual, over parts that are already negated if necessary."""
+        """The parts are already negated if necessary."""
         nodes = self._nodes
         if operator == "next":
             return nodes.next(parts[0])

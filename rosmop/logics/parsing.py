@@ -1,4 +1,4 @@
-"""Recognise any context-free grammar, and report after each event whether the trace so far is in the language.
+"""Recognise any context-free grammar.
 
 Theory of operation. This is Earley's algorithm with the nullable symbols of Aycock and Horspool. Instead of the
 position where it began, an item holds a *continuation*: the items that wait there for its left side to be completed.
@@ -9,14 +9,14 @@ Positions are therefore not stored, and an item without a waiting continuation i
 - A continuation is a frame and a symbol: the items of that frame's closure that wait for the symbol. None is the
   continuation of the whole trace: its completion means that the trace is in the language.
 - If completing a symbol in a frame only completes one of the frame's own continuations, that continuation is used
-  instead (Leo, 1991). So right recursion needs neither memory nor time, and LR grammars need constant time per event on
-  average.
+  instead (Leo, 1991). So right recursion needs neither memory nor time, and LR grammars need constant time per event
+  on average.
 - Every step that depends on shapes alone (scanning an event, completing a symbol, joining two sets of items) is
   computed once and stored in tables. A deterministic grammar soon finds every step there. Large shapes, which only
   ambiguous grammars have, are not stored.
 
-Invariants: the continuations of a frame belong to less deep frames, so completing goes from deep to less deep and ends.
-A frame is viable if it has an item, because every symbol of the grammar can be completed (``grammar.prepare``).
+Invariants: the continuations of a frame belong to less deep frames, so completing goes from deep to less deep and
+ends. A frame is viable if it has an item, because every symbol of the grammar can be completed (``grammar.prepare``).
 """
 
 from collections.abc import Sequence
@@ -26,11 +26,11 @@ from rosmop.logics.cfg_grammar import Grammar, nullable_symbols
 from rosmop.logics.interface import RunFaultError
 
 MAX_WIDTH = 4_000
-"""The maximum number of continuations of a frame; only ambiguous grammars come close to it."""
+"""Only ambiguous grammars come close to this number of continuations of a frame."""
 MAX_STEP_WORK = 300_000
-"""The maximum number of items that one step completes, which limits its time to a fraction of a second."""
+"""The items that one step may complete, in a fraction of a second."""
 MAX_DEPTH = 1_000_000
-"""The maximum number of nested frames: the nesting of the trace."""
+"""The nesting of the trace."""
 KEPT_SHAPE_WIDTH = 8
 KEPT_SHAPE_ITEMS = 400
 KEPT_ENTRIES = 20_000
@@ -41,7 +41,7 @@ symbol A."""
 
 
 class EarleyShape:
-    """Items with numbered continuations. ``done``: the continuations that have been completed."""
+    """Items with numbered continuations, of which ``done`` are completed."""
 
     __slots__ = ("done", "items", "kept", "returned", "scanned", "waiters", "width")
 
@@ -59,7 +59,7 @@ Step = tuple[EarleyShape, tuple[int, ...]]
 
 
 class EarleySet:
-    """An Earley set. ``depth`` counts the frames below that wait."""
+    """``depth`` counts the frames below that wait."""
 
     __slots__ = ("conts", "depth", "shape")
 
@@ -75,7 +75,6 @@ class EarleySet:
         self.conts, self.depth, self.shape = saved
 
     def resolve(self, references: Sequence[int]) -> "Conts":
-        """Return the continuations that references of this frame's shape refer to."""
         if len(references) == 1:
             only = references[0]
             return (self.conts[only] if only >= 0 else (self, only),)
@@ -110,7 +109,7 @@ class EarleyRecogniser:
     # ---- one event
 
     def step(self, frame: EarleySet, event: int) -> tuple[EarleySet, bool] | None:
-        """Return the next frame and whether the trace is in the language; None if no continuation can be in it."""
+        """Return whether the trace is in the language, or None if no continuation can be in it."""
         scanned = self._scan(frame.shape, event)
         if scanned is None:
             return None
@@ -146,7 +145,7 @@ class EarleyRecogniser:
     def _complete_wide(
         self, shape: EarleyShape, conts: Conts, before: EarleySet, *, accepted: bool
     ) -> tuple[EarleyShape, Conts, bool]:
-        """Return the shape after all completions, without tables, for the large frames of ambiguous grammars."""
+        """The large frames of ambiguous grammars use no tables."""
         items = {(item, conts[reference]) for item, reference in shape.items}
         waiting = [conts[reference] for reference in shape.done]
         completed = set(waiting)
@@ -190,7 +189,7 @@ class EarleyRecogniser:
         return shape
 
     def _canonical(self, items: set[Entry], done: set[int]) -> Step:
-        """Number the used references in sorted order, so that equal sets give equal shapes."""
+        """Number references in sorted order, so that equal sets give equal shapes."""
         references = sorted({reference for _, reference in items} | done)
         number = {reference: index for index, reference in enumerate(references)}
         shape = self._shape(
@@ -216,8 +215,8 @@ class EarleyRecogniser:
         return known
 
     def _closure(self, shape: EarleyShape) -> tuple[dict[int, set[Entry]], dict[int, set[Entry]]]:
-        """Return, for each nonterminal and event, the items (including predicted items) that wait for this symbol,
-        advanced by it.
+        """Return, for each nonterminal and event, the items that wait for it (including predicted ones), advanced by
+        it.
         """
         if shape.waiters is not None:
             return shape.waiters
@@ -242,7 +241,7 @@ class EarleyRecogniser:
         return shape.waiters
 
     def _skip_nullable(self, item: int) -> list[int]:
-        """Return the item, and the items after each of its next symbols that may be empty."""
+        """Include the items after each next symbol that may be empty."""
         items = [item]
         while self._next[item] in self._nullable:
             item += 1
@@ -250,10 +249,7 @@ class EarleyRecogniser:
         return items
 
     def _complete(self, shape: EarleyShape, entries: set[Entry]) -> Step:
-        """Return the entries after all completions inside the frame.
-
-        Completed continuations outside the frame are ``done``.
-        """
+        """Completed continuations outside the frame are ``done``."""
         waiters, _ = self._closure(shape)
         items: set[Entry] = set()
         done: set[int] = set()
@@ -291,7 +287,7 @@ class EarleyRecogniser:
     def _join(
         self, shape: EarleyShape, conts: Conts, index: int, other: EarleyShape, others: Conts
     ) -> tuple[EarleyShape, Conts]:
-        """Return the union of both sets of items, without ``index`` in ``done``."""
+        """Return the union, without ``index`` in ``done``."""
         place = {cont: number for number, cont in enumerate(conts)}
         mapping = tuple(place.get(cont, -1) for cont in others)
         key = (shape, index, other, mapping)
@@ -311,7 +307,7 @@ class EarleyRecogniser:
 
 
 def _deepest(done: tuple[int, ...], conts: Conts) -> int:
-    """Return the deepest of the completed continuations; completing it completes only less deep continuations."""
+    """Completing the deepest continuation completes only less deep ones."""
     deepest, depth = done[0], -2
     if len(done) > 1:
         for index in done:

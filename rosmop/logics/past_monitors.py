@@ -1,18 +1,17 @@
-"""Monitors for formulas about the past: ptltl, and the past part of mtl (`bounded.py` implements the part about the
-future).
+"""Monitors for formulas about the past: ptltl, and the past part of mtl (`bounded.py` has the future part).
 
-Theory of operation. A formula becomes a *program*: its distinct subformulas, each after its operands. The only temporal
-operators are ``previously`` and ``since`` (``once b`` is ``true since b``). A step computes all subformulas from the
-event and from the values that the last step kept (Havelund and Rosu, 2002):
+Theory of operation. A formula becomes a *program*: its distinct subformulas, each after its operands. The only
+temporal operators are ``previously`` and ``since`` (``once b`` is ``true since b``). A step computes all subformulas
+from the event and from the values that the last step kept (Havelund and Rosu, 2002):
 
 - for ``previously``: the value of the operand at the last event;
 - for ``since``: its own last value;
 - for either operator with bounds: the intervals of time in which the operator will hold while its left operand holds
   (`SinceWindow`).
 
-Each event determines which atoms hold. Therefore the program is folded in advance, for each event, into the operations
-that remain, as data (`FoldedProgram`). Without time bounds the values are bits and the program is a finite automaton,
-which is built if it is small enough.
+Each event determines which atoms hold. Therefore the program is folded in advance, for each event, into the
+operations that remain, as data (`FoldedProgram`). Without time bounds the values are bits and the program is a finite
+automaton, which is built if it is small enough.
 """
 
 import copy
@@ -38,9 +37,9 @@ VERDICTS = ("violation", "validation")
 ANEW = "anew"
 TOLD: tuple[Categories, Categories] = VERDICTS[:1], VERDICTS[1:]
 MAX_TABLE_WORK = 2_000_000
-"""The maximum number of values computed to build a table."""
+"""Limits the work of building a table."""
 MAX_FOLDED = 50_000
-"""The maximum number of operands visited to fold a program; larger programs are not folded."""
+"""Larger programs are not folded."""
 FOREVER = 10**30
 
 
@@ -67,7 +66,7 @@ class PastInstruction:
 
 
 class PastProgram:
-    """The distinct subformulas of a formula, operands first; the last one is the formula."""
+    """The distinct subformulas, operands first; the last one is the formula."""
 
     def __init__(self, formula: Formula, events: Sequence[str]) -> None:
         self.events = {name: index for index, name in enumerate(events)}
@@ -89,7 +88,6 @@ class PastProgram:
         return instruction.operands[0] if instruction.operator == "not" else self._emit("not", operand)
 
     def _add(self, formula: Formula) -> int:
-        """Return the number of a subformula; add it and its operands if they are new."""
         if formula.operator == "event":
             return self._emit("event", event=self.events[formula.name])
         operands = [self._add(operand) for operand in formula.operands]
@@ -119,7 +117,7 @@ class PastProgram:
 
 
 _OF_ONE = {"once": "since", "historically": "since", "eventually": "until", "always": "until"}
-"""Operators that equal another operator with `true` as its left operand."""
+"""These equal another operator with `true` as its left operand."""
 
 
 Operation = tuple[str, int, int, int, int]
@@ -128,18 +126,18 @@ Operation = tuple[str, int, int, int, int]
 An `event` has the event's number in place of the first operand.
 """
 Residue = tuple[tuple[Operation, ...], tuple[int, ...]]
-"""The residue at an event: operations, and the places of the requested values."""
+"""The operations at an event, and the places of the requested values."""
 
 
 @dataclass(frozen=True)
 class FoldedProgram:
     """A program as runs execute it.
 
-    A run keeps a list of *values*: first `False` and `True`, so a place below 2 is a constant; then the values kept for
-    the next step; then the values used within one step.
+    A run keeps a list of *values*: first `False` and `True`, so a place below 2 is a constant; then the values kept
+    for the next step; then the values used within one step.
 
     ``bounds`` has the bounds of each kept window (None for other kept values), ``abstract`` the places of abstract
-    operators. ``residues`` has a residue for each event, and a last one for all unnamed events.
+    operators. The last residue is for all unnamed events.
     """
 
     bounds: tuple[Bounds | None, ...]
@@ -156,7 +154,7 @@ class FoldedProgram:
         return [False, True, *kept, *[False] * (self.size - 2 - len(kept))]
 
     def take(self, values: list[Any], event: int, now: int) -> tuple[int, ...]:
-        """Compute the values at an event; return the places of the requested values."""
+        """Return the places of the requested values."""
         operations, results = self.residues[event]
         compute(operations, values, event, now)
         return results
@@ -179,7 +177,7 @@ def compute(operations: Sequence[Operation], values: list[Any], event: int, now:
 
 
 def fold(program: PastProgram, wanted: Sequence[int]) -> FoldedProgram:
-    """Return the folded program that computes these instructions."""
+    """Return a program that computes these instructions."""
     needed = {*wanted}
     for number in range(max(wanted), -1, -1):
         if number in needed:
@@ -200,7 +198,7 @@ def fold(program: PastProgram, wanted: Sequence[int]) -> FoldedProgram:
 
 
 class _Fold:
-    """Folds instructions for an event (None: any event). ``kept`` are the places of instructions that look back."""
+    """Folds instructions for an event, or for any. ``kept`` are the places of those that look back."""
 
     def __init__(self, chosen: dict[int, PastInstruction], kept: dict[int, int], event: int | None) -> None:
         self._chosen = chosen
@@ -211,7 +209,6 @@ class _Fold:
         self.size = 2 + len(kept)
 
     def residue(self, wanted: Sequence[int]) -> Residue:
-        """Return the operations whose values are needed."""
         for number, instruction in self._chosen.items():
             self._places[number] = self._place(number, instruction)
         before = {
@@ -238,7 +235,7 @@ class _Fold:
         return tuple(reversed(left)), results
 
     def _place(self, number: int, instruction: PastInstruction) -> int:
-        """Return the place of an instruction's value; below 2 if it is a constant."""
+        """A place below 2 is a constant."""
         operands = [self._places[operand] for operand in instruction.operands]
         operator, kept = instruction.plain, self._kept.get(number, 0)
         if operator == "event" and self._event is None:
@@ -274,9 +271,7 @@ class _Fold:
 
 
 def compile_past(source: Source, formula: Formula) -> CompiledProperty:
-    """Return the monitor of a past formula: a table if the automaton is finite and small, otherwise the folded
-    program.
-    """
+    """Return a table if the automaton is finite and small, otherwise the folded program."""
     program = PastProgram(formula, source.events)
     folded = fold(program, [program.result])
     bounds = [found for found in folded.bounds if found is not None]
@@ -340,7 +335,6 @@ class _Clock:
         return self._there
 
     def step(self, unbroken: bool, anchor: bool, late: bool) -> bool:
-        """Return the value, as `SinceWindow.step` does."""
         self._there = self._there and unbroken and (self._first or not late)
         if anchor and not (self._first and self._there):
             self._there = self.anew = True
@@ -348,7 +342,7 @@ class _Clock:
 
 
 class ClockedPastProperty(ClockedProperty):
-    """A property for a past formula with one time bound in one window, a `_Clock`."""
+    """A past formula with one time bound in one window, a `_Clock`."""
 
     def __init__(self, source: Source, automaton: Automaton, within: int) -> None:
         super().__init__(source, VERDICTS)
@@ -375,7 +369,7 @@ class SinceWindow:
         self._intervals: deque[tuple[int, int]] = deque()
 
     def step(self, unbroken: bool, anchor: bool, now: int) -> bool:
-        """Return the value at ``now``; ``unbroken`` is the left operand, ``anchor`` the right operand."""
+        """``unbroken`` is the left operand, ``anchor`` the right operand."""
         intervals = self._intervals
         if intervals and not unbroken:
             intervals.clear()
@@ -408,7 +402,7 @@ class SinceWindow:
 
 
 class PastRun(UntimedRun):
-    """A run of a past formula: its values, and the time."""
+    """A run of a past formula."""
 
     __slots__ = ("_residues", "now", "values")
 
@@ -444,7 +438,7 @@ class PastRun(UntimedRun):
 
 
 class PastProperty(CompiledProperty):
-    """A property for a past formula without tables."""
+    """A past formula without tables."""
 
     def __init__(self, source: Source, folded: FoldedProgram) -> None:
         super().__init__(source, VERDICTS)

@@ -1,7 +1,8 @@
-"""``pattern``: properties in near-English, after Dwyer's scopes and patterns, with the meaning of HPL (Santos et al.).
+"""``pattern``: properties in near-English, after Dwyer's scopes and patterns, with the meaning of HPL (Santos et
+al.).
 
-``globally: no c``, ``after a: some c within 2s``, ``until b: c causes d``, ``after a until b: c requires d
-within 1s``, ``… c forbids d``.
+``globally: no c``, ``after a: some c within 2s``, ``until b: c causes d``, ``after a until b: c requires d within
+1s``, ``… c forbids d``.
 
 Scopes. ``globally`` is open from the start, ``until b`` from the start to the first ``b``, and ``after a`` from the
 first ``a`` on. ``after a until b`` opens at an ``a``, closes at the next ``b``, and so on. The events that open and
@@ -18,16 +19,16 @@ Patterns concern only events inside one scope. Time bounds are closed:
 ``before`` and ``after`` are strict: no event answers, requires or forbids itself.
 
 The verdict's category is ``violation`` once the property is certainly violated, and ``validation`` once nothing can
-violate it any more. Both are permanent. A pattern that waits (``some``, ``causes``) may give no verdict for ever:
-silence violates the pattern only if there is a time bound, and never validates it.
+violate it any more. Both are permanent. A pattern that waits (``some``, ``causes``) may never give a verdict: silence
+violates it only if there is a time bound, and never validates it.
 
 ``some c within t enforced by f`` and ``… causes d within t enforced by f``: when the deadline passes, the category is
 ``enforced`` and ``f`` publishes the due message, which counts as received.
 
 Theory of operation. A run is in a *mode*: the scope has not opened, is over, or is open and either *quiet* or
-*stirred*. For ``some`` and ``requires``, a run is stirred once the good event came; for ``causes``, while an answer is
-due; for ``forbids``, once the first event came. The mode and the time of one event are the whole state. Whether a mode
-settles the verdict follows from the modes that are reachable from it.
+*stirred*. For ``some`` and ``requires``, a run is stirred once the good event came; for ``causes``, while an answer
+is due; for ``forbids``, once the first event came. The mode and the time of one event are the whole state. Whether a
+mode settles the verdict follows from the modes that are reachable from it.
 """
 
 from dataclasses import dataclass
@@ -53,16 +54,12 @@ Mode = Literal["waiting", "quiet", "stirred", "over", "violated"]
 MODES: tuple[Mode, ...] = ("waiting", "quiet", "stirred", "over", "violated")
 _DUE: dict[str, Mode] = {"some": "quiet", "causes": "stirred"}
 _DONE: dict[str, Mode] = {"some": "stirred", "causes": "quiet"}
-"""The mode after the awaited event."""
 ENFORCED: Categories = ("enforced",)
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """A pattern as written; events are indexes.
-
-    ``first`` is None for ``no`` and ``some``, and ``within_ns`` may be None.
-    """
+    """A pattern as written; events are indexes. ``no`` and ``some`` have no ``first``."""
 
     kind: str
     opens: int | None
@@ -76,7 +73,7 @@ class Pattern:
         return "quiet" if self.opens is None else "waiting"
 
     def after_event(self, mode: Mode, event: int, *, late: bool) -> Mode:
-        """Return the next mode. ``late``: more than ``within_ns`` after the start of the mode's clock."""
+        """``late``: more than ``within_ns`` after the start of the mode's clock."""
         if mode == "waiting":
             return "quiet" if event == self.opens else "waiting"
         if mode in ("over", "violated"):
@@ -96,10 +93,7 @@ class Pattern:
         return "quiet" if second and self.kind == "causes" else mode
 
     def restarts_clock(self, before: Mode, event: int, mode: Mode) -> bool:
-        """Return whether the clock restarts.
-
-        It runs from the opening of the scope, the oldest unanswered event, or the latest event.
-        """
+        """The clock runs from the opening of the scope, the oldest unanswered event, or the latest event."""
         if before == "waiting":
             return mode == "quiet"
         if mode != "stirred":
@@ -116,7 +110,6 @@ class Pattern:
         return "over" if self.opens is None else "waiting"
 
     def after_deadline(self, mode: Mode) -> Mode:
-        """Return the next mode when the clock of the mode has run out."""
         if self.within_ns is None:
             return mode
         if self.kind == "no" and mode == "quiet" and (self.opens is None or self.closes is None):
@@ -127,7 +120,7 @@ class Pattern:
 
 
 def verdicts(pattern: Pattern, events: int) -> dict[Mode, Categories]:
-    """Return the verdict of each mode: `violation` or `validation` if either is certain.
+    """Return `violation` or `validation` for each mode if either is certain.
 
     A due event can always come or be published later, unless it is the event that closes the scope.
     """
@@ -158,7 +151,7 @@ def _reachable(pattern: Pattern, mode: Mode, events: int) -> set[Mode]:
 
 
 class TimedPattern(ClockedProperty):
-    """A property for a pattern with a time bound, as tables; a state is the number of a mode.
+    """A pattern with a time bound, as tables; a state is the number of a mode.
 
     ``expiries[mode]`` is the mode after the deadline, or None without a deadline. ``at_expiry`` are the categories at
     the deadline that come before the verdict.
@@ -199,7 +192,7 @@ class TimedPattern(ClockedProperty):
         return tuple(table)
 
     def blocking_refused(self, category: str) -> str | None:
-        """Return why a handler cannot drop the message: a deadline may decide the category without a message."""
+        """A deadline may decide the category without a message."""
         super().blocking_refused(category)
         kind = self.pattern.kind
         comes_along = kind == "no" or self.pattern.enforced
@@ -209,7 +202,7 @@ class TimedPattern(ClockedProperty):
 
 
 def compile_pattern(source: Source) -> CompiledProperty:
-    """Compile a ``pattern`` formula. Raises FormulaError."""
+    """Raises `FormulaError`."""
     reader = TokenReader(source, (":", "(", ")"))
     opens, closes = _read_scope(reader)
     reader.expect(":", "`:` after the scope")

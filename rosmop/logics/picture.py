@@ -1,10 +1,10 @@
-"""Draw the automata of properties, for Graphviz or as SVG. SVG needs no installed program.
+"""Draw automata, for Graphviz or as SVG, which needs no installed program.
 
-Colours and sizes are attributes, not styles: they also work on pages whose content security policy forbids
-styles. A style sheet can change the classes `title`, `event`, `state` and `edge`.
+Colours and sizes are attributes, not styles: they also work on pages whose content security policy forbids styles. A
+style sheet can change the classes `title`, `event`, `state` and `edge`.
 
-The column of a state is its distance from the start. Each pair of states has one curve, labelled with all events that
-lead from the first state to the second.
+The column of a state is its distance from the start. One curve joins each pair of states, labelled with all its
+events.
 """
 
 from collections import Counter, deque
@@ -32,13 +32,13 @@ class _State:
 
 
 def dot_of(properties: Sequence[CompiledProperty]) -> str | None:
-    """Return the automata in Graphviz's language, one `digraph` after the other; None if there are none to draw."""
+    """Return one `digraph` after the other, or None if there are none."""
     graphs = [graph for graph in map(to_dot, properties) if graph is not None]
     return "\n".join(graphs) if graphs else None
 
 
 def svg_of(properties: Sequence[CompiledProperty]) -> str | None:
-    """Return the automata as an SVG picture, one below the other, or None if no property has one."""
+    """Draw one below the other; return None if no property has an automaton."""
     parts: list[str] = []
     top, right = 0, 0
     for compiled in properties:

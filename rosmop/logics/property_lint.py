@@ -16,12 +16,12 @@ from rosmop.logics.pattern import TimedPattern
 from rosmop.logics.tfsm import TimedStateMachine
 
 TIME = "<time>"
-"""An element of traces: a deadline or a time bound passes."""
+"""In traces: a deadline or a time bound passes."""
 
 
 @dataclass(frozen=True)
 class PropertyFact:
-    """A certain fact about a property. ``trace`` is a shortest trace that shows the fact, if such a trace exists."""
+    """A certain fact. ``trace`` is a shortest one that shows it, if any."""
 
     kind: Literal["never runs", "never violated", "violated at once"]
     category: str
@@ -31,7 +31,7 @@ class PropertyFact:
 
 @dataclass(frozen=True)
 class VerdictGraph:
-    """A graph of states, transitions, and the categories on entering each state."""
+    """``verdicts`` are the categories on entering each state."""
 
     initial: int
     edges: tuple[tuple[tuple[tuple[str, ...], int], ...], ...]
@@ -39,7 +39,6 @@ class VerdictGraph:
 
 
 def analyse(compiled: CompiledProperty, handled: Sequence[str]) -> list[PropertyFact]:
-    """Return the facts about a property with handlers for the categories ``handled``."""
     graph = graph_of(compiled)
     if graph is None:
         return []
@@ -63,7 +62,7 @@ def analyse(compiled: CompiledProperty, handled: Sequence[str]) -> list[Property
 
 
 def shortest_trace_to(compiled: CompiledProperty, category: str) -> tuple[str, ...] | None:
-    """Return a shortest trace of events that leads to a category; None if none is known.
+    """Return None if no trace is known.
 
     ``TIME`` among them means that a deadline or a time bound passes.
     """
@@ -88,7 +87,7 @@ def _shortest_traces(graph: VerdictGraph) -> dict[str, tuple[str, ...]]:
 
 
 def graph_of(compiled: CompiledProperty) -> VerdictGraph | None:
-    """Return the graph of a property's states, or None if it is not known to be finite."""
+    """Return None if the states are not known to be finite."""
     if isinstance(compiled, FiniteProperty):
         automaton = compiled.automaton
         labels = [(event,) for event in compiled.events]
@@ -104,7 +103,7 @@ def graph_of(compiled: CompiledProperty) -> VerdictGraph | None:
 
 
 def _past_graph(compiled: ClockedPastProperty) -> VerdictGraph:
-    """Return the graph, which has each state twice: before and after the time bound has passed."""
+    """Each state occurs twice: before and after the time bound has passed."""
     size = len(compiled.moves)
     late = [
         [
@@ -125,7 +124,7 @@ def _past_graph(compiled: ClockedPastProperty) -> VerdictGraph:
 
 
 def _machine_graph(compiled: TimedStateMachine) -> VerdictGraph:
-    """Return the graph. It has the start, and each state twice: entered by an event, and entered by a timeout."""
+    """Besides the start, each state occurs twice: entered by an event, and by a timeout."""
     base = compiled.automaton
     size = len(base)
     silent = compiled.silence_ns is not None
@@ -145,7 +144,7 @@ def _machine_graph(compiled: TimedStateMachine) -> VerdictGraph:
 
 
 def _pattern_graph(compiled: TimedPattern) -> VerdictGraph:
-    """Return the graph of the modes. With a remedy, each mode has a second node: entered by the remedy.
+    """With a remedy, each mode has a second node: entered by the remedy.
 
     In a mode without a deadline, an event may still come too late for the time bound.
     """

@@ -27,7 +27,6 @@ from rosmop.logics.past_monitors import TOLD, VERDICTS, FoldedProgram, PastProgr
 from rosmop.logics.ptltl import SYNTAX as PTLTL
 
 MAX_DEPTH = 10_000
-"""The maximum number of open calls."""
 
 BEGIN, END, CALL = "begin", "end", "call"
 
@@ -54,7 +53,7 @@ SYNTAX = Syntax(
 
 
 def compile_ptcaret(source: Source) -> CompiledProperty:
-    """Compile a ``ptcaret`` formula. Raises FormulaError."""
+    """Raises `FormulaError`."""
     formula = plain(read_formula(source, SYNTAX))
     missing = [name for name in (BEGIN, END) if name not in source.events]
     if missing and any(node.operator.startswith("abstract ") for node in nodes(formula)):
@@ -69,7 +68,7 @@ def compile_ptcaret(source: Source) -> CompiledProperty:
 
 
 class CaretProperty(CompiledProperty):
-    """A property with a stack: the state of the abstract operators for each open call."""
+    """Its stack has the state of the abstract operators for each open call."""
 
     def __init__(self, source: Source, folded: FoldedProgram) -> None:
         super().__init__(source, VERDICTS)
@@ -82,7 +81,7 @@ class CaretProperty(CompiledProperty):
 
 
 class CaretRun(UntimedRun):
-    """A run: its values, and for each open call the values about the abstract past from before the call."""
+    """Its values, and for each open call the values about the abstract past from before it."""
 
     __slots__ = ("_compiled", "_stack", "_values")
 
@@ -97,7 +96,7 @@ class CaretRun(UntimedRun):
         return made
 
     def step(self, event: int, _time_ns: int) -> Categories:
-        """Take the event; the time does not matter. If it raises RunFaultError, the run is unchanged."""
+        """If it raises `RunFaultError`, the run is unchanged."""
         compiled, values, stack = self._compiled, self._values, self._stack
         abstract = compiled.folded.abstract
         if event == compiled.begin:
@@ -119,7 +118,7 @@ class CaretRun(UntimedRun):
 
 
 def plain(formula: Formula) -> Formula:
-    """Return the formula without the derived operators."""
+    """Expand the derived operators."""
     operands = tuple(plain(operand) for operand in formula.operands)
     operator, _, where = formula.operator.partition(" ")
     if operator == "stack-since":
@@ -141,7 +140,7 @@ def plain(formula: Formula) -> Formula:
 
 
 def _stack_since(where: str, left: Formula, right: Formula) -> Formula:
-    """Return `left Ss@where right`, expanded as in MOP's plugin."""
+    """Expand `left Ss@where right` as in MOP's plugin."""
     begin, call = Formula("event", name=BEGIN), Formula("event", name=CALL)
     both = Formula("or", (begin, call))
     guard = {"b": begin, "c": call, "bc": both}[where]

@@ -22,5 +22,5 @@ SYNTAX = Syntax(
 
 
 def compile_ptltl(source: Source) -> CompiledProperty:
-    """Compile a ``ptltl`` formula. Raises FormulaError."""
+    """Raises `FormulaError`."""
     return compile_past(source, read_formula(source, SYNTAX))

@@ -18,9 +18,8 @@ from rosmop.logics.lexer import FormulaToken, TokenReader
 CATEGORIES: Categories = ("fail", "succeed")
 MAX_RULES = 1_000
 MAX_STRING = 100_000
-"""The maximum number of symbols in a run's string."""
 MAX_WORK = 200_000
-"""The maximum number of rules tried and symbols moved for one event.
+"""The limit of rules tried and symbols moved for one event.
 
 Sixteen comparisons of symbols count as one move.
 """
@@ -28,9 +27,8 @@ Sixteen comparisons of symbols count as one move.
 
 @dataclass(frozen=True)
 class RewriteRule:
-    """A rule ``left -> right`` or ``left -> verdict``.
-
-    ``begins`` and ``ends``: the rule applies only at the string's beginning or end.
+    """A rule ``left -> right`` or ``left -> verdict``. ``begins`` and ``ends`` bind it to the string's beginning or
+    end.
     """
 
     left: tuple[int, ...]
@@ -41,7 +39,7 @@ class RewriteRule:
 
 
 class RewritingProperty(CompiledProperty):
-    """A property for a rewriting system. Symbols are numbers, events first."""
+    """Symbols are numbers, events first."""
 
     def __init__(self, source: Source, rules: Sequence[RewriteRule]) -> None:
         super().__init__(source, CATEGORIES)
@@ -59,7 +57,7 @@ class RewritingProperty(CompiledProperty):
 
 
 class RewritingRun(UntimedRun):
-    """A run: its string, or its final verdict. Between two events, no rule applies to the string."""
+    """Its string, or its final verdict. Between two events no rule applies."""
 
     __slots__ = ("_property", "string", "verdict")
 
@@ -69,7 +67,7 @@ class RewritingRun(UntimedRun):
         self.verdict: Categories = ()
 
     def step(self, event: int, _time_ns: int) -> Categories:
-        """Append the event and rewrite; the time does not matter. If it raises RunFaultError, the run is unchanged."""
+        """If it raises `RunFaultError`, the run is unchanged."""
         if not self.verdict:
             self.string, self.verdict = self._rewritten([*self.string, event])
         return self.verdict
@@ -81,10 +79,7 @@ class RewritingRun(UntimedRun):
         self.string, self.verdict = saved
 
     def _rewritten(self, string: list[int]) -> tuple[list[int], Categories]:
-        """Return the rewritten string, and its verdict.
-
-        Invariant: no rule matches before `place`.
-        """
+        """Invariant: no rule matches before `place`."""
         longest, work = self._property.longest, MAX_WORK
         place = max(0, len(string) - longest)
         while place < len(string):
@@ -119,7 +114,7 @@ def _matching(rules: Sequence[RewriteRule], string: list[int], place: int) -> tu
 
 
 def compile_srs(source: Source) -> RewritingProperty:
-    """Compile an ``srs`` formula. Raises FormulaError."""
+    """Raises `FormulaError`."""
     reader = TokenReader(source, ("->", "^", "$", ".", "#"))
     numbers = {name: number for number, name in enumerate(source.events)}
     rules = [_read_rule(reader, numbers)]

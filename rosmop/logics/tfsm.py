@@ -13,15 +13,12 @@ from rosmop.logics.fsm import FAIL, TIMEOUT, machine_automaton, read_state_machi
 from rosmop.logics.interface import ClockedProperty, Source, Wait
 
 SILENCE_NS = 10**9
-"""The time that a machine without timeout clauses waits for the next event."""
 
 
 class TimedStateMachine(ClockedProperty):
-    """A compiled ``tfsm``.
-
-    ``automaton`` has the transitions on events; ``timeouts[state]`` is (nanoseconds, next state) or None. With
-    ``silence_ns`` set there are no timeout clauses, and the clock runs after each event. Then each state occurs twice:
-    after an event, and (in the second half) while the machine waits for no deadline.
+    """``automaton`` has the transitions on events; ``timeouts[state]`` is (nanoseconds, next state) or None. With
+    ``silence_ns`` set there are no timeout clauses, and the clock runs after each event. Then each state occurs
+    twice: after an event, and (in the second half) while the machine waits for no deadline.
     """
 
     expiry = TIMEOUT
@@ -53,17 +50,14 @@ class TimedStateMachine(ClockedProperty):
             self.waits = (*silent, *[None] * size)
 
     def categories_after(self, event: int) -> frozenset[str]:
-        """Return the categories of the states that this event leads to.
-
-        ``timeout`` is not included, because it needs no event.
-        """
+        """``timeout`` is not included, because it needs no event."""
         verdicts = self.automaton.verdicts
         return frozenset(name for row in self.automaton.table for name in verdicts[row[event]])
 
     def blocking_refused(self, category: str) -> str | None:
-        """Return why a handler cannot drop the message: ``timeout`` comes without a message.
+        """``timeout`` comes without a message.
 
-        Other categories may drop, because an event may stay in a state that only a timeout enters.
+        Other categories may drop the message, because an event may stay in a state that only a timeout enters.
         """
         super().blocking_refused(category)
         if category == TIMEOUT:
@@ -72,7 +66,7 @@ class TimedStateMachine(ClockedProperty):
 
 
 def compile_tfsm(source: Source) -> TimedStateMachine:
-    """Compile a ``tfsm`` formula. Raises FormulaError."""
+    """Raises `FormulaError`."""
     machine = read_state_machine(source, timed=True)
     number = {name: index for index, name in enumerate(machine.order)}
     timeouts: list[tuple[int, int] | None] = [

@@ -1,6 +1,6 @@
-"""Decodes a module into functions: types, local variables, and instructions in a tree.
+"""Decode a module into functions.
 
-It knows only the instructions that the writer of modules uses. Any other instruction raises `UnknownInstructionError`.
+Only the instructions that the writer of modules uses are known; any other raises `UnknownInstructionError`.
 """
 
 import struct
@@ -15,7 +15,7 @@ class UnknownInstructionError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class WasmInstruction:
-    """An instruction. `operands` are its constants. A block has a `body`, and `if` also has the branch `otherwise`."""
+    """`operands` are constants. A block has a `body`; `if` also has the branch `otherwise`."""
 
     name: str
     operands: tuple[int | float, ...] = ()
@@ -25,7 +25,7 @@ class WasmInstruction:
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """A function: the types of its parameters, its result and its local variables ("i32", "f64", …)."""
+    """Types are "i32", "f64", …."""
 
     parameters: tuple[str, ...]
     result: str
@@ -51,7 +51,7 @@ _TRUNCATED = """i32.trunc_sat_f32_s i32.trunc_sat_f32_u i32.trunc_sat_f64_s i32.
 
 
 def _plain() -> dict[int, str]:
-    """Return the opcodes of instructions without operands (WebAssembly 1.0, section 5.4)."""
+    """The opcodes are in WebAssembly 1.0, section 5.4."""
     found = {
         0x00: "unreachable",
         0x0F: "return",
@@ -83,7 +83,7 @@ _FLOATS = MappingProxyType(
 
 
 class Reader:
-    """Reads numbers and instructions of a module, from `at` on."""
+    """Reads a module from `at` on."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -94,7 +94,6 @@ class Reader:
         return self._data[self.at - 1]
 
     def unsigned(self) -> int:
-        """Read an unsigned number (LEB128)."""
         value = shift = 0
         while True:
             byte = self.byte()
@@ -104,7 +103,6 @@ class Reader:
                 return value
 
     def signed(self) -> int:
-        """Read a signed number (LEB128)."""
         begun = self.at
         value = self.unsigned()
         bits = 7 * (self.at - begun)
@@ -118,7 +116,7 @@ class Reader:
         return tuple(TYPES[self.byte()] for _ in range(self.unsigned()))
 
     def block(self) -> tuple[tuple[WasmInstruction, ...], int]:
-        """Read instructions up to `else` or `end`. Return the instructions, and which of the two ended them."""
+        """Read up to `else` or `end`, and return which of the two came."""
         found: list[WasmInstruction] = []
         while True:
             code = self.byte()
@@ -127,7 +125,7 @@ class Reader:
             found.append(self.instruction(code))
 
     def instruction(self, code: int) -> WasmInstruction:
-        """Read the rest of an instruction that begins with this byte."""
+        """Read the rest of the instruction `code`."""
         if code in PLAIN:
             return WasmInstruction(PLAIN[code])
         if code in MEMORY:
@@ -156,9 +154,10 @@ class Reader:
 
 
 def functions_of(module: bytes) -> list[Code]:
-    """Return the functions of a module without imports.
+    """The module must not have imports.
 
-    Raises `UnknownInstructionError`, `KeyError` for an unknown type, and `IndexError` where the module ends too early.
+    Raises `UnknownInstructionError`, `KeyError` for an unknown type, and `IndexError` where the module ends too
+    early.
     """
     reader = Reader(module)
     reader.take(8)

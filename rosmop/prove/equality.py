@@ -54,7 +54,7 @@ from rosmop.types.value_types import Type
 EQUAL = "equal"
 IN_PYTHON = "not compiled: Python evaluates the messages of this topic"
 PATIENCE = 30.0
-"""The default time limit for each event, in seconds."""
+"""The default for each event, in seconds."""
 
 _NOW, _REST = 16, 32  # addresses of the time and of the number of bytes that are not shown
 _HAPPENED, _DROPPED, _CHANGED, _ELSEWHERE, _REPLACED = 1, 2, 4, 8, 32
@@ -63,11 +63,8 @@ _LATEST = 1 << 62
 
 @dataclass(frozen=True)
 class ProofFinding:
-    """The result for an event on a topic, or part of a service.
-
-    `answer` is `EQUAL`, the reason why equality is not known, or the difference.
-
-    `differs`: the two are not equal, which is a defect in the writer of modules.
+    """The result for an event on a topic, or part of a service. `answer` is `EQUAL`, the reason why equality is not
+    known, or the difference; `differs` is a defect in the writer of modules.
     """
 
     topic: str
@@ -79,10 +76,7 @@ class ProofFinding:
 def findings_of(
     compiled: Compiled, clock: Callable[[], float], patience: float = PATIENCE
 ) -> Iterator[ProofFinding]:
-    """Yield the result for each event of a set except timers, in order.
-
-    `patience` is the time limit for each event, in seconds.
-    """
+    """Yield the result for each event except timers. `patience` is the time limit for each, in seconds."""
     found = list(groups(compiled.specifications))
     values = ValueCodec(compiled.messages)
     module = written(compiled.functions, [group.component for group in found], values)
@@ -101,7 +95,7 @@ def findings_of(
 
 
 class Validation:
-    """Compares the module of a set with the form. Raises `UnknownInstructionError` for a module that cannot be read."""
+    """Compares the module of a set with the form. Raises `UnknownInstructionError`."""
 
     def __init__(
         self,
@@ -123,7 +117,6 @@ class Validation:
         self._strings += [range(at, at + SENDER) for at in module.senders.values()]
 
     def finding(self, topic: str, event: str, function: str, place: int) -> ProofFinding:
-        """Return the result for the event with this index on a topic."""
         feed = self._module.feeds.get(topic)
         if feed is None:
             return ProofFinding(topic, event, IN_PYTHON)
@@ -175,7 +168,7 @@ class Validation:
         return EQUAL
 
     def _first(self, known: Sequence[Term], wrong: Mapping[str, Term]) -> str | None:
-        """Return why the two are not known to be equal; None if they are equal. Raises `DiffersError`."""
+        """Return why the two are not known to be equal, or None. Raises `DiffersError`."""
         begun = self._clock()
         undecided = False
         possible = {
@@ -196,10 +189,7 @@ class Validation:
         return "not decided in time" if undecided else None
 
     def _asked(self, conditions: Sequence[Term], begun: float) -> tuple[Any, Any]:
-        """Return whether the conditions are satisfiable, and a model.
-
-        `begun` is the time when the event's first question was asked.
-        """
+        """Return whether the conditions are satisfiable, and a model. The event's first question was at `begun`."""
         rest = int(1000 * (begun + self._patience - self._clock()))
         if rest <= 0:
             return z3.unknown, None
@@ -249,9 +239,7 @@ class Validation:
 
 
 def _holds(conditions: Sequence[Term], guess: Any) -> bool:
-    """Return whether the guessed message and state still satisfy the conditions with the true results of costly
-    operations.
-    """
+    """Check a guess with the true results of costly operations."""
     values = [
         (declaration(), guess[declaration]) for declaration in guess.decls() if declaration.arity() == 0
     ]

@@ -1,13 +1,14 @@
 """Translate the intermediate form of an event (`form/nodes.py`) to terms of z3.
 
-This module follows `run/interpreter.py` line by line, for all messages at once.
+It follows `run/interpreter.py` line by line, for all messages at once.
 
-- Positions and counts have 64 bits here, but are unbounded in the interpreter. This is enough: a function without loops
-  adds a few products of a count below 2**32 and a size, which never exceed 64 bits. Times also have 64 bits, and the
-  sum of two times fits.
+- Positions and counts have 64 bits here, but are unbounded in the interpreter. A function without loops adds a few
+  products of a count below 2**32 and a size, which never exceed 64 bits. Times also have 64 bits, and the sum of two
+  times fits.
 - For 32-bit floats, the interpreter rounds the double result of `+ - * /`. That equals the result of the operation on
   floats: a double has more than twice as many digits, so rounding twice gives the same result as rounding once.
-- The interpreter measures the values of a specification once for each megabyte that it allocates. This is left out.
+- The interpreter also measures the values of a specification once for each megabyte that it allocates; this is left
+  out.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -59,7 +60,7 @@ _MESSAGE, _DROPPED, _REPLACED, _CHANGED, _BUDGET, _SAID = (
 
 @dataclass(frozen=True)
 class _View:
-    """A string, vector or message in the bytes: its start and number of elements."""
+    """A string, vector or message in the bytes."""
 
     message: Term
     start: Term
@@ -74,7 +75,7 @@ _LOOPS: Mapping[type[nodes.FormNode], str] = MappingProxyType(
         nodes.Skip: "a field comes after strings or arrays in an array",
     }
 )
-"""Why a part of an event takes a number of steps that depends on the message."""
+"""Why the number of steps depends on the message."""
 
 
 class UnknownError(Exception):
@@ -90,7 +91,6 @@ def width(kind: Type) -> int:
 
 
 def wrapped(value: Term, kind: value_types.IntegerType) -> Term:
-    """Wrap a number to the bits of its type, and extend it to the width of the bit vector."""
     if kind.bits >= 32:
         return value
     return (z3.SignExt if kind.signed else z3.ZeroExt)(32 - kind.bits, z3.Extract(kind.bits - 1, 0, value))
@@ -101,7 +101,7 @@ def _text(view: _View) -> Term:
 
 
 def _word(value: Term, kind: Type) -> Term:
-    """Return a number as it is stored in a line of output."""
+    """Numbers are stored like this in a line of output."""
     if isinstance(kind, value_types.FloatingType):
         return z3.fpToIEEEBV(value if kind.bits == 64 else z3.fpFPToFP(NEAREST, value, DOUBLE))
     bits = as_bits(value) if z3.is_bool(value) else value
@@ -109,11 +109,7 @@ def _word(value: Term, kind: Type) -> Term:
 
 
 class FormTerms:
-    """Translates one event on a topic.
-
-    `functions` are the functions of its set, `values` the types of its messages. `lines` has the module's lines of
-    output, by number.
-    """
+    """Translates one event on a topic. `lines` has the module's lines of output, by number."""
 
     def __init__(
         self,
@@ -143,7 +139,7 @@ class FormTerms:
         self._shared: Sequence[str] = self._function.shared
 
     def result(self) -> FormResult:
-        """Return the result. Raises `NotProvedError` for a loop."""
+        """Raises `NotProvedError` for a loop."""
         begin, no = self._beginning, z3.BoolVal(False)
         budget = begin.budgets[self._function.context]
         slots: dict[Any, Any] = {_MESSAGE: begin.message, _DROPPED: no, _REPLACED: no, _CHANGED: no}
@@ -256,7 +252,7 @@ class FormTerms:
         state.slots[_REPLACED] = z3.BoolVal(True)
 
     def _put_safe(self, safe: nodes.SafeMessage, state: State) -> None:
-        """Replace the message, except for `seq` and `stamp` of its header."""
+        """Keep `seq` and `stamp` of the header."""
         message, changed = state.slots[_MESSAGE], state.slots[_CHANGED]
         place = SAFE_HEAD if safe.stamped else 0
         while place < len(
@@ -271,7 +267,7 @@ class FormTerms:
         state.slots |= {_MESSAGE: message, _CHANGED: changed}
 
     def _log(self, node: nodes.Log, state: State) -> None:
-        """Charge the highest possible cost of a line."""
+        """Charge the highest possible cost."""
         line = OutputLine("", node)
         cost, words = integer(line.cost, 64), []
         for expression in line.values:
@@ -299,7 +295,7 @@ class FormTerms:
         state.slots[_SAID] = begin + (offset + 7 & ~7)
 
     def _pending(self, node: nodes.Pending, state: State) -> None:
-        """Do nothing: only `Whole` uses this list, and `Whole` is not compiled."""
+        """Only `Whole` uses this list, and it is not compiled."""
 
     def _require(self, node: nodes.Require, state: State) -> None:
         test = self._value(node.test, state)
@@ -427,7 +423,7 @@ class FormTerms:
             state.slots[_CHANGED] = either(state.slots[_CHANGED], differs)
 
     def _packed(self, value: Term, kind: Type, state: State) -> Term:
-        """Encode a number. The bits of a NaN are left to Python."""
+        """The bits of a NaN are left to Python."""
         if isinstance(kind, value_types.FloatingType):
             self._leave_to_python(state, z3.fpIsNaN(value))
             return z3.fpToIEEEBV(value)
@@ -520,7 +516,7 @@ class FormTerms:
     def _truncated(self, value: Term, target: value_types.IntegerType) -> Term:
         """Truncate toward zero, within the limits of the type.
 
-        For types narrower than 32 bits, first use the limits of `int`.
+        Types narrower than 32 bits are first limited as `int`.
         """
         whole = target if target.bits >= 32 else value_types.INT
         bits = whole.bits
@@ -582,10 +578,8 @@ class FormTerms:
         return self._of_parts(node.type, seconds, rest, state)
 
     def _of_parts(self, kind: Type, seconds: Term, rest: Term, state: State) -> Term:
-        """Return the exact time.
-
-        Seconds beyond 2**33 are out of range for all allowed nanoseconds. Below that limit, the sum in 72 bits shows
-        whether the sum in 64 bits overflows.
+        """Seconds beyond 2**33 are out of range for all allowed nanoseconds. Below that limit, the sum in 72 bits
+        shows whether the sum in 64 bits overflows.
         """
         far = either(seconds >= 1 << 33, seconds <= -(1 << 33), rest >= 1 << 62, rest <= -(1 << 62))
         known = state.where(far)
@@ -651,7 +645,7 @@ class FormTerms:
         return self._beginning.now
 
     def _throttle(self, node: nodes.Throttle, state: State) -> Any:
-        """Leave the message to Python if the output is due; otherwise do nothing."""
+        """Leave the message to Python if the output is due."""
         last = self._beginning.throttles.get((self._function.context, node.site))
         if last is None:
             raise UnknownError("output with a rate limit")

@@ -1,6 +1,6 @@
-"""Translate a function of a WebAssembly module to terms of z3, by the standard of WebAssembly.
+"""Translate a function of a WebAssembly module to terms of z3.
 
-Memory has these parts. Access to any other address counts as a difference:
+Memory has these parts; access to any other address counts as a difference:
 
 - cells, 8 bytes each at constant addresses: variables, budgets, times, and the end of the log (`UNDO`);
 - the message, from the address that the function gets: all reads and writes are within its size;
@@ -46,7 +46,6 @@ from rosmop.prove.terms import (
 )
 
 POSITION, UNDO, SAID = 0, 8, 12
-"""Addresses of the frame, the end of the log and the end of the lines."""
 
 _ENTRY = 16  # bytes of an entry: address, size (4 bytes each), old bytes
 _MESSAGE, _NOTE, _LINES = "message", "note", "lines"
@@ -57,7 +56,7 @@ _SORTS: Mapping[str, Any] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Pointer:
-    """An address: an offset from the start of the message, or of the next entry of the log."""
+    """An offset from the start of the message, or of the next entry of the log."""
 
     place: str
     offset: Term
@@ -75,10 +74,7 @@ class _Note:
 
 @dataclass(frozen=True)
 class ModuleResult:
-    """The result of the function of an event.
-
-    `bits` are its return value, unless it has `trapped`. `outside`: it reads beyond the message.
-    """
+    """`bits` are the return value, unless the function has `trapped`. `outside`: it reads beyond the message."""
 
     trapped: Term
     outside: Term
@@ -91,7 +87,7 @@ class ModuleResult:
 
 
 class ModuleExecution:
-    """Executes the function of one event, by its number, on these cells. Booleans in cells are also numbers.
+    """Executes the function of one event on these cells. Booleans in cells are also numbers.
 
     `strings` are the addresses of strings, and of the cells that refer to strings.
     """
@@ -128,7 +124,7 @@ class ModuleExecution:
         self._number = number
 
     def done(self) -> ModuleResult:
-        """Return the result of the function. Raises `DiffersError` and `NotProvedError`."""
+        """Raises `DiffersError` and `NotProvedError`."""
         state = self._state
         bits = _bits(self._call(self._number, [Pointer("message", integer(0, 32)), self._size], state))
         cells = {
@@ -142,7 +138,7 @@ class ModuleExecution:
         )  # fmt: skip
 
     def _call(self, number: int, arguments: Sequence[Any], state: State) -> Any:
-        """Return the value of a function call. `state` becomes the state after the call."""
+        """`state` becomes the state after the call."""
         code = self._functions[number]
         self._frames += 1
         outer = self._frame, self._returned
@@ -405,7 +401,7 @@ def _calculated(family: str, name: str, operands: Sequence[float], stack: list[A
 
 
 def _cut(value: Term, bits: int, *, signed: bool) -> Term:
-    """Return the result of `trunc_sat`: rounded toward zero, saturated, 0 for NaN."""
+    """`trunc_sat`: round toward zero, saturate, 0 for NaN."""
     least, most = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
     whole = (z3.fpToSBV if signed else z3.fpToUBV)(z3.RTZ(), value, z3.BitVecSort(bits))
     # A value between a limit and the next whole number can only be cut to the limit.

@@ -13,7 +13,7 @@ from typing import Any
 import z3
 
 Term = Any
-"""A term of z3, which has no Python types."""
+"""Z3 has no Python types."""
 
 DOUBLE, SINGLE = z3.Float64(), z3.Float32()
 NEAREST = z3.RNE()
@@ -27,14 +27,14 @@ class NotProvedError(Exception):
 
 
 class _Mixed:
-    """The content of a slot that has different kinds of values in two branches. It must not be read."""
+    """A slot has different kinds of values in two branches, and must not be read."""
 
 
 MIXED = _Mixed()
 
 
 class DiffersError(Exception):
-    """The WebAssembly module behaves differently from the form."""
+    """The module behaves differently from the form."""
 
 
 def integer(value: int, bits: int) -> Term:
@@ -42,7 +42,7 @@ def integer(value: int, bits: int) -> Term:
 
 
 def floating(value: float, bits: int) -> Term:
-    """Return a floating-point constant, exact to the last bit."""
+    """The constant is exact to the last bit."""
     number = int.from_bytes(struct.pack("<d" if bits == 64 else "<f", value), "little")
     return z3.simplify(z3.fpBVToFP(integer(number, bits), DOUBLE if bits == 64 else SINGLE))
 
@@ -69,7 +69,7 @@ def opposite(condition: Term) -> Term:
 
 
 def choice(test: Term, yes: Term, no: Term) -> Term:
-    """Return `test ? yes : no` for terms, or for structures of terms.
+    """`test ? yes : no` for terms, or for structures of terms.
 
     A part that only one structure has is taken from that structure.
     """
@@ -100,13 +100,13 @@ def as_bits(truth: Term, bits: int = 32) -> Term:
 
 
 def number_at(message: Term, position: Term, size: int) -> Term:
-    """Return the little-endian number in the `size` bytes that start at a position."""
+    """The number is little-endian."""
     every = [z3.Select(message, position + integer(more, 32) if more else position) for more in range(size)]
     return every[0] if size == 1 else z3.Concat(*reversed(every))
 
 
 def with_number(message: Term, position: Term, value: Term) -> Term:
-    """Return the message with the little-endian bytes of `value` at a position."""
+    """Write `value` in little-endian order."""
     for more in range(value.size() // 8):
         place = position + integer(more, 32) if more else position
         message = z3.Store(message, place, z3.Extract(8 * more + 7, 8 * more, value))
@@ -114,13 +114,13 @@ def with_number(message: Term, position: Term, value: Term) -> Term:
 
 
 def with_sign(value: Term, sign: Term) -> Term:
-    """Return `copysign(value, sign)`. The sign of a NaN is not known."""
+    """`copysign`; the sign of a NaN is not known."""
     return z3.If(z3.fpIsNegative(sign), z3.fpNeg(z3.fpAbs(value)), z3.fpAbs(value))
 
 
 @dataclass
 class State:
-    """The state at a point of a function: the condition under which it is reached (`alive`), and values (`slots`)."""
+    """A point of a function: the condition under which it is reached (`alive`), and values."""
 
     alive: Term
     slots: dict[Any, Any]
@@ -132,14 +132,13 @@ class State:
         self.alive = both(self.alive, condition)
 
     def join(self, test: Term, yes: "State", no: "State") -> None:
-        """Continue after two branches."""
         whole = yes.alive.eq(both(self.alive, test)) and no.alive.eq(both(self.alive, opposite(test)))
         self.alive = self.alive if whole else either(yes.alive, no.alive)
         self.slots = merged(test, yes, no)
 
 
 def merged(test: Term, yes: State, no: State) -> dict[Any, Any]:
-    """Return the values after two branches; a branch that has ended has none."""
+    """A branch that has ended has no values."""
     if z3.is_false(no.alive):
         return yes.slots
     if z3.is_false(yes.alive):
@@ -149,9 +148,7 @@ def merged(test: Term, yes: State, no: State) -> dict[Any, Any]:
 
 @dataclass(frozen=True)
 class StartTerms:
-    """The initial state of an event: message and size, time, variables by name, budgets by context, and times of output
-    by context and site.
-    """
+    """The initial state of an event; budgets are by context, times of output by context and site."""
 
     message: Term
     size: Term
@@ -163,7 +160,7 @@ class StartTerms:
 
 @dataclass(frozen=True)
 class LineTerm:
-    """A part of a line of output at an offset: under the condition `alive`, it is one of these values."""
+    """A part of a line of output: under the condition `alive`, it is one of the allowed values."""
 
     alive: Term
     offset: Term
@@ -172,10 +169,9 @@ class LineTerm:
 
 @dataclass(frozen=True)
 class FormResult:
-    """The result of an event.
+    """The result of an event, valid unless `left` (the condition of a fault) or one of `unknown` (by reason) holds.
 
-    `left` is the condition of a fault, and `unknown` has, by name, the conditions under which the result is unknown.
-    The other fields are valid if neither holds. The lines of output are `noted`, and take `said` bytes.
+    The lines of output are `noted`, and take `said` bytes.
     """
 
     left: Term
@@ -228,7 +224,6 @@ def abstracted(terms: Sequence[Term], *, floats: bool = False) -> list[Term]:
 
 
 def _abstracted(term: Term, operands: Sequence[Term], *, floats: bool) -> Term:
-    """Return a term with these operands; its result is a variable if its operation is costly."""
     kind, parts = term.decl().kind(), term.children()
     sorts = [part.sort() for part in (*parts, term)]
     if floats and any(sort.kind() in _FLOATING for sort in sorts):
@@ -245,7 +240,6 @@ def _abstracted(term: Term, operands: Sequence[Term], *, floats: bool) -> Term:
 
 
 def _is_cheap(kind: int, operands: Sequence[Term]) -> bool:
-    """Return whether an operation is cheap: only on constants, or a product with a small constant."""
     small = any(z3.is_bv_value(operand) and operand.as_long() < _SMALL for operand in operands)
     return (kind == z3.Z3_OP_BMUL and small) or all(map(_is_number, operands))
 

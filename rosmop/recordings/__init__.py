@@ -1,1 +1,1 @@
-"""Read recordings: bags and MCAP files, one message after the other, and run monitors on them."""
+"""Read recordings (bags and MCAP files), and run monitors on them."""

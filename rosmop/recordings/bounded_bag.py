@@ -46,15 +46,13 @@ _Entry = tuple[int, int, int]  # nanoseconds, offset of the chunk in the file, o
 
 
 class _Content(NamedTuple):
-    """The records of a chunk: in `file`, from `begin` to `end`."""
-
     file: BinaryIO
     begin: int
     end: int
 
 
 class BoundedReader(Reader):
-    """The reader of `rosbags`; raises `ReaderError` and `ValueError` beyond a limit."""
+    """Raises `ReaderError` and `ValueError` beyond a limit."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(regular_files.BoundedPath(path))
@@ -72,10 +70,10 @@ class BoundedReader(Reader):
         return sum(sum(info.connection_counts.values()) for info in self.chunk_infos)
 
     def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
-        """Skip the index of one connection in one chunk: `in_order` reads it when the chunk's time has come."""
+        """`in_order` reads the index of a chunk when its time has come."""
 
     def in_order(self) -> Iterator[tuple[Connection, int, bytes]]:
-        """Yield connection, nanoseconds and bytes of every message: by time, then by position in the file."""
+        """Yield nanoseconds and bytes: by time, then by position in the file."""
         connections = {connection.id: connection for connection in self.connections}
         self._entries = 0
         self._unread.clear()
@@ -93,7 +91,6 @@ class BoundedReader(Reader):
                 yield connections[number], time, data
 
     def _message(self, place: int, offset: int, time: int) -> tuple[int, bytes]:
-        """Return the connection's number and the bytes of the message at an offset in the chunk at `place`."""
         file, begin, end = self._content(place)
         file.seek(begin + offset)
         while (header := Header.read(file)).get_uint8("op") == RecordType.CONNECTION:
@@ -126,7 +123,6 @@ class BoundedReader(Reader):
         return entries
 
     def _content(self, place: int) -> _Content:
-        """Return the content of the chunk at `place`: the bag itself, or the unpacked chunk."""
         assert self.bio is not None  # noqa: S101  the reader is open
         chunk = self.chunks[place]
         if chunk.decompressor not in _UNPACKERS:

@@ -35,7 +35,7 @@ class _ChunkPlace(NamedTuple):
 
 
 class BoundedMcap:
-    """An open MCAP file. Its `connections` are its ROS 1 channels.
+    """An open MCAP file, whose `connections` are its ROS 1 channels.
 
     Raises `McapError`, `ValueError` and the errors of the decompressors for a damaged file.
     """
@@ -54,7 +54,7 @@ class BoundedMcap:
         self._file.close()
 
     def in_order(self) -> Iterator[tuple[Connection, int, bytes]]:
-        """Yield connection, nanoseconds and bytes of every message: by time, then by position in the file."""
+        """Yield nanoseconds and bytes: by time, then by position in the file."""
         connections = {connection.id: connection for connection in self.connections}
         waiting: list[tuple[int, int, int, int, bytes]] = []
         held = 0
@@ -163,7 +163,7 @@ def _unpacked(chunk: Chunk) -> bytes:
 
 
 def _md5sum(kind: str, text: str) -> str:
-    """Return the md5sum of a definition; if it cannot be read, a string that is not an md5sum."""
+    """Return a string that is not an md5sum if the definition cannot be read."""
     try:
         return Definitions.from_full_text(kind, text).md5sum(kind)
     except DefinitionError:

@@ -1,4 +1,4 @@
-"""Open recordings: bags and MCAP files, told apart by their first bytes."""
+"""Open recordings: bags and MCAP files, distinguished by their first bytes."""
 
 import struct
 from collections.abc import Iterator, Sequence
@@ -27,17 +27,17 @@ _DAMAGE = (
 
 
 class RecordingError(Exception):
-    """A recording cannot be read or used; the text names the recording and the reason."""
+    """The text names the recording and the reason."""
 
 
 def ros_type(name: str) -> str:
-    """Return `package/Type` for the reader's `package/msg/Type`."""
+    """The reader writes `package/msg/Type`."""
     package, _, kind = name.partition("/")
     return f"{package}/{kind.rpartition('/')[2]}"
 
 
 def open_recording(path: Path) -> Reader:
-    """Open a recording. Raises `RecordingError`."""
+    """Raises `RecordingError`."""
     is_mcap = False
     try:
         if path.is_file():
@@ -59,7 +59,7 @@ def open_recording(path: Path) -> Reader:
 
 
 def messages_of(reader: Reader) -> Iterator[tuple[Connection, int, bytes]]:
-    """Yield connection, time in nanoseconds and bytes of every message, in order.
+    """Yield times in nanoseconds.
 
     Raises `RecordingError` for a damaged file.
     """
@@ -74,7 +74,7 @@ def _text_of(error: Exception) -> str:
 
 
 def definitions_of(reader: Reader) -> Definitions:
-    """Return the message definitions in the recording, without those that cannot be parsed."""
+    """Definitions that cannot be parsed are left out."""
     found: dict[str, MessageDefinition] = {}
     sent = dict.fromkeys((ros_type(row.msgtype), row.msgdef.data) for row in reader.connections)
     for name, text in sent:
@@ -93,8 +93,8 @@ def fits(topic: str, patterns: Sequence[str]) -> bool:
 class RecordedFile:
     """The messages of a recording on topics that match a pattern, read again for each pass.
 
-    `definitions` has the message definitions of the recording. Raises `RecordingError` for a recording that cannot be
-    read, has no messages, or has two types on one topic. `name` is its name for messages to the user.
+    `name` is for messages to the user. Raises `RecordingError` for a recording that cannot be read, has no messages,
+    or has two types on one topic.
     """
 
     def __init__(self, path: Path, patterns: Sequence[str], name: str | None = None) -> None:
@@ -116,7 +116,7 @@ class RecordedFile:
                     raise RecordingError(f"{path}: {connection.topic} carries both {other} and {kind}")
 
     def messages(self) -> Iterator[tuple[str, int, bytes]]:
-        """Yield topic, time in nanoseconds and bytes of every message, in order. Raises `RecordingError`."""
+        """Yield times in nanoseconds. Raises `RecordingError`."""
         with closing(open_recording(self._path)) as reader:
             for connection, time_ns, data in messages_of(reader):
                 if connection.topic in self.topics:

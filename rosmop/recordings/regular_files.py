@@ -8,7 +8,7 @@ from pathlib import Path, PosixPath
 from typing import BinaryIO
 
 LARGEST_CHUNK = 256 << 20
-"""The limit in bytes of one read, and of an unpacked chunk."""
+"""In bytes, for one read, and for an unpacked chunk."""
 _LONGEST_LINE = 64
 _NULL = os.makedev(1, 3)  # /dev/null: an empty file
 _KINDS = {
@@ -23,7 +23,7 @@ _KINDS = {
 def open_regular(path: Path) -> BufferedReader:
     """Open a regular file, or the pipe that a shell made for `<(command)` or `command |`. Raises `OSError`.
 
-    Other files are rejected: a named pipe may block its reader for ever, and a device may be endless.
+    Other files are rejected: a named pipe may block its reader forever, and a device may be endless.
     """
     descriptor = os.open(os.fspath(path), os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     try:
@@ -41,10 +41,10 @@ def open_regular(path: Path) -> BufferedReader:
 
 
 class _BoundedFile(BufferedReader):
-    """A file with a limit for each read."""
+    """Limits each read."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Read bytes, at most `LARGEST_CHUNK`. Raises `ValueError` for more."""
+        """Raises `ValueError` beyond `LARGEST_CHUNK` bytes."""
         if size is None or not 0 <= size <= LARGEST_CHUNK:
             raise ValueError(f"it has a record of more than {LARGEST_CHUNK} bytes.")
         return super().read(size)
@@ -57,5 +57,5 @@ class BoundedPath(PosixPath):
     """The path of a regular file that is read in bounded pieces."""
 
     def open(self, *_mode: object) -> BinaryIO:  # type: ignore[override] # readers of recordings ask for bytes
-        """Open the file. Raises `OSError`."""
+        """Raises `OSError`."""
         return _BoundedFile(open_regular(Path(self)).detach())

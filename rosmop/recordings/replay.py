@@ -1,4 +1,4 @@
-"""Run monitors on a recording, and write the messages that subscribers would have received into a bag.
+"""Run monitors on a recording, and write a bag with the messages that subscribers would have received.
 
 Messages of a topic with a different definition than the specifications expect are dropped.
 """
@@ -22,9 +22,9 @@ _OWN = "/rosrv"  # caller id of messages that monitors publish; monitors do not 
 
 @dataclass(frozen=True)
 class ReplayStep:
-    """The outcome of one message or, without a topic, of a tick or deadline.
+    """The outcome of a message, or without a topic, of a tick or deadline.
 
-    A message without an index was published by the monitor `publisher`, and has gone through the monitors behind it.
+    A message without an index was published by the monitor `publisher`, and went through the monitors behind it.
     """
 
     outcome: Outcome
@@ -38,9 +38,9 @@ _Header = tuple[str, str, str, str, str | None, int | None]
 
 
 class OutputBag:
-    """Write a bag of the messages that subscribers would have received. Raises `RecordingError`.
+    """Raises `RecordingError`.
 
-    Tools order messages of the same time by their connections. So a message after or before one of a monitor gets a
+    Tools order messages of the same time by their connections. So a message before or after one of a monitor gets a
     later time than the earlier of the two, if need be by a nanosecond.
     """
 
@@ -99,7 +99,7 @@ def replay(
     topics: Sequence[str] = ("*",),
     span: tuple[int, int] = (0, 1 << 63),
 ) -> Iterator[ReplayStep]:
-    """Run the monitors on the messages of a bag, in its order and by its clock.
+    """The order and the clock are those of the bag.
 
     `topics` are patterns; `span` is the first and last time in nanoseconds since the epoch.
     """
@@ -147,7 +147,7 @@ def _steps(step: ReplayStep) -> Iterator[ReplayStep]:
 
 
 class _Caller:
-    """The host and the caller id of the current message; a recording does not have the host."""
+    """A recording does not have the host."""
 
     name = ""
 
@@ -156,7 +156,7 @@ class _Caller:
 
 
 class _ExplainOnce:
-    """Select verdicts for explanation: in each second, the first of each category and binding of a property."""
+    """In each second, the first verdict of each category and binding of a property is explained."""
 
     def __init__(self) -> None:
         self.now = 0
@@ -189,7 +189,7 @@ def _outcome(  # noqa: PLR0917  a message and its facts
 
 
 def _after(started: Outcome, outcome: Outcome) -> Outcome:
-    """Return the outcome of the first message, with the output of `init` in front."""
+    """The output of `init` comes before the first message."""
     shift = len(started.published)
     outcome.judged = {**started.judged, **{shift + number: one for number, one in outcome.judged.items()}}
     outcome.handling = {
@@ -202,7 +202,7 @@ def _after(started: Outcome, outcome: Outcome) -> Outcome:
 
 
 def _refusal(monitors: MonitorSet, connection: Connection) -> str | None:
-    """Return why the monitors drop the messages of a connection, or None."""
+    """Return why the monitors drop messages of a connection, or None."""
     wanted = monitors.topics.get(connection.topic)
     if wanted is None:
         return None
@@ -215,7 +215,7 @@ def _refusal(monitors: MonitorSet, connection: Connection) -> str | None:
 
 
 def refusals(monitors: MonitorSet, reader: Reader, topics: Sequence[str] = ("*",)) -> list[str]:
-    """Return the reasons why messages on topics that match a pattern are dropped."""
+    """Return why messages on topics that match a pattern are dropped."""
     found = [
         _refusal(monitors, connection) for connection in reader.connections if fits(connection.topic, topics)
     ]

@@ -1,1 +1,1 @@
-"""Runs specifications: interpreter, engine, slices, timers, explanations. No I/O, no clock."""
+"""Run specifications: interpreter, engine, slices, timers, explanations. No I/O, no clock."""

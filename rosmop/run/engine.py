@@ -4,16 +4,17 @@ Theory of operation:
 
 1. `MonitorSet.of` takes compiled specifications; `start` gives the variables their first values.
 2. `process` gives a message to the events on its topic (`execution.py`).
-3. The caller gives the time, in nanoseconds, with every message. Ticks and deadlines that are due (`timers.py`) happen
-   before the message; `process` returns their outcomes in `before`. While no message comes, the caller calls `advance`
-   at `next_due`. Deadlines may change in the meantime.
-4. For most topics, `lane` returns a lane of the fast path (`fast_path.py`). A lane processes many messages at once, as
-   long as no message has to be recorded or explained. The results are the same as those of `process`.
-5. `succeed` replaces another set between two messages. Specifications with the same text keep their variables and runs.
-6. Specifications in shadow mode are in separate sets (`shadows`), so that they do not affect other specifications. Each
-   set has specifications that share variables. `tapped` collects copies of their messages. After a message is passed
-   on, the caller gives its copies in order to the sets (`ShadowCopy.give`). The outcome lists the actions that the
-   specifications would have taken.
+3. The caller gives the time, in nanoseconds, with every message. Ticks and deadlines that are due (`timers.py`)
+   happen before the message; `process` returns their outcomes in `before`. While no message comes, the caller calls
+   `advance` at `next_due`, which may change in the meantime.
+4. For most topics, `lane` returns a lane of the fast path (`fast_path.py`). A lane processes many messages at once,
+   as long as none has to be recorded or explained, with the same results.
+5. `succeed` replaces another set between two messages. Specifications with the same text keep their variables and
+   runs.
+6. Specifications in shadow mode are in separate sets (`shadows`), so that they do not affect other specifications.
+   Each set has specifications that share variables. `tapped` collects copies of their messages. After a message is
+   passed on, the caller gives its copies in order to the sets (`ShadowCopy.give`). The outcome lists the actions that
+   the specifications would have taken.
 """
 
 import sys
@@ -56,7 +57,7 @@ from rosmop.runtime.wire import Buffer, WireMessage
 from roswire.definitions import Definitions
 
 GivenValues = Mapping[str, Mapping[str, bool | int | float | str]]
-"""Values of given constants, by specification and name."""
+"""By specification and name."""
 
 _CHANGED = "its text, or the definition of a message, has changed, and its state is lost"
 
@@ -66,13 +67,13 @@ def _never() -> bool:
 
 
 class _Tap(Step):
-    """A pseudo-event that never happens: it copies messages for specifications in shadow mode."""
+    """A pseudo-event that never happens: it copies messages for shadow mode."""
 
     __slots__ = ()
 
 
 class ShadowCopy(NamedTuple):
-    """A copy of a message for specifications in shadow mode: topic or service, part of the service, time."""
+    """A copy of a message for specifications in shadow mode."""
 
     shadow: "MonitorSet"
     resource: str
@@ -81,17 +82,16 @@ class ShadowCopy(NamedTuple):
     time: int
 
     def give(self, sender: MessageSender = NOBODY) -> Outcome:
-        """Process the copy, and return the outcome as if the specifications were in force."""
         if self.part is None:
             return self.shadow.process(self.resource, self.data, self.time, sender)
         return self.shadow.process_service(self.resource, self.part, self.data, self.time, sender)
 
 
 class KeptGroup:
-    """A group of specifications, and its state as data that the caller keeps (`MonitorSet.kept_groups`).
+    """A group of specifications, and its state as data that the caller keeps.
 
-    The state is `base`; or `base` and newer `cells`, whose layout is `layout` and whose size is `size` (bytes). The
-    slices of parametric specifications are kept in parts, of the specifications in `part_names`.
+    The state is `base`; or `base` and newer `cells` of `size` bytes, with the layout `layout`. The slices of
+    parametric specifications are in parts, of the specifications in `part_names`.
     """
 
     def __init__(
@@ -116,13 +116,13 @@ class KeptGroup:
         return 0 if self._group.home is None else self._group.home.size
 
     def cells(self) -> bytes | None:
-        """Return the cells if only they may have changed (empty: nothing has). None: keep `base` and the parts."""
+        """Return the cells (empty if unchanged), or None if `base` and the parts must be kept."""
         if self._group.changed:
             return None
         return b"" if self._group.home is None else self._group.home.cells()
 
     def base(self) -> bytes:
-        """Return the state as data. If the state is too large, return the reason why it is not saved."""
+        """Return the state, or the reason why it is too large to be saved."""
         group = self._group
         try:
             data = encoded([
@@ -148,7 +148,7 @@ class KeptGroup:
 
 
 class MonitorSet:
-    """A set of specifications that run together."""
+    """Specifications that run together."""
 
     def __init__(
         self,
@@ -162,10 +162,10 @@ class MonitorSet:
         deadlines: int = sys.maxsize,
         holder_of: HolderOf = no_holder,
     ) -> None:
-        """`compiled` has all specifications in order; `shadows` has those in shadow mode.
+        """Without `fast` the engine processes every message.
 
-        `fast` was compiled from the other specifications; without it the engine processes every message. At most
-        `deadlines` deadlines of slices pass at a time. `holder_of(source)` is charged for slices (`slice_quota.py`).
+        At most `deadlines` deadlines of slices pass at a time. `holder_of(source)` is charged for slices
+        (`slice_quota.py`).
         """
         shadowed = {name for shadow in shadows for name in shadow.names}
         self.names: tuple[str, ...] = tuple(one.name for one in compiled.specifications)
@@ -228,10 +228,10 @@ class MonitorSet:
         deadlines: int = sys.maxsize,
         holder_of: HolderOf = no_holder,
     ) -> "MonitorSet":
-        """Return the set. If a specification is in `shadows`, all that share variables with it are in shadow mode.
+        """If a specification is in `shadows`, all that share variables with it are in shadow mode.
 
-        When something is due, `patience()` is called (in shadow mode: `shadow_patience()`). It returns a function that
-        returns whether the work takes too long. A parametric specification has at most `slices` slices.
+        When something is due, `patience()` (in shadow mode: `shadow_patience()`) returns a function that returns
+        whether the work takes too long. A parametric specification has at most `slices` slices.
         """
         shadowed = []
         for group in compiled.groups(shadows):
@@ -341,13 +341,13 @@ class MonitorSet:
         )
 
     def _is_true(self, monitor: MonitorInstance, variable: str) -> bool:
-        """Return the value of a variable, without moving the state of its monitor."""
+        """The state of its monitor stays where it is."""
         if monitor.home is not None:
             return monitor.home.is_true(variable)
         return bool(self.interpreter.variables[variable])
 
     def type_of(self, topic: str, *, shadowed: bool = False) -> str | None:
-        """Return the message type of a topic with enabled events, or None. Shadow mode counts only if `shadowed`."""
+        """Return None without enabled events. Shadow mode counts only if `shadowed`."""
         steps = self.steps.get(topic, ())
         return next((step.event.type for step in steps if shadowed or not isinstance(step, _Tap)), None)
 
@@ -355,7 +355,7 @@ class MonitorSet:
         return self.compiled.is_stamped(self.type_of(topic, shadowed=True))
 
     def service_type_of(self, service: str, *, shadowed: bool = False) -> str | None:
-        """Return the type of a service with enabled events, or None. Shadow mode counts only if `shadowed`."""
+        """Return None without enabled events. Shadow mode counts only if `shadowed`."""
         for part in ("request", "response"):
             for step in self.steps.get(channel_of(service, part), ()):
                 if shadowed or not isinstance(step, _Tap):
@@ -363,7 +363,7 @@ class MonitorSet:
         return None
 
     def limit_time(self, clock: Callable[[], float], seconds: float) -> None:
-        """Bound the processor time that all monitors together spend on one message; `clock` returns seconds.
+        """Bound the processor time (seconds) of all monitors together for one message; `clock` returns seconds.
 
         Exceeding it is a fault. The same bound holds for ticks, deadlines, and monitors in shadow mode.
         """
@@ -371,7 +371,7 @@ class MonitorSet:
             part.interpreter.turn.limit(clock, seconds)
 
     def hurry(self, part: float) -> None:
-        """Set the fraction of the time from `limit_time` that messages may take."""
+        """Messages may take this fraction of the time of `limit_time`."""
         self.interpreter.turn.part = part
 
     @property
@@ -379,7 +379,7 @@ class MonitorSet:
         return self.interpreter.turn.late()
 
     def name_senders(self, names: Callable[[int], tuple[str, str]]) -> None:
-        """Set how the host and the caller id of a source are found; both are empty for source 0."""
+        """Set how the host and the caller id of a source are found; source 0 has neither."""
 
         def encoded(source: int) -> tuple[bytes, bytes]:
             host, caller = names(source) if source else ("", "")
@@ -389,7 +389,7 @@ class MonitorSet:
             part.interpreter.turn.names = encoded
 
     def explain_when(self, asked: Asked, shadowed: Asked) -> None:
-        """Explain a verdict only if `asked` (in shadow mode: `shadowed`) returns true for the message's source."""
+        """Explain a verdict only if `asked` (in shadow mode: `shadowed`) is true for the message's source."""
         self._execution.asked = asked
         for shadow in self.shadows:
             shadow.explain_when(shadowed, shadowed)
@@ -400,46 +400,42 @@ class MonitorSet:
 
     @property
     def area(self) -> memoryview | None:
-        """Return memory to receive frames in, so that lanes need no copy; None without lanes."""
+        """Memory to receive frames in, so that lanes need no copy; None without lanes."""
         return self._lanes.area
 
     def contexts(self, topic: str) -> tuple[Context, ...]:
         return self._contexts.get(topic, ())
 
     def lane(self, topic: str) -> FastLane | None:
-        """Return the lane for a topic, or `channel_of` a service; None if there is none."""
+        """Return the lane of a topic, or `channel_of` a service."""
         return self._lanes.of_topic.get(topic) if topic in self.steps and not self.taps(topic) else None
 
     def lane_ready(self, lane: FastLane, time_ns: int) -> bool:
-        """Return whether the lane may be used.
-
-        Nothing may be due, no monitor may wait for its first message, and none may have failed to start.
-        """
+        """Nothing may be due, no monitor may wait for its first message, and none may have failed to start."""
         return not self._agenda.has_come(time_ns) and not self._broken and lane.ready()
 
     def monitor(self, name: str) -> MonitorInstance:
-        """Return a running specification by name; raises KeyError."""
+        """Raises `KeyError`."""
         for monitor in self._monitors:
             if monitor.name == name:
                 return monitor
         raise KeyError(name)
 
     def value(self, name: str, variable: str) -> Any:
-        """Return the value of a shared variable of a running specification; raises KeyError."""
+        """Raises `KeyError`."""
         monitor = self.monitor(name)
         monitor.move_to_python()
         return self.interpreter.variables[monitor.code.variables[variable]]
 
     def take_margins(self) -> Iterator[Margin]:
-        """Yield the closest true and the closest false result of each comparison since the last call.
-
-        There are none unless the set was compiled with `margins`.
+        """Yield the closest true and the closest false result of each comparison since the last call, if the set was
+        compiled with `margins`.
         """
         return taken_margins(self.monitors, self.interpreter.variables)
 
     @staticmethod
     def topics_of(monitors: Iterable[MonitorInstance]) -> frozenset[str]:
-        """Return the topics and services on whose messages these monitors have events."""
+        """Include services."""
         return frozenset(
             step.event.topic for monitor in monitors for step in monitor.steps if step.event.topic
         )
@@ -456,11 +452,11 @@ class MonitorSet:
     def start(
         self, time_ns: int, expected: frozenset[str] | None = None, *, restarted: bool = False
     ) -> Outcome:
-        """Set the first values, run `init`, and start the timers. The outcome has the output of `init`.
+        """Start, and return the output of `init`.
 
-        `expected` are topics that are known to carry messages, as in a recording. A specification with events on such a
-        topic starts its timers at its first message. With `restarted`, specifications with the modifier `hold` block
-        their topics until `resume`, except in shadow mode.
+        `expected` are topics that are known to carry messages, as in a recording. A specification with events on such
+        a topic starts its timers at its first message. With `restarted`, specifications declared `hold` block their
+        topics until `resume`, except in shadow mode.
         """
         outcome = self._start(self._monitors, time_ns, expected)
         for monitor in self._monitors if restarted else ():
@@ -470,7 +466,7 @@ class MonitorSet:
         return self._with_shadows(outcome, [shadow.start(time_ns, expected) for shadow in self.shadows])
 
     def kept_groups(self) -> "list[KeptGroup]":
-        """Return the groups, to keep their state outside the process; from now on, changes of slices are noted."""
+        """Their state can be kept outside the process; from now on, changes of slices are noted."""
         return [
             KeptGroup(group, self.interpreter.variables, self._types, _slice_parts(group))
             for group in self.groups
@@ -482,7 +478,7 @@ class MonitorSet:
         """Start with the state of earlier processes: for each specification, the last state in `kept`.
 
         A specification restarts if its state is `lost` (with the reason; key "": all) or unusable. Then `hold_lost`
-        decides whether it holds its topics. With `restarted`, specifications with the modifier `hold` always hold their
+        decides whether it holds its topics. With `restarted`, specifications declared `hold` always hold their
         topics. Safe messages are sent until a message comes on their topics.
         """
         states, slices, unread = states_of(kept)
@@ -520,37 +516,34 @@ class MonitorSet:
         return self._with_shadows(outcome, [shadow.start(time_ns) for shadow in self.shadows])
 
     def hold_lost(self, monitor: MonitorInstance, why: str) -> None:
-        """Handle the lost state of a monitor that has restarted.
-
-        The monitor holds its topics if it is declared `hold`, or if its actions depend on a state and it is not
-        declared `begin`.
+        """A monitor that has restarted without its state holds its topics if it is declared `hold`, or if its actions
+        depend on a state and it is not declared `begin`.
         """
         if self.holds_if_lost(monitor.code):
             self.hold(monitor, why)
 
     def hold(self, monitor: MonitorInstance, why: str) -> None:
-        """Let a specification drop the messages of its topics, and send its safe messages, until `resume`."""
+        """Drop the messages of its topics, and send its safe messages, until `resume`."""
         monitor.touch()
         monitor.hold(why)
         self._agenda.schedule()
 
     def guards(self, topic: str) -> list[str]:
-        """Return the names of the enabled monitors that have a safe message for a topic."""
+        """Return the enabled monitors that have a safe message for a topic."""
         return [monitor.name for monitor in self._monitors if monitor.enabled and topic in monitor.safes]
 
     def stop(self, topic: str) -> None:
-        """Send the safe messages on a topic until a message comes on it."""
+        """Send the safe messages until a message comes on the topic."""
         for monitor in self._monitors:
             if monitor.enabled and topic in monitor.safes:
                 monitor.starting.add(topic)
         self._agenda.schedule()
 
     def holds_if_lost(self, code: SpecificationCode) -> bool:
-        """Return whether a specification holds its topics if its state is lost."""
         return code.hold or (code.name in self._guards.names and not code.begins)
 
     def identity(self, code: SpecificationCode) -> bytes:
-        """Return what a specification's state belongs to: its text, and the definitions of its message types."""
+        """A state belongs to the text, and to the definitions of its message types."""
         return code.identity + self._types[code.name]
 
     def _start(
@@ -577,10 +570,10 @@ class MonitorSet:
         """Replace another set and start; `began` names the specifications that start with this set.
 
         Specifications with the same text keep their state, and `init` does not run again. They restart if the
-        definition of a message type that they use has changed. A specification that restarts continues to hold its
-        topics if it held them and is still declared `hold`. A specification that enters or leaves shadow mode keeps its
-        state; in shadow mode it holds no topic. Specifications in `incomplete` have missed messages in shadow mode, so
-        they restart when they leave it.
+        definition of a message type that they use has changed. A specification that restarts still holds its topics
+        if it held them and is still declared `hold`. A specification that enters or leaves shadow mode keeps its
+        state; in shadow mode it holds no topic. Specifications in `incomplete` have missed messages in shadow mode,
+        so they restart when they leave it.
         """
         known = {
             monitor.name: (monitor, part.interpreter.variables)
@@ -641,7 +634,7 @@ class MonitorSet:
         return outcome
 
     def switch(self, enabled: Mapping[str, bool], time_ns: int) -> tuple[MonitorInstance, ...]:
-        """Enable or disable monitors, ignoring unknown names; return the monitors that changed.
+        """Unknown names are ignored. Return the monitors that changed.
 
         The time while a monitor is disabled does not count: its timers, and its properties with time bounds, restart.
         """
@@ -669,9 +662,9 @@ class MonitorSet:
         return tuple(changed)
 
     def give(self, values: GivenValues) -> None:
-        """Set given constants, by specification and name; the others get their defaults.
+        """Set given constants, by specification and name; the others get their defaults. The state stays.
 
-        The state stays. Unknown names, and values outside of their ranges, are ignored: the caller has checked them.
+        Unknown names, and values outside their ranges, are ignored: the caller has checked them.
         """
         for part in (self, *self.shadows):
             for monitor in part._monitors:
@@ -686,7 +679,7 @@ class MonitorSet:
                         present[given.code] = value
 
     def resume(self, name: str) -> None:
-        """Let a specification that holds its topics pass messages again; raises KeyError."""
+        """Let a specification that holds its topics pass messages again. Raises `KeyError`."""
         monitor = self.monitor(name)
         monitor.resume()
         monitor.touch()
@@ -695,7 +688,6 @@ class MonitorSet:
     # Events
 
     def process(self, topic: str, buffer: Buffer, time_ns: int, sender: MessageSender = NOBODY) -> Outcome:
-        """Process a message: the bytes of its fields, received at this time on this topic."""
         outcome, steps = Outcome(buffer, time_ns), self.steps.get(topic, ())
         if self._agenda.has_come(time_ns):
             outcome.before = self.advance(time_ns)
@@ -728,10 +720,9 @@ class MonitorSet:
         prepare: Callable[[FastLane], BatchOptions],
         fuel: int = MESSAGE_FUEL,
     ) -> Outcome | None:
-        """Process a message on a topic, or `channel_of` a service, if its lane accepts the message.
+        """Return None, and do nothing, unless a lane accepts the message. The topic may be `channel_of` a service.
 
-        Return None if nothing was done. The arguments are those of `FastLane.process_message`: the options from
-        `prepare`, and the fuel.
+        `prepare` returns the options.
         """
         lane = self.lane(topic)
         if lane is None or not self.lane_ready(lane, time_ns):
@@ -745,11 +736,11 @@ class MonitorSet:
 
     @property
     def next_due(self) -> int | None:
-        """Return the time of the next tick or deadline; None if there is none."""
+        """The time of the next tick or deadline."""
         return self._agenda.due
 
     def advance(self, time_ns: int) -> list[Outcome]:
-        """Process the ticks up to this time and the deadlines before it, in the order of their times."""
+        """Process the ticks up to this time and the deadlines before it, in order of time."""
         outcomes = self._agenda.advance(time_ns, self._follow_up)
         self._agenda.schedule()
         return outcomes
@@ -761,7 +752,7 @@ class MonitorSet:
             self._judge_published(outcome)
 
     def _judge_published(self, outcome: Outcome) -> None:
-        """Give published messages to the monitors behind their publisher, whose own go to those behind them.
+        """Give published messages to the monitors behind their publisher, and theirs to those behind them.
 
         A message that a remedy publishes at a deadline also goes to its own monitor if that is `ordered`. There is
         still no loop: each other message goes only further back, and its deadlines are later than a message.
@@ -782,10 +773,10 @@ class MonitorSet:
             outcome.judged = judged
 
     def _after_faults(self, outcome: Outcome) -> None:
-        """Handle monitors that cannot judge, because an event that keeps a state up to date has faulted.
+        """A monitor cannot judge if an event that keeps its state up to date has faulted.
 
-        Those that are declared `begin` start again; the others hold their topics and keep their state. In shadow mode
-        none holds its topics.
+        If it is declared `begin`, it starts again; otherwise it keeps its state and holds its topics (not in shadow
+        mode).
         """
         for fault in outcome.faults if self.on_fault == "drop" else ():
             monitors = [

@@ -37,20 +37,19 @@ OnFault = Literal["drop", "pass"]
 Asked = Callable[[Verdict, int], bool]
 
 EXPLAINED = 3
-"""The maximum number of slices' verdicts that are explained for one message, or for one call with deadlines.
-
-Each explanation takes a millisecond.
+"""The limit of explained verdicts of slices for one message, or for one call with deadlines: each takes a
+millisecond.
 """
 
 SLICE_SECONDS = 50e-6
-"""Additional processor time of a message for each slice concerned."""
+"""More processor time of a message for each slice concerned."""
 
 TICK_BUDGET = 2_000
-"""The maximum number of instructions of each slice for a tick that concerns several slices."""
+"""For each slice, if a tick concerns several."""
 
 
 class MonitorExecution:
-    """Runs the events, properties and handlers of compiled specifications on the state of their monitors."""
+    """Runs events, properties and handlers on the state of monitors."""
 
     def __init__(self, interpreter: Interpreter, on_fault: OnFault, judging: Collection[str]) -> None:
         """A fault of an event's function in `judging` only drops the message (`Guards.judging`)."""
@@ -74,7 +73,7 @@ class MonitorExecution:
         self._passed: int | None = None
 
     def begin(self, monitors: Sequence[MonitorInstance], time_ns: int) -> Outcome:
-        """Start monitors in stages (constants, first values, `init`), because a monitor may read another monitor's
+        """Stages (constants, first values, `init`) are common, because a monitor may read another monitor's
         variables.
         """
         outcome = Outcome(time=time_ns)
@@ -100,7 +99,7 @@ class MonitorExecution:
         *,
         published: bool = False,
     ) -> None:
-        """Process a message received at the time of the outcome; `steps` is not empty.
+        """Process a message received at the time of the outcome.
 
         A message that a monitor has `published` has what is left of the time of the message that caused it.
         """
@@ -142,7 +141,7 @@ class MonitorExecution:
         self._finish(message, writers, outcome)
 
     def tick(self, step: Step, time_ns: int) -> Outcome:
-        """Process a tick; the caller calls `collect`."""
+        """The caller calls `collect`."""
         self._sender, self._function = NOBODY, None
         self._taking_back.clear()
         step.monitor.move_to_python()
@@ -172,7 +171,7 @@ class MonitorExecution:
         return outcome
 
     def send_safe(self, monitor: MonitorInstance, sender: SafeSender, time_ns: int) -> Outcome:
-        """Send a safe message, and return the outcome. All but the first of a series are `repeated`."""
+        """All but the first of a series are `repeated`."""
         safe = sender.safe
         outcome = Outcome(time=time_ns)
         outcome.timer, outcome.repeated = f"{monitor.name}.safe", sender.due is not None
@@ -187,7 +186,7 @@ class MonitorExecution:
     def expire(
         self, monitor: MonitorInstance, running: RunningProperty | None, *, explains: bool
     ) -> list[Outcome]:
-        """Process the deadline of a property, or, if `running` is None, the first deadline of a slice.
+        """Process the deadline of a property or, without `running`, the first deadline of a slice.
 
         Return the outcomes to report. A slice's verdict is explained only if `explains`.
         """
@@ -216,7 +215,7 @@ class MonitorExecution:
         return outcome
 
     def _expire_in_slice(self, monitor: MonitorInstance, slice_: Slice) -> list[Outcome]:
-        """Process the first deadline of a slice. A slice that lacks a parameter reports nothing."""
+        """A slice that lacks a parameter reports nothing."""
         slices = monitor.slices
         assert slices is not None  # noqa: S101  it has a slice
         deadline = slice_.deadline or 0
@@ -236,7 +235,7 @@ class MonitorExecution:
         return [outcome] if whole else []
 
     def _catch_up(self, monitor: MonitorInstance, behind: Sequence[Slice], outcome: Outcome) -> None:
-        """Process the overdue deadlines of slices before a message, after there were too many to process in time."""
+        """Process overdue deadlines of slices before a message, after there were too many to process in time."""
         turn, go_on = self._turn, monitor.context.put_off()
         kept = turn.log, turn.published, turn.looked, self._sender, self._bound, self._function
         turn.log, turn.published, turn.looked = [], [], {}
@@ -262,7 +261,7 @@ class MonitorExecution:
     # One event
 
     def _happen(self, step: Step, message: WireMessage, outcome: Outcome) -> bool:
-        """Run an event on the message; return whether it was dropped."""
+        """Return whether the message was dropped."""
         try:
             has_happened = step.function(message)
         except Exception as error:  # noqa: BLE001  any exception is a recorded fault of this action
@@ -284,7 +283,7 @@ class MonitorExecution:
         return False
 
     def _happen_in_slices(self, step: Step, message: WireMessage, outcome: Outcome) -> bool:
-        """Run an event of a parametric specification on the message; return whether it was dropped."""
+        """Return whether the message was dropped."""
         assert step.key is not None  # noqa: S101  the caller checks this
         try:
             found = step.key(message)
@@ -328,7 +327,7 @@ class MonitorExecution:
         outcome: Outcome,
         act: Callable[[Outcome, WireMessage | None], bool],
     ) -> None:
-        """Run an event in each of its slices, until one has dropped the message.
+        """Run an event in each of its slices, until one drops the message.
 
         A message that exceeds its budget before the last slice has happened in no slice. At a tick each slice has its
         own budget.
@@ -392,7 +391,7 @@ class MonitorExecution:
         message: WireMessage | None,
         act: Callable[[Outcome, WireMessage | None], bool],
     ) -> Callable[[], None]:
-        """Run an event in a slice; return a function that stores the state in the slice."""
+        """Return a function that stores the state in the slice."""
         slices = step.monitor.slices
         assert slices is not None  # noqa: S101  it has a slice
         if message is not None:
@@ -413,7 +412,7 @@ class MonitorExecution:
         message: WireMessage | None,
         act: Callable[[Outcome, WireMessage | None], bool],
     ) -> Callable[[], None]:
-        """Run the event in a slice that lacks a parameter, on a copy of the message and without output."""
+        """A slice that lacks a parameter gets a copy of the message, and its output is discarded."""
         turn, explains = self._turn, self._explains
         lines, published, looked = len(turn.log), len(turn.published), {**turn.looked}
         copied = message and WireMessage(bytes(message.buffer), message.time, message.channel)
@@ -432,7 +431,7 @@ class MonitorExecution:
         message: WireMessage | None,
         act: Callable[[Outcome, WireMessage | None], bool],
     ) -> Callable[[], None]:
-        """Load the slice into the monitor and run the event; return a function that stores the state in the slice."""
+        """Return a function that stores the state in the slice."""
         slices = monitor.slices
         assert slices is not None  # noqa: S101  it has a slice
         for running, run in zip(monitor.properties, slices.select(slice_), strict=True):
@@ -450,7 +449,7 @@ class MonitorExecution:
         message: WireMessage | None,
         outcome: Outcome,
     ) -> None:
-        """Report as a fault that an event's binding cannot have a slice."""
+        """Report a binding that cannot have a slice as a fault."""
         monitor = step.monitor
         monitor.faults += 1
         text = f"{why}: {step.name} is not monitored for this binding"
@@ -479,9 +478,8 @@ class MonitorExecution:
             outcome.changed_at = tuple([sites[site].position for _, at in writers for site in at])
 
     def _first(self, monitor: MonitorInstance, message: WireMessage, outcome: Outcome) -> bool:
-        """Handle a monitor's first message, or a message on a topic that it holds.
-
-        Return whether the monitor does not judge it: it is dropped, unless it is the safe message.
+        """Return whether the monitor drops its first message, or a message on a topic that it holds, without judging
+        it. It passes the safe message.
         """
         if monitor.held:
             why = f" ({monitor.why_held})" if monitor.why_held else ""
@@ -535,7 +533,7 @@ class MonitorExecution:
         self._trailed[monitor] = self._trailed.get(monitor, 0) + 1
 
     def _take_back(self) -> None:
-        """Undo the steps of formulas at this message, the last step first."""
+        """Undo the steps of formulas at this message, the last one first."""
         for take_back in reversed(self._taking_back.values()):
             take_back()
         for monitor, entries in self._trailed.items():
@@ -552,7 +550,7 @@ class MonitorExecution:
         *,
         in_order_told: bool = False,
     ) -> None:
-        """Run the handlers of these categories, in source order, or after a deadline in the given order."""
+        """Handlers run in source order, or after a deadline in the given order."""
         handlers = [(category, handler) for category, handler in running.handlers if category in categories]
         if in_order_told:
             handlers.sort(key=lambda pair: categories.index(pair[0]))
@@ -601,7 +599,7 @@ class MonitorExecution:
             self._block(monitor, message, outcome)
 
     def _block(self, monitor: MonitorInstance, message: WireMessage | None, outcome: Outcome) -> None:
-        """Apply the effect of the last fault to the message: it is dropped, or replaced by the safe one."""
+        """Drop the message after a fault, or replace it by the safe one."""
         if message is None or self.on_fault != "drop":
             return
         sender = monitor.safes.get(message.channel or "")
@@ -614,7 +612,7 @@ class MonitorExecution:
     def _replaced(self, message: WireMessage) -> None:
         """Go on with the safe message: for formulas, the replaced message has not happened.
 
-        If the monitors before it have used up the time of the message, those behind it have the same time again.
+        If earlier monitors have used up the time of the message, later ones have the same time again.
         """
         self._take_back()
         self._taking_back.clear()
@@ -636,7 +634,7 @@ class MonitorExecution:
         outcome.faults = (*outcome.faults, fault)
 
     def _past(self, step: Step, message: WireMessage) -> None:
-        """Count an event that did not happen because an index was past the end, and report it now and then."""
+        """Count events that did not happen because an index was past the end, and report them now and then."""
         step.past += 1
         now = message.time
         if step.told is None or now - step.told >= FOLDED_NS:
@@ -660,7 +658,7 @@ class MonitorExecution:
 
 
 def _fault_of(error: Exception, interpreter: Interpreter, monitor: str, otherwise: Position) -> Fault:
-    """Return the fault for an exception. `otherwise` is the fault's position if no better position is known."""
+    """`otherwise` is the position if no better one is known."""
     failed = interpreter.failed if error is interpreter.failed.error else LastFailure()
     interpreter.failed = LastFailure()  # the error refers to its callers, and so to much other data
     site = interpreter.sites[failed.site] if failed.site >= 0 else Site(otherwise)

@@ -1,16 +1,16 @@
-"""Explain a verdict by few past events that suffice for it, and by the senders of their messages.
+"""Explain a verdict by few past events that suffice for it.
 
 Theory of operation:
 
 1. For a property with tables, `Exits` stores for each state the event that left it last. From the initial state these
-   events lead to the present state, each later than the previous event: the trace without its loops. So nothing is cut,
-   however long the trace is, and events before `__RESET;` are left out. The compiled module stores the same data in the
-   same memory.
+   events lead to the present state, each later than the previous event: the trace without its loops. Nothing is cut,
+   however long the trace is, and events before `__RESET;` are left out. The compiled module stores the same data in
+   the same memory.
 2. For other properties, `Steps` keeps the last events and the run before them. (With a clock it is `ClockedSteps`,
-   which the compiled module also stores.) If the events give the verdict to a new run, they explain it alone. Otherwise
-   they explain it only together with the run before them (`Explanation.since`). A run about the future cannot be
-   copied. For such runs more events are kept, and the run knows at which event the decided formula was evaluated. The
-   events from there on suffice, unless the formula also looks back; then there is no explanation.
+   which the compiled module also stores.) If the events give the verdict to a new run, they explain it alone.
+   Otherwise they explain it only together with the run before them (`Explanation.since`). A run about the future
+   cannot be copied. For such runs more events are kept, and the run knows at which event the decided formula was
+   evaluated. The events from there on suffice, unless the formula also looks back; then there is no explanation.
 3. For a parametric specification, the last `TRAIL` events are kept with their bindings. The events of the slice must
    explain its verdict alone; otherwise there is no explanation.
 4. Each explanation is tested: its events must give the verdict.
@@ -35,22 +35,20 @@ from rosmop.logics.interface import (
 from rosmop.run.outcomes import NOBODY, EventOccurrence, Explanation, MessageSender
 
 TRAIL = 4096
-"""Events kept for all slices of a parametric specification together."""
+"""For all slices of a parametric specification together."""
 
 KEPT = 64
-"""The minimum number of events kept for a property without tables; the maximum is twice this number."""
+"""The minimum for a property without tables; the maximum is twice this number."""
 
 FUTURE_KEPT = 1024
-"""Events kept for `mtl` about the future."""
+"""For `mtl` about the future."""
 
 ENTRY = struct.Struct("<qqI4x")
-"""How a state was left: time (ns); the sender's source, its kind (from bit 24) and the event; the sender's number."""
+"""Time (ns) when a state was left; source of the sender; its kind (from bit 24) and the event; its number."""
 
 RUNS, RING = 4, 256
-"""Runs and steps kept for a property with a clock.
-
-The numbers are twice those needed, so that the entries of a message that the module leaves to the engine overwrite no
-needed entry.
+"""Runs and steps kept for a property with a clock, twice those needed: the entries of a message that the module
+leaves to the engine overwrite no needed entry.
 """
 
 _COUNT = struct.Struct("<q")
@@ -61,15 +59,13 @@ _MOST_STEPS = 5_000  # the maximum number of steps tried for one explanation: so
 _DEADLINE = -1
 
 CLOCKED_ROOM = _COUNT.size + _RUN.size * RUNS + ENTRY.size * RING
-"""Size of `ClockedSteps.room`."""
 
 
 class Bound(NamedTuple):
-    """An event of a parametric specification that happened.
+    """An event of a parametric specification that happened: parameters by number, and their values after True.
 
-    `binds` are the parameters that it bound (by number), and `key` has their values, after True. `creates`: a slice may
-    begin with the event. `everywhere`: it happened in each of its slices. (A `when` may depend on the slice, and a
-    message that one slice drops reaches no other slice.) `passed`: its message was not dropped.
+    `everywhere`: it happened in each of its slices. (A `when` may depend on the slice, and a message that one slice
+    drops reaches no other slice.) `passed`: its message was not dropped.
     """
 
     event: int
@@ -83,7 +79,7 @@ class Bound(NamedTuple):
 
 
 class Exits:
-    """The history of how each state of an automaton was left last.
+    """How each state of an automaton was left last.
 
     It is stored in `room` (an `ENTRY` for each state), which `owner` keeps alive.
     """
@@ -109,13 +105,12 @@ class Exits:
         return run.expire()
 
     def begin(self, time_ns: int) -> None:
-        """Do nothing: a path from the initial state never has earlier events."""
+        """A path from the initial state never has earlier events."""
 
     def mark(self) -> None:
-        """Return None: a path from the initial state never has an undone step."""
+        """A path from the initial state never has an undone step."""
 
-    def take_back(self, mark: object) -> None:
-        """Do nothing; see `mark`."""
+    def take_back(self, mark: object) -> None: ...
 
     def move(self, owner: object, room: memoryview) -> None:
         self.room, self.owner = room[: len(self.room)], owner
@@ -127,13 +122,11 @@ class Exits:
             ENTRY.pack_into(self.room, ENTRY.size * state, 0, _EVENT, 0)
 
     def follow(self, earlier: "Exits | Steps") -> "Exits":
-        """Continue the history of the same property."""
         assert isinstance(earlier, Exits)  # noqa: S101  it has the same tables
         self.room[:] = bytes(earlier.room)
         return self
 
     def explain(self, category: str) -> Explanation | None:
-        """Explain the last step's verdict."""
         way = self._way()
         if way is None:
             return None
@@ -169,7 +162,7 @@ class Exits:
 def _shortest(
     automaton: Automaton, way: Sequence[EventOccurrence], category: str
 ) -> Sequence[EventOccurrence]:
-    """Return the smallest number of events that give the category; if there are several choices, the latest events."""
+    """If there are several choices, return the latest events."""
     best: dict[int, tuple[int, ...]] = {automaton.initial: ()}
     fewest: tuple[int, ...] = ()
     mine: tuple[int, ...] = ()
@@ -194,7 +187,7 @@ def _shortest(
 
 
 class Steps:
-    """The history of a property without tables: at least the last `KEPT` steps, and the run before them."""
+    """The history of a property without tables."""
 
     _run: Run | None = None
 
@@ -210,7 +203,6 @@ class Steps:
         self._following: Run | None = None
 
     def mark(self) -> Any:
-        """Return the data that `take_back` needs to forget all later steps."""
         return self._started, self._steps, len(self._steps), self._before, self._following
 
     def take_back(self, mark: Any) -> None:
@@ -218,14 +210,14 @@ class Steps:
         del self._steps[size:]
 
     def step(self, run: Run, event: int, time_ns: int, sender: MessageSender) -> Categories:
-        """Step the run with the event. Raises `RunFaultError`."""
+        """Raises `RunFaultError`."""
         self._make_room(run)
         categories = run.step(event, time_ns)
         self._steps.append(EventOccurrence(event, time_ns, sender))
         return categories
 
     def forget(self, run: Run, time_ns: int) -> None:
-        """Explain only from the present state on: the run continues a run of another process."""
+        """The run continues a run of another process, so explain only from the present state on."""
         self.begin(time_ns)
         self._before = None if isinstance(run, BoundedRun) else copy.copy(run)
 
@@ -241,7 +233,7 @@ class Steps:
         return earlier
 
     def _kept(self) -> tuple[Sequence[EventOccurrence], Run | None]:
-        """Return the last steps, and the run before them if there were earlier steps."""
+        """Return the last steps, and the run before them if there were earlier ones."""
         return self._steps, self._before
 
     def _make_room(self, run: Run) -> None:
@@ -254,7 +246,6 @@ class Steps:
             self._following = None if isinstance(run, BoundedRun) else copy.copy(run)
 
     def explain(self, category: str) -> Explanation | None:
-        """Explain the last step's verdict; None if unknown."""
         steps, earlier = self._kept()
         if not steps:
             return None
@@ -277,7 +268,7 @@ class Steps:
 
 
 class ClockedSteps(Steps):
-    """Like `Steps`, for an automaton with a clock. The data are in `room`, where the module also stores them.
+    """Like `Steps`, for an automaton with a clock; the module stores the same data in `room`.
 
     `room` has the number of steps (i64), the last `RUNS` saved runs, and the last `RING` steps. A run (state, `since`
     and `now`) is saved before each group of `KEPT` steps.
@@ -354,7 +345,7 @@ def _step_at(number: int) -> int:
 
 
 class _Trial:
-    """A test whether events lead to a category, at the last event, or at a deadline if it has `ended`."""
+    """Tests whether events lead to a category, at the last event, or at a deadline if it has `ended`."""
 
     def __init__(
         self, compiled: CompiledProperty, before: Run | None, started: int, category: str, ended: int | None
@@ -367,7 +358,6 @@ class _Trial:
         self._left = _MOST_STEPS
 
     def gives(self, events: Sequence[EventOccurrence]) -> bool:
-        """Return whether these events alone give the category."""
         self._left -= 1 + len(events)
         run = self._start()
         told: Categories = ()
@@ -387,7 +377,7 @@ class _Trial:
         return told
 
     def fewest(self, events: list[EventOccurrence]) -> tuple[tuple[EventOccurrence, ...], bool]:
-        """Return as few of the events as suffice, and whether every one of these is needed."""
+        """Return as few events as suffice, and whether each of them is needed."""
         last = events[-1:] if self._ended is None else []
         some = self._fewer(events[: len(events) - len(last)], last)
         if last and some and self._left > 0 and self.gives(some):
@@ -417,10 +407,10 @@ def of_slice(
     category: str,
     passed: int | None = None,
 ) -> Explanation | None:
-    """Return the events that caused the verdict in the slice of a binding (parameters by number).
+    """Return the events that caused a verdict in the slice of a binding (parameters by number): the last one, or the
+    deadline that has `passed`, gave the verdict.
 
-    The cause is the last event, or the deadline that has `passed`. Return None if it is unknown whether a needed event
-    happened in this slice.
+    Return None if it is unknown whether a needed event happened in this slice.
     """
     own: dict[EventOccurrence, bool] = {}
     happened: list[EventOccurrence] = []
@@ -446,7 +436,6 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def history_of(compiled: CompiledProperty, time_ns: int) -> Exits | Steps:
-    """Return the empty history of a run."""
     if isinstance(compiled, ClockedProperty):
         return ClockedSteps(compiled, time_ns)
     return Exits(compiled.automaton) if isinstance(compiled, FiniteProperty) else Steps(compiled, time_ns)

@@ -1,4 +1,4 @@
-"""The interface between the engine and compiled code: the engine uses only the types of this file.
+"""The interface between the engine and compiled code.
 
 The caller that makes a `MonitorSet` also makes the implementation (`rosmop/fast/wasm_runner.py`) and passes it to the
 set.
@@ -16,17 +16,17 @@ from rosmop.runtime.action_context import LogLine
 from rosmop.runtime.wire import Buffer
 
 MESSAGE_FUEL = FUEL_PER_SECOND // 100
-"""The maximum number of instructions for one message, unless `process_one` gets a different number."""
+"""`process_one` may get a different limit."""
 
 
 class BatchResult(NamedTuple):
     """The result of one batch.
 
-    `position` is the offset of the first message that was not processed, and `run` is the offset after the last dropped
-    message. `dropped` counts dropped messages for each event of the lane, and `told` counts verdicts for each verdict
-    of the lane. Both are empty if all counts are zero. `sooner`: a deadline is earlier than before. `output` has the
-    printed lines, in order, each with the offset of its message. `paused`: the batch used up its fuel; the next batch
-    may begin with the message at `position`.
+    `position` is the offset of the first message that was not processed, and `run` is the offset after the last
+    dropped message. `dropped` counts dropped messages for each event of the lane, and `told` counts verdicts for each
+    verdict of the lane. Both are empty if all counts are zero. `sooner`: a deadline is earlier than before. `output`
+    has the printed lines, in order, each with the offset of its message. `paused`: the batch used up its fuel; the
+    next batch may begin with the message at `position`.
     """
 
     position: int
@@ -39,11 +39,10 @@ class BatchResult(NamedTuple):
 
 
 class BatchOptions(NamedTuple):
-    """The options of all batches of a topic until the state of the engine changes.
+    """Valid for all batches of a topic until the state of the engine changes.
 
-    `source` is the sender of the messages. `told`, `enabled` and `counted` are bits for the module; `told` also has a
-    bit for whether messages may be changed. Batches count in `changed` how many messages each set of events has changed
-    (see `FastLane.writers`).
+    `told`, `enabled` and `counted` are bits for the module; `told` also has a bit for whether messages may be
+    changed. Batches count in `changed` how many messages each set of events has changed (see `FastLane.writers`).
     """
 
     source: int
@@ -54,7 +53,7 @@ class BatchOptions(NamedTuple):
 
 
 class PreparedState(Protocol):
-    """The state of specifications that share topics or variables, as the caller of `NativeCall` uses it."""
+    """The state of specifications, as the caller of `NativeCall` uses it."""
 
     def prepare(self, prepared: BatchOptions) -> None:
         """Move the state into the module, and set the options of the next batch."""
@@ -90,26 +89,24 @@ class NativeCall(NamedTuple):
 
 
 class NextDue(Protocol):
-    """Returns the time of the next tick or deadline (ns; None if there is none)."""
+    """Returns the time of the next tick or deadline (ns), or None."""
 
     def __call__(self, *, anew: bool) -> int | None:
-        """Return the time. With `anew`, compute it again, because there may be an earlier deadline."""
+        """With `anew`, compute it again, because there may be an earlier deadline."""
 
 
 class FastLane(Protocol):
     """Processes the messages of one topic, or part of a service, many at a time."""
 
     events: tuple[tuple[str], ...]
-    """For each event: the value of `Outcome.events` if only this event happens."""
+    """For each event: the value of `Outcome.events` if it happens alone."""
 
     monitors: tuple[str, ...]
-    """For each event: the name of its monitor."""
+    """For each event."""
 
     drops: bool
-    """Whether messages may be dropped."""
 
     changes: bool
-    """Whether messages may be changed."""
 
     verdicts: tuple[Verdict, ...]
     """The possible verdicts, without explanation."""
@@ -118,10 +115,10 @@ class FastLane(Protocol):
         """Return `Outcome.changed_by` for a set of events: bit N stands for event N."""
 
     def happened(self) -> Sequence[int]:
-        """Return how often each event has happened since the last call."""
+        """Since the last call."""
 
     def ready(self) -> bool:
-        """Return whether no monitor waits for its first message, or holds its topics."""
+        """No monitor waits for its first message, or holds its topics."""
 
     def prepare(
         self,
@@ -132,7 +129,7 @@ class FastLane(Protocol):
         source: int = 0,
         changed: dict[int, int] | None = None,
     ) -> BatchOptions:
-        """Return the options. They are valid until the next action of the engine.
+        """The options are valid until the next action of the engine.
 
         If `loud`, no message may be changed. `told` lists the events that may not drop a message, `counted` the
         verdicts that are only counted.
@@ -148,13 +145,14 @@ class FastLane(Protocol):
         prepared: BatchOptions,
         answer: int | Exception | None = None,
     ) -> BatchResult | None:
-        """Process messages from `position` on, up to the first message that needs the engine. Return None if all
-        messages were processed and all stay in their buffer.
+        """Process messages from `position` on, up to the first one that needs the engine. Return None if all were
+        processed and stay in their buffer.
 
         `answer` is the module's answer, or the exception, if it was already called for these messages (`native`).
 
-        Call this only while the lane is `ready` and nothing in the set is due. `view` has whole frames and is writable.
-        It is the beginning of `Lanes.area`, or other memory. Bytes before a dropped message are appended to `pieces`.
+        Call this only while the lane is `ready` and nothing in the set is due. `view` has whole frames and is
+        writable. It is in other memory, or begins like `Lanes.area`. Bytes before a dropped message are appended to
+        `pieces`.
         """
 
     def process_one(  # noqa: PLR0917  as `process_batch`
@@ -167,10 +165,7 @@ class FastLane(Protocol):
         prepared: BatchOptions,
         fuel: int = MESSAGE_FUEL,
     ) -> BatchResult:
-        """Process only the message at `position`, with this fuel.
-
-        `paused` in the result means that the fuel was not enough.
-        """
+        """Process only the message at `position`. `paused` means that the fuel was not enough."""
 
     def native(self) -> NativeCall | None:
         """Return how to call the module for batches in `Lanes.area`; None if its state is more than numbers."""
@@ -178,15 +173,15 @@ class FastLane(Protocol):
     def process_message(
         self, message: Buffer, time_ns: int, prepared: BatchOptions, fuel: int = MESSAGE_FUEL
     ) -> Outcome | None:
-        """Process one message; return None if it is left to the engine. Verdicts are not explained, and positions of
-        changes are not reported.
+        """Return None if the message is left to the engine. Verdicts are not explained, and positions of changes are
+        not reported.
 
         The conditions are those of `process_batch`. Use separate options for this method, and do not call `happened`.
         """
 
 
 class Lanes(NamedTuple):
-    """The lanes of a set by topic (see `EventCode.channel`), and the memory to receive frames in, if there is any."""
+    """The lanes of a set by `EventCode.channel`, and the memory to receive frames in."""
 
     of_topic: Mapping[str, FastLane] = MappingProxyType({})
     area: memoryview | None = None
@@ -198,8 +193,4 @@ class FastPath(Protocol):
     def lanes(
         self, compiled: Compiled, interpreter: Interpreter, monitors: Sequence[MonitorInstance], due: NextDue
     ) -> Lanes:
-        """Return the lanes that process messages of these monitors. Set `home` of each monitor whose state a lane takes
-        over.
-
-        A topic without a lane is processed by the engine.
-        """
+        """Set `home` of each monitor whose state a lane takes over. The engine processes a topic without a lane."""

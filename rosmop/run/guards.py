@@ -14,10 +14,10 @@ from rosmop.types import value_types
 
 @dataclass(frozen=True, slots=True)
 class Guards:
-    """The guards of a set: `names`; and for each specification the guards that depend on its state (`depending`).
+    """`depending` has, for each specification, the guards that depend on its state.
 
-    A fault in the function of an event in `judging` only drops the event's own message, because the guards that depend
-    on the event act on its topic alone: no subscriber saw what the state lacks.
+    A fault in the function of an event in `judging` only drops the event's own message, because the guards that
+    depend on the event act on its topic alone: no subscriber saw what the state lacks.
     """
 
     names: frozenset[str]
@@ -54,7 +54,7 @@ def guards_of(compiled: Compiled) -> Guards:
 
 
 def _used(codes: Mapping[str, SpecificationCode], name: str) -> Iterator[str]:
-    """Yield a specification, and those whose variables it uses, directly or indirectly."""
+    """Yield the specification itself, and all whose variables it uses, directly or indirectly."""
     waiting, found = [name], set[str]()
     while waiting:
         name = waiting.pop()
@@ -65,7 +65,7 @@ def _used(codes: Mapping[str, SpecificationCode], name: str) -> Iterator[str]:
 
 
 def _places(code: SpecificationCode, compiled: Compiled, acts: set[str]) -> set[str | None]:
-    """Return the topics (or parts of services) of the messages by which a guard acts; None for a tick or deadline.
+    """Return the channels of the messages by which a guard acts, and None for a tick or deadline.
 
     A handler or a helper function may act by each message.
     """

@@ -1,11 +1,12 @@
-"""The interpreter, which defines the meaning of the intermediate form (`form/nodes.py`). Every faster implementation is
+"""The interpreter defines the meaning of the intermediate form (`form/nodes.py`). Every faster implementation is
 compared with it.
 
 Each expression becomes a Python function that computes a value from the variables of a call. Each statement becomes a
 function that returns how it ends its block (None: the block goes on). There is one method for each kind of node
 (`STATEMENTS`, `EXPRESSIONS`). `runtime/` defines the functions that the form calls, and `runtime/values.py` encodes
-values in messages. A function is built on its first call. Strings are bytes, vectors and messages are lists, times and
-durations are integers; every other value has the closest Python type. This is one file because it is the definition.
+values in messages. A function is built on its first call. Strings are bytes, vectors and messages are lists, times
+and durations are integers; every other value has the closest Python type. This is one file because it is the
+definition.
 
 Invariants:
 
@@ -68,9 +69,7 @@ _RESULT = "result"
 
 @dataclass(frozen=True)
 class LastFailure:
-    """The last error: its site (-1: unknown), the variables of the call, and whether the event had happened before the
-    error.
-    """
+    """The last error. `happened`: the event had already happened."""
 
     error: Exception | None = None
     site: int = -1
@@ -79,10 +78,7 @@ class LastFailure:
 
 
 class Interpreter:
-    """The interpreter of one set's functions, with its own values.
-
-    `variables` has the values of the set's variables by name, `contexts` the budgets by name.
-    """
+    """Runs one set's functions. `variables` and `contexts` (budgets) are by name."""
 
     def __init__(
         self,
@@ -92,7 +88,7 @@ class Interpreter:
         contexts: Mapping[str, str],
         messages: MessageTypes,
     ) -> None:
-        """`types` has the types of variables by name, `contexts` the names of the specifications."""
+        """`contexts` has the names of the specifications by context."""
         self.sites = sites
         self.turn = Turn()
         self.variables: dict[str, Any] = {}
@@ -117,11 +113,11 @@ class Interpreter:
         self._made.clear()
 
     def value(self, name: str, variables: Mapping[str, Any]) -> Any:
-        """Return the value of a variable of the set, or of a call with these variables. Raises KeyError."""
+        """`variables` are those of a call. Raises `KeyError`."""
         return variables[name] if name in variables else self.variables[name]
 
     def function(self, name: str) -> Callable[..., Any]:
-        """Return a function that takes a message, or None if the event has none; for its result see `nodes.Function`.
+        """The function takes a message, or None if the event has none; for its result see `nodes.Function`.
 
         The function raises the error that stops it; `failed` has the details.
         """
@@ -175,7 +171,7 @@ class Interpreter:
 
 
 def constant_of(node: nodes.Expression) -> bool | int | float:
-    """Return the value of an expression of numbers without variables. Raises `FaultError`."""
+    """The expression has no variables. Raises `FaultError`."""
     nowhere = nodes.Function("", "", (), ())
     maker = _Maker(_nobody(), nowhere)
     value: bool | int | float = maker.value(node)({})
@@ -188,8 +184,6 @@ def _nobody() -> Interpreter:
 
 
 class _Maker:
-    """Builds one function."""
-
     def __init__(self, interpreter: Interpreter, function: nodes.Function) -> None:
         self._interpreter = interpreter
         self._context = interpreter.contexts[function.context]
@@ -278,7 +272,7 @@ class _Maker:
         return run if node.no else run_yes
 
     def _branch(self, site: int, statements: Sequence[nodes.Statement]) -> _Run:
-        """Build a branch. Its condition is noted if the branch drops, changes or publishes a message."""
+        """The condition of a branch is noted if the branch drops, changes or publishes a message."""
         block = self.block(statements)
         if not any(isinstance(node, nodes.Drop | nodes.StopMessage | nodes.Publish) or self._marks_field(node)
                    for node in nodes.walk(tuple(statements))):  # fmt: skip
@@ -292,7 +286,7 @@ class _Maker:
         return run
 
     def _look(self, site: int) -> _Run:
-        """Note the values that were compared by a condition that was met."""
+        """Note the values that a condition compared when it was met."""
         turn = self._interpreter.turn
         compared = [self._variable(variable.code) for variable in self._interpreter.sites[site].compared]
 
@@ -551,10 +545,7 @@ class _Maker:
         return lambda _: None
 
     def _write_back(self, node: nodes.WriteBack) -> _Run:
-        """Build the write of all fields.
-
-        Fields of variable size can fault, so they are encoded before the first byte is written.
-        """
+        """Fields of variable size can fault, so they are encoded before the first byte is written."""
         marks, writes = tuple(self._marks), []
         for write in sorted(node.writes, key=lambda write: write.end is None):
             value, encode = self.value(write.value), self._values.encoder(write.value.type)
@@ -622,10 +613,7 @@ class _Maker:
         return isinstance(value, nodes.Literal) and value.value is True
 
     def _assigned(self, node: nodes.Assign) -> _Value:
-        """Build the assigned value.
-
-        For the flag of a field, the value is the set of sites that have assigned to the field, as bits.
-        """
+        """The flag of a field holds the set of sites that have assigned to the field, as bits."""
         if not self._marks_field(node):
             return self.value(node.value)
         if self._at not in self._marks:
@@ -866,7 +854,7 @@ def _is_shared(name: str) -> bool:
 def conversion(  # noqa: PLR0911  one for each kind
     source: Type, target: Type
 ) -> Callable[[Any], Any] | None:
-    """Return the conversion of numbers between two types; None if it changes nothing."""
+    """Return None if nothing changes."""
     if source == target:
         return None
     if isinstance(target, value_types.BoolType):
@@ -890,7 +878,6 @@ def _converting(source: Type, target: Type) -> Callable[[Any], Any]:
 
 
 def wrapping(kind: value_types.IntegerType) -> Callable[[int], int]:
-    """Return a function that wraps an integer into its type."""
     mask, half = (1 << kind.bits) - 1, 1 << (kind.bits - 1) if kind.signed else 0
     return lambda value: (value + half & mask) - half
 

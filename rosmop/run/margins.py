@@ -1,4 +1,6 @@
-"""How close comparisons of numbers came during the replay of a recording. Monitors in force do not measure this."""
+"""Measure how close comparisons of numbers came during the replay of a recording. Monitors in force do not measure
+this.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -16,7 +18,6 @@ def begin_margins(monitors: Sequence[MonitorInstance], variables: dict[str, Any]
 
 
 def taken_margins(monitors: Sequence[MonitorInstance], variables: dict[str, Any]) -> Iterator[Margin]:
-    """Yield the closest true and the closest false result of each comparison since the last call."""
     for monitor in monitors:
         for number, comparison in enumerate(monitor.code.comparisons):
             for holds, sides in ((True, comparison.when_true), (False, comparison.when_false)):

@@ -1,4 +1,4 @@
-"""A running specification: its events as functions, the runs of its properties, its timers."""
+"""A running specification: events as functions, runs of properties, timers."""
 
 from collections import deque
 from collections.abc import Callable
@@ -19,14 +19,12 @@ from rosmop.runtime.action_context import Context
 from rosmop.runtime.wire import WireMessage
 
 FAILING_AFTER = 10
-"""The number of faults after which a monitor is shown as failing."""
+"""A monitor with this many faults is shown as failing."""
 
 
 class CellNames(msgspec.Struct, frozen=True, array_like=True):
-    """The layout of a group's state in a module.
-
-    First come the states of properties (monitor, number). Then come the variables (monitor, name; None if the cell is
-    not part of the state) with their `struct` codes, then the clocks of the properties with these numbers.
+    """The layout of a group's state in a module: states of properties (monitor, number), then variables (monitor,
+    name; None if not part of the state) with their `struct` codes, then clocks of the properties with these numbers.
     """
 
     properties: list[tuple[str, int]] = []
@@ -36,10 +34,9 @@ class CellNames(msgspec.Struct, frozen=True, array_like=True):
 
 
 class StateHolder(Protocol):
-    """The holder of the state of monitors, in Python or in a module."""
+    """Holds the state of monitors in Python or in a module."""
 
     names: CellNames
-    """The layout of `cells`."""
 
     def leave(self) -> None:
         """Move the state to Python."""
@@ -47,26 +44,23 @@ class StateHolder(Protocol):
     def show(self) -> None:
         """Copy the state to Python."""
 
-    def is_true(self, name: str) -> bool:
-        """Return the value of a `bool`."""
+    def is_true(self, name: str) -> bool: ...
 
     size: int
-    """Size of `cells` in bytes; 0 if the state does not consist only of numbers."""
+    """Bytes of `cells`; 0 if the state is not only numbers."""
 
     left: bool
-    """Whether the state has been in Python since it was last saved."""
+    """The state has been in Python since it was last saved."""
 
     def cells(self) -> bytes | None:
-        """Return the state in the module's memory, if it consists only of numbers.
-
-        The result is empty if the state has been in Python since the last save. It is None if the state must be saved
-        from Python.
+        """Return the state in the module's memory: empty if it has been in Python since the last save, and None if it
+        must be saved from Python.
         """
 
 
 @dataclass(eq=False, slots=True)
 class MonitorGroup:
-    """Monitors that share topics or variables, so that a message changes the state of at most one group.
+    """Monitors that share topics or variables: a message changes the state of at most one group.
 
     `channels` are the topics and parts of services. `changed`: the state may have changed outside the module since it
     was last saved.
@@ -83,9 +77,7 @@ Handler = Callable[[WireMessage | None], None]
 
 @dataclass(eq=False, slots=True)
 class RunningProperty:
-    """A property of a running specification: its run, its handlers in source order, and the history that explains
-    verdicts.
-    """
+    """A property of a running specification. Its history explains verdicts."""
 
     index: int
     code: PropertyCode
@@ -118,9 +110,10 @@ class RunningProperty:
 
 @dataclass(eq=False, slots=True)
 class Step:
-    """One event's processing of a message: its function, then its properties.
+    """One event's processing of a message.
 
-    `past` counts how often the event did not happen because an index was past the end, since the last report (`told`).
+    Since the last report (`told`), `past` counts how often the event did not happen because an index was past the
+    end.
     """
 
     monitor: "MonitorInstance"
@@ -129,16 +122,16 @@ class Step:
     name: str
     function: Callable[[WireMessage | None], bool]
     first: bool = False
-    """Whether it is the first step of its monitor on its topic."""
+    """The first step of its monitor on its topic."""
     past: int = 0
     told: int | None = None
     key: Callable[[WireMessage], Any] | None = None
-    """For a parametric specification: the parameters that a message binds."""
+    """Returns the parameters that a message binds."""
 
 
 @dataclass(eq=False, slots=True)
 class Timer:
-    """A periodic event; `due` is the time of its next tick, None while it does not run."""
+    """A periodic event. `due` is None while it does not run."""
 
     step: Step
     period: int
@@ -148,7 +141,7 @@ class Timer:
 
 @dataclass(eq=False, slots=True)
 class SafeSender:
-    """Sends a safe message while its monitor cannot judge; `due` is the time of the next one, None before the first."""
+    """Sends a safe message while its monitor cannot judge. `due` is None before the first one."""
 
     safe: SafeMessage
     due: int | None = None
@@ -166,23 +159,23 @@ class MonitorInstance:
     enabled: bool = True
     held: bool = False
     why_held: str = ""
-    """Why its state was lost, if it holds its topics for that reason."""
+    """Why its state was lost, if it therefore holds its topics."""
     broken: bool = False
-    """Whether its first values or `init` faulted, so that it has no valid state."""
+    """Its first values or `init` faulted, so it has no valid state."""
     faults: int = 0
     seen: bool = False
-    """Whether a message for any of its events has come."""
+    """A message for any of its events has come."""
     home: StateHolder | None = None
-    """The holder of its state, if the state may be in a module."""
+    """Set if the state may be in a module."""
     slices: Slices | None = None
-    """The slices of a parametric specification. `properties` has the runs of the slice used last."""
+    """`properties` has the runs of the slice used last."""
     slice: Slice | None = None
     group: MonitorGroup | None = None
     """The monitors whose state changes together with its own."""
     trail: deque[Bound] = field(default_factory=partial(deque, maxlen=TRAIL))
     safes: dict[str, SafeSender] = field(default_factory=dict)
     starting: set[str] = field(default_factory=set)
-    """The topics with a safe message on which no message has come since the monitor started again."""
+    """The topics with a safe message on which no message has come since the last start."""
     """The last events of all slices of a parametric specification."""
 
     @property
@@ -194,7 +187,7 @@ class MonitorInstance:
         return self.broken or self.faults >= FAILING_AFTER
 
     def picture(self) -> str | None:
-        """Return the automata of its properties (SVG); None if no automaton is finite."""
+        """As SVG; None if no automaton is finite."""
         from rosmop.logics.picture import svg_of  # noqa: PLC0415  only tools draw
 
         return svg_of([code.property for code in self.code.properties])
@@ -208,7 +201,7 @@ class MonitorInstance:
     def sending(self, *, passes: bool) -> list[SafeSender]:
         """Return the senders that send now: all while no message can be judged, else those of `starting` topics.
 
-        `passes`: faults pass messages, also those of the start.
+        `passes`: faults pass messages, even those of the start.
         """
         if not self.safes or not self.enabled:
             return []
@@ -224,10 +217,7 @@ class MonitorInstance:
             self.group.changed = True
 
     def move_to_python(self) -> None:
-        """Move the state to Python.
-
-        Call this before Python reads the state of this monitor, or of other monitors on its topics.
-        """
+        """Call this before Python reads the state of this monitor, or of other monitors on its topics."""
         if self.home is not None:
             self.home.leave()
 
@@ -239,10 +229,7 @@ def monitors_of(
     slices: int,
     holder_of: HolderOf,
 ) -> tuple[MonitorInstance, ...]:
-    """Return the running forms of compiled specifications, in their initial state.
-
-    Each has at most `slices` slices, which are charged to `holder_of(source)`.
-    """
+    """Each has at most `slices` slices, which are charged to `holder_of(source)`."""
     return tuple(_monitor(interpreter, code, time_ns, slices, holder_of) for code in compiled.specifications)
 
 

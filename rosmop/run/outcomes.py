@@ -1,5 +1,5 @@
-"""Outcomes of messages, ticks and deadlines: as values, with their causes as data (for a record, the CLI and REST), and
-as lines of text. Also the margins of comparisons, and the bounds that a caller may state.
+"""Outcomes of messages, ticks and deadlines: as values, as data (for a record, the CLI and REST), and as lines of
+text.
 
 Data about causes are limited in size, and use the words of the specification. `who` names the source of a message.
 """
@@ -24,22 +24,17 @@ _EACH_END = 5
 Result = Literal["passed", "changed", "dropped"]
 
 SHADOW_BUDGET = 100_000
-"""The maximum number of instructions of a specification in shadow mode for one message: some tens of milliseconds, for
-which other messages wait.
-"""
+"""Some tens of milliseconds for one message, for which other messages wait."""
 
 FUEL_PER_SECOND = 1_500_000_000
-"""The number of a module's instructions that take about a second."""
+"""A module takes about a second for these instructions."""
 
 DROPPED = -1
-"""The key of the drop in `Outcome.handling`."""
+"""Stands for the drop in `Outcome.handling`."""
 
 
 class MessageSender(NamedTuple):
-    """The source of a message (a number chosen by the caller; 0: none), and a sequence number of the given `kind`.
-
-    `kind` says which sequence number the message has.
-    """
+    """The source of a message (chosen by the caller; 0: none), and a sequence number of the given `kind`."""
 
     source: int = 0
     number: int = 0
@@ -51,11 +46,11 @@ Who = Callable[[int], Mapping[str, Any]]
 
 NOBODY = MessageSender()
 NO_NUMBER, SEQ = range(2)
-"""Kinds of sequence numbers: none; `seq` of the header."""
+"""Kinds of sequence numbers: none, and `seq` of the header."""
 
 
 class EventOccurrence(NamedTuple):
-    """An event (its number in the specification), its time and sender, and the name of the state after it, if any."""
+    """`event` is its number in the specification; `state` is the one after it, if any."""
 
     event: int
     time: int
@@ -77,10 +72,10 @@ class Explanation(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """A property's arrival in a category that has a handler. `property` counts from 0 in its specification; `source` is
-    its formula. `why` is None if an explanation was not wanted (`MonitorSet.explain_when`) or is impossible.
+    """A property's arrival in a category that has a handler. `property` counts from 0 in its specification; `source`
+    is its formula. `why` is None if an explanation was not wanted (`MonitorSet.explain_when`) or is impossible.
 
-    `binding` has the values of the parameters of a parametric specification, by name.
+    `binding` has the values of parameters by name.
     """
 
     monitor: str
@@ -94,7 +89,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A fault, which stopped an action: position, reason, and the values of the variables involved.
+    """A fault stopped an action. `values` are those of the variables involved.
 
     `outdates`: the monitor's state may be out of date now, because an event that it observes did not take effect.
     """
@@ -112,28 +107,27 @@ def named(verdict: Verdict) -> str:
 
 
 def bound(verdict: Verdict) -> str:
-    """Return the binding as text after the name of the property; empty without parameters."""
+    """Text to append to the name of the property; empty without parameters."""
     if not verdict.binding:
         return ""
     return f" with {', '.join(f'{name} = {value}' for name, value in verdict.binding.items())}"
 
 
 class Outcome:
-    """The result of processing a message, and all events on the way.
+    """The result of a message, tick or deadline.
 
     `buffer` is the message to relay: the buffer that came in (changed in place where possible), or another buffer.
     `events` are named `specification.event`. `timer` names the source of a tick or deadline (`specification.tick`,
-    `specification.timeout`, `specification.deadline`, `specification.safe`).
-    `time` is in nanoseconds. `before` has the outcomes of ticks and
-    deadlines that were due before this message. `shadowed` has the outcomes of the sets in shadow mode when a set
-    starts.
+    `specification.timeout`, `specification.deadline`, `specification.safe`). `time` is in nanoseconds. `before` has
+    the outcomes of ticks and deadlines that were due before this message. `shadowed` has the outcomes of the sets in
+    shadow mode when a set starts.
 
     `changed_by` are the events whose actions changed bytes of the message, in order. It is empty unless the result is
     `changed`. `changed_at` are the positions of the statements that assigned to the changed fields. An event that
-    assigned nothing, or the same value, is not included. `dropped_by` is the specification that dropped the message: at
-    its last event, after a fault (`fatal`), or for `reason` (the topic is held, or the start failed). `dropped_at` is
-    the position of the statement, the action or the specification. `handling` has the verdicts whose handlers dropped
-    the message (key `DROPPED`) or published messages (keys: their indices in `published`).
+    assigned nothing, or the same value, is not included. `dropped_by` is the specification that dropped the message:
+    at its last event, after a fault (`fatal`), or for `reason` (the topic is held, or the start failed). `dropped_at`
+    is the position of the statement, the action or the specification. `handling` has the verdicts whose handlers
+    dropped the message (key `DROPPED`) or published messages (keys: their indices in `published`).
 
     `began_holding` are the monitors that hold their topics from now on, because of a fault.
 
@@ -180,13 +174,13 @@ class Outcome:
         self.time = time
 
     def restore(self, buffer: memoryview) -> None:
-        """Restore the received bytes in the buffer, unless it is read-only."""
+        """Restore the received bytes, unless the buffer is read-only."""
         if not buffer.readonly:
             for start, old in reversed(self.overwritten):
                 buffer[start : start + len(old)] = old
 
     def sent(self) -> Iterator[Published]:
-        """Yield the published messages as they go out: without those that were dropped, and as they were changed.
+        """Yield published messages as they go out: changed by later monitors, and without those that were dropped.
 
         Calls of services are included; their requests go through the monitors when they are sent.
         """
@@ -199,7 +193,7 @@ class Outcome:
 
     @property
     def conditions(self) -> dict[str, dict[str, object]]:
-        """Return the positions of conditions that were met, with the values that they compared."""
+        """The positions of conditions that were met, with the values that they compared."""
         return {
             str(site.position): {
                 each.name: showing(each.type)(value)
@@ -216,8 +210,7 @@ class Outcome:
 class Margin(NamedTuple):
     """The two sides of a comparison when they were closest, while it was true (`holds`) or while it was false.
 
-    `number` counts the monitor's comparisons in the order of the text. `threshold` is the constant side, 0 or 1 (None:
-    neither side is a constant).
+    `number` counts the monitor's comparisons in the order of the text. `threshold` is the constant side, 0 or 1.
     """
 
     monitor: str
@@ -234,7 +227,7 @@ class Margin(NamedTuple):
 
     @property
     def threshold_at(self) -> float | None:
-        """Return the constant at which the result would have changed; None if neither side is a constant."""
+        """The constant at which the result would have changed."""
         return None if self.threshold is None else (self.right, self.left)[self.threshold]
 
 
@@ -247,7 +240,7 @@ def of_drop(outcome: Outcome, who: Who) -> dict[str, Any]:
 
 
 def of_change(outcome: Outcome, who: Who) -> dict[str, Any]:
-    """Return the causes of the change of the message, with the positions of the statements."""
+    """Return the causes, with the positions of the statements."""
     return {
         "changed_by": list(outcome.changed_by),
         "at": [str(position) for position in outcome.changed_at],
@@ -256,14 +249,14 @@ def of_change(outcome: Outcome, who: Who) -> dict[str, Any]:
 
 
 def of_published(outcome: Outcome, number: int, who: Who) -> dict[str, Any]:
-    """Return the causes of a published message, with the position of the statement."""
+    """Return the causes, with the position of the statement."""
     message = outcome.published[number]
     position = outcome.sites[message.site].position
     return {"type": message.type, "at": [str(position)], **_led(outcome, who, outcome.handling.get(number))}
 
 
 def of_fault(outcome: Outcome, fault: Fault, who: Who) -> dict[str, Any]:
-    """Return the causes of the fault, its position, and the values of variables there."""
+    """Return the causes, the position, and the values of variables there."""
     where = fault.position
     return {
         "file": where.file,
@@ -277,7 +270,7 @@ def of_fault(outcome: Outcome, fault: Fault, who: Who) -> dict[str, Any]:
 
 
 def of_verdict(outcome: Outcome, verdict: Verdict, who: Who) -> dict[str, Any]:
-    """Return the causes of the verdict, with the position of its property."""
+    """Return the causes, with the position of the property."""
     return {
         "property": verdict.property,
         "logic": verdict.logic,
@@ -299,7 +292,7 @@ def _led(outcome: Outcome, who: Who, handled: Verdict | None = None) -> dict[str
 
 
 def why_of(verdict: Verdict, who: Who) -> dict[str, Any]:
-    """Return the field `why` of a verdict; empty if the explanation was not requested or is unknown."""
+    """Return an empty mapping if the explanation was not requested or is unknown."""
     why = verdict.why
     if why is None:
         return {}
@@ -329,16 +322,14 @@ def _event(verdict: Verdict, happened: EventOccurrence, who: Who) -> dict[str, A
 
 
 def decided_by(source: Source, why: Explanation) -> list[str]:
-    """Return the subformulas that decide the formula at the last event, with their values; empty if earlier events
-    matter.
-    """
+    """Return the subformulas that decide the formula at the last event; empty if earlier events matter."""
     if why.since is not None:
         return []
     return deciding(source, [event.event for event in why.events], [event.time for event in why.events])
 
 
 def lines_of_why(why: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a line for each event of an explanation (`why_of`), and how far the events explain the verdict."""
+    """Yield a line for each event of `why_of`, and how far the events explain the verdict."""
     events = _list(why.get("events"))
     if not why:
         return

@@ -7,11 +7,11 @@ from typing import Generic, TypeVar
 Thing = TypeVar("Thing", bound=Hashable)
 
 Holder = Hashable | None
-"""The holder of a slice, named by the caller; None if holders are not distinguished."""
+"""Named by the caller; None if holders are not distinguished."""
 
 
 HolderOf = Callable[[int], Holder]
-"""Returns the holder that is charged for the slices of a source (`MessageSender.source`)."""
+"""Names the holder that is charged for the slices of a source (`MessageSender.source`)."""
 
 
 def no_holder(_source: int) -> Holder:
@@ -19,10 +19,10 @@ def no_holder(_source: int) -> Holder:
 
 
 class Quota(Generic[Thing]):
-    """The holdings of a bounded resource.
+    """The holdings of a bounded resource, oldest first.
 
-    A holder may have at most as much as is still free, so that a later holder finds room and no other holder loses
-    anything. The holder None is limited only by the total.
+    A holder may have at most as much as is still free, so a later holder finds room and no other one loses anything.
+    The holder None is limited only by the total.
     """
 
     def __init__(self, whole: int) -> None:

@@ -1,29 +1,29 @@
 """The slices of a running parametric specification (Chen and Roşu, "Parametric trace slicing and monitoring", 2012).
 
-A *binding* gives a value to some or all of the parameters. The *slice* of a binding contains the events whose bindings
-are part of it, from the first `creation event` on. Without creation events, the slice begins with the first event. Each
-slice whose events bind all parameters is monitored like a separate specification.
+A *binding* gives a value to some or all of the parameters. The *slice* of a binding contains the events whose
+bindings are part of it, from the first `creation event` on. Without creation events, the slice begins with the first
+event. Each slice whose events bind all parameters is monitored like a separate specification.
 
 Theory of operation:
 
-1. `targets` returns the slices of an event: every known binding that agrees with the event's binding, joined with it. A
-   new slice starts with the state of the largest known binding within its own binding. That binding is unique, because
-   the union of two known bindings that agree is also known. Slices that lack a parameter (`seeds`) only provide such
-   start states; their actions and handlers have no output.
+1. `targets` returns the slices of an event: every known binding that agrees with the event's binding, joined with it.
+   A new slice starts with the state of the largest known binding within its own binding. That binding is unique,
+   because the union of two known bindings that agree is also known. Slices that lack a parameter (`seeds`) only
+   provide such start states; their actions and handlers have no output.
 2. The engine (`execution.py`) loads each slice in turn into the monitor (`select`), steps the monitor as usual, and
-   stores the state again (`settle`). Tables, functions and handlers are the same as without parameters. If an event
-   only changes the states of automata, `step` and `quiet` do so directly.
+   stores the state again (`settle`). If an event only changes the states of automata, `step` and `quiet` do so
+   directly.
 3. Each slice has its own clocks. `deadline` is the first deadline of all slices (in a heap), and `due` is the slice
-   with that deadline. A slice has one valid entry in the heap (`Slice.due`), whose time may be too early, but never too
-   late.
+   with that deadline. A slice has one valid entry in the heap (`Slice.due`), whose time may be too early, but never
+   too late.
 4. A slice ends when it cannot act any more: no event and no deadline leads to a handler, and its actions only change
-   its own variables. Its binding is remembered, so that the slice does not start again. A slice in its initial state is
-   forgotten at once if any relevant event would create it again.
+   its own variables. Its binding is remembered, so that the slice does not start again. A slice in its initial state
+   is forgotten at once if any relevant event would create it again.
 5. There are at most `limit` slices, and no host (*holder*) has more slices than are left for all other hosts
    (`slice_quota.py`). A host at its limit pays with its own slices. If the specification only observes, the host's
-   oldest slice is forgotten. If the specification acts on messages or publishes, the new binding is `refused`, so that
-   no host can get rid of an obligation. A host never causes the removal of another host's slice. Ended bindings are
-   remembered under the same rule. No binding has more than `MAX_BINDING` bytes.
+   oldest slice is forgotten. If the specification acts on messages or publishes, the new binding is `refused`, so
+   that no host can get rid of an obligation. A host never causes the removal of another host's slice. Ended bindings
+   are remembered under the same rule. No binding has more than `MAX_BINDING` bytes.
 6. These limits bound the cost of one message. An event that does not bind all parameters may concern all slices; then
    the limit is `TOGETHER_LIMIT`.
 """
@@ -54,31 +54,28 @@ from rosmop.types import value_types
 LIMIT = 100_000
 
 GROWING_LIMIT = 1_000
-"""The limit if a run needs more than the state of an automaton (`cfg`, `srs`, `ptcaret`, `mtl` about the future)."""
+"""If a run needs more than the state of an automaton (`cfg`, `srs`, `ptcaret`, `mtl` about the future)."""
 
 TOGETHER_LIMIT = 250
-"""The limit if an event, or a tick, may concern all slices at once.
-
-Each slice then takes 2 µs, or 20 µs with a verdict.
-"""
+"""If an event or a tick may concern all slices at once: each takes 2 µs, or 20 µs with a verdict."""
 
 MAX_BINDING = 256
-"""The maximum number of bytes of all strings in a binding."""
+"""For all strings of a binding together."""
 
 Key = tuple[Any, ...]
-"""A binding: True, and the values of its parameters, in their order."""
+"""True, and the values of the bound parameters, in their order."""
 
 Binding = tuple[int, Key]
-"""The bound parameters, as a set of bits, and their values."""
+"""The bound parameters as a set of bits, and their values."""
 
 _NAN = float("nan")  # dictionaries find this one object again, although NaN is not equal to itself
 
 
 @dataclass(eq=False, slots=True)
 class Slice:
-    """One slice: the parameters of its binding (a set of bits), their values, its state, and the host that made it.
+    """One slice; `domain` has its parameters as bits.
 
-    The slice is `kept` once an event has happened in it, and `gone` once it has ended or was forgotten.
+    It is `kept` once an event has happened in it, and `gone` once it has ended or was forgotten.
     """
 
     domain: int
@@ -89,9 +86,8 @@ class Slice:
     kept: bool = False
     gone: bool = False
     due: int | None = None
-    """The time of its valid entry in the heap of deadlines."""
     turn: int = 0
-    """The number of that entry; at equal times, the smallest number comes first."""
+    """The number of its entry in the heap; at equal times, the smallest number comes first."""
 
     @property
     def deadline(self) -> int | None:
@@ -105,9 +101,9 @@ class Slice:
 
 @dataclass(eq=False, slots=True)
 class _Known:
-    """The slices whose bindings have the same parameters. The value is None for a slice that has ended.
+    """The slices whose bindings have the same parameters; None for an ended slice.
 
-    For each set of parameters in use, `parts` groups the same keys by the values of these parameters.
+    For each set of parameters in use, `parts` groups the same keys by their values.
     """
 
     slices: dict[Key, Slice | None] = field(default_factory=dict)
@@ -124,7 +120,7 @@ class Slices:
         limit: int,
         holder_of: HolderOf,
     ) -> None:
-        """`holder_of(source)` is charged for the slices that messages of this source make."""
+        """`holder_of(source)` is charged for slices that messages of this source make."""
         assert code.slicing is not None  # noqa: S101  the caller checks this
         properties = [declared.property for declared in code.properties]
         self._all = (1 << len(code.slicing.parameters)) - 1
@@ -177,7 +173,7 @@ class Slices:
         return self.quota.total
 
     def _look_at(self, properties: Sequence[PropertyCode]) -> None:
-        """Compute in which states of automata a slice is over, counts as absent, or consists only of its state."""
+        """Compute in which states a slice is over, counts as absent, or consists only of its state."""
         self._properties, events = properties, self._code.events
         finite = [declared for declared in properties if isinstance(declared.property, FiniteProperty)]
         every = len(finite) == len(properties)
@@ -196,7 +192,7 @@ class Slices:
         ]
 
     def begin(self, properties: Sequence[PropertyCode], runs: tuple[Run, ...]) -> None:
-        """Start without slices. New slices begin with the present state of the specification."""
+        """New slices begin with the present state of the specification."""
         self._look_at(properties)
         zero = tuple(self._namespace[code] for _, code, _ in self._parameters)
         values = self.own()
@@ -219,10 +215,10 @@ class Slices:
     # The slices of an event
 
     def step(self, event: int, key: Key) -> bool | None:
-        """Step the slice of an event that binds all parameters, if the only effect is new states.
+        """Step the slice of an event that binds all parameters, if the only effect is new states; otherwise return
+        None and do nothing.
 
-        Return whether the event happened (False if the slice is over). Return None, and do nothing, if the event has
-        other effects.
+        Return whether the event happened (False if the slice is over).
         """
         if key not in self._whole:
             return None
@@ -248,7 +244,7 @@ class Slices:
         return self._whole.get(key)
 
     def quiet(self, event: int, slice_: Slice) -> Sequence[int] | None:
-        """Return the states of a slice after an event, if the event has no other effect."""
+        """Return None if the event has another effect than new states."""
         calm = self._calm[event]
         if calm is None or not slice_.kept:
             return None
@@ -260,10 +256,9 @@ class Slices:
         self._note(slice_)
 
     def targets(self, event: EventCode, key: Key, time_ns: int, source: int) -> Sequence[Slice]:
-        """Return the slices of an event, in the order in which they began, but slices with all parameters first.
+        """Return slices in the order in which they began, but those with all parameters first.
 
-        New slices begin at this time, and belong to the host of `source`. `refused` is set if a slice cannot be
-        created.
+        New slices belong to the host of `source`. `refused` is set if a slice cannot be created.
         """
         self.refused = None
         self.behind = []
@@ -324,7 +319,7 @@ class Slices:
         return [slice_ for slice_ in found if slice_ is not None]
 
     def _derived(self, domain: int, key: Key, most: int) -> Slice | None:
-        """Return a slice with the state of the largest known binding within `key`; None if that slice has ended."""
+        """Copy the state of the largest known binding within `key`; None if that slice has ended."""
         values = dict(zip(_members(domain), key[1:], strict=True))
         parent: Slice | None = self._first
         for other in sorted(self._known, key=int.bit_count, reverse=True):
@@ -365,7 +360,7 @@ class Slices:
     # The state of the monitor
 
     def select(self, slice_: Slice) -> tuple[Run, ...]:
-        """Load the variables of this slice, and return its runs for the properties."""
+        """Load the variables of this slice, and return its runs."""
         namespace = self._namespace
         if slice_.domain == self._all:
             for (_, code, _), value in zip(self._parameters, slice_.key[1:], strict=True):
@@ -384,7 +379,7 @@ class Slices:
     def settle(
         self, slice_: Slice, runs: tuple[Run, ...], values: tuple[Any, ...], *, happened: bool
     ) -> None:
-        """Store the state in the slice. A slice that begins with this event is kept only if the event `happened`."""
+        """Store the state. A slice that begins with this event is kept only if the event `happened`."""
         slice_.runs, slice_.values = runs, values
         if slice_.gone:
             return
@@ -403,9 +398,8 @@ class Slices:
             self._await(slice_)
 
     def forgotten(self, time_ns: int) -> str:
-        """Return as text how many slices were forgotten for newer slices of the same host.
-
-        The text is empty if there are none, or if the last report was less than `FOLDED_NS` ago.
+        """Return as text how many slices were forgotten for newer ones of the same host, or nothing if the last
+        report was less than `FOLDED_NS` ago.
         """
         number = self._forgotten
         if not number or (self._told is not None and time_ns - self._told < FOLDED_NS):
@@ -439,7 +433,7 @@ class Slices:
         return self._deadlines[0][2]
 
     def _await(self, slice_: Slice) -> None:
-        """Ensure that the heap has an entry for the slice, at its deadline or earlier."""
+        """The heap needs an entry at the slice's deadline or earlier."""
         deadline = slice_.deadline
         if deadline is None or (slice_.due is not None and slice_.due <= deadline):
             return
@@ -469,7 +463,7 @@ class Slices:
     # State
 
     def keep(self) -> None:
-        """Track changed bindings from now on, starting with all present bindings."""
+        """Track changed bindings from now on, starting with all present ones."""
         self.changed = {
             (domain, key): None if slice_ is None else slice_.holder
             for domain, known in self._known.items()
@@ -487,7 +481,7 @@ class Slices:
         return self._first
 
     def state(self, binding: Binding) -> Slice | None:
-        """Return the slice of a binding; None if it has ended. Raises `KeyError` for an unknown binding."""
+        """Return None if the slice has ended. Raises `KeyError` for an unknown binding."""
         domain, key = binding
         return self._known[domain].slices[key]
 
@@ -524,9 +518,9 @@ class Slices:
         return slice_.domain == self._all
 
     def mark(self, slice_: Slice) -> Callable[[], None]:
-        """Return a function that undoes all later changes to the formulas of a slice, except the passing of time.
+        """Return a function that undoes later changes to the formulas of a slice, except the passing of time.
 
-        If the slice has only formulas, the function also undoes the beginning of the slice.
+        If the slice has only formulas, it also undoes its beginning.
         """
         runs = slice_.runs
         begun = not slice_.kept and all(self._formulas)
@@ -604,7 +598,7 @@ class Slices:
             self._note(slice_)
 
     def _remember(self, domain: int, key: Key, holder: Holder) -> None:
-        """Remember that this binding has ended, until the host has too many ended bindings."""
+        """An ended binding is remembered until the host has too many of them."""
         while not self._ended.fits(holder, 1):
             if not self._ended.held(holder):
                 if key in self._known[domain].slices:
@@ -632,7 +626,7 @@ class Slices:
 
 
 def of_nan(key: Key) -> Key:
-    """Return the key with all NaNs replaced by one object, so that it is found again."""
+    """One object replaces all NaNs, so that the key is found again."""
     return tuple(_NAN if value != value else value for value in key)  # noqa: PLR0124  NaN
 
 
@@ -653,7 +647,7 @@ def _key(values: Mapping[int, Any], domain: int) -> Key:
 
 
 def _joined(domains: Iterator[int]) -> list[int]:
-    """Return the possible sets of bound parameters: the parameters of one event, or of several events together."""
+    """Return the possible sets of bound parameters, of one event or of several together."""
     found: set[int] = set()
     for domain in domains:
         found |= {domain, *(domain | other for other in found)}
@@ -661,7 +655,7 @@ def _joined(domains: Iterator[int]) -> list[int]:
 
 
 def _calm(code: PropertyCode, event: int, lost: frozenset[int], renews: bool) -> list[int]:
-    """Return the state after an event for each state; -1 if a handler runs or the slice may end."""
+    """Return the next state for each state; -1 if a handler runs or the slice may end."""
     assert isinstance(code.property, FiniteProperty)  # noqa: S101  the caller checks this
     automaton, handled = code.property.automaton, {*code.order}
     return [
@@ -691,7 +685,7 @@ def _lost(code: PropertyCode) -> frozenset[int]:
 
 
 def _steps(compiled: CompiledProperty) -> list[list[tuple[int, Categories]]]:
-    """Return for each state the next states at events and deadlines, with their categories."""
+    """Include the next states at deadlines."""
     if isinstance(compiled, FiniteProperty):
         automaton = compiled.automaton
         return [[(target, automaton.verdicts[target]) for target in row] for row in automaton.table]
@@ -705,9 +699,7 @@ def _steps(compiled: CompiledProperty) -> list[list[tuple[int, Categories]]]:
 
 
 def _renews(events: Sequence[EventCode], properties: Sequence[PropertyCode], everything: int) -> bool:
-    """Return whether a slice in its initial state may be forgotten: each event either creates a slice or does not
-    change it.
-    """
+    """A slice in its initial state may be forgotten if each event either creates it or does not change it."""
     return all(
         _domain(event) == everything
         and (event.creates or (event.plain and all(_stays(one, number) for one in properties)))

@@ -1,11 +1,11 @@
-"""The state of monitors as data that outlives their process. It is written group by group, and read back under limits.
+"""Keep the state of monitors as data that outlives their process, written group by group and read back under limits.
 
-A group consists of the specifications that share topics or variables, so a message changes the state of at most one
-group. The saved state is everything that affects later messages: variables, runs of properties, timers, and whether a
-monitor holds its topics. The events that explain a verdict, and the times of throttled output, are not saved.
+A group shares topics or variables, so a message changes the state of at most one. The state is everything that
+affects later messages: variables, runs of properties, timers, and whether a monitor holds its topics. The events that
+explain a verdict, and the times of throttled output, are not saved.
 
-If the variables of a group are numbers, its state is saved as the bytes in the module's memory, which `CellNames`
-describes. This keeps the common case cheap. Times are those of the caller's clock, which the next process continues.
+If the variables of a group are numbers, its state is the bytes in the module's memory, which `CellNames` describes;
+this is the cheap, common case. Times are those of the caller's clock, which the next process continues.
 """
 
 import hashlib
@@ -27,23 +27,20 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 MOST_BYTES = 64 << 10
-"""The maximum number of bytes of a group's state, without slices.
-
-The state is written with each batch that changes it.
-"""
+"""In bytes, for a group without slices: it is written with each batch that changes it."""
 
 _CLOCK = struct.Struct("<qq")
 
 
 class TimerSnapshot(msgspec.Struct, frozen=True, array_like=True):
-    """A periodic event: the time of its next tick."""
+    """A periodic event."""
 
     due: int | None
     ticked: bool
 
 
 class MonitorSnapshot(msgspec.Struct, frozen=True, array_like=True):
-    """A monitor's state; `identity` and `types` identify its text and its message definitions."""
+    """`identity` and `types` stand for its text and its message definitions."""
 
     name: str
     identity: bytes
@@ -58,11 +55,11 @@ class MonitorSnapshot(msgspec.Struct, frozen=True, array_like=True):
     runs: list[Any]
     variables: dict[str, Any]
     first: tuple[list[Any], list[Any]] = ([], [])
-    """For a parametric specification: initial values of parameters and of the slices' own variables."""
+    """Initial values of parameters, and of the slices' own variables."""
 
 
 def encoded(states: Sequence[MonitorSnapshot]) -> bytes:
-    """Serialize the state of a group. Raises `StateTooLargeError`."""
+    """Raises `StateTooLargeError`."""
     data = msgspec.msgpack.encode(states)
     if len(data) > MOST_BYTES:
         raise StateTooLargeError(f"its state has {len(data)} bytes; {MOST_BYTES} are kept")
@@ -70,20 +67,20 @@ def encoded(states: Sequence[MonitorSnapshot]) -> bytes:
 
 
 def refused(why: str) -> bytes:
-    """Return the bytes that are written instead of a state that cannot be saved."""
+    """Replaces a state that cannot be saved."""
     return msgspec.msgpack.encode(why)
 
 
 GroupSnapshot = tuple[Sequence[str], bytes, bytes, bytes | None]
-"""The saved state of a group: the names of its monitors, the layout of its cells (`CellNames` as MessagePack), their
-state (`encoded`, `refused`), and the cells of the module if they are newer.
+"""The names of a group's monitors, the layout of its cells (`CellNames` as MessagePack), their state (`encoded`,
+`refused`), and the cells if they are newer.
 """
 
 
 def states_of(
     groups: Sequence[GroupSnapshot],
 ) -> tuple[dict[str, MonitorSnapshot], dict[str, list[SliceSnapshot]], dict[str, str]]:
-    """Return the last saved state of each monitor, the slices, and the reasons why other states are lost."""
+    """Return the last state of each monitor, the slices, and the reasons why other states are lost."""
     found: dict[str, MonitorSnapshot] = {}
     slices: dict[str, list[SliceSnapshot]] = {}
     lost: dict[str, str] = {}
@@ -134,7 +131,7 @@ def _with_cells(states: list[MonitorSnapshot], cells: bytes, names: CellNames) -
 
 
 def kept_monitor(monitor: MonitorInstance, variables: Mapping[str, Any], types: bytes) -> MonitorSnapshot:
-    """Return the state of a monitor as data. Raises `StateTooLargeError`."""
+    """Raises `StateTooLargeError`."""
     slices = monitor.slices
     first: tuple[list[Any], list[Any]] = ([], [])
     if slices is not None:
@@ -159,7 +156,7 @@ def kept_monitor(monitor: MonitorInstance, variables: Mapping[str, Any], types: 
 
 
 def shape(monitor: MonitorInstance, variables: Mapping[str, Any]) -> bytes:
-    """Return a state without times, to compare it with the initial one."""
+    """A state without times can be compared with the initial one."""
     monitor.move_to_python()
     runs = [
         kept(running.run)[0][:1] if isinstance(running.run, FiniteRun | ClockedRun) else kept(running.run)
@@ -179,7 +176,7 @@ def restore(
     *,
     time_ns: int,
 ) -> None:
-    """Restore the state of a new monitor. If this raises `ValueError`, the monitor must be started."""
+    """Restore a new monitor. After a `ValueError`, the monitor must be started."""
     code, values, types = monitor.code, state.variables, compiled.types
     fits = partial(_fits, ValueCodec(compiled.messages))
     properties = monitor.properties if monitor.slices is None else ()
@@ -238,7 +235,7 @@ def _fits(known: ValueCodec, kind: Type, value: Any) -> bool:
 
 
 def types_of(compiled: Compiled) -> dict[str, bytes]:
-    """Return for each specification a digest of the message definitions that it uses."""
+    """Return a digest of the message definitions that each specification uses."""
     definitions = compiled.messages.definitions
     return {
         code.name: hashlib.sha256(

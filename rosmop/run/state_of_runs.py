@@ -1,8 +1,8 @@
 """Runs of properties as plain data that outlives a process, and back.
 
-A run returns the values that change (`saved`). They become numbers, strings and arrays of MessagePack. A
-container is `[tag, item, …]`. An object with several references is `["o", number]`; the table entry with that number
-has its fields. Reading creates only objects of the classes below.
+A run returns its values that change (`saved`), which become numbers, strings and arrays of MessagePack. A container
+is `[tag, item, …]`. An object with several references is `["o", number]`; the table entry with that number has its
+fields. Reading creates only objects of the classes below.
 """
 
 from collections import deque
@@ -16,7 +16,7 @@ from rosmop.logics.interface import ClockedRun, CompiledProperty, FiniteRun, Run
 from rosmop.logics.parsing import EarleySet, EarleyShape
 
 MOST_PARTS = 5_000
-"""The maximum number of objects of one run: more than a hundred times the usual number."""
+"""For one run: more than a hundred times the usual number of objects."""
 
 _CONTAINERS: Mapping[str, Callable[[list[Any]], Any]] = MappingProxyType(
     {"l": list, "t": tuple, "d": deque, "s": set}
@@ -28,18 +28,18 @@ _SMALL = 1 << 63
 
 
 class StateTooLargeError(Exception):
-    """A state has too many parts, or bytes, to be saved."""
+    """A state has too many parts or bytes."""
 
 
 def kept(run: Any) -> list[Any]:
-    """Return the state of a `Run` as plain data. Raises `StateTooLargeError`."""
+    """Raises `StateTooLargeError`."""
     if isinstance(run, FiniteRun | ClockedRun):
         return [[*run.saved()], []]
     return _Writer(run).written()
 
 
 def run_of(compiled: CompiledProperty, data: Any, time_ns: int) -> Run:
-    """Return the run of a property with the state `data`. Raises `ValueError` for invalid data."""
+    """Raises `ValueError` for invalid data."""
     run = compiled.start(time_ns)
     try:
         _Reader(compiled, run, data).read()
@@ -50,7 +50,7 @@ def run_of(compiled: CompiledProperty, data: Any, time_ns: int) -> Run:
 
 
 class _Writer:
-    """A writer of the parts of one run, each part once."""
+    """Writes each part of a run once."""
 
     def __init__(self, run: Any) -> None:
         self._run = run
@@ -102,7 +102,7 @@ class _Writer:
 
 
 class _Reader:
-    """A reader that restores the written state in a new run."""
+    """Restores the written state in a new run."""
 
     def __init__(self, compiled: CompiledProperty, run: Any, data: Any) -> None:
         self._compiled = compiled
@@ -151,7 +151,7 @@ class _Reader:
             self._fill(run.operators[number], fields)
 
     def _fill_run(self, fields: list[Any]) -> None:
-        """Fill the run itself; each value has the type of the first one (a grammar's frame may be gone)."""
+        """Each value has the type of the new run's value; a grammar's frame may be gone."""
         before = self._run.saved()
         self._fill(self._run, fields)
         for first, value in zip(before, self._run.saved(), strict=True):

@@ -1,8 +1,7 @@
-"""The slices of a running parametric specification as data. Only the parts that a message changes are written.
+"""Keep the slices of a running parametric specification as data.
 
-The slices are divided by their bindings into `BUCKETS` parts. If one slice of a part has changed, the whole part is
-written. So a message costs the writing of one part, a hundredth of all slices, and a part is written completely or not
-at all.
+The slices are divided by their bindings into `BUCKETS` parts. If a slice has changed, its whole part is written. So a
+message costs a hundredth of all slices, and a part is written completely or not at all.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,9 +18,9 @@ BUCKETS = 128
 
 
 class SliceSnapshot(msgspec.Struct, frozen=True, array_like=True):
-    """A slice: the parameters of its binding (a set of bits), their values, the host that is charged for it, its state.
+    """A slice: `domain` has the parameters as bits, and `holder` is charged.
 
-    `number` counts the slices in the order in which they began or ended. A slice that has `ended` has no state.
+    `number` counts slices in the order in which they began or ended; an ended one has no state.
     """
 
     number: int
@@ -56,7 +55,7 @@ class SliceParts:
         slices.keep()
 
     def changed(self) -> dict[int, bytes]:
-        """Return the parts that have changed since the last call, by number, or the reason why one cannot be saved."""
+        """Since the last call, by number. A part that cannot be saved is replaced by the reason."""
         bindings, dirty = self._slices.changed or {}, set()
         self._slices.changed = {}
         for binding, holder in bindings.items():

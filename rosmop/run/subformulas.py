@@ -1,4 +1,4 @@
-"""Finds the subformulas that decide a past-time formula over the events that explain a verdict.
+"""Find the subformulas that decide a past-time formula over the events of an explanation.
 
 An explanation has few events, so the formula is evaluated by its definition, position by position.
 """
@@ -25,9 +25,7 @@ _MOST = 8
 
 
 def deciding(source: Source, events: Sequence[int], times: Sequence[int]) -> list[str]:
-    """Return the subformulas that decide the formula at the last event, with their values there.
-
-    `events` are the numbers of the events in the source, `times` their times (ns). The result is empty for other
+    """`events` are the numbers of the events in the source, `times` their times (ns). The result is empty for other
     logics, and for formulas about the future.
     """
     syntax = _SYNTAXES.get(source.logic)
@@ -64,7 +62,7 @@ def _decisive(meaning: "Meaning", formula: Formula, at: int) -> Iterator[tuple[F
 
 
 class Meaning:
-    """The values of formulas at the positions of a trace."""
+    """Evaluates formulas at the positions of a trace."""
 
     def __init__(self, events: Sequence[str], times: Sequence[int]) -> None:
         self._events = events
@@ -80,7 +78,7 @@ class Meaning:
         return self._known[key]
 
     def _seen(self, at: int) -> list[int]:
-        """Return the positions up to this one, without calls that have returned."""
+        """Calls that have returned are left out."""
         seen: list[int] = []
         for place, event in enumerate(self._events[:at]):
             seen.append(place)
@@ -106,7 +104,7 @@ class Meaning:
         )
 
     def _past(self, operator: str, formula: Formula, places: list[int], *, dual: bool) -> bool:
-        """Evaluate an operator over these positions; `dual` negates the operands and the result."""
+        """`dual` negates the operands and the result."""
         low, high = formula.bounds or (0, None)
         *first, last = formula.operands
         now = self._times[places[-1]]
@@ -130,14 +128,14 @@ class Meaning:
 
 
 class _Words:
-    """A formatter of formulas in the syntax of a logic."""
+    """Formats formulas in the syntax of a logic."""
 
     def __init__(self, syntax: Syntax) -> None:
         levels = [syntax.unary, *(level.operators for level in syntax.levels)]
         self._spelled = {meant: word for words in levels for word, meant in reversed([*words.items()])}
 
     def text(self, formula: Formula) -> str:
-        """Return a formula as text; nested operators are in parentheses."""
+        """Nested operators are in parentheses."""
         if not formula.operands:
             return formula.name or formula.operator
         parts = [

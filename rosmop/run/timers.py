@@ -1,8 +1,7 @@
 """Ticks (`every`), deadlines and safe messages, in the order of their times.
 
-The caller gives the time, in nanoseconds. At a given time, all ticks up to and including that time happen, and all
-deadlines before it. Ticks beyond the caller's `patience` are skipped, which is logged. Deadlines wait for the next
-call.
+The caller gives the time, in nanoseconds: all ticks up to it happen, and all deadlines before it. Ticks beyond the
+caller's `patience` are skipped, which is logged; deadlines wait for the next call.
 
 Slices of parametric specifications have their own deadlines. Senders choose the bindings, and thereby how many
 deadlines pass at one time. Therefore `advance` processes at most `most` deadlines; the others stay due. A slice
@@ -18,10 +17,7 @@ from rosmop.run.outcomes import Outcome
 Patience = Callable[[], Callable[[], bool]]
 
 MAX_TICKS = 100_000
-"""The maximum number of ticks of one timer between two messages.
-
-After a larger jump of the clock the rest is skipped and reported.
-"""
+"""For one timer between two messages. After a larger jump of the clock the rest is skipped and reported."""
 
 
 class Agenda:
@@ -34,9 +30,7 @@ class Agenda:
         patience: Patience,
         most: int,
     ) -> None:
-        """`patience()` is called when something is due; it returns a function that returns whether the work takes too
-        long.
-        """
+        """When something is due, `patience()` returns a function that returns whether the work takes too long."""
         self.due: int | None = None
         """Time of the next tick or deadline; None if there is none."""
         self._monitors = monitors
@@ -60,7 +54,7 @@ class Agenda:
         return self.due is not None and self.due <= time_ns
 
     def schedule(self) -> None:
-        """Compute the next time that something is due. A deadline passes after its last nanosecond."""
+        """A deadline passes after its last nanosecond."""
         if not self._timed:
             return
         timer, deadline = self._next_timer(), self._next_deadline()
@@ -76,16 +70,13 @@ class Agenda:
         self.due = min(times, default=None)
 
     def when_due(self, *, anew: bool) -> int | None:
-        """Return the next time that something is due.
-
-        With `anew`, compute it again, because lanes may have moved deadlines.
-        """
+        """With `anew`, compute the time again, because lanes may have moved deadlines."""
         if anew:
             self.schedule()
         return self.due
 
     def advance(self, time_ns: int, follow_up: Callable[[Outcome], None]) -> list[Outcome]:
-        """Process the ticks up to this time and the deadlines before it, in the order of their times.
+        """Process events in order of time.
 
         `follow_up(outcome)` is called before the next tick or deadline, which its publications may change.
         """
@@ -124,7 +115,7 @@ class Agenda:
         return outcomes
 
     def send_safe(self, time_ns: int) -> list[Outcome]:
-        """Send the safe messages that are due, each at most once: those that were missed are of no use."""
+        """Each is sent at most once, because those that were missed are of no use."""
         outcomes = []
         for monitor in self._monitors:
             for sender in monitor.sending(passes=self._execution.on_fault == "pass"):
@@ -173,10 +164,7 @@ class Agenda:
     def _next_deadline(
         self, *, slices: bool = True
     ) -> tuple[int, MonitorInstance, RunningProperty | None] | None:
-        """Return the next deadline and its property.
-
-        The property is None for a slice's deadline (only with `slices`).
-        """
+        """The property is None for a slice's deadline."""
         found: tuple[int, MonitorInstance, RunningProperty | None] | None = None
         for monitor in self._monitors:
             if monitor.enabled and monitor.slices is not None:

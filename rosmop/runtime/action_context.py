@@ -1,10 +1,10 @@
-"""The bounds of one specification's actions, and their output: log lines, published messages, faults.
+"""Bound a specification's actions, and collect their output: log lines, published messages, faults.
 
 Invariants:
 
-1. Between two calls of `begin` a specification spends at most its budget of instructions. Loops, calls, copies of long
-   values, and reads of many elements are charged before they run. If processor time is bounded (`Turn.limit`), the
-   clock is read every `STEP` instructions, and every `PART` elements of a loop or copy.
+1. Between two calls of `begin` a specification spends at most its budget of instructions. Loops, calls, copies of
+   long values, and reads of many elements are charged before they run. If processor time is bounded (`Turn.limit`),
+   the clock is read every `STEP` instructions, and every `PART` elements of a loop or copy.
 2. The values of a specification never exceed `MAX_BYTES` plus `UNMEASURED` bytes. Code that makes long values calls
    `allocate`; after `UNMEASURED` bytes the live values are measured.
 """
@@ -15,21 +15,21 @@ from math import inf
 from typing import Any, NamedTuple
 
 BUDGET = 1_000_000
-"""The maximum number of instructions of a specification for one message."""
+"""For one message."""
 
 STEP = 250
 """Instructions between two readings of the processor time."""
 
 PART = 250
-"""Elements read or made between two readings of the processor time."""
+"""Like `STEP`, for elements of arrays."""
 
 _AT_ONCE = 10e-9  # seconds: the least that an instruction takes, where many are charged in advance
 
 MAX_BYTES = 16 << 20
-"""The maximum size in bytes of all values of a specification together."""
+"""In bytes, for all values of a specification together."""
 
 UNMEASURED = 1 << 20
-"""The number of bytes that may be allocated between two measurements."""
+"""Bytes that may be allocated between two measurements."""
 
 MAX_CALLS = 100
 """The maximum depth of recursive calls of helper functions."""
@@ -43,7 +43,7 @@ Measure = Callable[[object], int]
 
 
 class FaultError(Exception):
-    """A fault that stops an action: its site and reason."""
+    """A fault stops an action."""
 
     def __init__(self, site: int, text: str) -> None:
         super().__init__(text)
@@ -57,7 +57,7 @@ class MalformedError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class LogLine:
-    """A line of output: `level` is DEBUG, INFO, WARN, ERROR or FATAL."""
+    """`level` is DEBUG, INFO, WARN, ERROR or FATAL."""
 
     level: str
     text: str
@@ -65,12 +65,12 @@ class LogLine:
 
 
 def line_of(level: str, text: bytes, monitor: str) -> LogLine:
-    """Return a line of output. U+FFFD replaces bytes that are not UTF-8."""
+    """U+FFFD replaces bytes that are not UTF-8."""
     return LogLine(level, text.decode("utf-8", "replace").rstrip("\n"), monitor)
 
 
 class Published(NamedTuple):
-    """A message that a monitor publishes, or a service that it calls; `site` is the site of the statement."""
+    """A message that a monitor publishes, or a service that it calls."""
 
     monitor: str
     topic: str
@@ -82,7 +82,7 @@ class Published(NamedTuple):
 
 @dataclass(slots=True)
 class Turn:
-    """The state that all actions of one message or tick share: time, output, and values of evaluated conditions."""
+    """The state that all actions of one message or tick share."""
 
     now: int = 0
     source: int = 0
@@ -98,7 +98,7 @@ class Turn:
     until: float = inf
 
     def limit(self, clock: Callable[[], float], seconds: float) -> None:
-        """Limit the processor time of each message, tick or deadline, starting with the next."""
+        """Limit the processor time (seconds) of each message, tick or deadline, starting with the next."""
         self.clock, self.seconds = clock, seconds
 
     def begin(self) -> None:
@@ -110,7 +110,6 @@ class Turn:
         return self.clock is not None and self.clock() + more > self.until
 
     def check(self) -> None:
-        """Fault if the time is over."""
         if self.late():
             raise FaultError(-1, self.too_late)
 
@@ -123,7 +122,7 @@ class Turn:
         )
 
     def exclude(self, make: Callable[[], Any]) -> Any:
-        """Call `make` without charging its time."""
+        """Do not charge the time of `make`."""
         if self.clock is None:
             return make()
         began = self.clock()
@@ -133,7 +132,7 @@ class Turn:
 
 
 class Context:
-    """The bounds and the output of one specification: its name, and the rest of its budget."""
+    """The bounds and the output of one specification."""
 
     __slots__ = (
         "_allocated",
@@ -196,7 +195,7 @@ class Context:
             self._go_on(-1, ": too many elements precede a field")
 
     def _go_on(self, site: int, otherwise: str) -> None:
-        """Release the next step of the budget; fault if the budget is used up or the time is over."""
+        """Fault if the budget is used up or the time is over."""
         missing = -self.budget
         if missing > self._left:
             self._left = 0
@@ -209,7 +208,7 @@ class Context:
         self.budget += given
 
     def allocate(self, size: int, site: int, replaced: int = 0) -> None:
-        """Charge for `size` new or copied bytes, which replace `replaced` bytes of a variable."""
+        """The `size` new bytes replace `replaced` bytes of a variable."""
         if size > MAX_BYTES:
             raise FaultError(site, f"{_TOO_LARGE}: a value of {size} bytes")
         self.spend(size // BYTES_PER_INSTRUCTION, site)
@@ -222,7 +221,7 @@ class Context:
         self.turn.log.append(line_of(level, text, self.monitor))
 
     def throttle(self, period: float, site: int) -> bool:
-        """Return whether output at this site is due: the last one was at least `period` seconds ago."""
+        """Return whether output is due: the last one was at least `period` seconds ago."""
         now = self.turn.now
         last = self.throttled.get(site)
         if last is not None and last <= now < last + period * 1e9:

@@ -1,7 +1,7 @@
-"""The functions that the intermediate form (`form/nodes.py`) may call, by name.
+"""Name the functions that the intermediate form (`form/nodes.py`) may call.
 
-If the first parameter is `context`, it gets the context of the running specification, to charge the call to it. If the
-last parameter is `site`, it gets the position to report for a fault.
+A first parameter `context` gets the context of the running specification, which pays for the call. A last parameter
+`site` gets the position to report for a fault.
 """
 
 import inspect

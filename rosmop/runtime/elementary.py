@@ -1,6 +1,7 @@
-"""`sin`, `cos`, `atan2` and `hypot` of doubles, from IEEE operations only, so every machine gives the same bits.
+"""`sin`, `cos`, `atan2` and `hypot` of doubles give the same bits on every machine, because they use IEEE operations
+only.
 
-The algorithms are those of fdlibm (Sun Microsystems, 1993) and, for `hypot`, of musl. The error is below one unit in
+The algorithms are those of fdlibm (Sun Microsystems, 1993) and, for `hypot`, of musl; the error is below one unit in
 the last place. `check/library_functions.py` has the same operations in the same order, in the language itself, for
 modules and proofs.
 """
@@ -9,7 +10,7 @@ import math
 from math import copysign, fabs, inf, sqrt
 
 LARGEST = 1048576.0
-"""The largest angle that is reduced here. The functions of the C library take larger angles."""
+"""The C library reduces larger angles."""
 
 _EIGHTH = 7.85398163397448278999e-01
 _WHOLE = 1.5 * 2.0**52  # adding and subtracting it rounds to a whole number
@@ -28,7 +29,7 @@ def cos(x: float) -> float:
 
 
 def _turned(x: float, quarters: float) -> float:
-    """Return the sine of `x` plus a number of right angles."""
+    """Add a number of right angles to `x`."""
     # Subtract `turns` right angles in three steps: each has 33 bits of a right angle, and the rest.
     turns = (x * 6.36619772367581382433e-01 + _WHOLE) - _WHOLE
     first = turns * 1.57079632673412561417e00
@@ -77,7 +78,7 @@ def atan2(y: float, x: float) -> float:
 
 
 def _arctangent(x: float) -> float:
-    """Return `atan(x)` for `x` from 0 to 2**60: `atan(v)` for a smaller `v`, and the rest in two parts."""
+    """`x` is from 0 to 2**60: `atan(v)` for a smaller `v`, and the rest in two parts."""
     high, low, v = 0.0, 0.0, x
     if x >= 39 / 16:
         high, low, v = 1.57079632679489655800, 6.12323399573676603587e-17, -1.0 / x

@@ -11,19 +11,19 @@ def to_text_integer(value: int) -> bytes:
 
 
 def to_text_streamed(value: float) -> bytes:
-    """Return the text of `std::cout << value`: six significant digits."""
+    """`std::cout << value`: six significant digits."""
     return b"%g" % value
 
 
 def to_text_fixed(value: float, precision: int, site: int) -> bytes:
-    """Return the text of `std::cout << std::fixed << std::setprecision(precision) << value`."""
+    """`std::cout << std::fixed << std::setprecision(precision) << value`."""
     if not 0 <= precision <= MAX_PRECISION:
         raise FaultError(site, f"a precision of {precision}")
     return b"%.*f" % (precision, value)
 
 
 def to_text_precise(value: float, precision: int, site: int) -> bytes:
-    """Return the text of `std::cout << std::setprecision(precision) << value`."""
+    """`std::cout << std::setprecision(precision) << value`."""
     if not 0 <= precision <= MAX_PRECISION:
         raise FaultError(site, f"a precision of {precision}")
     return b"%.*g" % (precision, value)
@@ -34,7 +34,7 @@ def to_text_character(value: int) -> bytes:
 
 
 def to_text_alternate(template: bytes, value: int) -> bytes:
-    """Return the text of `printf` with the flag `#`: octal begins with 0, and nonzero hexadecimal with 0x."""
+    """`printf` with the flag `#`: octal begins with 0, and nonzero hexadecimal with 0x."""
     if not value:
         return template % value
     if template[-1:] != b"o":
@@ -50,7 +50,7 @@ def to_text_alternate(template: bytes, value: int) -> bytes:
 
 
 def to_text_hexadecimal(value: float, plus: bool, upper: bool) -> bytes:
-    """Return the text of `%a`: the shortest hexadecimal form of a floating-point number."""
+    """`%a`: the shortest hexadecimal form."""
     digits, exponent, power = value.hex().partition("p")
     text = (digits.rstrip("0").rstrip(".") if "." in digits else digits) + exponent + power
     if plus and value >= 0:
@@ -59,7 +59,7 @@ def to_text_hexadecimal(value: float, plus: bool, upper: bool) -> bytes:
 
 
 def to_text_moment(nanoseconds: int) -> bytes:
-    """Return the text of `std::cout << time`: seconds, a point, nine digits."""
+    """`std::cout << time`: seconds, a point, nine digits."""
     sign = b"-" if nanoseconds < 0 else b""
     return b"%s%d.%09d" % (sign, *divmod(abs(nanoseconds), 1_000_000_000))
 
@@ -74,7 +74,7 @@ def join_all(context: Context, pieces: tuple[bytes, ...], site: int) -> bytes:
 def formatted(
     context: Context, template: bytes, arguments: tuple[object, ...], size: int, site: int
 ) -> bytes:
-    """Return `template % arguments`, charged in advance. `size` is the length of the text without its strings."""
+    """Charge in advance. `size` is the length of the text without its strings."""
     size += sum(len(argument) for argument in arguments if isinstance(argument, bytes))
     if size > _LONG:
         context.allocate(size, site)

@@ -1,4 +1,4 @@
-"""Numbers as in C++ on a 64-bit machine: two's complement that wraps, IEEE floating point, 32-bit floats."""
+"""Calculate as C++ on a 64-bit machine: two's complement that wraps, IEEE floating point, 32-bit floats."""
 
 import ctypes
 import math
@@ -15,7 +15,7 @@ _F32_LIMIT = 3.4028235677973366e38  # from this number on, the nearest float is 
 
 
 def f32(value: float) -> float:
-    """Return the nearest 32-bit float."""
+    """The nearest 32-bit float."""
     if -_F32_LIMIT < value < _F32_LIMIT:
         result: float = _F32.unpack(_F32.pack(value))[0]
         return result
@@ -23,9 +23,8 @@ def f32(value: float) -> float:
 
 
 def f32_of_integer(value: int) -> float:
-    """Return the nearest 32-bit float, rounded only once.
-
-    A double cannot hold an integer beyond 2**53, so the low bits of such an integer are first merged into one bit.
+    """The nearest 32-bit float, rounded only once: a double cannot hold an integer beyond 2**53, so its low bits are
+    first merged into one.
     """
     if -_EXACT <= value <= _EXACT:
         return f32(value)
@@ -36,7 +35,7 @@ def f32_of_integer(value: int) -> float:
 
 
 def truncate(value: float, least: int, most: int) -> int:
-    """Return a floating-point number as an integer: truncated, clamped to the limits, 0 for NaN."""
+    """Truncate, and clamp to the limits; NaN becomes 0."""
     if value != value:  # noqa: PLR0124  NaN
         return 0
     if value <= least:
@@ -50,7 +49,7 @@ def wrap(value: int, bits: int, signed: bool) -> int:
 
 
 def divide(left: int, right: int, site: int) -> int:
-    """Divide integers, rounding toward zero."""
+    """Rounds toward zero."""
     if right == 0:
         raise FaultError(site, "division by zero")
     result = abs(left) // abs(right)
@@ -58,7 +57,7 @@ def divide(left: int, right: int, site: int) -> int:
 
 
 def remainder(left: int, right: int, site: int) -> int:
-    """Return the remainder of an integer division, with the sign of `left`."""
+    """Has the sign of `left`."""
     if right == 0:
         raise FaultError(site, "division by zero")
     result = abs(left) % abs(right)
@@ -66,7 +65,7 @@ def remainder(left: int, right: int, site: int) -> int:
 
 
 def ratio(left: float, right: float) -> float:
-    """Divide floating-point numbers; division by zero gives infinity or NaN."""
+    """Division by zero gives infinity or NaN."""
     try:
         return left / right
     except ZeroDivisionError:
@@ -76,7 +75,7 @@ def ratio(left: float, right: float) -> float:
 
 
 def _total(function: Callable[..., float]) -> Callable[..., float]:
-    """Return the function with C's results wherever Python's function raises."""
+    """Return C's results wherever Python's function raises."""
 
     def answer(*arguments: float) -> float:
         try:
@@ -112,7 +111,7 @@ def power(base: float, exponent: float) -> float:
 
 
 def round_half_away(value: float) -> float:
-    """Return C's `round`."""
+    """C's `round`."""
     if not math.isfinite(value):
         return value
     whole = math.floor(abs(value))
@@ -120,7 +119,7 @@ def round_half_away(value: float) -> float:
 
 
 def round_half_even(value: float) -> float:
-    """Return C's `rint`."""
+    """C's `rint`."""
     return math.copysign(float(round(value)), value) if math.isfinite(value) else value
 
 
@@ -137,7 +136,7 @@ def trunc(value: float) -> float:
 
 
 def fma(left: float, right: float, added: float) -> float:
-    """Return C's `fma`, which rounds only once."""
+    """C's `fma`, which rounds only once."""
     if not (math.isfinite(left) and math.isfinite(right)):
         return left * right + added
     if not math.isfinite(added):
@@ -160,17 +159,17 @@ def _inverse_hyperbolic_tangent(value: float) -> float:
 
 
 def fmin(left: float, right: float) -> float:
-    """Return C's `fmin`: if one value is NaN, the result is the other."""
+    """C's `fmin`: a number is preferred to NaN."""
     return right if left != left or right < left else left  # noqa: PLR0124  NaN
 
 
 def fmax(left: float, right: float) -> float:
-    """Return C's `fmax`: if one value is NaN, the result is the other."""
+    """C's `fmax`: a number is preferred to NaN."""
     return right if left != left or right > left else left  # noqa: PLR0124  NaN
 
 
 def positive_difference(left: float, right: float) -> float:
-    """Return C's `fdim`."""
+    """C's `fdim`."""
     if math.isnan(left) or math.isnan(right):
         return math.nan
     return left - right if left > right else 0.0
@@ -225,11 +224,11 @@ MATH: dict[str, tuple[int, Callable[..., float]]] = {
     "erf": (1, math.erf),
     "erfc": (1, math.erfc),
 }
-"""Functions of `<math.h>` on doubles: number of arguments, and implementation."""
+"""Functions of `<math.h>` on doubles, with their number of arguments."""
 
 
 def _of_floats(name: str, count: int) -> Callable[..., float]:
-    """Return a function of the C library on floats, with the bits that a compiled C++ monitor would get."""
+    """Return a function of the C library, with the bits that a compiled C++ monitor would get."""
     function = ctypes.CDLL("libm.so.6")[f"{name}f"]
     function.argtypes, function.restype = [ctypes.c_float] * count, ctypes.c_float
 
@@ -243,4 +242,4 @@ def _of_floats(name: str, count: int) -> Callable[..., float]:
 FLOAT_MATH: dict[str, Callable[..., float]] = {
     name: _of_floats(name, count) for name, (count, _) in MATH.items()
 }
-"""Functions on floats. Their results can differ from rounded doubles, as for `sinf(380738.94)`."""
+"""Their results can differ from rounded doubles, as for `sinf(380738.94)`."""

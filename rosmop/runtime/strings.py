@@ -41,7 +41,7 @@ def repeat(context: Context, count: int, character: int, site: int) -> bytes:
 
 
 def character(text: bytes, index: int, site: int) -> int:
-    """Return `text[index]`, a signed char. The character after the last is 0."""
+    """`text[index]`, a signed char; the character after the last is 0."""
     if 0 <= index < len(text):
         value = text[index]
         return value - 256 if value > 127 else value
@@ -51,7 +51,7 @@ def character(text: bytes, index: int, site: int) -> int:
 
 
 def member(text: bytes, index: int, site: int) -> int:
-    """Return `text.at(index)`, `front` or `back`. Unlike in `character`, the index after the last is a fault."""
+    """`text.at(index)`, `front` or `back`: unlike in `character`, the index after the last is a fault."""
     if index == len(text):
         raise FaultError(site, f"index {index} is past the end of a string of {len(text)} characters")
     return character(text, index, site)
@@ -97,7 +97,7 @@ def find_any(context: Context, text: bytes, wanted: bytes, start: int, site: int
 
 
 def charged(context: Context, text: bytes, site: int) -> bytes:
-    """Charge for reading or copying a text, and return it."""
+    """Charge for reading or copying."""
     if len(text) > _LONG:
         context.spend(len(text) // BYTES_PER_INSTRUCTION, site)
     return text
@@ -134,14 +134,14 @@ def replace(context: Context, text: bytes, start: int, count: int, added: bytes,
 
 
 def shorten(context: Context, text: bytes, site: int) -> bytes:
-    """Return `text` after `text.pop_back()`."""
+    """`text.pop_back()`."""
     if not text:
         raise FaultError(site, "pop_back of an empty string")
     return charged(context, text, site)[:-1]
 
 
 def filled(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
-    """Return a `char` buffer after `strcpy(buffer, text)`."""
+    """A `char` buffer after `strcpy(buffer, text)`."""
     _allocate(context, buffer, site)
     copied = _cut(text) + b"\0"
     if len(copied) > len(buffer):
@@ -150,7 +150,7 @@ def filled(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
 
 
 def filled_at_most(context: Context, buffer: bytes, text: bytes, count: int, site: int) -> bytes:
-    """Return a `char` buffer after `strncpy(buffer, text, count)`."""
+    """A `char` buffer after `strncpy(buffer, text, count)`."""
     _allocate(context, buffer, site)
     if count > len(buffer):
         raise FaultError(site, f"strncpy of {count} characters into a buffer of {len(buffer)}")
@@ -163,13 +163,13 @@ def printed(context: Context, buffer: bytes, text: bytes, limit: int, site: int)
 
 
 def extended(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
-    """Return a `char` buffer after `strcat(buffer, text)`."""
+    """A `char` buffer after `strcat(buffer, text)`."""
     _allocate(context, buffer, site)
     return filled(context, buffer, _cut(buffer) + _cut(text), site)
 
 
 def terminated(context: Context, buffer: bytes, site: int) -> bytes:
-    """Return the string in a `char` buffer: up to the first zero."""
+    """Return the string in a `char` buffer, up to the first zero."""
     return _cut(charged(context, buffer, site))
 
 
@@ -184,7 +184,7 @@ def _allocate(context: Context, buffer: bytes, site: int) -> None:
 
 
 def parse_integer(text: bytes, base: int, least: int, most: int, site: int) -> int:
-    """Return the result of `std::stoi` and similar functions; fault where C++ throws."""
+    """`std::stoi` and similar functions; fault where C++ throws."""
     found = _INTEGERS[base].match(text[:1000])
     if found is None:
         raise FaultError(site, "the string does not begin with a number")
@@ -197,7 +197,7 @@ def parse_integer(text: bytes, base: int, least: int, most: int, site: int) -> i
 
 
 def parse_floating(text: bytes, bits: int, site: int) -> float:
-    """Return the result of `std::stod` or `std::stof`; fault where C++ throws."""
+    """`std::stod` or `std::stof`; fault where C++ throws."""
     found = _FLOATING.match(text[:1000])
     if found is None:
         raise FaultError(site, "the string does not begin with a number")
@@ -209,12 +209,12 @@ def parse_floating(text: bytes, bits: int, site: int) -> float:
 
 
 def lenient_integer(text: bytes) -> int:
-    """Return `atoi(text)`: 0 for text that is not a number."""
+    """`atoi(text)`: 0 for text that is not a number."""
     found = re.match(rb"\s*+[+-]?[0-9]{1,18}+", text[:1000])
     return int(found[0]) if found else 0
 
 
 def lenient_floating(text: bytes) -> float:
-    """Return `atof(text)`: 0 for text that is not a number."""
+    """`atof(text)`: 0 for text that is not a number."""
     found = _FLOATING.match(text[:1000])
     return float(found[1]) if found else 0.0

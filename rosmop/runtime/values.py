@@ -30,7 +30,7 @@ BILLION = 1_000_000_000
 
 
 def struct_code(kind: Type) -> str | None:
-    """Return the `struct` code of a type of fixed size, or None.
+    """Return None for a type without a fixed size.
 
     A time has two codes: for seconds and for nanoseconds.
     """
@@ -48,10 +48,10 @@ def struct_size(codes: str) -> int:
 
 
 class ValueCodec:
-    """Encodes, decodes, copies and measures values of a set of definitions; functions are cached by type."""
+    """Encodes, decodes, copies and measures values; functions are cached by type."""
 
     def __init__(self, messages: MessageTypes, check: Callable[[], None] = lambda: None) -> None:
-        """`check` is called from time to time while many elements are decoded. It may raise to stop the decoding."""
+        """`check` is called from time to time while many elements are decoded, and may raise."""
         self._messages = messages
         self._check = check
         self._made: dict[tuple[Callable[[ValueCodec, Any], Any], Type], Callable[..., Any]] = {}
@@ -69,7 +69,7 @@ class ValueCodec:
     # Sizes
 
     def width(self, kind: Type) -> int:
-        """Return the size of a value in C++, without the contents of strings and vectors."""
+        """In C++, without the contents of strings and vectors."""
         if isinstance(kind, value_types.IntegerType | value_types.FloatingType):
             return kind.bits // 8
         if isinstance(kind, value_types.RecordType):
@@ -85,7 +85,7 @@ class ValueCodec:
         )
 
     def least(self, kind: Type) -> int:
-        """Return the encoded size of the shortest value of a type."""
+        """The encoded size of the shortest value."""
         code = struct_code(kind)
         if code is not None:
             return struct_size(code)
@@ -132,7 +132,7 @@ class ValueCodec:
         return lambda: zero
 
     def copier(self, kind: Type) -> Callable[[Context, Any, int], Any]:
-        """Return a function of context, value and site that charges for a deep copy and makes it."""
+        """The result takes context, value and site, and charges for a deep copy."""
         return self._once(ValueCodec._copier, kind)
 
     def _copier(self, kind: Type) -> Callable[[Context, Any, int], Any]:
@@ -154,7 +154,7 @@ class ValueCodec:
     # In a message
 
     def decoder(self, kind: Type) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
-        """Return a function that decodes the value at a position, and returns the value and its end."""
+        """The result takes a position, and returns the value and its end."""
         return (
             wire.text if isinstance(kind, value_types.StringType) else self._once(ValueCodec._decoder, kind)
         )
@@ -206,7 +206,7 @@ class ValueCodec:
         return lambda buffer, start: decode(buffer, start + 4, wire.count(buffer, start, least))
 
     def encoder(self, kind: Type) -> Callable[[Any, bytearray], None]:
-        """Return a function that appends the bytes of a value."""
+        """The result appends the bytes of a value."""
         return (
             wire.put_text
             if isinstance(kind, value_types.StringType)
@@ -264,7 +264,7 @@ class ValueCodec:
 
 
 def zero_of(kind: Type) -> bool | float | bytes | None:
-    """Return the zero value of a type whose values are immutable; None for void."""
+    """Return None for void."""
     if isinstance(kind, value_types.BoolType):
         return False
     if isinstance(kind, value_types.FloatingType):
@@ -275,7 +275,7 @@ def zero_of(kind: Type) -> bool | float | bytes | None:
 
 
 def unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequence[Any], int]]:
-    """Return a function that decodes numbers with these `struct` codes; two codes are nanoseconds."""
+    """Two codes are nanoseconds."""
     plain = struct.Struct("<" + "".join(codes))
     unpack, size = plain.unpack_from, plain.size
     if all(len(code) == 1 for code in codes):
@@ -291,7 +291,7 @@ def unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequenc
 
 
 def packer(codes: Sequence[str]) -> Callable[[Sequence[Any]], bytes]:
-    """Return a function that encodes numbers with these `struct` codes; two codes are nanoseconds."""
+    """Two codes are nanoseconds."""
     pack = struct.Struct("<" + "".join(codes)).pack
     if all(len(code) == 1 for code in codes):
         return lambda values: pack(*values)

@@ -1,6 +1,6 @@
-"""Operations on vectors, which are Python lists. Functions that make long values charge for them first.
+"""Operations on vectors, which are Python lists, charge for long values first.
 
-`width` is the size of an element in C++, in bytes. It counts towards the memory limit.
+`width` is the size of an element in C++ in bytes, which counts towards the memory limit.
 """
 
 import math
@@ -21,7 +21,7 @@ def element(values: Values, index: int, site: int) -> Any:
 
 
 def put(values: Values, index: int, value: Any, site: int) -> Any:
-    """Assign `values[index] = value`; return the value."""
+    """`values[index] = value` returns the value."""
     if 0 <= index < len(values):
         values[index] = value
         return value
@@ -29,7 +29,7 @@ def put(values: Values, index: int, value: Any, site: int) -> Any:
 
 
 def put_slot(record: Values, slot: int, value: Any) -> Any:
-    """Set a field of a message; return the value."""
+    """Return the value."""
     record[slot] = value
     return value
 
@@ -45,7 +45,7 @@ def append_text(context: Context, values: Values, value: bytes, width: int, site
 
 
 def weighed(context: Context, values: Values, measure: Callable[[Values], int], site: int) -> Values:
-    """Charge for reading a whole vector or message, and return it. `measure` returns its size."""
+    """Charge for reading a whole vector or message of the size `measure`."""
     size = measure(values)
     if size > LARGE:
         context.spend(size // BYTES_PER_INSTRUCTION, site)
@@ -53,7 +53,7 @@ def weighed(context: Context, values: Values, measure: Callable[[Values], int], 
 
 
 def same(left: Any, right: Any) -> bool:
-    """Return whether two vectors or messages are equal. A NaN equals nothing, not even itself."""
+    """A NaN equals nothing, not even itself."""
     return left == right and _numbers(left)
 
 
@@ -68,13 +68,13 @@ def pop(values: Values, site: int) -> None:
 
 
 def copied(context: Context, values: Values, width: int, site: int) -> Values:
-    """Return a copy of a vector of numbers, strings or times."""
+    """The elements are numbers, strings or times."""
     context.allocate(len(values) * width, site)
     return values.copy()
 
 
 def copied_deep(context: Context, values: Values, width: int, copy: Callable[..., Any], site: int) -> Values:
-    """Return a copy of a vector of vectors or messages; `copy` copies an element."""
+    """The elements are vectors or messages; `copy` copies one."""
     context.allocate(len(values) * width, site)
     return [copy(context, value, site) for value in values]
 
@@ -103,7 +103,6 @@ def truths(values: Values) -> Values:
 
 
 def filled(context: Context, count: int, make: Callable[[], Any], width: int, site: int) -> Values:
-    """Return a vector of `count` new elements."""
     context.allocate(count * width, site)
     context.spend(count // 4, site)
     return _made(context, count, make)
@@ -120,7 +119,7 @@ def _made(context: Context, count: int, make: Callable[[], Any]) -> Values:
 def resized(  # noqa: PLR0917  the arguments are C++'s
     context: Context, values: Values, count: int, make: Callable[[], Any], width: int, site: int
 ) -> None:
-    """Change the number of elements: `values.resize(count)`."""
+    """`values.resize(count)`."""
     more = count - len(values)
     if more <= 0:
         del values[count:]
@@ -141,14 +140,14 @@ def filled_with(  # noqa: PLR0917  the arguments are C++'s
     measure: Callable[[Any], int],
     site: int,
 ) -> Values:
-    """Return `std::vector<T>(count, value)`; `measure` returns the size of a value."""
+    """`std::vector<T>(count, value)`; `measure` returns the size of a value."""
     context.allocate(count * max(measure(value), 1), site)
     context.spend(count // 4, site)
     return _made(context, count, lambda: copy(value))
 
 
 def fixed(values: Values, count: int, site: int) -> Values:
-    """Return the elements for an array of fixed length; fault if their number differs."""
+    """For an array of fixed length; fault if the number of elements differs."""
     if len(values) != count:
         raise FaultError(site, f"{len(values)} elements for an array of exactly {count}")
     return values
@@ -160,7 +159,7 @@ def _check_span(values: Values, first: int, last: int, site: int) -> None:
 
 
 def erase(context: Context, values: Values, first: int, last: int | None, site: int) -> None:
-    """Remove elements: `values.erase(first)`, `values.erase(first, last)`."""
+    """`values.erase(first)`, `values.erase(first, last)`."""
     last = first + 1 if last is None else last
     _check_span(values, first, last, site)
     context.spend((len(values) - first) // 64, site)
@@ -175,7 +174,7 @@ def insert(context: Context, values: Values, at: int, value: Any, width: int, si
 
 
 def sort(context: Context, values: Values, first: int, last: int, site: int) -> None:
-    """Sort elements in ascending order: `std::sort`."""
+    """`std::sort`."""
     _check_span(values, first, last, site)
     steps = (last - first).bit_length()
     context.spend((last - first) * steps, site)
@@ -185,14 +184,14 @@ def sort(context: Context, values: Values, first: int, last: int, site: int) -> 
 
 
 def reverse(context: Context, values: Values, first: int, last: int, site: int) -> None:
-    """Reverse elements: `std::reverse`."""
+    """`std::reverse`."""
     _check_span(values, first, last, site)
     context.spend((last - first) // 4, site)
     values[first:last] = values[first:last][::-1]
 
 
 def nearest(context: Context, values: Values, first: int, last: int, site: int) -> float:
-    """Return the smallest number from `first` to before `last`, infinity without one; NaN is ignored.
+    """Return the smallest number from `first` to before `last`, or infinity; NaN is ignored.
 
     If `first` is after `last`, the elements go on at the beginning.
     """
@@ -215,7 +214,7 @@ def accumulate(  # noqa: PLR0917  the arguments are C++'s, and how to add
     start: Any,
     add: Callable[[Any, Any], Any],
 ) -> Any:
-    """Return the sum of elements: `std::accumulate`."""
+    """`std::accumulate`."""
     _check_span(values, first, last, site)
     context.spend(last - first, site)
     for index in range(first, last):

@@ -1,7 +1,6 @@
 """Decode and encode the parts of messages.
 
-`buffer` is any object with the buffer interface that indexes bytes (bytes, bytearray, memoryview). Positions count from
-its start. Reading past the end raises `MalformedError` or `struct.error`.
+Positions count from the start of `buffer`. Reading past the end raises `MalformedError` or `struct.error`.
 """
 
 import struct
@@ -17,7 +16,7 @@ Buffer = bytes | bytearray | memoryview
 
 _LENGTH = struct.Struct("<I")
 MAX_EMPTY = 1_000_000
-"""The maximum number of elements of an array whose elements have no bytes."""
+"""For an array whose elements have no bytes."""
 
 _MAX_DECODED = 1_000_000  # the maximum number of elements that are decoded one by one
 FEW = 64  # this number of elements takes less time than one instruction
@@ -37,7 +36,7 @@ def text_end(buffer: Buffer, start: int) -> int:
 
 
 def count(buffer: Buffer, start: int, least: int) -> int:
-    """Return the number of elements of the array at `start`; each has at least `least` bytes."""
+    """Each element of the array at `start` has at least `least` bytes."""
     number: int = _LENGTH.unpack_from(buffer, start)[0]
     if number * least > len(buffer) - start - 4 or (not least and number > MAX_EMPTY):
         raise MalformedError(f"an array of {number} elements in a message of {len(buffer)} bytes")
@@ -45,7 +44,7 @@ def count(buffer: Buffer, start: int, least: int) -> int:
 
 
 def numbers(buffer: Buffer, start: int, number: int, code: str, size: int) -> tuple[list[Any], int]:
-    """Return `number` values of one `struct` code, and their end."""
+    """Return `number` values, and their end."""
     end = start + number * size
     if end > len(buffer):
         raise MalformedError(f"an array ends at byte {end} of a message of {len(buffer)}")
@@ -55,7 +54,7 @@ def numbers(buffer: Buffer, start: int, number: int, code: str, size: int) -> tu
 
 
 def moments(buffer: Buffer, start: int, number: int, code: str) -> tuple[list[int], int]:
-    """Return `number` times (code `I`) or durations (`i`) as nanoseconds, and their end."""
+    """Return times (code `I`) or durations (`i`) as nanoseconds, and their end."""
     pairs, end = numbers(buffer, start, 2 * number, code, 4)
     return [pairs[i] * 1_000_000_000 + pairs[i + 1] for i in range(0, len(pairs), 2)], end
 
@@ -67,7 +66,7 @@ def elements(
     decode: Callable[[Buffer, int], tuple[Any, int]],
     check: Callable[[], None],
 ) -> tuple[list[Any], int]:
-    """Return `number` values decoded with `decode`, and their end. `check` is called from time to time."""
+    """Return `number` values, and their end. `check` is called from time to time."""
     if number > _MAX_DECODED:
         raise MalformedError(
             f"an array of {number} elements; at most {_MAX_DECODED} that are not numbers are read"
@@ -82,7 +81,7 @@ def elements(
 
 
 def skip(buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context) -> int:
-    """Return the end of `number` elements; `end` returns the end of each. Many elements are charged first."""
+    """Return the end of `number` elements. Many are charged first."""
     if number > FEW:
         context.walk(number)
     return _skipped(buffer, start, number, end, context)
@@ -91,7 +90,7 @@ def skip(buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], i
 def skip_inner(
     buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context
 ) -> int:
-    """Do the same as `skip`, but within a skipped element.
+    """Like `skip`, but within a skipped element.
 
     There may be many such calls, so even a few elements are charged.
     """
@@ -120,19 +119,19 @@ def put_numbers(values: list[Any], code: str, out: bytearray) -> None:
 
 
 def put_moments(values: list[int], code: str, out: bytearray) -> None:
-    """Append times (code `I`) or durations (`i`)."""
+    """Times have the code `I`, durations `i`."""
     out += struct.pack(
         f"<{2 * len(values)}{code}", *(part for v in values for part in divmod(v, 1_000_000_000))
     )
 
 
 class WireMessage:
-    """The message of an event: its bytes with all changes so far, and whether it is dropped.
+    """The message of an event, with all changes so far.
 
-    Numbers are written in place, and only the replaced bytes are kept. So a large image, for example, is not copied
-    when its stamp changes. `touched` has a bit for each statement (of the sites in `marks`) whose write changed bytes;
-    it is cleared after each event. `cause` is the site of the statement that dropped the message. `stopped` is the
-    site that replaced it by the safe one of its `channel` (see `EventCode.channel`).
+    Numbers are written in place, and only the replaced bytes are kept, so a large image is not copied when its stamp
+    changes. `touched` has a bit for each statement (of the sites in `marks`) whose write changed bytes; it is cleared
+    after each event. `cause` is the site of the statement that dropped the message. `stopped` is the site that
+    replaced it by the safe one of its `channel` (see `EventCode.channel`).
     """
 
     __slots__ = (
@@ -164,7 +163,7 @@ class WireMessage:
 
     @property
     def changed(self) -> bool:
-        """Whether the bytes differ from the received bytes."""
+        """The bytes differ from the received ones."""
         if self._replaced is not None:
             return bytes(self.buffer) != self._replaced
         if self.written is None:
@@ -181,7 +180,7 @@ class WireMessage:
         return self.written or ()
 
     def patch(self, start: int, new: bytes, by: int = 1) -> None:
-        """Replace bytes with the same number of new bytes. If they differ, `touched` gets the bits `by`."""
+        """Replace bytes with the same number of new ones. If they differ, `touched` gets the bits `by`."""
         end = start + len(new)
         old = self.buffer[start:end]
         if old == new:
@@ -198,7 +197,7 @@ class WireMessage:
         self.buffer[start:end] = new  # type: ignore[index]  # it is a bytearray or a writable memoryview
 
     def splice(self, edits: list[tuple[int, int, bytes, int]]) -> None:
-        """Replace the bytes of each edit (start, end, new bytes, bits); see `patch`."""
+        """An edit has start, end, new bytes and bits; see `patch`."""
         if all(len(new) == end - start for start, end, new, _ in edits):
             for start, _, new, by in edits:
                 self.patch(start, new, by)
@@ -222,7 +221,7 @@ class WireMessage:
         self.stopped = site
 
     def _original(self) -> bytes:
-        """Return the received bytes, while the buffer has the same length."""
+        """The buffer must still have the same length."""
         if not self.written:
             return bytes(self.buffer)
         original = bytearray(self.buffer)

@@ -1,1 +1,1 @@
-"""The text of ``.rv`` files: grammar, parser and syntax tree, without knowledge of message types."""
+"""Parse ``.rv`` files to a syntax tree, without knowledge of message types."""

@@ -36,7 +36,7 @@ MAX_PERIOD_NS = 10**18
 
 
 class _LiteralError(Exception):
-    """An invalid literal; the text says what to write instead."""
+    """The text says what to write instead."""
 
 
 class _Unsaid:
@@ -51,7 +51,7 @@ def _binary(operator: str) -> Callable[..., tree.BinaryExpression]:
 
 
 def _made(kind: Callable[..., _T], first: int = 0, **more: bool) -> Callable[..., _T]:
-    """Return the method for a rule whose children from `first` on are the fields of its node."""
+    """The children from `first` on are the fields of the node."""
 
     def build(self: "TreeBuilder", meta: Meta, *children: Any) -> _T:
         given = (str(child) if isinstance(child, Token) else child for child in children[first:])
@@ -70,7 +70,7 @@ def _unsaid(_builder: "TreeBuilder", _: Meta, *_children: Any) -> _Unsaid:
 
 @v_args(inline=True, meta=True)
 class TreeBuilder(Transformer_NonRecursive[Token, Any]):
-    """Builds the tree of one file; `findings` lists the invalid literals."""
+    """`findings` lists the invalid literals."""
 
     def __init__(self, file: str, text: str) -> None:
         super().__init__()
@@ -79,7 +79,6 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
         self.findings: list[Diagnostic] = []
 
     def at(self, meta: Meta | Token) -> Position:
-        """Return the start of a rule or token."""
         if isinstance(meta, Token):
             return Position(self._file, meta.line or 1, meta.column or 1)
         if meta.empty:
@@ -505,7 +504,6 @@ def check(builder: TreeBuilder) -> None:
 
 
 def _string_bytes(inner: str) -> bytes:
-    """Return the bytes of a string literal, given the text between its quotes."""
     result = bytearray()
     last = 0
     for found in _ESCAPE.finditer(inner):
@@ -528,7 +526,7 @@ def _resource(name: Any, kind: Any) -> tuple[str, str]:
 
 
 def _duration_ns(text: str) -> int:
-    """Return the nanoseconds of a duration such as `100ms`, `0.5 s` or `2`."""
+    """A duration is `100ms`, `0.5 s` or `2` (seconds)."""
     found = _DURATION.match(text)
     if found is None or len(found[1]) > 30:
         raise _LiteralError("this is not a duration; write for example `100ms`, `0.5s` or `2m`")

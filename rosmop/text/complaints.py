@@ -50,14 +50,14 @@ FORBIDDEN = {
     "or": "write `||`",
     "not": "write `!`",
 }
-"""Words of C++ that are not part of the language, and what to write instead."""
+"""Words of C++ outside the language, and what to write instead."""
 
 RESERVED = frozenset({
     "if", "else", "while", "do", "for", "switch", "case", "default", "break", "continue", "return", "const",
     "static", "auto", "void", "bool", "char", "short", "int", "long", "float", "double", "signed",
     "unsigned", "new", "delete", "static_cast", "DROP", "PUBLISH", "__RESET", "using",
 })  # fmt: skip
-"""Words of the language that are never names."""
+"""Words that are never names."""
 
 _FOUND = re.compile(
     r'"(?:\\.|[^"\\\n])*"|[A-Za-z_]\w*|\d[\w.]*|->|::|<<=|>>=|[-+*/%&|^<>=!]=|\+\+|--|&&|\|\||<<|>>|.',
@@ -91,7 +91,7 @@ _FORMS = tuple(
         (r"\b(?:if|while|switch|for|when)\s*\Z", "a condition is written in parentheses"),
     )
 )
-"""A pattern for the text before a syntax error, and the correct form of the construct."""
+"""The text before a syntax error, and the correct form of the construct."""
 _PIECE = re.compile(
     r"""(?P<gap>\s+|//[^\n]*|/\*(?:[^*]|\*(?!/))*\*/)|"(?:\\.|[^"\\\n])*"|'\\?[^\n]'|[{}]|[^\s{}"'/]+|."""
 )
@@ -158,13 +158,13 @@ _SITUATIONS: tuple[tuple[Set[str], str, str], ...] = (
 
 
 def shown(text: str) -> str:
-    """Return a piece of the file for a message, shortened and without control characters."""
+    """Shorten and escape a piece of the file for a message."""
     clean = "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in text)
     return f"`{clean if len(clean) <= 40 else clean[:37] + '…'}`"
 
 
 def describe(text: str, offset: int, accepted: Set[str]) -> tuple[int, str]:
-    """Return the offset and the message for text at `offset` where only tokens of `accepted` may follow."""
+    """Return the offset and the message where only tokens of `accepted` may follow."""
     if offset >= len(text):
         return _at_end(text, accepted)
     if text.startswith("/*", offset):
@@ -189,7 +189,7 @@ def describe(text: str, offset: int, accepted: Set[str]) -> tuple[int, str]:
 
 
 def misplaced(text: str, offset: int, word: str) -> tuple[int, str]:
-    """Return the offset and the message for a word at `offset` that cannot be a name."""
+    """Return the offset and the message for a word that cannot be a name."""
     if word in FORBIDDEN:
         return offset, f"`{word}` is not part of the language; {FORBIDDEN[word]}"
     opened = _open_braces(text, offset)

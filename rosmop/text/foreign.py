@@ -1,4 +1,4 @@
-"""Constructs of C++, roscpp, other MOPs and Python that the language lacks, and what to write instead."""
+"""Advise on constructs of C++, roscpp, other MOPs and Python that the language lacks."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -103,7 +103,6 @@ _FAMILIES = {
 
 
 def instead(parts: Sequence[str]) -> str | None:
-    """Return the text to write for a known foreign name, or None."""
     pointer = re.fullmatch(r"(\w+::\w+?)(?:::)?(?:Const)?Ptr", "::".join(parts))
     if pointer is not None:
         return f"there are no pointers; write `{pointer[1]}`"
@@ -120,9 +119,9 @@ _Advice = str | Callable[[re.Match[str]], str]
 
 @dataclass(frozen=True)
 class _Shape:
-    """A construct outside the grammar, and the brace `depths` where it can occur.
+    """A construct outside the grammar; `depths` are the braces around it.
 
-    Depth 0 is outside all specifications, depth 1 in a specification, and depth 2 in braces inside a specification.
+    Depth 0 is outside all specifications, depth 1 in one, and depth 2 in its braces.
     """
 
     pattern: re.Pattern[str]
@@ -291,7 +290,7 @@ _WINDOW = 200
 
 
 def foreign(text: str, offset: int, depth: int) -> tuple[int, int, str] | None:
-    """Return the start and end of a foreign construct at `offset`, and the advice; None if the construct is unknown."""
+    """Return start, end and advice, or None if the construct is unknown."""
     before = text[max(0, offset - _WINDOW) : offset]
     begin = offset - len(before) + max(before.rfind(mark) for mark in ";{}\n") + 1
     end = min(len(text), offset + _WINDOW)

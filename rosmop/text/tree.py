@@ -1,7 +1,7 @@
 """The tree of an ``.rv`` file: frozen dataclasses, each with the position of its first character.
 
-Strings are bytes, as in C++ (a character outside ASCII is its UTF-8 bytes). Nothing is resolved here: a name
-is the tuple of its parts (`std::string` is `("std", "string")`).
+Strings are bytes, as in C++ (a character outside ASCII is its UTF-8 bytes). Nothing is resolved: a name is the tuple
+of its parts (`std::string` is `("std", "string")`).
 """
 
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from rosmop.form.findings import Position
 
 @dataclass(frozen=True)
 class SyntaxNode:
-    """A node of the syntax tree."""
+    """A node of the tree."""
 
     position: Position = field(compare=False)
 
@@ -367,7 +367,7 @@ class CallStatement(Statement):
 
 @dataclass(frozen=True)
 class PathStep(SyntaxNode):
-    """One field of a path, with its index if it has one."""
+    """One field of a path, perhaps with an index."""
 
     name: str
     index: int | None
@@ -375,7 +375,7 @@ class PathStep(SyntaxNode):
 
 @dataclass(frozen=True)
 class Binding(SyntaxNode):
-    """A field of the pattern: its path from the message, and a variable or a constant."""
+    """A field of the pattern, and a variable or a constant."""
 
     path: tuple[PathStep, ...]
     variable: str | None
@@ -385,7 +385,7 @@ class Binding(SyntaxNode):
 
 @dataclass(frozen=True)
 class MessageTrigger(SyntaxNode):
-    """The trigger of an event: a message on a topic, or a request or response of a service (`part`)."""
+    """A message on a topic, or a request or response of a service (`part`)."""
 
     topic: str
     type: str
@@ -397,7 +397,7 @@ class MessageTrigger(SyntaxNode):
 
 @dataclass(frozen=True)
 class TimerTrigger(SyntaxNode):
-    """The trigger of a timer: its period in nanoseconds, and whether the text has its unit."""
+    """A period; `has_unit` is false if the text lacks its unit."""
 
     period_ns: int
     has_unit: bool = field(default=True, compare=False)
@@ -405,7 +405,7 @@ class TimerTrigger(SyntaxNode):
 
 @dataclass(frozen=True)
 class EventDefinition(SyntaxNode):
-    """An event and its action. `after` is what follows an action that does not drop the message."""
+    """`after` is what follows an action that does not drop the message."""
 
     modifiers: tuple[Name, ...]
     name: str
@@ -442,7 +442,7 @@ class Handler(SyntaxNode):
 
 @dataclass(frozen=True)
 class Property(SyntaxNode):
-    """A formula of a logic, and its handlers; `formula_position` is where the formula begins."""
+    """A formula of a logic, and its handlers."""
 
     logic: str
     formula: str
@@ -452,7 +452,7 @@ class Property(SyntaxNode):
 
 @dataclass(frozen=True)
 class GivenValue(SyntaxNode):
-    """`type name = default unit in least..most;`, a constant that operators may set. `bool` has no range."""
+    """`type name = default unit in least..most;`: a constant that operators may set. `bool` has no range."""
 
     type: tuple[str, ...]
     name: str
@@ -463,7 +463,7 @@ class GivenValue(SyntaxNode):
 
 @dataclass(frozen=True)
 class TopicDeclaration(SyntaxNode):
-    """`topic name = /default;`, a name for a topic that a load may replace."""
+    """`topic name = /default;`: a topic that a load may replace."""
 
     name: str
     topic: str
@@ -508,14 +508,14 @@ class Specification(SyntaxNode):
 
 @dataclass(frozen=True)
 class OrderStatement(SyntaxNode):
-    """`order first < second;`: specifications in the order in which they get messages."""
+    """`order first < second;`"""
 
     names: tuple[Name, ...]
 
 
 @dataclass(frozen=True)
 class SpecificationFile:
-    """The specifications of one file, in order, its `text`, and its `order` statements."""
+    """The specifications and `order` statements of one file."""
 
     name: str
     text: str

@@ -1,1 +1,1 @@
-"""The command `rosmop`, shared with `rosrv monitor`: the only part of the language that reads and writes files."""
+"""The command `rosmop`, shared with `rosrv monitor`: only this part of the language reads and writes files."""

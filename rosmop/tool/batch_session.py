@@ -1,6 +1,6 @@
-"""The recordings of a command and the executor of its jobs, for `run`, `learn`, `coverage` and `replay`.
+"""Execute the jobs of `run`, `learn`, `coverage` and `replay` on recordings.
 
-Exit status 3 if one of several recordings failed. A single recording that fails is a usage error.
+The exit status is 3 if one of several recordings failed; if the only one failed, that is a usage error.
 """
 
 import json
@@ -42,7 +42,7 @@ class RecordingsOptions:
 
     @property
     def single(self) -> Path | None:
-        """Return the recording if it is a single one and no option concerns many; otherwise None."""
+        """The recording, if it is the only one and no option concerns many."""
         many = self.sets or self.workers or self.on or self.resume or self.report
         return self.bags[0] if len(self.bags) == 1 and not many else None
 
@@ -58,12 +58,12 @@ class BatchSession:
     kept: TemporaryStore
 
     def results(self, what: str, jobs: Sequence[Job]) -> Iterator[tuple[int, Result | Failure]]:
-        """Yield the number and result of each job, in the order in which they end, and show progress by bytes."""
+        """Yield results in the order in which they end, with progress by bytes."""
         with self._progress(what, jobs) as done:
             yield from self.runner.run(jobs, done)
 
     def in_order(self, what: str, jobs: Sequence[Job]) -> Iterator[Result | Failure]:
-        """Yield the results in the order of the jobs, and show progress by bytes."""
+        """Yield results in the order of the jobs, with progress by bytes."""
         with self._progress(what, jobs) as done:
             yield from self.runner.in_order(jobs, done)
 
@@ -78,7 +78,7 @@ class BatchSession:
             raise self.program.usage_error(failures[0].text)
 
     def failed_rows(self, failures: Iterable[tuple[int, Failure]]) -> list[dict[str, object]]:
-        """Return a row for each recording that failed, by its number, and print its reason on standard error."""
+        """Print each reason on standard error."""
         rows: list[dict[str, object]] = []
         for number, failure in failures:
             uri = self.recordings[number].uri
@@ -92,7 +92,6 @@ class BatchSession:
             self.kept.append(lines.encode("ascii"))
 
     def write_report(self) -> None:
-        """Write the rows to the file of --report, if it is given."""
         if self.options.report is None:
             return
         try:
@@ -116,7 +115,7 @@ class BatchSession:
 
 @contextmanager
 def batch_session(program: CommandContext, options: RecordingsOptions) -> Iterator[BatchSession]:
-    """Open a block with the recordings of the options. Exits with status 2 if there are none or an option is wrong."""
+    """Exit with status 2 if there are no recordings, or an option is wrong."""
     if not options.bags and not options.sets:
         raise program.usage_error("give recordings: --bag FILE, or --bags with a folder, a pattern or s3://…")
     if options.report is not None and not os.access(options.report.parent, os.W_OK):

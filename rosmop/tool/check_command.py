@@ -28,9 +28,9 @@ def check(
     dot: Path | None,
     svg: Path | None,
 ) -> int:
-    """Report every error and warning with its position.
+    """Report every error and warning.
 
-    Return the exit status: 0 without errors, 1 with errors. A usage error ends with 2.
+    Return 0 without errors, 1 with errors. A usage error ends with 2.
     """
     if prove and find_spec("z3") is None:
         raise program.usage_error("--prove needs the package z3-solver: pip install z3-solver")
@@ -69,7 +69,6 @@ def check(
 
 
 def _say_slow(compiled: Compiled, *, as_json: bool) -> None:
-    """Write the messages that the interpreter processes, with the reasons."""
     found = slow_paths(compiled)
     for path in found:
         if as_json:

@@ -1,4 +1,4 @@
-"""The context of a CLI command: the name used in its messages, and its access to the files that the user names."""
+"""The context of a CLI command, with its access to the files that the user names."""
 
 import errno
 import io
@@ -15,21 +15,21 @@ from rosmop.recordings.regular_files import open_regular
 from rosmop.tool.terminal import printable
 
 MAX_FILE = 64 << 20
-"""The size limit in bytes of a file that is read whole."""
+"""In bytes, for a file that is read whole."""
 
 
 @dataclass(frozen=True)
 class CommandContext:
-    """The context of a command.
+    """`name` begins each message.
 
-    `name` begins each message. `write` replaces a file, or raises `OSError`.
+    `write` replaces a file, or raises `OSError`.
     """
 
     name: str
     write: Callable[[Path, bytes | mmap], object]
 
     def read(self, path: Path) -> bytes:
-        """Return the bytes of a regular file, `MAX_FILE` at most. Raises `OSError`."""
+        """Reads a regular file of at most `MAX_FILE` bytes. Raises `OSError`."""
         with open_regular(path) as file:
             data = file.read(MAX_FILE + 1)
         if len(data) > MAX_FILE:
@@ -37,7 +37,7 @@ class CommandContext:
         return data
 
     def read_text(self, path: Path) -> str:
-        """Return the text of a file with LF line endings; invalid UTF-8 bytes become surrogates. Raises `OSError`."""
+        """Line ends become LF, and invalid UTF-8 bytes surrogates. Raises `OSError`."""
         with io.TextIOWrapper(io.BytesIO(self.read(path)), "utf-8", "surrogateescape") as text:
             return text.read()
 

@@ -56,7 +56,7 @@ def learn_monitors(
 
 
 def _surveys(session: BatchSession, topics: list[str]) -> tuple[list[tuple[int, Survey]], dict[int, Failure]]:
-    """Return the headers of the recordings by number, and the recordings that failed."""
+    """Return headers and failures by the number of the recording."""
     jobs = [SurveyJob(recording, topics) for recording in session.recordings]
     surveys: list[tuple[int, Survey]] = []
     failures: dict[int, Failure] = {}
@@ -73,7 +73,7 @@ def _surveys(session: BatchSession, topics: list[str]) -> tuple[list[tuple[int, 
 
 
 def _definitions(program: CommandContext, surveys: Sequence[Survey]) -> Definitions:
-    """Return the definitions of all recordings. Rejects recordings with different definitions of one type."""
+    """Rejects recordings with different definitions of one type."""
     recorded = Definitions({})
     for survey in surveys:
         own = definitions_by_type(survey.definitions)
@@ -89,8 +89,6 @@ def _definitions(program: CommandContext, surveys: Sequence[Survey]) -> Definiti
 
 @dataclass(frozen=True)
 class _Passes:
-    """Executes the passes of learning as jobs."""
-
     session: BatchSession
     recordings: Sequence[RecordingName]
     recorded: Definitions
@@ -165,7 +163,7 @@ def _write(program: CommandContext, out: Path, learnt: LearningResult, recorded:
 
 
 def _needed(learnt: LearningResult, recorded: Definitions) -> list[str]:
-    """Return the message types of the specifications, and of their fields, that `check` would not know."""
+    """Return the types of the specifications, and of their fields, that `check` would not know."""
     own = standard_definitions()
     waiting = [learnt.types[topic] for candidate in learnt.candidates for topic in candidate.topics]
     found: set[str] = set()

@@ -22,7 +22,7 @@ def say_finding(finding: Diagnostic, *, as_json: bool) -> None:
 def record(
     outcome: Outcome, index: int | None = None, topic: str | None = None, publisher: str = ""
 ) -> dict[str, object]:
-    """Return the JSON record of a message (of the recording, or of a monitor), or of a tick or deadline."""
+    """A message is one of the recording, or of a monitor; without a topic, it is a tick or deadline."""
     head: dict[str, object] = {"timer": outcome.timer}
     if topic is not None:
         head = {"publisher": publisher, "topic": topic} if publisher else {"index": index, "topic": topic}
@@ -51,7 +51,6 @@ def record(
 
 
 def explained(monitor: MonitorInstance) -> Iterator[str]:
-    """Yield the meaning of the parameters of a specification."""
     slices, slicing = monitor.slices, monitor.code.slicing
     if slices is None or slicing is None:
         return
@@ -70,7 +69,7 @@ def _fault(fault: Fault) -> dict[str, object]:
 def lines(
     outcome: Outcome, index: int | None = None, topic: str | None = None, publisher: str = ""
 ) -> Iterator[str]:
-    """Yield the lines for a person. A message without an outcome to report has no lines."""
+    """A message without an outcome to report has no lines."""
     seconds = f"{outcome.time / BILLION:.3f}"
     number = f"published by {publisher}:" if publisher else f"#{index}"
     head = f"{seconds} {outcome.timer}" if topic is None else f"{seconds} {number} {topic}"

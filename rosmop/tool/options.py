@@ -1,4 +1,4 @@
-"""The arguments, options and summaries of the commands of `rosmop`, which `rosrv monitor` shares."""
+"""The arguments and options of the commands of `rosmop`, which `rosrv monitor` shares."""
 
 from collections.abc import Mapping
 from pathlib import Path

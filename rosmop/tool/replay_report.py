@@ -1,4 +1,4 @@
-"""Report the effects of monitors on recordings: lines and tables for people, rows for programs."""
+"""Report the effects of monitors: lines and tables for people, rows for programs."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -14,7 +14,7 @@ from rosmop.tool.tables import add_row, say_table, table_of
 from rosmop.tool.terminal import counted, say, say_json
 
 MOST_IN_ROWS = 10_000
-"""The number of places in the rows, for each recording, monitor, topic and kind. The counts are of all."""
+"""For each recording, monitor, topic and kind. The counts are of all."""
 _MOST_RECORDINGS = 100  # lines of the table of recordings
 _WOULD = {"drop": "would drop it", "change": "would change it"}
 _HEADS = ("would drop", "would change", "verdicts", "warnings", "faults")
@@ -34,7 +34,7 @@ class ReplayReport:
         self._closest: dict[tuple[Position, int, bool], tuple[ClosestMargin, str]] = {}
 
     def add(self, recording: str, result: Replayed | Failure) -> list[dict[str, Any]]:
-        """Add the result of a recording, print its first effects, and return its rows for programs."""
+        """Print the first effects, and return the rows for programs."""
         rows = self._printed(_rows(recording, result))
         self._recordings.append(_Line.of(recording, result))
         if isinstance(result, Failure):
@@ -52,7 +52,7 @@ class ReplayReport:
         return rows
 
     def show(self, texts: Mapping[str, str]) -> list[dict[str, Any]]:
-        """Print the counts by monitor and topic and by recording, and the margins. Return the rows for programs."""
+        """Print counts and margins, and return the rows for programs."""
         closest = [row for _key, row in sorted(self._closest.items())]
         rows = self._printed(_margin_row(margin, recording) for margin, recording in closest)
         if self._as_json:
@@ -112,7 +112,7 @@ class ReplayReport:
 
 
 class _Line(NamedTuple):
-    """A recording in the table: its effects by kind, the times of the first and the last one, or its error."""
+    """A recording in the table: its effects by kind, with the times of the first and the last one, or its error."""
 
     recording: str
     messages: int

@@ -31,7 +31,7 @@ def run(
     output: Path | None,
     as_json: bool,
 ) -> int:
-    """Report the outcome of every message of a single recording, or the effects on many; return the exit status."""
+    """Report every message of a single recording, or the effects on many. Return the exit status."""
     try:
         specifications = read_for_recordings(program, files, folders)
         if options.single is not None:
@@ -55,7 +55,7 @@ def run_batch(
     margins: bool = False,
     strict: bool = True,
 ) -> int:
-    """Run specifications on all recordings, print the report and return the exit status."""
+    """Return the exit status."""
     # Each recording has its rows, so the same places are kept with and without --json.
     jobs = [
         ReplayJob(recording, specifications, topics or ["*"], EVER, MOST_IN_ROWS, margins, strict)
@@ -79,7 +79,7 @@ def run_spans(
     *,
     margins: bool,
 ) -> None:
-    """Run specifications on spans of files, each with a name, in this process, and print the report.
+    """Run specifications on named spans of files, in this process.
 
     Raises `RecordingError` and `SpecificationError`.
     """

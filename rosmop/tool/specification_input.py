@@ -17,16 +17,16 @@ from roswire.errors import DefinitionError
 from roswire.standard import standard_definitions
 
 BESIDE = "msg"
-"""The folder of message definitions beside a specification."""
+"""Beside a specification."""
 _RECORDINGS = (b"#ROSBAG ", b"\x89MCAP")
 
 
 def load(
     program: CommandContext, files: list[Path], folders: list[Path], recorded: Definitions | None = None
 ) -> Compiled:
-    """Compile specifications. Raises `SpecificationError`.
+    """Raises `SpecificationError`.
 
-    The definitions in `recorded` apply to types that no file defines.
+    `recorded` applies to types that no file defines.
     """
     definitions = read_definitions(program, files, folders)
     if recorded is not None:
@@ -35,7 +35,7 @@ def load(
 
 
 def read_specifications(program: CommandContext, files: Sequence[Path]) -> dict[str, str]:
-    """Return the texts of specifications by name, in the order of file names.
+    """Return texts by name, in the order of file names.
 
     Bytes outside UTF-8 are escaped in names. In texts they become surrogates, which the parser rejects with their
     position.
@@ -54,7 +54,7 @@ def read_specifications(program: CommandContext, files: Sequence[Path]) -> dict[
 
 
 def topics_of(specifications: Specifications) -> dict[str, str]:
-    """Return the topics, with their types, of the chosen specification or of all. Raises `SpecificationError`."""
+    """Return types by topic, of the chosen specification or of all. Raises `SpecificationError`."""
     chosen, topics = specifications.chosen, specifications.topics
     return {
         event.trigger.topic: event.trigger.type
@@ -67,9 +67,10 @@ def topics_of(specifications: Specifications) -> dict[str, str]:
 
 
 def read_definitions(program: CommandContext, files: Sequence[Path], folders: Sequence[Path]) -> Definitions:
-    """Return the definitions of ROS, of `msg/` beside the specifications, and of the folders.
+    """The definitions are those of ROS, of `msg/` beside the specifications, and of the folders; later ones replace
+    earlier ones.
 
-    Later definitions replace earlier ones. Raises `SpecificationError` for a definition that cannot be read.
+    Raises `SpecificationError` for a definition that cannot be read.
     """
     definitions = standard_definitions()
     for folder in definition_folders(program, files, folders):
@@ -85,7 +86,7 @@ def read_definitions(program: CommandContext, files: Sequence[Path], folders: Se
 def read_for_recordings(
     program: CommandContext, files: Sequence[Path], folders: Sequence[Path]
 ) -> Specifications:
-    """Return specifications that workers compile, with the definitions that are not those of ROS.
+    """Return specifications that workers compile, without the definitions of ROS.
 
     Raises `SpecificationError` for a text that cannot be parsed and a definition that cannot be read.
     """
@@ -105,7 +106,7 @@ def read_for_recordings(
 
 
 def definition_folders(program: CommandContext, files: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
-    """Return the folders of definitions beside the files, followed by the given folders."""
+    """Folders beside the files come before the given ones."""
     for folder in folders:
         if not folder.is_dir():
             raise program.usage_error(f"--msg: {folder} is not a folder")
@@ -114,7 +115,7 @@ def definition_folders(program: CommandContext, files: Sequence[Path], folders: 
 
 
 def definition_texts(program: CommandContext, folder: Path) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the definitions below a folder by name (`package/File`), and their paths by this name and by type."""
+    """Return definitions by `package/File`, and their paths by this name and by type."""
     texts: dict[str, str] = {}
     places: dict[str, str] = {}
 

@@ -1,6 +1,6 @@
 """Write lines: coloured on a terminal, plain otherwise, or as JSON.
 
-Control characters of untrusted strings are escaped, and the strings are never read as markup.
+Control characters of untrusted strings are escaped, and nothing is read as markup.
 """
 
 import json
@@ -21,7 +21,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def refused(findings: Iterable[object]) -> typer.Exit:
-    """Write errors, one on each line. The caller raises the result (exit status 1)."""
+    """Write errors. The caller raises the result (exit status 1)."""
     for finding in findings:
         typer.echo(printable(str(finding)), err=True)
     return typer.Exit(1)

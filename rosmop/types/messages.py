@@ -1,6 +1,6 @@
-"""Message types as the language sees them: fields in order, their types, and constants.
+"""Look up message types: fields in order, their types, and constants.
 
-The definitions are those of `roswire`. The error for an unknown name suggests the nearest known name.
+The error for an unknown name suggests the nearest known one.
 """
 
 import difflib
@@ -41,7 +41,7 @@ PRIMITIVES: Mapping[str, Type] = MappingProxyType(
 
 @dataclass(frozen=True)
 class FieldSlot:
-    """A field of a message: its index in the list of the message's values, its type, and its definition."""
+    """`index` is that in the list of the message's values."""
 
     index: int
     name: str
@@ -50,7 +50,7 @@ class FieldSlot:
 
 
 class UnknownNameError(Exception):
-    """An unknown type or field; the text suggests a similar name."""
+    """The text suggests a similar name."""
 
 
 class MessageTypes:
@@ -61,7 +61,7 @@ class MessageTypes:
         self._slots: dict[str, dict[str, FieldSlot]] = {}
 
     def definition(self, name: str) -> MessageDefinition:
-        """Return the definition of a message type, complete and usable; raises `UnknownNameError`."""
+        """Raises `UnknownNameError` unless the definition is complete and usable."""
         try:
             self.definitions.layout(name)
             return self.definitions.message(name)
@@ -74,7 +74,7 @@ class MessageTypes:
             ) from None
 
     def slots(self, name: str) -> dict[str, FieldSlot]:
-        """Return the fields of a message type by name, in the order of the definition."""
+        """By name, in the order of the definition."""
         if name not in self._slots:
             fields = self.definition(name).fields
             self._slots[name] = {
@@ -84,7 +84,7 @@ class MessageTypes:
         return self._slots[name]
 
     def slot(self, name: str, field: str) -> FieldSlot:
-        """Return one field; raises `UnknownNameError` with the nearest name."""
+        """Raises `UnknownNameError` with the nearest name."""
         slots = self.slots(name)
         if field not in slots:
             paths = self._paths_to(name, field)
@@ -94,14 +94,14 @@ class MessageTypes:
         return slots[field]
 
     def constant(self, name: str, constant: str) -> Constant:
-        """Return a constant of a message type; raises `UnknownNameError`."""
+        """Raises `UnknownNameError`."""
         constants = {known.name: known for known in self.definition(name).constants}
         if constant not in constants:
             raise UnknownNameError(f"{name} has no constant {shown(constant)}{nearest(constant, constants)}")
         return constants[constant]
 
     def _paths_to(self, name: str, field: str) -> list[str]:
-        """Return the shortest paths, of two or three steps, that end in a field of this name."""
+        """The paths have two or three steps."""
         level = [("", name)]
         for _ in range(3):
             found = []
@@ -124,7 +124,7 @@ def field_type(field: Field) -> Type:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return a suggestion to append to an error. Compares at most `_COMPARED` names."""
+    """Return text to append to an error. At most `_COMPARED` names are compared."""
     known = list(islice(known, _COMPARED))  # a file can have thousands of names and thousands of mistakes
     near = difflib.get_close_matches(name[:100], known, 1, 0.65)
     if near:

@@ -45,12 +45,12 @@ _SHORT_NAMES = {short: f"unsigned {short[1:]}" for short in ("uint", "ushort", "
 
 
 def named_type(parts: tuple[str, ...]) -> Type | None:
-    """Return the type of a name that is not a message type (`std::string`, `size_t`, `ros::Time`), or None."""
+    """Return None for a message type (others: `std::string`, `size_t`, `ros::Time`)."""
     return _NAMED.get(parts[1:] if parts[0] == "std" and len(parts) > 1 else parts)
 
 
 def resolve(name: tree.TypeName, messages: MessageTypes) -> Type:
-    """Return the type of a type name (not `auto`); raises `SpecificationError`."""
+    """Raises `SpecificationError`; `auto` is not resolved here."""
     if name.element is not None:
         element = resolve(name.element, messages)
         if element in (value_types.VOID, value_types.CHARACTERS):
@@ -104,7 +104,7 @@ def _message(name: tree.TypeName, messages: MessageTypes) -> Type:
 
 
 def _meant(parts: tuple[str, ...], messages: MessageTypes) -> str:
-    """Return the advice to append to the error for an unknown type that is not written as a message type."""
+    """Return advice on an unknown type that is not written as a message type."""
     advice = instead(parts)
     if advice is not None:
         return f"; {advice}"
@@ -116,7 +116,7 @@ def _meant(parts: tuple[str, ...], messages: MessageTypes) -> str:
 
 
 def record(position: Position, name: str, messages: MessageTypes) -> value_types.RecordType:
-    """Return the message type of this name; raises `SpecificationError`."""
+    """Raises `SpecificationError`."""
     try:
         messages.definition(name)
     except UnknownNameError as error:

@@ -13,7 +13,7 @@ def _tag(name: str) -> str:
 
 
 class _Kind(msgspec.Struct, frozen=True, tag=_tag, tag_field="kind", array_like=True):
-    """A type; its class name without `Type` is its tag."""
+    """The tag is the class name without `Type`."""
 
 
 class VoidType(_Kind, frozen=True):
@@ -24,7 +24,7 @@ class VoidType(_Kind, frozen=True):
 
 
 class IteratorType(_Kind, frozen=True):
-    """The type of an iterator: a position in a vector. No variable holds it."""
+    """A position in a vector; no variable holds it."""
 
     def __str__(self) -> str:
         return "an iterator"
@@ -38,7 +38,7 @@ class BoolType(_Kind, frozen=True):
 
 
 class IntegerType(_Kind, frozen=True):
-    """An integer type; `name` is only for error messages (`long` and `long long` are the same type)."""
+    """`name` is only for error messages: `long` and `long long` are the same type."""
 
     bits: int
     signed: bool
@@ -157,12 +157,12 @@ def is_number(kind: Type) -> bool:
 
 
 def is_scalar(kind: Type) -> bool:
-    """Return whether values of this type never change in place, so they need no copy."""
+    """Values of this type never change in place, so they need no copy."""
     return not isinstance(kind, VectorType | RecordType)
 
 
 def promoted(kind: Type) -> Type:
-    """Return the type to which C++ promotes an operand of this type."""
+    """Return the type to which C++ promotes an operand."""
     if isinstance(kind, BoolType) or (isinstance(kind, IntegerType) and kind.bits < 32):
         return INT
     return kind
@@ -183,7 +183,7 @@ def common(left: Type, right: Type) -> Type:
 
 
 def convertible(source: Type, target: Type) -> bool:
-    """Return whether a value of one type can be assigned to a variable of another."""
+    """A value of one type can be assigned to a variable of the other."""
     if is_number(source) and is_number(target):
         return True
     if isinstance(target, StringType | CharactersType):
@@ -195,7 +195,7 @@ def convertible(source: Type, target: Type) -> bool:
 
 
 def same_elements(one: Type, other: Type) -> bool:
-    """Whether ROS encodes vectors of both element types alike. Bytes, characters and booleans each take one byte."""
+    """ROS encodes vectors of both element types alike: bytes, characters and booleans each take one byte."""
     bytes_alike = all(isinstance(kind, BoolType) or (isinstance(kind, IntegerType) and kind.bits == 8)
                       for kind in (one, other))  # fmt: skip
     if bytes_alike:

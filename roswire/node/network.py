@@ -15,7 +15,7 @@ BUFFER_BYTES = 1 << 19
 
 
 class NodeCallError(RosError):
-    """A call of the master, a node or a service without a usable result; the text says which and why."""
+    """The text says which call of the master, a node or a service, and why it has no usable result."""
 
 
 class PeerUnreachableError(NodeCallError):
@@ -23,56 +23,57 @@ class PeerUnreachableError(NodeCallError):
 
 
 class MasterDenialError(NodeCallError):
-    """The master answered that the call failed; the text is the master's."""
+    """The text is the master's."""
 
 
 class ServiceFailedError(NodeCallError):
-    """The service answered that the call failed; the text is the service's."""
+    """The text is the service's."""
 
 
 class ByteWriter(Protocol):
     """The part of `asyncio.StreamWriter` that a node uses."""
 
-    def write(self, data: bytes) -> None:
-        """Send bytes, after all earlier ones."""
+    def write(self, data: bytes) -> None: ...
 
     async def drain(self) -> None:
-        """Wait until the peer has room for more. Raises `OSError` if the connection has ended."""
+        """Waits until the peer has room for more.
 
-    def close(self) -> None:
-        """End the connection."""
+        Raises `OSError` if the connection has ended.
+        """
+
+    def close(self) -> None: ...
 
 
 Serve = Callable[[asyncio.StreamReader, ByteWriter], Awaitable[None]]
 
 
 class ListeningServer(Protocol):
-    """A server at a port of the source address."""
+    """It listens at the source address."""
 
     @property
-    def port(self) -> int:
-        """Return the port."""
+    def port(self) -> int: ...
 
-    def close(self) -> None:
-        """Accept no further connection."""
+    def close(self) -> None: ...
 
 
 class NodeNetwork(Protocol):
-    """A network as a node uses it, from one source address."""
+    """A network as a node uses it."""
 
     @property
-    def source(self) -> str:
-        """Return the source address."""
+    def source(self) -> str: ...
 
     async def connect(self, host: str, port: int) -> tuple[asyncio.StreamReader, ByteWriter]:
-        """Return a new connection. Raises `OSError`."""
+        """Raises `OSError`."""
 
     async def serve(self, serve: Serve) -> ListeningServer:
-        """Call `serve` for each connection to a free port. Raises `OSError`."""
+        """Listens at a free port.
+
+        Raises `OSError`.
+        """
 
 
 class SourceNetwork:
-    """The network of this machine, from one of its addresses."""
+    """This machine's network, from one of its addresses."""
 
     def __init__(self, source: str) -> None:
         self.source = source
@@ -116,7 +117,7 @@ class OwnedTasks:
             task.add_done_callback(self._tasks.discard)
 
     async def close(self) -> None:
-        """Cancel all tasks, and return when they have ended."""
+        """Returns when all tasks have ended."""
         tasks = [task for task in self._tasks if task is not asyncio.current_task()]
         for task in tasks:
             task.cancel()

@@ -18,30 +18,26 @@ class NodeTables(Protocol):
 
     @property
     def publishers(self) -> Mapping[str, NodePublication]:
-        """Return the publications by topic."""
+        """The key is the topic."""
 
     @property
     def subscribers(self) -> Mapping[str, NodeSubscription]:
-        """Return the subscriptions by topic."""
+        """The key is the topic."""
 
     @property
-    def services(self) -> Mapping[str, ServiceServer]:
-        """Return the offered services by name."""
+    def services(self) -> Mapping[str, ServiceServer]: ...
 
     @property
-    def parameters(self) -> Mapping[str, ParameterChanged]:
-        """Return the subscriptions to parameters by key."""
+    def parameters(self) -> Mapping[str, ParameterChanged]: ...
 
     @property
-    def tcpros(self) -> tuple[str, int]:
-        """Return the address of the topics and services."""
+    def tcpros(self) -> tuple[str, int]: ...
 
-    def follow(self, subscriber: NodeSubscription, uris: Sequence[Value]) -> None:
-        """Follow the publishers of a list."""
+    def follow(self, subscriber: NodeSubscription, uris: Sequence[Value]) -> None: ...
 
 
 class NodeApi:
-    """Answers the calls. A call with other parameters than the API defines gets an error, and changes nothing."""
+    """A call with other parameters than the API defines gets an error, and changes nothing."""
 
     def __init__(self, node: NodeTables, master: str, pid: int, shut_down: Callable[[str], None]) -> None:
         self._node = node

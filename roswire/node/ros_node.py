@@ -45,7 +45,7 @@ _Kind = Literal["publisher", "subscriber", "service", "parameter"]
 
 
 class RosNode:
-    """A node with the canonical name `name`, registered with the master at the URI `master`.
+    """`name` is canonical, `master` is a URI.
 
     `shut_down` is called with the reason if the master ends the node, for example because another node has its name.
     `memory` bounds the messages that wait for other nodes; by default, the node has one of its own.
@@ -77,7 +77,7 @@ class RosNode:
         self._locks: WeakValueDictionary[tuple[_Kind, str], asyncio.Lock] = WeakValueDictionary()
 
     async def start(self) -> None:
-        """Listen for other nodes. Raises `OSError` if the source address cannot be used."""
+        """Raises `OSError` if the source address cannot be used."""
         for serve in (self._serve_api, self._serve_tcpros):
             self._servers.append(await self._network.serve(serve))
         self._uri = node_uri(self._network.source, self._servers[0].port)
@@ -91,7 +91,7 @@ class RosNode:
         return self._network.source, self._servers[1].port
 
     async def close(self) -> None:
-        """Unregister everything, as far as the master answers soon, and end all connections."""
+        """Unregisters everything, as far as the master answers soon."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_CLOSE_SECONDS):
                 await self._unregister_all()
@@ -116,10 +116,7 @@ class RosNode:
     # --- the master ---
 
     async def master(self, method: str, *params: Value) -> Value:
-        """Call a method of the Master API, and return its value.
-
-        Raises `MasterDenialError` with the master's reason, or another `RosError`.
-        """
+        """Raises `MasterDenialError` with the master's reason, or another `RosError`."""
         return await self._call_master(self.name, method, *params)
 
     async def _call_master(self, caller_id: str, method: str, *params: Value) -> Value:
@@ -143,10 +140,7 @@ class RosNode:
     async def subscribe(
         self, topic: str, received: Received, wanted: MessageType = ANY_TYPE
     ) -> NodeSubscription:
-        """Subscribe to a topic; `received` is called for each message.
-
-        Raises ValueError if the node already has a subscription, and `RosError` if the master denies it.
-        """
+        """Raises ValueError if the node already has a subscription, and `RosError` if the master denies it."""
         async with self._lock("subscriber", topic):
             if topic in self.subscribers:
                 raise ValueError(f"{self.name} already subscribes to {topic}")
@@ -163,13 +157,13 @@ class RosNode:
             return subscriber
 
     def repeat(self, topic: str, received: Received) -> None:
-        """Give `received` the last message of each latched publisher of a subscribed topic."""
+        """`received` gets the last message of each latched publisher."""
         self.subscribers[topic].repeat(received)
         if topic in self.publishers:
             self.publishers[topic].repeat(received)
 
     def follow(self, subscriber: NodeSubscription, uris: Sequence[Value]) -> None:
-        """Follow the publishers of a list, except the node itself, whose messages take no connection."""
+        """The node's own messages take no connection."""
         subscriber.update([uri for uri in uris if isinstance(uri, str) and uri != self._uri])
 
     async def unsubscribe(self, topic: str) -> None:
@@ -181,9 +175,10 @@ class RosNode:
     async def advertise(
         self, topic: str, kind: MessageType, *, latched: bool, queue: int, replay: float = 0.0
     ) -> NodePublication:
-        """Advertise a topic; `queue` is the number of messages that may wait for each subscriber.
+        """`queue` is the number of messages that may wait for each subscriber.
 
         Subscribers that connect within `replay` seconds get the messages that were published until then.
+
         Raises ValueError if the node already publishes it, and `RosError` if the master denies it.
         """
         async with self._lock("publisher", topic):
@@ -206,7 +201,10 @@ class RosNode:
             return publisher
 
     async def advertise_again(self, topic: str) -> None:
-        """Register a publication again, which shows whether the master still grants it. Raises `RosError`."""
+        """The result shows whether the master still grants the publication.
+
+        Raises `RosError`.
+        """
         await self.master("registerPublisher", topic, self.publishers[topic].type.name, self._uri)
 
     async def unadvertise(self, topic: str) -> None:
@@ -218,7 +216,7 @@ class RosNode:
     # --- parameters ---
 
     async def subscribe_parameter(self, key: str, changed: ParameterChanged) -> None:
-        """Subscribe to a canonical key; `changed` is called for each new value of it, or of a key below.
+        """`changed` is called for each new value of the canonical key, or of a key below.
 
         Raises ValueError if the node already subscribes to it, and `RosError` if the master denies it.
         """
@@ -233,17 +231,16 @@ class RosNode:
                 raise
 
     async def unsubscribe_parameter(self, key: str) -> None:
-        """End a subscription, if there is one."""
         async with self._lock("parameter", key):
             if key in self.parameters:
                 await self._forget("unsubscribeParam", self._uri, key)
                 del self.parameters[key]
 
     async def set_parameter(self, name: str, value: Value) -> None:
-        """Set a parameter. Raises `RosError`.
+        """A master sends the node that sets a parameter no update. So the call has its own name, and subscriptions of
+        this node get all values in the order of the master.
 
-        A master sends the node that sets a parameter no update. So the call has a name of its own, and subscriptions
-        of this node get all values in the order of the master.
+        Raises `RosError`.
         """
         key = resolve_parameter(name, self.name)
         await self._call_master(f"{self.name}/parameters", "setParam", key, value)
@@ -253,7 +250,7 @@ class RosNode:
     async def offer(
         self, service: str, kind: ServiceType, answer: Callable[[bytes], Awaitable[bytes]]
     ) -> ServiceServer:
-        """Offer a service. Raises ValueError if the node already offers it, and `RosError` if the master denies it."""
+        """Raises ValueError if the node already offers it, and `RosError` if the master denies it."""
         async with self._lock("service", service):
             if service in self.services:
                 raise ValueError(f"{self.name} already offers {service}")
@@ -272,11 +269,14 @@ class RosNode:
                 del self.services[service]
 
     async def probe_service(self, service: str) -> dict[str, str]:
-        """Return the header of a service, with its `type` and `md5sum`. Raises `RosError`."""
+        """The header has `type` and `md5sum`.
+
+        Raises `RosError`.
+        """
         return await probe_service(self._link, service, await self._service_uri(service))
 
     async def call_service(self, service: str, md5sum: str, request: bytes, seconds: float) -> bytes:
-        """Call a service, and return the serialised response.
+        """Returns the serialised response.
 
         Raises `ServiceFailedError` with the service's reason, or another `RosError`.
         """
@@ -301,7 +301,7 @@ class RosNode:
                 await self._serve_header(reader, writer)
 
     def _accept(self, writer: ByteWriter) -> bool:
-        """Return whether the node serves a new connection, whose task it then owns."""
+        """The node then owns the connection's task."""
         if len(self._tasks) >= self._limits.connections:
             writer.close()
             return False
@@ -334,6 +334,6 @@ class RosNode:
         return lock
 
     async def _forget(self, method: str, *params: Value) -> None:
-        """Unregister; a master that is gone has forgotten the registration, or will notice the end of the node."""
+        """A master that is gone has forgotten the registration, or will notice the end of the node."""
         with contextlib.suppress(RosError):
             await self.master(method, *params)

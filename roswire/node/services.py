@@ -31,13 +31,13 @@ class ServiceType:
 
     @classmethod
     def defined(cls, definitions: Definitions, name: str) -> "ServiceType":
-        """Return the type of this name; raises `DefinitionError`."""
+        """Raises `DefinitionError`."""
         service = definitions.service(name)
         return cls(name, definitions.service_md5sum(name), service.request.name, service.response.name)
 
 
 async def probe_service(link: NodeLink, service: str, uri: NodeUri) -> dict[str, str]:
-    """Return the header of a service, which names its type. Raises `RosError`."""
+    """Raises `RosError`."""
     fields = {"callerid": link.name, "service": service, "md5sum": ANY, "probe": "1"}
     header, _reply = await _connected(
         link, service, uri, fields, request=b"", seconds=link.limits.call_seconds
@@ -48,10 +48,7 @@ async def probe_service(link: NodeLink, service: str, uri: NodeUri) -> dict[str,
 async def call_service(
     link: NodeLink, service: str, uri: NodeUri, *, md5sum: str, request: bytes, seconds: float
 ) -> bytes:
-    """Call a service with a serialised request, and return the serialised response.
-
-    Raises `ServiceFailedError` with the service's reason, or another `RosError`.
-    """
+    """Raises `ServiceFailedError` with the service's reason, or another `RosError`."""
     fields = {"callerid": link.name, "service": service, "md5sum": md5sum, "persistent": "0"}
     _header, reply = await _connected(
         link, service, uri, fields, request=encode_frame(request), seconds=seconds
@@ -62,7 +59,7 @@ async def call_service(
 async def _connected(
     link: NodeLink, service: str, uri: NodeUri, fields: Mapping[str, str], *, request: bytes, seconds: float
 ) -> tuple[dict[str, str], bytes]:
-    """Open a connection to a service; if there is a request, send it and wait for the reply."""
+    """Without a request, no reply is awaited."""
     try:
         async with asyncio.timeout(seconds):
             reader, writer = await link.network.connect(uri.host, uri.port)
@@ -92,7 +89,7 @@ async def _read_reply(link: NodeLink, reader: asyncio.StreamReader) -> bytes:
 
 
 class ServiceServer:
-    """A service that a node offers. `answer` returns the serialised response, or raises `ServiceFailedError`."""
+    """`answer` returns the serialised response, or raises `ServiceFailedError`."""
 
     def __init__(
         self, link: NodeLink, name: str, kind: ServiceType, answer: Callable[[bytes], Awaitable[bytes]]

@@ -18,7 +18,7 @@ _LENGTH = struct.Struct("<I")
 
 @dataclass(frozen=True, slots=True)
 class NodeLimits:
-    """Upper bounds for one node; times are in seconds."""
+    """Times are in seconds."""
 
     message_bytes: int = 64 << 20
     connections: int = 256  # from other nodes, to its topics, services and API
@@ -30,7 +30,7 @@ class NodeLimits:
 
 @dataclass(frozen=True, slots=True)
 class MessageType:
-    """A message type as connection headers describe it: name, md5sum and full text."""
+    """`definition` is the full text."""
 
     name: str
     md5sum: str
@@ -38,18 +38,17 @@ class MessageType:
 
     @classmethod
     def defined(cls, definitions: Definitions, name: str) -> "MessageType":
-        """Return the type of this name; raises `DefinitionError`."""
+        """Raises `DefinitionError`."""
         return cls(name, definitions.md5sum(name), definitions.full_text(name))
 
 
 ANY_TYPE = MessageType(ANY, ANY, "")
-"""The type of a subscriber that accepts every type."""
+"""A subscriber with it accepts every type."""
 
 
 async def read_frame(reader: asyncio.StreamReader, limit: int) -> bytes:
-    """Return the next frame: a header, message, request or response.
-
-    Raises `LimitExceededError` as soon as the announced length exceeds the limit, and `OSError` if the connection ends.
+    """Raises `LimitExceededError` as soon as the announced length exceeds the limit, and `OSError` if the connection
+    ends.
     """
     try:
         (size,) = _LENGTH.unpack(await reader.readexactly(_LENGTH.size))
@@ -61,10 +60,7 @@ async def read_frame(reader: asyncio.StreamReader, limit: int) -> bytes:
 
 
 async def read_header(reader: asyncio.StreamReader, seconds: float) -> dict[str, str]:
-    """Return the peer's header.
-
-    Raises `ProtocolError`, or `OSError` if the connection ends or the time limit passes.
-    """
+    """Raises `ProtocolError`, or `OSError` if the connection ends or the time limit passes."""
     async with asyncio.timeout(seconds):
         return decode_header(await read_frame(reader, HEADER_LIMIT))
 
@@ -72,7 +68,7 @@ async def read_header(reader: asyncio.StreamReader, seconds: float) -> dict[str,
 async def exchange_headers(
     reader: asyncio.StreamReader, writer: ByteWriter, header: Mapping[str, str], seconds: float
 ) -> dict[str, str]:
-    """Send a header, and return the answer.
+    """Returns the answer.
 
     Raises `ProtocolError` with the peer's reason if it rejects the connection, or `OSError`.
     """
@@ -84,6 +80,6 @@ async def exchange_headers(
 
 
 def refuse(writer: ByteWriter, reason: str) -> None:
-    """Reject a connection with a reason, which the peer's node logs."""
+    """The peer's node logs the reason."""
     writer.write(encode_header({"error": reason}))
     writer.close()

@@ -72,7 +72,7 @@ class NodeLink:
 
 
 class NodeSubscription:
-    """A subscription of a node: one connection for each publisher, opened again whenever it ends.
+    """One connection for each publisher, opened again whenever it ends.
 
     `problems` has the reason for each publisher that cannot be reached.
     """
@@ -93,7 +93,7 @@ class NodeSubscription:
         ] = {}  # number and hash of each latched publisher's last message
 
     def update(self, uris: Sequence[str]) -> None:
-        """Follow exactly the publishers of this list of node API URIs."""
+        """Drops publishers that are not in the list."""
         self.updates += 1
         wanted = dict.fromkeys(uris[: self._link.limits.publishers])
         for uri in [uri for uri in self._followed if uri not in wanted]:
@@ -104,12 +104,12 @@ class NodeSubscription:
                 self._followed[uri] = self._tasks.start(self._follow(uri))
 
     async def headers(self) -> list[Mapping[str, str]]:
-        """Return the headers of the publishers as soon as one has connected."""
+        """Waits until one publisher has connected."""
         await self._connection.wait()
         return [*self.connected.values()]
 
     def hear_own(self, body: bytes, header: Mapping[str, str]) -> None:
-        """Take a message that the node itself publishes, if it has the wanted type."""
+        """Other types than the wanted one are ignored."""
         if self.wanted.md5sum in (ANY, header["md5sum"]):
             self._received(body, header)
 
@@ -215,7 +215,7 @@ class NodeSubscription:
 
 
 class NodePublication:
-    """A publication of a node.
+    """At most `queue` messages wait for each subscriber; `dropped` counts the older ones that are dropped.
 
     At most `queue` messages wait for each subscriber; if more come, the oldest are dropped, as `dropped` counts. A
     latched publication sends its last message to each new subscriber. Subscribers connect some time after the
@@ -280,13 +280,13 @@ class NodePublication:
             own.hear_own(body, self._header)
 
     def repeat(self, received: Received) -> None:
-        """Give `received` the last message, if the publication is latched."""
+        """Only if the publication is latched."""
         if self.latched:
             for frame in self._kept.frames:
                 received(frame[4:], self._header)  # without its length
 
     def replay_from_now(self) -> None:
-        """Keep the next messages for subscribers that connect within `replay` seconds from now; forget earlier ones."""
+        """Forgets earlier messages."""
         loop = asyncio.get_running_loop()
         self._kept.clear()
         self._replay_until = loop.time() + self._replay
@@ -300,7 +300,7 @@ class NodePublication:
     async def serve(
         self, reader: asyncio.StreamReader, writer: ByteWriter, header: Mapping[str, str]
     ) -> None:
-        """Serve one subscriber, from its header on, until the connection ends."""
+        """From the subscriber's header on, until the connection ends."""
         if header.get("md5sum") not in (ANY, self.type.md5sum):
             refuse(
                 writer,
@@ -405,7 +405,7 @@ class _SendQueue:
         self._queues.queues.discard(self)
 
     async def send_to(self, writer: ByteWriter) -> None:
-        """Send what is added, until the connection ends."""
+        """Until the connection ends."""
         try:
             while True:
                 await self._ready.wait()

@@ -28,14 +28,14 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class MethodCall:
-    """A request: the name of the method as received, and its parameters."""
+    """`method` is as received."""
 
     method: str
     params: tuple[Value, ...]
 
 
 class FaultReceived(PeerError):  # noqa: N818 - named as the event it is: the answer was a fault
-    """The answer was a fault: the method failed."""
+    """The method failed."""
 
     def __init__(self, code: int, text: str) -> None:
         super().__init__(f"fault {code}: {text}")
@@ -44,7 +44,7 @@ class FaultReceived(PeerError):  # noqa: N818 - named as the event it is: the an
 
 
 def parse_call(body: bytes, limits: XmlRpcLimits = DEFAULT_LIMITS) -> MethodCall:
-    """Parse a request; raises `ProtocolError` or `LimitExceededError`."""
+    """Raises `ProtocolError` or `LimitExceededError`."""
     parsed = read_common_call(body, limits)
     if parsed is None:
         document = XmlRpcDocument(body, limits, "methodCall")
@@ -60,7 +60,7 @@ def parse_call(body: bytes, limits: XmlRpcLimits = DEFAULT_LIMITS) -> MethodCall
 
 
 def parse_response(body: bytes, limits: XmlRpcLimits = DEFAULT_LIMITS) -> Value:
-    """Parse an answer; raises `FaultReceived` if it is a fault, `ProtocolError` or `LimitExceededError`."""
+    """Raises `FaultReceived` if the answer is a fault, `ProtocolError` or `LimitExceededError`."""
     parsed = read_common_answer(body, limits)
     if parsed is not None:
         return parsed

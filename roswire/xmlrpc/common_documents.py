@@ -25,7 +25,7 @@ _DOUBLE = rb"-?[0-9]++(?:\.[0-9]++)?(?:e[-+]?[0-9]++)?"
 
 
 def _scalar(group: bytes = b"(?:") -> bytes:
-    """Return the pattern of a scalar. The group for each kind of content has a name that begins with `group`."""
+    """The group for each kind of content has a name that begins with `group`."""
     kinds = (
         (b"string", _TEXT), (b"int", _INTEGER), (b"i4", _INTEGER), (b"boolean", b"[01]"), (b"double", _DOUBLE)
     )  # fmt: skip
@@ -44,9 +44,9 @@ def _spaced(*parts: bytes) -> re.Pattern[bytes]:
 
 
 def _list_in(group: bytes) -> bytes:
-    """Return the pattern of a list of scalars.
+    """The last item may itself be a list of scalars.
 
-    The last item may itself be a list of scalars. The name of each group begins with `group`.
+    The name of each group begins with `group`.
     """
     each = group + _EACH + b")"
     return _ARRAY + each + b"(?:" + _ARRAY + each + _END + b")?" + _END
@@ -85,9 +85,9 @@ _STRUCT_END = re.compile(b"</struct>" + _SPACE + b"</value>" + _SPACE)
 
 
 def read_common_call(body: bytes, limits: XmlRpcLimits) -> tuple[str, list[Value]] | None:
-    """Return the method and the parameters of a call if all parameters are scalars; otherwise None.
+    """None unless all parameters are scalars.
 
-    For a multicall, return the parameters of all parts.
+    For a multicall, returns the parameters of all parts.
     """
     if not _fits(body, limits):
         return None
@@ -99,9 +99,7 @@ def read_common_call(body: bytes, limits: XmlRpcLimits) -> tuple[str, list[Value
 
 
 def read_common_answer(body: bytes, limits: XmlRpcLimits) -> list[Value] | None:
-    """Return the answer, or the answers of a multicall, if each is a list of scalars whose last item may be such a
-    list.
-    """
+    """None unless each answer is a list of scalars whose last item may be such a list."""
     if not _fits(body, limits):
         return None
     found = _ANSWER.match(body) if len(body) <= _LONGEST else None
@@ -116,7 +114,7 @@ def _several(
     patterns: tuple[re.Pattern[bytes], re.Pattern[bytes], re.Pattern[bytes]],
     read: Callable[[re.Match[bytes]], Value],
 ) -> list[Value] | None:
-    """Return the parts of a document, if it has at least one part and nothing else between its head and end."""
+    """None unless the document has at least one part and nothing else between its head and end."""
     head, part, end = patterns
     found = head.match(body)
     if found is None:
@@ -134,8 +132,9 @@ def _several(
 
 
 def _struct(body: bytes, begin: int, limits: XmlRpcLimits) -> tuple[Value, int]:
-    """Return the struct that begins here, as `reader` returns it, and its end. Raises `PeerError` if there is not a
-    struct here.
+    """Returns the struct as `reader` does, and its end.
+
+    Raises `PeerError` if there is no struct.
 
     A value that is valid alone in a document is also valid in any other position one level deeper.
     """

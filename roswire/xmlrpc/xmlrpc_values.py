@@ -5,12 +5,11 @@ from datetime import datetime
 from typing import TypeAlias
 
 Value: TypeAlias = "bool | int | float | str | bytes | datetime | list[Value] | dict[str, Value] | None"
-"""A parameter or an answer of XML-RPC."""
 
 
 @dataclass(frozen=True, slots=True)
 class XmlRpcLimits:
-    """Upper bounds for one document; the defaults exceed what a large robot sends."""
+    """The defaults exceed what a large robot sends."""
 
     body: int = 16 << 20  # bytes
     elements: int = 1_000_000  # values, including those in arrays and structs
