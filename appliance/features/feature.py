@@ -1,11 +1,12 @@
-"""Define a feature: everything that it adds to the core.
+"""Define all that a feature adds to the core.
 
 Invariants:
 
 1. The core knows these classes and `table.py`, and nothing else of a feature. No feature imports another one.
 2. Each process loads the table, so a row imports only settings and roles. `make`, `operations` and entries of roles
    import the rest when they are called, in the process that needs it; routes and verbs are named by strings.
-3. No feature imports `configuration.settings` except in the entry of a process, because the settings import the table.
+3. No feature imports `configuration.settings` except in the entry of a process, because the settings import the
+   table.
 """
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -48,15 +49,15 @@ class KeptHosts(Protocol):
     """Hosts of a feature that the policy names."""
 
     def addresses(self) -> "Mapping[str, Address]":
-        """Return the addresses of the names in the policy, such as `door:alice`."""
+        """Names are as in the policy, such as `door:alice`."""
 
 
 @dataclass(frozen=True)
 class FeatureContext:
-    """Hold the objects of control that parts of features use. `robot` is the robot's name, empty if it has none.
+    """Objects of control that parts of features use. `robot` may be empty.
 
-    `charged_to(host)` returns the name that is charged for a host's acts. `in_force()` returns the revisions of policy
-    and specifications in force.
+    `charged_to(host)` returns the name that is charged for a host's acts. `in_force()` returns the revisions of
+    policy and specifications.
     """
 
     sections: Sections
@@ -69,12 +70,11 @@ class FeatureContext:
 
 @dataclass(frozen=True)
 class OperatorContext:
-    """Hold the objects of control that exist later, and that parts of features use for operators' work.
+    """Objects of control that exist later, for operators' work.
 
-    `appliance` is the name of one of two appliances, empty on a single one. `processes` returns the processes of the
-    appliance. `received` notes that another machine has all records up to a sequence. `graph` returns the present
-    graph. `bearers` returns the names of the tokens and sessions that may be used now. `tokens_changed` sends the api
-    the usable tokens and sessions. `status` returns the present status. `kept` has the results of `Feature.keep`.
+    `appliance` is the name of one of two appliances, empty on a single one. `received` notes that another machine has
+    all records up to a sequence. `bearers` returns the names of the tokens and sessions that may be used now.
+    `tokens_changed` sends the api the usable tokens and sessions. `kept` has the results of `Feature.keep`.
     """
 
     core: FeatureContext
@@ -95,20 +95,20 @@ class OperatorContext:
 
 @dataclass(frozen=True)
 class FeaturePart:
-    """The part of control that a feature adds.
+    """A feature's part of control.
 
     `links` are control's ends of the links to the feature's roles, with the messages that control accepts, and
     `longest` limits the bytes of a message. `methods` answer the feature's `operations`. `work` runs until control
-    ends; its names go into error messages. `limits` returns how much of its resources is used.
-    `connected(door, ticket, peer, descriptor)` passes a WebSocket of the api on; it returns an HTTP status and why it
-    is refused, or an empty text. `details` returns what it adds to the details of a record (`RecordDetails`), if it
-    adds anything. `called` answers nodes' calls of its services, by name without the appliance's own name. `sessions`
-    are those of people whom the feature signs in; they count beside tokens. `hosts` are those in tunnels. `holders`
-    returns the host that holds each group (`Policy.holders`). `approved` returns the approvals that last
-    (`Policy.approved`), `hold_call` holds a call that needs one, and `approve` decides about a request to a service.
+    ends; its names go into error messages. `limits` returns how much of its resources is used. `connected(door,
+    ticket, peer, descriptor)` passes a WebSocket of the api on; it returns an HTTP status and why it is refused, or
+    an empty text. `details` returns what it adds to the details of a record (`RecordDetails`), if it adds anything.
+    `called` answers nodes' calls of its services, by name without the appliance's own name. `sessions` are those of
+    people whom the feature signs in. `holders` returns the host that holds each group (`Policy.holders`). `approved`
+    returns the approvals that last (`Policy.approved`), `hold_call` holds a call that needs one, and `approve`
+    decides about a request to a service.
 
-    `status_fields()` returns the present states of the feature by their fields in `rosrv status --json`. The feature's
-    view defines the fields (`StateView`). A state that is None or missing is null there.
+    `status_fields()` returns the present states of the feature by their fields in `rosrv status --json`. The
+    feature's view defines the fields (`StateView`). A state that is None or missing is null there.
     """
 
     links: "Mapping[str, tuple[Link, Any]]" = field(default_factory=dict)
@@ -131,9 +131,9 @@ class FeaturePart:
 
 
 class ConsolePart(NamedTuple):
-    """A component of the console: its name in a file of the feature's folder `console`, and where it is shown.
+    """A component of the console, in a file of the feature's folder `console`.
 
-    A `view` is a page with this title. The others are parts of the core's pages: `banner` is above every view, `now`
+    A `view` is a page with this title; the others are parts of the core's pages: `banner` is above every view, `now`
     and `robot` are on these pages, `record` is in an audit record, and `standby` is the page of an appliance that is
     not active.
     """
@@ -149,21 +149,20 @@ class Feature:
     """All that a feature adds: a section of `appliance.yaml`, processes, requests, verbs, and a part of control.
 
     `operations` returns the requests of operators' tools; the admin socket, REST and the client follow from their
-    rows. `answers` are the `Answer`s (`module:name`) of operations over REST that are not just control's, by name, and
-    `routes` is the function (`module:function`) that returns further routes of the api for its `Services`.
+    rows. `answers` are the `Answer`s (`module:name`) of operations over REST that are not just control's, by name,
+    and `routes` is the function (`module:function`) that returns further routes of the api for its `Services`.
     `without_token` lists the paths of routes that need no token. `page` returns settings for the console's page.
-    `verbs` are commands of `rosrv`.
-    `quotas` are rows that the table of quotas lists.
-    `recorded` is the function (`module:function`) that gives `rosrv monitor replay` the recorded messages of a period.
-    `console` are components of the console; all style sheets of the folder are part of its style.
-    `memory` makes the memory that the supervisor shares with this number of relays; None if none is configured.
+    `quotas` are rows that the table of quotas lists. `recorded` is the function (`module:function`) that gives `rosrv
+    monitor replay` the recorded messages of a period. `console` are components of the console; all style sheets of
+    the folder are part of its style. `memory` makes the memory that the supervisor shares with this number of relays;
+    None if none is configured.
 
     `pairing(state)` returns what the start of one of two appliances needs; it raises `StartError`. `state_files` are
-    files in the state directory that the feature may write before the first start.
-    Hooks of control are named by `module:name`, so that their modules may import what imports the table. `may_start` is
-    a class of `control.assembly.active_role.StartGate`. `keep(sections, store, lifeline)` returns `KeptHosts`, before
-    the policy comes into force. `inherit(foundation, parts)` returns a `FeaturePart` once
-    control may serve and has its parts, before it serves.
+    files in the state directory that the feature may write before the first start. Hooks of control are named by
+    `module:name`, so that their modules may import what imports the table. `may_start` is a class of
+    `control.assembly.active_role.StartGate`. `keep(sections, store, lifeline)` returns `KeptHosts`, before the policy
+    comes into force. `inherit(foundation, parts)` returns a `FeaturePart` once control may serve and has its parts,
+    before it serves.
     """
 
     name: str

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from appliance.policy.policy import Approval
 
 LONGEST = 64 << 20
-"""The most bytes of a message on a link of a feature, unless its part has a smaller limit."""
+"""Applies unless a part has a smaller limit."""
 
 
 _NO_APPROVALS = "no operator can approve calls on this appliance"
@@ -40,7 +40,7 @@ class FeatureParts:
         self._parts = [feature.make(core) for feature in FEATURES if feature.make is not None]
 
     async def keep(self, store: Any, lifeline: Any) -> None:
-        """Read the hosts that features keep in the state, before the policy comes into force."""
+        """Read the hosts in the state, before the policy comes into force."""
         for feature in FEATURES:
             if feature.keep is not None:
                 keep = pkgutil.resolve_name(feature.keep)
@@ -58,7 +58,7 @@ class FeatureParts:
         )
 
     def operate(self, **later: Any) -> None:
-        """Add the parts that need objects of control that exist now: the fields of `OperatorContext`."""
+        """`later` has the fields of `OperatorContext`."""
         context = OperatorContext(self._core, **later, hosts=self.hosts(), kept=self.kept)
         self._parts += [feature.operate(context) for feature in FEATURES if feature.operate is not None]
 
@@ -70,12 +70,12 @@ class FeatureParts:
                 self._parts.append(part)
 
     def add(self, part: FeaturePart | None) -> None:
-        """Add the part of the feature that let control serve, if there is one."""
+        """Add the part that let control serve, if there is one."""
         if part is not None:
             self._parts.append(part)
 
     def link(self, role: str, index: int = 0) -> "tuple[Link, Any] | None":
-        """Return control's end of the link to a process, with the accepted messages; None for an unknown one.
+        """Return control's end of the link, with the accepted messages; None for an unknown process.
 
         The second process of a role has the name `ROLE-2`.
         """
@@ -97,7 +97,6 @@ class FeatureParts:
     def details(
         self, event: str, decision: str | None, severity: "Severity", host: str | None, now: int
     ) -> dict[str, str]:
-        """Return what the features add to the details of a record."""
         details: dict[str, str] = {}
         for part in self._parts:
             if part.details is not None:
@@ -132,7 +131,7 @@ class FeatureParts:
         return ApprovalAnswered(wanted.number, _NO_APPROVALS)
 
     def sessions(self) -> "Sessions | None":
-        """Return the sessions of people, or None if people sign in with tokens only."""
+        """Return None if people sign in with tokens only."""
         return next((part.sessions for part in self._parts if part.sessions is not None), None)
 
     def hosts(self) -> TunnelHosts:

@@ -63,7 +63,7 @@ FEATURES: tuple[Feature, ...] = (
 
 
 def memories(sections: Sections, relays: int) -> tuple[SharedMemory, ...]:
-    """Make the shared memory of all features. Raises `StartError`, `OSError`."""
+    """Raises `StartError`, `OSError`."""
     return tuple(filter(None, (feature.memory(sections, relays) for feature in FEATURES)))
 
 
@@ -72,12 +72,12 @@ def recorded_messages() -> Any:
 
 
 def pairing_in(state: Path) -> "Pairing | None":
-    """Return what makes the appliance in a state directory one of two; None on a single one. Raises `StartError`."""
+    """None on a single appliance. Raises `StartError`."""
     found = (feature.pairing(state) for feature in FEATURES if feature.pairing is not None)
     return next(filter(None, found), None)
 
 
 def start_gate() -> Any:
-    """Return the gate of the feature that decides when control may serve, or None if no feature does."""
+    """The gate decides when control may serve."""
     named = (feature.may_start for feature in FEATURES if feature.may_start is not None)
     return next((pkgutil.resolve_name(name)() for name in named), None)

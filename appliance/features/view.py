@@ -11,7 +11,7 @@ from appliance.base.user_errors import UserError
 S = TypeVar("S")
 
 Samples = Iterable[tuple[tuple[str, ...], Any]]
-"""The samples of a metric: values of its labels, and the value."""
+"""Values of labels, and the value."""
 
 
 class Trouble(NamedTuple):
@@ -25,12 +25,10 @@ class Trouble(NamedTuple):
 
 @dataclass(frozen=True)
 class StateView(Generic[S]):
-    """A state of a feature: a field of `rosrv status --json`, with its alarms, metrics and line.
-
-    `kind` defines the state, and `doc` describes the field. The field belongs to the status, or to its `audit`, before
-    the field `before`, or at the end. It is null without a state; a client may rely on a field that is `required`.
-    `metrics` have no samples without a state. `line(state)` returns what `rosrv status` prints: a name, and a text for
-    rich; an empty name adds the text to the line of the audit log.
+    """`kind` defines a field of `rosrv status --json`, described by `doc`. The field belongs to the status, or to its
+    `audit`, before the field `before`, or at the end. It is null without a state; a client may rely on a field that
+    is `required`. `metrics` have no samples without a state. `line(state)` returns what `rosrv status` prints: a
+    name, and a text for rich; an empty name adds the text to the line of the audit log.
     """
 
     field: str
@@ -49,7 +47,7 @@ _NO_PAIRS = UserError("this appliance is one of two, which this rosrv cannot sho
 
 
 class PairView:
-    """The views of two appliances; this class is for a product without pairs."""
+    """This class is for a product without pairs."""
 
     def request(self) -> Any:
         raise _NO_PAIRS
@@ -59,7 +57,7 @@ class PairView:
         return {}
 
     def status(self, state: Any) -> Any:
-        """Return the `StatusView` of an appliance that waits for the other one to end."""
+        """For an appliance that waits for the other one to end."""
         del state
         raise _NO_PAIRS
 
@@ -71,10 +69,9 @@ class PairView:
         state: Path,
         verify: Callable[[], Any],
     ) -> tuple[Any, Callable[[Any], None]]:
-        """Verify the log `own` and the log `other` in a state directory.
+        """`verified` is the `Verification` of the log `own`, and `verify()` returns that of `other`.
 
-        `verified` is the `Verification` of `own`, and `verify()` returns that of `other`. Return the result, and the
-        function that prints it.
+        Return the result, and the function that prints it.
         """
         del verified, state, verify
         raise UserError(f"{own} and {other}: this rosrv cannot verify takeovers: use one with `standby`")
@@ -82,7 +79,7 @@ class PairView:
 
 @dataclass(frozen=True)
 class FeatureView:
-    """The states of a feature. `pair` is a class of `PairView` (`module:name`), for the feature that makes pairs."""
+    """`pair` is a class of `PairView` (`module:name`), for the feature that makes pairs."""
 
     name: str
     states: tuple[StateView[Any], ...] = ()

@@ -23,7 +23,7 @@ STATES: tuple[StateView[Any], ...] = tuple(state for view in VIEWS for state in 
 
 
 def with_states(kind: type[msgspec.Struct], part: str) -> Any:
-    """Return the struct with a field for each state of a feature that belongs to this part of the status."""
+    """Add a field for each state of a feature that belongs to this part of the status."""
     fields: list[Any] = []
     for field in msgspec.structs.fields(kind):
         defaults = {"default": field.default, "default_factory": field.default_factory}
@@ -44,7 +44,7 @@ def states_in(states: Mapping[str, Any], part: str) -> dict[str, Any]:
 
 
 def states_of(status: Any) -> Iterator[tuple[StateView[Any], Any]]:
-    """Yield each view with its state in a status; features that are not configured have no state."""
+    """Features that are not configured have no state."""
     for view in STATES:
         state = getattr(status.audit if view.part == "audit" else status, view.field)
         if state is not None:

@@ -1,4 +1,4 @@
-"""Answer operators' requests about alarms. `control/operators/handled_alarms.py` keeps what they decide."""
+"""Answer operators' requests about alarms; `control/operators/handled_alarms.py` keeps what they decide."""
 
 from collections.abc import Callable
 
@@ -30,7 +30,7 @@ def operate(context: OperatorContext) -> FeaturePart:
 
 
 class AlarmOrders:
-    """The answers and orders about alarms. `status()` returns the present status, with the handled alarms."""
+    """`status()` returns the present status, with the handled alarms."""
 
     def __init__(self, handled: HandledAlarms, trail: AuditTrail, status: Callable[[], Status]) -> None:
         self._handled = handled
@@ -41,7 +41,7 @@ class AlarmOrders:
         return self._list()
 
     async def acknowledge(self, request: AlarmAcknowledge, who: str) -> AlarmList:
-        """Record who takes care of an alarm. Raises `UnknownThingError` if there is no such alarm."""
+        """Raises `UnknownThingError` if there is no such alarm."""
         self._must_be_present(request.kind)
         self._handled.put(HandledAlarm(request.kind, who, clock.wall(), None, request.note))
         self._record("alarm acknowledged", f"{request.kind} is acknowledged", request.kind, who, request.note)

@@ -1,4 +1,4 @@
-"""The feature alarms: `rosrv alarm`. The core finds the present alarms (`channel/alarms.py`)."""
+"""`rosrv alarm`. The core finds the present alarms (`channel/alarms.py`)."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -1,7 +1,7 @@
 """Hold calls that need an approval, and give and end approvals, by orders of operators and at their time.
 
 A lease on a topic or a parameter takes the path of a change of the policy: all rights are decided again
-(`Policy.approved`). A call of a service is decided here, because the relay asks about each request. Nothing is stored:
+(`Policy.approved`). A service call is decided here, because the relay asks about each request. Nothing is stored:
 after a restart of control, and after a takeover, nothing is approved.
 """
 
@@ -35,21 +35,21 @@ from appliance.telemetry.audit_trail import NOT_RECORDED, Asker, AuditTrail
 
 CHECK_SECONDS = 0.25
 LEASE_SECONDS = 60.0
-"""The lease of a topic or a parameter, if the operator names none."""
+"""The default for a topic or a parameter."""
 SILENT_SECONDS = 5.0
 """The silence that ends a lease on a motion outside the groups of `[Authority]`."""
 UNANSWERED_SECONDS = 600.0
-"""How long the alarm about an unanswered call lasts."""
+"""The alarm about an unanswered call lasts this long."""
 
 
 class ApprovalOrders:
-    """The held calls, the approvals and the orders. Orders raise `SenselessError` and `UnknownThingError`.
+    """Orders raise `SenselessError` and `UnknownThingError`.
 
     `first` is the number of the first held call. `decide_again()` brings the present `approved` into force, and
     `carried_out(topics)` waits until the relays of topics have carried out their orders. `guards(topic)` returns the
     monitors with a safe message for a topic, or None if its relay does not answer.
 
-    An order or an end takes effect before it waits for anything, so a relay that hangs delays no other order or end.
+    An order or an end takes effect before it waits for anything, so a hanging relay delays no other one.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class ApprovalOrders:
         return self._held(call, request.caller_id, "", b"")
 
     async def approve_call(self, wanted: ApprovalWanted) -> ApprovalAnswered:
-        """Decide about a request of a client to a service. An approval of one call is used up."""
+        """Decide about a request to a service. An approval of one call is used up."""
         answer = partial(ApprovalAnswered, wanted.number)
         if obstacle := self._trail.obstacle or self._trail.shut_out(wanted.host):
             return answer(obstacle)
@@ -142,7 +142,7 @@ class ApprovalOrders:
         )
 
     async def approve(self, request: requests.ApproveCall, who: str) -> requests.Approval:
-        """Approve a held call once, or give a lease; a lease may be given again to extend or shorten it."""
+        """A lease may be given again to extend or shorten it."""
         entry = self._entry(request.number)
         seconds = request.seconds
         if seconds is None and entry.lease and entry.call.category is Category.CALL:
@@ -167,7 +167,7 @@ class ApprovalOrders:
         return _shown(entry)
 
     async def refuse(self, request: requests.RefuseCall, who: str) -> requests.Approval:
-        """Refuse a held call, so that repetitions are not held again; or end an approval."""
+        """A refused call is not held again when it is repeated."""
         entry = self._entry(request.number)
         take_effect()
         if entry.state is ApprovalState.APPROVED:
@@ -211,7 +211,7 @@ class ApprovalOrders:
         await asyncio.gather(*map(self._stop_motion, ended), *map(self._end_if_guarded, still))
 
     def _ended(self, entry: ApprovalEntry) -> str:
-        """Return why an entry ends now; empty: it goes on."""
+        """Return why an entry ends now; empty if it goes on."""
         now, call = clock.now(), entry.call
         if entry.until <= now:
             return (
@@ -225,7 +225,7 @@ class ApprovalOrders:
         return "" if any(asking) else "the policy no longer asks"
 
     def _silence(self, entry: ApprovalEntry) -> str:
-        """Return why a lease on a topic ends now if the topic is a motion; empty: its host is not silent.
+        """Return why a lease on a topic ends now if the topic is a motion; empty while its host is not silent.
 
         A topic is a motion if it is in a group of `[Authority]`, or if an enabled guard has a safe message for it.
         """
@@ -246,7 +246,7 @@ class ApprovalOrders:
             await self._stop_motion(present)
 
     def _last_message(self, entry: ApprovalEntry) -> float:
-        """Return the time of the last message under a lease on a topic; 0: none."""
+        """Return the time of the last message under a lease on a topic, or 0."""
         if not entry.lease or entry.call.category is not Category.PUBLISH:
             return 0.0
         moved = self._signs.moved(entry.call.host, frozenset({entry.call.resource}))
@@ -260,17 +260,17 @@ class ApprovalOrders:
         self._record("approval ended", entry, f"approval {entry.number} ended: {reason}", who=who)
 
     def _enforce(self) -> bool:
-        """Decide all rights again if the leases differ from those in force; return whether they did."""
+        """Decide all rights again if the leases have changed; return whether they have."""
         differ = self._policy().approved != self.approved()
         if differ:
             self._decide_again()
         return differ
 
     async def _stop_motion(self, entry: ApprovalEntry) -> None:
-        """Have the guards stop the robot after the end of a lease on a topic, once its relay cut the host off.
+        """After the end of a lease on a topic, once its relay has cut the host off, the guards stop the robot.
 
-        They also stop it if no message was reported, because a report may be missing: relays report once a second, and
-        the traffic of a node that has ended is forgotten.
+        They do so even if no message was reported: relays report once a second, and forget the traffic of a node that
+        has ended.
         """
         call = entry.call
         if not entry.lease or call.category is not Category.PUBLISH:

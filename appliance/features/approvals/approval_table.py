@@ -18,7 +18,7 @@ from appliance.policy.policy import Approval, Policy
 from appliance.quotas.pool import Pool, QuotaClass
 
 WAIT_SECONDS = 120.0
-"""How long a call waits for an answer, and how long an approval of one call waits to be used."""
+"""How long a call waits for an answer, and how long an approval of one call can be used."""
 
 
 class ApprovalState(StrEnum):
@@ -30,7 +30,7 @@ class ApprovalState(StrEnum):
 
 
 class HeldCall(NamedTuple):
-    """A call that needs an approval. `digest` is the SHA-256 of its arguments; empty for a topic or a parameter."""
+    """`digest` is the SHA-256 of its arguments; empty for a topic or a parameter."""
 
     host: Address
     category: Category
@@ -43,7 +43,7 @@ class HeldCall(NamedTuple):
 
 
 class ChargedHost(NamedTuple):
-    """The unit of the quota: the network by which the policy names a host, or the host's address."""
+    """The quota counts by the network by which the policy names a host, or by the host's address."""
 
     network: str
     named: bool
@@ -58,7 +58,7 @@ class ChargedHost(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ApprovalEntry:
-    """A call, and what operators said about it. `arguments` are its first bytes, `type` its service type.
+    """A call, and the operators' decision. `arguments` are its first bytes, `type` its service type.
 
     It ends at `until`. `once`: the approval is for one call; otherwise it is a lease for all calls of the key, which
     began at `since`.
@@ -82,7 +82,7 @@ class ApprovalEntry:
 
 
 class ApprovalTable:
-    """The entries; the first one gets the number `first`."""
+    """The first entry has the number `first`."""
 
     def __init__(self, first: int) -> None:
         self._next = first
@@ -117,7 +117,7 @@ class ApprovalTable:
         type_: str,
         arguments: bytes,
     ) -> ApprovalEntry | str:
-        """Let a call wait. Return its new entry, or why its host may have no more."""
+        """Return the entry of a waiting call, or why its host may have no more."""
         if refusal := self.pool.take(charged):
             return refusal
         entry = ApprovalEntry(self._next, call, charged, caller_id, type_, arguments, now, now + WAIT_SECONDS)

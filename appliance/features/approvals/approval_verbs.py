@@ -67,7 +67,7 @@ def _say(appliance: Appliance, one: Approval) -> None:
 
 
 def _arguments(one: Approval) -> str:
-    """Return the arguments of a call of a service, as far as its type is known here."""
+    """The type of the service may be unknown here."""
     if not one.sha256:
         return " with any arguments" if one.category == "call" else ""
     data = bytes.fromhex(one.arguments)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
-    """Return the part. It begins without a holder of any group, and stops what earlier ones commanded."""
+    """It begins without a holder of any group, and stops what earlier ones commanded."""
     relay, policy = parts.endpoints.relay, base.policies.policy
     stop = MotionStop(relay.stop, base.trail, policy)
     lost: Commands = set()

@@ -27,12 +27,12 @@ CHECK_SECONDS = 0.25
 
 
 class DriveOrders:
-    """The orders about groups. Their methods raise `SenselessError`, `UnavailableError` and `UnknownThingError`.
+    """The methods raise `SenselessError`, `UnavailableError` and `UnknownThingError`.
 
     `decide_again()` brings the present `holders` into force. `carried_out(topics)` waits until the relays of these
-    topics have carried out their orders; None: all relays. `relays_ready()` returns whether all relays are connected.
+    topics (None: all) have carried out their orders.
 
-    Each group has its own turn. So a relay that hangs delays the next holder of a group, and no other group.
+    Each group has its own turn, so a hanging relay delays the next holder of a group, and no other group.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class DriveOrders:
         return self._state(group)
 
     async def give(self, request: requests.DriveGive, who: str) -> requests.GroupState:
-        """Free a group, or give it to a host with any claim: so an operator lets an agent drive."""
+        """Give a group to a host with any claim, or free it."""
         group = self._group(request.group)
         to = self._host(request.to) if request.to else None
         if to is not None and self._claim(group, to) is None:
@@ -86,7 +86,7 @@ class DriveOrders:
         return self._state(group)
 
     async def ask(self, request: requests.DriveAsk, who: str) -> requests.GroupState:
-        """Let a host wait for a group; if the group is free and the host may take it, it gets it at once."""
+        """A host that may take a free group gets it at once."""
         group, host = self._group(request.group), self._host(request.host)
         async with self._turn(group):
             await self._asked(group, host, who)
@@ -95,7 +95,7 @@ class DriveOrders:
     # --- nodes ---
 
     async def take_called(self, call: OwnServiceCalled) -> OwnServiceAnswered:
-        """Give the caller's host all groups that it may take; answer with the reason if it gets none of them."""
+        """Give the caller's host all groups that it may take, or answer with the reason."""
         host, done, refused = address_of(call.host), [], []
         for group in self._policy().authority.values():
             claim = self._claim(group, host)
@@ -131,14 +131,13 @@ class DriveOrders:
     # --- the end of a lease ---
 
     async def watch(self) -> None:
-        """End the authority of silent and absent holders; runs until cancelled."""
         async with asyncio.TaskGroup() as checks:
             while True:
                 checks.create_task(self.check())
                 await asyncio.sleep(CHECK_SECONDS)
 
     async def check(self) -> None:
-        """End the authority that is over now, and give each group to the host that waits for it.
+        """End the authority that is over, and give each group to the host that waits for it.
 
         Every authority ends before this waits for a relay.
         """
@@ -193,10 +192,10 @@ class DriveOrders:
     async def _hand_over(
         self, group: AuthorityGroup, to: Address | None, reason: str, who: str, *, stop: bool = False
     ) -> None:
-        """Cut the holder off on all relays, then let the next host hold the group. This is one audit record.
+        """Cut the holder off on all relays, then let the next host hold the group, in one audit record.
 
-        The group is freed in any case. Without `to`, the first host that waits holds it next, if all relays are ready.
-        `stop`: the guards of the group stop the robot in between.
+        The group is freed in any case. Without `to`, the first waiting host follows, if all relays are ready. `stop`:
+        the guards of the group stop the robot in between.
         """
         if to is not None and not self._relays_ready():
             raise UnavailableError(f"a relay starts, so {group.name} cannot be handed over: try again")

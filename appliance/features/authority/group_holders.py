@@ -22,7 +22,7 @@ ClaimOf = Callable[[AuthorityGroup, Address], Claim | None]
 
 @dataclass(frozen=True, slots=True)
 class Holding:
-    """A host that holds a group: since when, when it last took it again, and whether it had a node since then."""
+    """`renewed` is when the host last took the group again; `had_node` is since then."""
 
     host: Address
     since: float
@@ -31,7 +31,7 @@ class Holding:
 
 
 class GroupHolders:
-    """The holders and the waiting hosts; `claim_of(group, host)` returns the present claim of a host."""
+    """`claim_of(group, host)` returns the present claim of a host."""
 
     def __init__(self, claim_of: ClaimOf) -> None:
         self._claim_of = claim_of
@@ -45,7 +45,7 @@ class GroupHolders:
         return self._held.get(group)
 
     def waiting(self, group: AuthorityGroup, now: float) -> list[Address]:
-        """Return the hosts that wait for a group, the first one first, without those that lost their claim."""
+        """Leave out hosts that lost their claim."""
         queue = self._waiting.get(group.name, {})
         left = {
             host: since
@@ -56,14 +56,14 @@ class GroupHolders:
         return list(left)
 
     def may_take(self, group: AuthorityGroup, host: Address) -> bool:
-        """Return whether a host may take the group now: it is free or its own, or the host may override its holder."""
+        """A group can be taken if it is free or the host's own, or if the host may override its holder."""
         claim, holding = self._claim_of(group, host), self._held.get(group.name)
         if holding is None or holding.host == host:
             return claim in (Claim.TAKE, Claim.OVERRIDE)
         return claim is Claim.OVERRIDE
 
     def wait(self, group: AuthorityGroup, host: Address, now: float) -> bool:
-        """Let a host wait for a group, from now on. Return False if too many hosts wait."""
+        """Return False if too many hosts wait."""
         waiting = self.waiting(group, now)
         if host not in waiting and len(waiting) >= MOST_WAITING:
             return False
@@ -74,7 +74,6 @@ class GroupHolders:
         return self._held.pop(group, None)
 
     def hold(self, group: str, host: Address, now: float) -> None:
-        """Give a free group to a host, or let its holder take it again."""
         before = self._held.get(group)
         if before is not None and before.host != host:
             raise ValueError(f"{group} is held by {before.host}: free it first")
@@ -82,7 +81,7 @@ class GroupHolders:
         self._waiting.get(group, {}).pop(host, None)
 
     def seconds_left(self, group: AuthorityGroup, now: float, moved: float) -> float | None:
-        """Return the seconds until silence ends the authority; None: the group is free.
+        """Return the seconds until silence ends the authority, or None if the group is free.
 
         `moved` is the time of the last message from the holder on a topic of the group.
         """
@@ -90,7 +89,7 @@ class GroupHolders:
         return None if holding is None else max(holding.renewed, moved) + group.lease - now
 
     def loss(self, group: AuthorityGroup, now: float, *, moved: float, live: bool) -> str:
-        """Return why the holder loses the group now; empty: it keeps it. `live`: the holder has a live node."""
+        """Return why the holder loses the group now; empty if it keeps it. `live`: the holder has a live node."""
         holding = self._held.get(group.name)
         if holding is None:
             return ""
@@ -108,7 +107,7 @@ class GroupHolders:
         return next((host for host in self.waiting(group, now) if self._claim_of(group, host) in able), None)
 
     def forget_others(self, names: frozenset[str]) -> dict[str, Holding]:
-        """Forget groups that the policy no longer has, and return those that had a holder."""
+        """Return the groups that had a holder and are no longer in the policy."""
         self._waiting = {name: queue for name, queue in self._waiting.items() if name in names}
         gone = {name: holding for name, holding in self._held.items() if name not in names}
         for name in gone:

@@ -1,11 +1,11 @@
-"""Check that an archive is complete and contains only entries that `back_up` writes, before it is restored.
+"""Check an archive before it is restored: it is complete, and has only entries that `back_up` writes.
 
 Invariants:
 
 1. The whole file is read and its checksum checked before any entry is used, so a damaged archive is rejected.
 2. An archive must unpack to no more than the free space, and have at most `MOST_FILES` entries, all of them regular
-   files. Headers that modify the next entry (sparse, pax, long names) are rejected, so exactly the checked entries are
-   extracted.
+   files. Headers that modify the next entry (sparse, pax, long names) are rejected, so exactly the checked entries
+   are extracted.
 3. Every name is valid for a backup and occurs once.
 """
 
@@ -28,8 +28,6 @@ class _StrangeEntryError(Exception):
 
 
 class _PlainEntry(tarfile.TarInfo):
-    """The entry of a regular file; any other type is rejected before its data is read."""
-
     @classmethod
     def frombuf(cls, buf: bytes | bytearray, encoding: str, errors: str) -> Self:
         entry = super().frombuf(buf, encoding, errors)
@@ -40,7 +38,7 @@ class _PlainEntry(tarfile.TarInfo):
 
 @contextmanager
 def checked_archive(file: Path, room: int) -> Iterator[tuple[tarfile.TarFile, list[tarfile.TarInfo]]]:
-    """Check an archive, limited to `room` unpacked bytes; yield the open archive and its entries.
+    """Check an archive, limited to `room` unpacked bytes.
 
     Raises `BackupError`, also for read errors inside the `with` block.
     """

@@ -66,7 +66,9 @@ _UNCONFIRMED_CHANGE = "a local change waits for its confirmation; the bundle wai
 
 
 class Trial(msgspec.Struct, frozen=True):
-    """The journal of a trial: the bundle, and what was in force before (`hosts_back` empty: the file hosts.yaml)."""
+    """The journal of a trial: the bundle, and what was in force before (`hosts_back` is empty for the file
+    hosts.yaml).
+    """
 
     path: str
     sha256: str
@@ -81,12 +83,12 @@ class Trial(msgspec.Struct, frozen=True):
 
 
 class BundleRecord(msgspec.Struct, frozen=True):
-    """The stored record: the bundle in force since `since`, the refused one, and a trial.
+    """The stored record.
 
     `policy_back` is the revision of the policy before the bundle. `content` is the fingerprint of all parts when the
-    bundle came into force. Revision numbers do not tell whether a part was changed: going back makes a new revision of
-    the same text. Records of earlier versions have only numbers. `interrupted` is the SHA-256 of the bundle whose last
-    `interruptions` trials ended with the process.
+    bundle came into force. Revision numbers do not tell whether a part was changed: going back makes a new revision
+    of the same text. Records of earlier versions have only numbers. `interrupted` is the SHA-256 of the bundle whose
+    last `interruptions` trials ended with the process.
     """
 
     in_force: str = ""
@@ -103,9 +105,9 @@ class BundleRecord(msgspec.Struct, frozen=True):
 
 
 class BundleGate:
-    """The gate, and control's end of the link to the process `bundles`.
+    """Control's end of the link to the process `bundles`.
 
-    `health(deprived)` returns the present health without denials of hosts for which `deprived(host)` is true.
+    `health(deprived)` leaves out denials of hosts for which `deprived(host)` is true.
     """
 
     def __init__(
@@ -136,7 +138,7 @@ class BundleGate:
         self._fingerprinted: tuple[object, str] = (None, "")
 
     def status(self) -> BundlesState | None:
-        """Return the state for `rosrv status` and the metrics, or None if no bundles are configured or in force."""
+        """None if no bundles are configured or in force."""
         record, fleet = self._record, self._fleet
         if fleet.bundles.root is None and not record.in_force:
             return None
@@ -211,7 +213,6 @@ class BundleGate:
         return there != (record.policy, record.monitors) or not self._hosts.bundled
 
     def _content(self) -> str:
-        """Return the fingerprint of the policy, the specifications, the switches of monitors and the hosts in force."""
         policies, monitors, hosts = self._policies, self._monitors, self._hosts
         switches = monitors.switches.states_of(monitors.checked)
         given = (policies.revision, monitors.revision, switches, hosts.bundled)
@@ -269,7 +270,7 @@ class BundleGate:
             self._save(msgspec.structs.replace(self._record, trial=None))
 
     async def _try(self, trial: Trial, contents: BundleContents) -> None:
-        """Put a bundle into force for the trial; keep it if the robot stays healthy, otherwise go back."""
+        """Keep the bundle if the robot stays healthy; otherwise go back."""
         before, self._earlier = self._health(), self._policies.current
         try:
             await self._put_in_force(trial, contents)
@@ -303,14 +304,14 @@ class BundleGate:
         )
 
     async def _put_in_force(self, trial: Trial, contents: BundleContents) -> None:
-        """Bring all parts into force. Raises one of `_REFUSALS`; then some parts may be in force."""
+        """Raises one of `_REFUSALS`; then some parts may be in force."""
         await self._monitors.take_bundle(_sources(contents), trial.who, "of the bundle")
         load = admin.PolicyLoad(contents.policy, "of the bundle", signature=contents.policy_signature)
         await self._policies.load_with(load, trial.who, _cases(contents))
         await self._hosts.take_bundle(contents.hosts or "\n", trial.who)
 
     async def _watched(self, before: RobotHealth) -> str:
-        """Watch the robot for the time of the trial; return why it is not healthy, or an empty text."""
+        """Return why the robot is not healthy during the trial, or an empty text."""
         deadline = clock.now() + self._fleet.bundles.confirm_seconds
         there = (self._policies.revision, self._monitors.revision)
         while True:
@@ -323,9 +324,8 @@ class BundleGate:
             await asyncio.sleep(min(_TICK_SECONDS, max(0.0, deadline - clock.now())))
 
     def _health(self) -> RobotHealth:
-        """Return the present health, without the effects that every activation of the bundle has.
-
-        These are denials of hosts from which it took a right, and monitors that lost their state and hold.
+        """Leave out the effects that every activation of the bundle has: denials of hosts from which it took a right,
+        and monitors that lost their state and hold.
         """
         old, new, lost = self._earlier, self._policies.current, self._lost
         if old is None:
@@ -350,7 +350,7 @@ class BundleGate:
     # --- going back ---
 
     async def _undo_interrupted(self, record: BundleRecord, trial: Trial) -> None:
-        """Go back after control or the appliance ended during a trial; the bundle may be tried again."""
+        """The bundle may be tried again."""
         await self._undo(trial)
         interruptions = 1 + (record.interruptions if record.interrupted == trial.sha256 else 0)
         self._save(
@@ -361,7 +361,7 @@ class BundleGate:
             self._refuse(trial.path, trial.sha256, reason)
 
     async def _undo(self, trial: Trial) -> None:
-        """Bring what was in force before a trial into force again, except parts that an operator has changed."""
+        """Keep parts that an operator has changed."""
         while True:
             try:
                 if self._policies.in_force.who == trial.who and self._policies.revision > trial.policy_back:

@@ -26,10 +26,9 @@ _OF_ONE_HOST, _OF_OTHER_HOSTS = 3, 12
 def counted_denials(
     by_host: Mapping[str, int], policy: Policy, deprived: Callable[[Address], bool] = lambda _host: False
 ) -> int:
-    """Return how many denials count. `by_host` has those of unknown hosts together, under an empty name.
+    """`by_host` has denials of unknown hosts together, under an empty name.
 
-    Addresses that the policy names as one network count as one host. Denials of hosts for which
-    `deprived(host)` is true do not count.
+    Addresses that the policy names as one network count as one host.
     """
     own, others = 0, Counter[str]()
     for host, number in by_host.items():
@@ -42,7 +41,9 @@ def counted_denials(
 
 
 class RobotHealth(NamedTuple):
-    """The denials of the last minute that count, monitors that fail or hold topics, processes that keep ending."""
+    """Denials are those of the last minute that count; `failing` monitors fail or hold topics; `processes` keep
+    ending.
+    """
 
     denials: int
     failing: frozenset[str]

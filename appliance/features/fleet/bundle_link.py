@@ -1,4 +1,4 @@
-"""The link control <-> bundles: verified bundles and the state of polling in one direction, their fate in the other."""
+"""The link control <-> bundles."""
 
 import msgspec
 
@@ -27,7 +27,7 @@ class BundlePollReported(Message):
 
 
 class RefusedBundle(msgspec.Struct, frozen=True):
-    """A bundle that this robot does not take, and why."""
+    """A bundle that this robot does not take."""
 
     path: str
     sha256: str
@@ -35,14 +35,14 @@ class RefusedBundle(msgspec.Struct, frozen=True):
 
 
 class BundleHealth(msgspec.Struct, frozen=True):
-    """The robot's health in reports: denials of the last minute, and monitors that fail or hold topics."""
+    """Denials of the last minute, and monitors that fail or hold topics."""
 
     denials: int = 0
     failing: int = 0
 
 
 class BundleStated(Message):
-    """Control states the bundle in force, the one under commit-confirm, and the last refused one; empty: none.
+    """The bundle in force, the one under commit-confirm, and the last refused one.
 
     `changed`: an operator has since changed the policy, the specifications or the hosts on the robot.
     """

@@ -47,17 +47,18 @@ class CollectorError(Exception):
 
 
 class ConditionalAnswer(NamedTuple):
-    """An answer that is asked for again with its entity tag."""
+    """Its entity tag is sent when it is asked for again."""
 
     tag: bytes
     body: bytes
 
 
 class CollectorConnection:
-    """A connection to one collector, made when it is needed. Not thread-safe."""
+    """Made when it is needed. Not thread-safe."""
 
     def __init__(self, url: str, context: Callable[[], ssl.SSLContext], name: str | None = None) -> None:
-        """`url` is `https://ADDRESS:PORT`. `context` makes the TLS context of each connection; it may raise `OSError`.
+        """`url` is `https://ADDRESS:PORT`; `context` makes the TLS context of each connection, and may raise
+        `OSError`.
 
         `name` is the name in the collector's certificate (None: the address).
         """
@@ -70,11 +71,11 @@ class CollectorConnection:
         self._connection: httpcore.HTTPConnection | None = None
 
     def get(self, path: str, longest: int = _LARGEST_ANSWER) -> bytes:
-        """Return the body at a path. Raises `CollectorError`."""
+        """Raises `CollectorError`."""
         return b"".join(self.chunks(path, longest))
 
     def get_changed(self, path: str, longest: int) -> bytes:
-        """Return the body at a path; ask with its entity tag if it is known. Raises `CollectorError`."""
+        """Ask with the entity tag if it is known. Raises `CollectorError`."""
         known = self._known.get(path)
         headers = [] if known is None else [("If-None-Match", known.tag)]
         with self._exchange("GET", path, headers) as answer:
@@ -87,26 +88,26 @@ class CollectorConnection:
             return body
 
     def chunks(self, path: str, longest: int) -> Iterator[bytes]:
-        """Yield the body at a path in parts. Raises `CollectorError`."""
+        """Raises `CollectorError`."""
         with self._exchange("GET", path) as answer:
             yield from _bounded(path, answer, longest)
 
     def put(
         self, path: str, content: Iterator[bytes], size: int, headers: Iterable[tuple[str, str]] = ()
     ) -> bytes:
-        """Send `size` bytes in parts; return the answer. Raises `CollectorError`, and what `content` raises."""
+        """Send `size` bytes. Raises `CollectorError`, and what `content` raises."""
         sent = [("Content-Length", str(size)), *headers]
         with self._exchange("PUT", path, sent, content, size) as answer:
             return b"".join(_bounded(path, answer, _LARGEST_ANSWER))
 
     def post(self, path: str, body: bytes) -> bytes:
-        """Send a body; return the answer. Raises `CollectorError`."""
+        """Raises `CollectorError`."""
         sent = [("Content-Length", str(len(body)))]
         with self._exchange("POST", path, sent, iter((body,)), len(body)) as answer:
             return b"".join(_bounded(path, answer, _LARGEST_ANSWER))
 
     def events(self, path: str) -> Iterator[bytes]:
-        """Yield parts of an event stream until it ends. Raises `CollectorError`, also if it is silent."""
+        """Yield parts until the stream ends. Raises `CollectorError`, even if the stream is silent."""
         with self._exchange("GET", path, [("Accept", "text/event-stream")]) as answer:
             self._deadline.begin(_SILENT_SECONDS)
             for part in _checked(path, answer).iter_stream():
@@ -115,7 +116,7 @@ class CollectorConnection:
 
     @property
     def is_open(self) -> bool:
-        """Whether the next exchange continues on the connection of the last one."""
+        """The next exchange continues on the connection of the last one."""
         connection = self._connection
         return connection is not None and connection.is_available() and not connection.has_expired()
 
@@ -133,7 +134,7 @@ class CollectorConnection:
         content: Iterator[bytes] | None = None,
         size: int = 0,
     ) -> Iterator[httpcore.Response]:
-        """Send a request and yield the answer, of which only the head is read. Raises `CollectorError`."""
+        """Only the head of the answer is read. Raises `CollectorError`."""
         self._deadline.begin(_EXCHANGE_SECONDS + size / _SLOWEST_UPLOAD)
         sent: Any = [*self._headers, *headers]  # httpcore takes text and bytes, but its types say one of them
         url = f"{self.url}/{path}"
@@ -156,7 +157,7 @@ class CollectorConnection:
             raise CollectorError(f"{self.url}/{path.partition('?')[0]}: {reason}") from error
 
     def _connected(self) -> httpcore.HTTPConnection:
-        """Return the idle connection, or a new one. Raises `OSError` for unusable certificate files."""
+        """Raises `OSError` for unusable certificate files."""
         if self._connection is None or not self.is_open:
             self.close()
             self._connection = httpcore.HTTPConnection(
@@ -166,7 +167,7 @@ class CollectorConnection:
 
 
 class _Deadline:
-    """The deadline of the exchange at work; all waits on the connection share it."""
+    """All waits on the connection share the deadline of an exchange."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -184,8 +185,6 @@ class _Deadline:
 
 
 class _Network(httpcore.NetworkBackend):
-    """The network of httpcore; every wait ends at the deadline."""
-
     def __init__(self, deadline: _Deadline) -> None:
         self._deadline = deadline
 
@@ -204,8 +203,6 @@ class _Network(httpcore.NetworkBackend):
 
 
 class _Stream(httpcore.NetworkStream):
-    """A connection of httpcore; every wait ends at the deadline."""
-
     def __init__(self, stream: httpcore.NetworkStream, deadline: _Deadline) -> None:
         self._stream = stream
         self._deadline = deadline
@@ -238,7 +235,7 @@ class _Stream(httpcore.NetworkStream):
 
 
 def _bounded(path: str, answer: httpcore.Response, longest: int) -> Iterator[bytes]:
-    """Yield the body of an expected answer. Raises `CollectorError`."""
+    """Raises `CollectorError`."""
     size = 0
     for part in _checked(path, answer).iter_stream():
         size += len(part)
@@ -248,7 +245,7 @@ def _bounded(path: str, answer: httpcore.Response, longest: int) -> Iterator[byt
 
 
 def _checked(path: str, answer: httpcore.Response) -> httpcore.Response:
-    """Return an expected answer. Raises `CollectorError` with the collector's reason for any other."""
+    """Raises `CollectorError` with the collector's reason for an unexpected answer."""
     if _header(answer, b"content-encoding") not in (b"", b"identity"):
         raise CollectorError(f"{path}: the collector compresses its answer")
     if answer.status in _EXPECTED:
@@ -272,7 +269,7 @@ def _header(answer: httpcore.Response, name: bytes) -> bytes:
 
 
 def trusting_context(ca: Path) -> ssl.SSLContext:
-    """Return a TLS context that trusts only `ca`. Raises `OSError`."""
+    """Raises `OSError`."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     try:
@@ -284,7 +281,7 @@ def trusting_context(ca: Path) -> ssl.SSLContext:
 
 
 def robot_context(ca: Path, certificate: Path, key: Path) -> ssl.SSLContext:
-    """Return the TLS context of a robot: it trusts only `ca`, and presents `certificate`.
+    """The context trusts only `ca`, and presents `certificate`.
 
     Raises `OSError`, and `CollectorError` for a certificate that is not valid now.
     """

@@ -15,7 +15,7 @@ _SETTING = "fleet of the active appliance"
 
 
 class FleetOfAppliance(msgspec.Struct, frozen=True):
-    """The fleet of the appliance `name`: the robot's name there, and the collector; empty for none."""
+    """The robot's name is that in the fleet; empty for none."""
 
     name: str
     robot: str = ""

@@ -127,7 +127,7 @@ def _unfinished(state: Path) -> Path:
 
 
 def prepare_membership(folder: Path, invitation: Invitation) -> str:
-    """Write the files of the membership to `folder`; return the certificate (PEM). Raises `OSError`.
+    """Write the files of the membership; return the certificate (PEM). Raises `OSError`.
 
     The key and the certificate of an earlier try with this token are kept: the collector may have enrolled them.
     """

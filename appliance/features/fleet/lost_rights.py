@@ -1,4 +1,4 @@
-"""Find whether another policy takes a right from a host, by some names for each rule of both policies."""
+"""Find whether another policy takes a right from a host, by some names for each rule."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -12,7 +12,7 @@ _ANY = "any_name"  # stands for the stars of a key
 
 
 class LostRights:
-    """The hosts that had a right under the policy `old` and do not have it under `new`; blocks of hosts are ignored."""
+    """Blocks of hosts are ignored."""
 
     def __init__(self, old: Policy, new: Policy) -> None:
         self.old, self.new = old, new
@@ -45,7 +45,7 @@ def _names(old: Policy, new: Policy, category: Category) -> Iterator[str]:
 
 
 def _matching(key: Key) -> Iterator[str]:
-    """Yield names that the key matches, at each depth at which another key may be more specific."""
+    """Include names at each depth at which another key may be more specific."""
     if key.exact:
         yield key.text
         return

@@ -36,7 +36,7 @@ _REPORT_AGAIN_SECONDS = 5.0
 
 @dataclass(slots=True)
 class Poller:
-    """A poller. `stated()` returns control's last statement (None: no link yet); `offer` sends a bundle to control."""
+    """`stated()` returns control's last statement, or None without a link; `offer` sends a bundle to control."""
 
     bundles: VerifiedBundles
     connection: CollectorConnection
@@ -52,7 +52,7 @@ class Poller:
     _retry_at: float = 0.0
 
     def step(self) -> float:
-        """Check for a bundle and report; return the seconds until the next step."""
+        """Return the seconds until the next step."""
         stated = self.stated()
         if stated is None:
             return _jittered(_BACK_OFF[0])
@@ -61,7 +61,7 @@ class Poller:
         return pause
 
     def report(self) -> None:
-        """Report the robot's state if it has changed or was not reported for some time."""
+        """Report a state that has changed, or was not reported for some time."""
         stated = self.stated()
         if stated is not None:
             self._report(stated)
@@ -138,5 +138,5 @@ def _offered(bundle: VerifiedBundle) -> BundleOffered:
 
 
 def _jittered(seconds: float) -> float:
-    """Return a pause that differs among robots, so that they do not ask at the same time."""
+    """Robots must not ask at the same time."""
     return seconds * random.uniform(1 - _JITTER, 1 + _JITTER)  # noqa: S311  spreads load, protects nothing

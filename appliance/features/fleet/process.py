@@ -1,6 +1,6 @@
 """Run the client of bundles as a process of the appliance: lifeline, link to control, and two threads.
 
-One thread polls the collector, the other listens to its events, which only make the next poll earlier. The process
+One thread polls the collector; the other listens to its events, which only make the next poll earlier. The process
 reads no state of the appliance. It runs as a separate user, and the firewall lets it reach only the collector.
 """
 
@@ -43,10 +43,10 @@ def main(lifeline_fd: int, config: Path) -> None:
 
 
 class PollLoop:
-    """The two threads of a client: one polls, the other listens to `events` at `path`.
+    """One thread polls, the other listens to `events` at `path`.
 
-    An event makes the next poll earlier. The first poll, and those after events, are spread over some seconds, because
-    all robots start or are woken at the same time.
+    The first poll, and those after events, are spread over some seconds, because all robots start or are woken at the
+    same time.
     """
 
     def __init__(self, poller: Poller, events: CollectorConnection, path: str) -> None:
@@ -58,11 +58,11 @@ class PollLoop:
 
     @property
     def alive(self) -> bool:
-        """Whether both threads run. An exception that ends one is a logged defect."""
+        """Both threads run; an exception that ends one is a logged defect."""
         return all(thread.is_alive() for thread in self._threads)
 
     def start(self) -> None:
-        """Start the threads. They are daemons: the end of the process does not wait for a collector that hangs."""
+        """The threads are daemons: the end of the process does not wait for a hanging collector."""
         for work in (self._poll, self._listen):
             context = contextvars.copy_context()  # keeps the process name in the thread's log lines
             thread = threading.Thread(target=context.run, args=(work,), name=work.__name__, daemon=True)
@@ -70,7 +70,7 @@ class PollLoop:
             self._threads.append(thread)
 
     def stop(self, seconds: float) -> None:
-        """End the polling thread; wait at most `seconds`."""
+        """Wait at most `seconds` for the polling thread."""
         self._ending.set()
         self._wake.set()
         self._threads[0].join(seconds)
@@ -93,8 +93,6 @@ class PollLoop:
 
 
 class _Process:
-    """The process: it connects the lifeline, the link to control and the threads."""
-
     def __init__(self, fleet: Fleet, lifeline_fd: int) -> None:
         lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
         self._child = Child(
@@ -141,7 +139,6 @@ class _Process:
             self._told = progress
 
     def _offer(self, offered: BundleOffered) -> None:
-        """Send a bundle to control; the polling thread calls this."""
         if self._event_loop is not None:
             self._event_loop.call_soon_threadsafe(self._child.tell, offered)
 
@@ -153,7 +150,7 @@ def _some_of(seconds: float) -> float:
 def listen(
     connection: CollectorConnection, path: str, ending: threading.Event, wake: Callable[[], None]
 ) -> None:
-    """Call `wake` at each event of the collector's stream at `path` until `ending` is set."""
+    """Call `wake` at each event of the stream until `ending` is set."""
     failures = 0
     while not ending.is_set():
         try:
@@ -178,7 +175,7 @@ def make_poller(
     stated: Callable[[], BundleStated | None],
     offer: Callable[[BundleOffered], object],
 ) -> Poller:
-    """Return the poller for these settings; they must configure bundles. Raises `OSError`."""
+    """The settings must configure bundles. Raises `OSError`."""
     wanted = fleet.bundles
     assert wanted.root is not None  # noqa: S101  the role runs only with it
     connection = robot_connection(*fleet.connection)

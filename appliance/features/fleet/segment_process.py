@@ -17,7 +17,7 @@ def main(lifeline_fd: int, config: Path) -> None:
 
 
 def make_pusher(settings: Settings, folder: Path) -> SegmentPusher:
-    """Return the pusher for these settings, which must configure a collector. Raises `KeyUnreadableError`."""
+    """The settings must configure a collector. Raises `KeyUnreadableError`."""
     fleet = settings.of(Fleet)
     assert fleet.receipt_key is not None  # noqa: S101  the role runs only with it
     return SegmentPusher(

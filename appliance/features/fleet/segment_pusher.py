@@ -48,7 +48,7 @@ _log = structlog.get_logger()
 
 
 class PushPosition(msgspec.Struct, frozen=True):
-    """The last segment with a receipt: its log, the number of its checkpoint, and its last sequence."""
+    """The last segment with a receipt: the number of its checkpoint, and its last sequence."""
 
     log: str
     number: int = 0
@@ -56,7 +56,7 @@ class PushPosition(msgspec.Struct, frozen=True):
 
 
 class StoredHead(msgspec.Struct, frozen=True):
-    """The collector's newest checkpoint of a log: its number (0: none), and the hashes of those with this number."""
+    """The collector's newest checkpoint of a log (number 0: none), with the hashes of all that have this number."""
 
     robot: str
     log: str
@@ -66,7 +66,7 @@ class StoredHead(msgspec.Struct, frozen=True):
 
 @dataclass(slots=True)
 class SegmentPusher:
-    """A pusher of the database `log`; it keeps its files in `folder`, and trusts receipts of `receipt_key` (raw)."""
+    """Its files are in `folder`. It trusts receipts of `receipt_key` (raw)."""
 
     log: Path
     folder: Path
@@ -93,7 +93,7 @@ class SegmentPusher:
         self.collector.close()
 
     def _begin(self) -> PushPosition:
-        """Return the position after the last checkpoint that the collector and the log both have."""
+        """Begin after the last checkpoint that the collector and the log both have."""
         log, upto = _newest_signed(self.log)
         lowest = next_segment(self.log, 0) or 1
         position, step = PushPosition(log), 1
@@ -117,7 +117,7 @@ class SegmentPusher:
         return position
 
     def _kept_sequence(self, log: str, number: int) -> int:
-        """Return the last sequence of segment `number` if it had the last receipt; 0: not known."""
+        """Return 0 unless segment `number` had the last receipt."""
         try:
             kept = msgspec.json.decode((self.folder / "position.json").read_bytes(), type=PushPosition)
         except (FileNotFoundError, ValueError):
@@ -125,11 +125,11 @@ class SegmentPusher:
         return kept.sequence if (kept.log, kept.number) == (log, number) else 0
 
     def _has_log(self) -> bool:
-        """Return whether there is a log, or was: only an appliance that was never active has none."""
+        """Only an appliance that was never active has no log."""
         return self.log.exists() or (self.folder / "position.json").exists()
 
     def _state_presence(self, position: PushPosition) -> bool:
-        """State that nothing waits, unless that was stated lately; return False.
+        """State that nothing waits, unless that was stated lately.
 
         If the collector lacks the last segment, pushing begins again. Raises `CollectorError` and `ValueError`.
         """
@@ -177,7 +177,7 @@ class SegmentPusher:
         return True
 
     def _write(self, file: Path, number: int) -> SegmentSummary | None:
-        """Write a segment to a file; None, without a file, if it is not signed yet."""
+        """Return None, without a file, if the segment is not signed yet."""
         left = _LARGEST_SEGMENT
         try:
             with (
@@ -210,7 +210,7 @@ class SegmentPusher:
             )
 
     def _keep(self, receipt: SegmentReceipt) -> None:
-        """Append the receipt; the last 16 to 32 MiB are kept."""
+        """Keep the last 16 to 32 MiB of receipts."""
         file = self.folder / "receipts.ndjson"
         with file.open("a+b") as kept:
             if kept.tell():  # a kill or a full disk may have left a part of a line
@@ -246,7 +246,7 @@ class SegmentPusher:
         )
 
     def _failed(self, error: Exception) -> float:
-        """Report the failure; return a pause that grows, with jitter, so that robots do not return together."""
+        """The pause grows, with jitter, so that robots do not return together."""
         self.collector.close()
         self._position = None
         reason = str(error) or type(error).__name__

@@ -10,7 +10,7 @@ from appliance.configuration.sections import FeatureSection, key, section, split
 from appliance.formats.fleet_membership import FOLDER, SETTINGS, joined_settings
 
 PUSHER, POLLER = "fleet", "bundles"
-"""The two roles, which also name their links."""
+"""The two roles also name their links."""
 
 _WORD = re.compile(r"[a-z0-9][a-z0-9-]{0,62}")
 
@@ -153,7 +153,7 @@ class Fleet(FeatureSection):
 
     @classmethod
     def with_stored(cls, state: Path, given: dict[str, Any]) -> dict[str, Any]:
-        """Return the section of `rosrv fleet join`, unless `given` names a collector; each given key overrides it."""
+        """A key in `given` overrides the key of `rosrv fleet join`, unless `given` names a collector."""
         joined = {} if given.get("collector") else joined_settings(state)
         if not joined:
             return given

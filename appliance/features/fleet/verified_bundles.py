@@ -1,4 +1,4 @@
-"""Verify bundles with TUF: keep the trusted metadata, refresh them, and get the bundle that the collector selects.
+"""Verify bundles with TUF.
 
 The collector is not trusted. It can withhold a bundle, delay it, and choose one of those that the group's key has
 signed and not withdrawn. It cannot change a bundle, bring back a withdrawn one, or give a robot the bundle of another
@@ -6,8 +6,8 @@ site, group or later ring.
 
 Invariants:
 1. Every check refreshes the metadata first. Expired, older or badly signed metadata end the check.
-2. The trusted metadata are on the disk before a bundle is used, so neither a kill nor a power cut undoes what the robot
-   knows.
+2. The trusted metadata are on the disk before a bundle is used, so neither a kill nor a power cut undoes what the
+   robot knows.
 3. A selected bundle is accepted only for the robot's own site and group, if their role has signed it and its ring may
    take it now.
 """
@@ -41,11 +41,11 @@ _UNFINISHED = "tmp*"  # the names that the TUF library gives to files that it ha
 
 
 class BundleRejectedError(Exception):
-    """The collector's metadata, its selection or the bundle is rejected. The text has the reason."""
+    """The text has the reason."""
 
 
 class BundleTooEarlyError(Exception):
-    """The robot's ring may not take the selected bundle yet; `at` is when (seconds since the epoch)."""
+    """`at` is when the robot's ring may take the bundle (seconds since the epoch)."""
 
     def __init__(self, path: BundlePath, at: float) -> None:
         super().__init__(f"{path} is for this robot's ring in {max(0.0, at - clock.wall()):.0f} s")
@@ -53,12 +53,12 @@ class BundleTooEarlyError(Exception):
 
 
 class BundleFolderError(Exception):
-    """The folder of trusted metadata cannot be written; nothing is lost, and the next check tries again."""
+    """Nothing is lost, and the next check tries again."""
 
 
 @dataclass(frozen=True, slots=True)
 class VerifiedBundle:
-    """A bundle that the robot may take; `sha256` identifies its archive."""
+    """A bundle that the robot may take. `sha256` identifies its archive."""
 
     path: BundlePath
     sha256: str
@@ -78,7 +78,7 @@ class SelectedBundle:
 
 
 class _Fetcher(FetcherInterface):
-    """Fetch TUF's files over the connection; ask for the timestamp with its entity tag."""
+    """Ask for the timestamp with its entity tag."""
 
     def __init__(self, connection: CollectorConnection) -> None:
         self._connection = connection
@@ -98,7 +98,7 @@ class _Fetcher(FetcherInterface):
 
 
 class VerifiedBundles:
-    """The robot's view of the bundles of its group. `folder` has the trusted metadata. Not thread-safe."""
+    """The robot's view of the bundles of its group, with trusted metadata in `folder`. Not thread-safe."""
 
     def __init__(
         self,
@@ -123,7 +123,7 @@ class VerifiedBundles:
         self._updater: Updater | None = None
 
     def refresh(self) -> None:
-        """Get and verify the newest metadata.
+        """Verify the newest metadata.
 
         Raises `BundleRejectedError`, `BundleFolderError` and `CollectorError`.
         """
@@ -177,7 +177,7 @@ class VerifiedBundles:
         return SelectedBundle(path, target)
 
     def get(self, selected: SelectedBundle) -> VerifiedBundle:
-        """Download, verify and unpack a selected bundle. Raises as `refresh`."""
+        """Raises as `refresh`."""
         if self._updater is None:
             raise RuntimeError("refresh the metadata first")
         with _translated():
@@ -200,7 +200,7 @@ class VerifiedBundles:
             raise BundleTooEarlyError(path, earliest)
 
     def _sync(self) -> None:
-        """Write the metadata to the disk: the library replaces its files, but does not sync them."""
+        """The library replaces its files, but does not sync them."""
         for path in (*self._metadata.rglob("*.json"), self._metadata / "root_history", self._metadata):
             descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
             try:

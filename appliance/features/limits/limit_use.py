@@ -1,4 +1,4 @@
-"""Collect how much of each finite resource is used, for `rosrv limits`. docs/reference/quotas.md has all quotas."""
+"""Collect how much of each finite resource is used. docs/reference/quotas.md has all quotas."""
 
 import shutil
 from collections import Counter
@@ -25,7 +25,7 @@ async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
 
 @dataclass(frozen=True)
 class LimitQueries:
-    """The answer to `rosrv limits`; `features()` returns the resources of features."""
+    """`features()` returns the resources of features."""
 
     parts: Parts
     settings: Settings
@@ -80,7 +80,7 @@ _MEMORY: dict[str, tuple[str, QuotaRow]] = {
     "queues": ("bytes waiting for subscribers", RELAY_QUEUES),
     "latched": ("bytes of latched messages", RELAY_LATCHED),
 }
-"""The resource of each kind of a relay's memory; a row has the relay that holds most of it."""
+"""A row has the relay that holds most of the resource."""
 
 _WHOLE_MEMORY = sum(row.bounds.whole for _resource, row in _MEMORY.values())  # as `RelayMemory.of` divides it
 

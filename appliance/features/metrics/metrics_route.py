@@ -74,8 +74,6 @@ def _page(samples: Mapping[str, _Samples], metrics: Iterable[Metric]) -> bytes:
 
 
 class _Once(Collector):
-    """A collector of the metrics of one answer."""
-
     def __init__(self, families: Sequence[Family]) -> None:
         self._families = families
 
@@ -174,7 +172,7 @@ _PORTS = {"open": 1, "closed": 0, "unknown": -1}
 
 
 def _tunnels(hosts: list[Host]) -> dict[str, _Samples]:
-    """Return the samples of hosts with tunnels; revoked hosts are only counted."""
+    """Revoked hosts are only counted."""
     enrolled = [host for host in hosts if host.serial is not None and host.revoked is None]
     now = clock.wall()
     return {
@@ -194,7 +192,7 @@ def _tunnels(hosts: list[Host]) -> dict[str, _Samples]:
 
 
 def _named(processes: Sequence[ProcessInfo]) -> Iterator[tuple[str, ProcessInfo]]:
-    """Yield each process with a unique name, so that two processes of one role are two series."""
+    """Two processes of one role are two series."""
     return zip(process_names(processes), processes, strict=True)
 
 

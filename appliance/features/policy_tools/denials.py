@@ -18,7 +18,7 @@ from appliance.policy.model import Category
 from appliance.policy.policy_settings import AT_ONCE
 
 _ASKS = {"topic": "requestTopic", "service": "lookupService"}
-"""By category of a connection: the call that grants it."""
+"""The call that grants a connection of this category."""
 
 
 def is_denial(record: AuditRecord) -> bool:
@@ -26,7 +26,7 @@ def is_denial(record: AuditRecord) -> bool:
 
 
 def asks_policy(record: AuditRecord) -> bool:
-    """Return whether a change of the policy might allow a denied request."""
+    """Return whether a change of the policy might allow the request."""
     try:
         return is_denial(record) and asked_of(record) is not None
     except UngrantableError:
@@ -34,7 +34,7 @@ def asks_policy(record: AuditRecord) -> bool:
 
 
 def asked_of(record: AuditRecord) -> DecidedRequest:
-    """Return the denied request. Raises `UngrantableError` if no change of the policy would allow it."""
+    """Raises `UngrantableError` if no change of the policy would allow it."""
     what = DENIALS.get(record.event)
     if what is None:
         raise UngrantableError("it is not a record of a decision about a host's call")
@@ -121,4 +121,4 @@ DENIALS: dict[str, str | Callable[[AuditRecord], DecidedRequest]] = {
     "tunnel refused": "a tunnel needs a valid certificate of this appliance (rosrv host list)",
     "packets refused": "replayed packets, and packets with the address of another host, are never accepted",
 }
-"""For each event: a function that derives the request from the record, or why no policy would allow the request."""
+"""A function that derives the request from the record, or why no policy would allow it."""

@@ -39,7 +39,7 @@ _MOST_CALLERS = 4  # names in one line
 
 @dataclass(frozen=True)
 class _Source:
-    """The text of a file, or of a kept revision, and its name for people."""
+    """The text of a file or revision, and its name for people."""
 
     name: str
     text: str
@@ -113,7 +113,7 @@ def _sources(appliance: Appliance, old: str | None, new: str | None) -> tuple[_S
 
 
 def _source(appliance: Appliance, word: str) -> _Source:
-    """Return the revision of a number, or the text of a file (`./7` if its name is a number)."""
+    """A number is a revision (`./7` is a file)."""
     return _revision(appliance, int(word)) if word.isdecimal() else _Source(word, read_text(Path(word)))
 
 
@@ -139,7 +139,7 @@ def _known(
     robot: list[str] | None,
     enrolled: list[str] | None,
 ) -> PolicyContext:
-    """Return the hosts of the options, and for a revision of the appliance also those that the appliance knows."""
+    """For a revision of the appliance, include the hosts that the appliance knows."""
     return (
         known_of(robot, enrolled) if _are_files(old, new) else policy_in_force(appliance, robot, enrolled)[2]
     )
@@ -177,7 +177,7 @@ def _requests(file: Path | None, appliance: Appliance) -> Iterator[Request]:
 
 
 def _say_requests(differences: list[Difference]) -> None:
-    """Print the requests of one host, those of several nodes with the same decisions once."""
+    """Requests of several nodes with the same decisions are printed once."""
     equal: dict[tuple[str, ...], list[Difference]] = {}
     for one in differences:
         request = one.request

@@ -32,7 +32,7 @@ _GRANTED = (
 
 
 def granted(record: AuditRecord, current: PolicyKnown, *, whole_tool: bool = False) -> Granted:
-    """Return the policy change that allows the denied request of a record. Raises `UngrantableError` if none does.
+    """Raises `UngrantableError` if no change allows the request.
 
     `whole_tool`: the change also has all other rights that the stock tool of the record needs.
     """
@@ -62,7 +62,7 @@ def explained(
     in_full: LogEntry | None = None,
     host_in_words: HostInWords = str,
 ) -> Why:
-    """Explain a record; if it is a denial that a policy might allow, `current` must be given.
+    """A denial that a policy might allow needs `current`.
 
     `in_full`: the record that a record of repetitions continues.
     """
@@ -80,7 +80,7 @@ def explained(
 
 
 def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> PolicyJudgement:
-    """Check a policy text, signed or not; `cases`: also run the test cases in the file next to the policy file.
+    """With `cases`, also run the test cases in the file next to the policy file.
 
     Raises `ProblemError` with every finding if the text or the cases are invalid.
     """
@@ -96,7 +96,7 @@ def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> Policy
 def explanation(
     text: str | None, current: PolicyKnown, *, host: str, node: str, category: Category, resource: str
 ) -> DecisionExplanation:
-    """Return the reasons for the decision of a request. Raises `ProblemError` if the request is invalid."""
+    """Raises `ProblemError` if the request is invalid."""
     fields = msgspec.structs.asdict(current)
     known = PolicyContext.of(fields)
     policy = judge_text(text, current, cases=False).policy

@@ -33,7 +33,7 @@ _SHOWN_NODES = 3
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """A recorded request that passed, `asked`: with an approval.
+    """A recorded request that passed, perhaps with an approval (`asked`).
 
     `call` is the name of the call on the wire, `key` its parameter.
     """
@@ -54,7 +54,7 @@ class _Right:
 
 @dataclass(frozen=True, slots=True)
 class LearnedPolicy:
-    """The text of the policy, the number of requests that it grants, and the number that no rule can grant."""
+    """`left_out` is the number of requests that no rule can grant."""
 
     text: str
     requests: int
@@ -62,7 +62,7 @@ class LearnedPolicy:
 
 
 def learn(observations: Iterable[Observation], robot: Collection[Address | Network] = ()) -> LearnedPolicy:
-    """Return the policy that grants the observed requests. `robot` lists the addresses of the group `robot`."""
+    """`robot` lists the addresses of the group `robot`."""
     rights: dict[tuple[Category, str], _Right] = {}
     requests = left_out = 0
     for observation in observations:
@@ -84,7 +84,7 @@ def learn(observations: Iterable[Observation], robot: Collection[Address | Netwo
 
 
 def covered(given: Network, places: Iterable[Network]) -> bool:
-    """Return whether all addresses of a network are among these places."""
+    """Return whether all addresses of a network are among these."""
     return any(
         given.version == place.version and given.subnet_of(place)  # type: ignore[arg-type]  # both are of one version
         for place in places
@@ -92,7 +92,7 @@ def covered(given: Network, places: Iterable[Network]) -> bool:
 
 
 def _needed(observation: Observation) -> Iterator[Request]:
-    """Yield every right that this request needs. Raises `BadWordError` if no rule can grant the request."""
+    """Yield every right that this request needs. Raises `BadWordError` if no rule can grant it."""
     for right in rights_of_call(observation.request, observation.call, observation.key or None):
         check_resource(right.request.category, right.request.resource)
         yield right.request
@@ -124,7 +124,7 @@ def _hand_down(rights: dict[tuple[Category, str], _Right]) -> None:
 
 
 def _needful(rights: dict[tuple[Category, str], _Right]) -> dict[tuple[Category, str], _Right]:
-    """Drop each parameter key that has the same hosts as the nearest key above it; return the other rights."""
+    """Drop each parameter key that has the same hosts as the nearest key above it."""
     left = dict(rights)
     for (category, key), right in rights.items():
         levels = key.removesuffix("/**").split("/") if category in PARAMETERS else []

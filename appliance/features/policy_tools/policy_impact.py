@@ -1,7 +1,6 @@
 """Compute the impact of a policy on the running appliance, for `rosrv policy check --state` (or `--api`).
 
-Over the socket, this program checks the policy with the hosts, robot and test cases that a reload would use. Over REST,
-the appliance does a dry run.
+Over the socket, this program checks the policy as a reload would; over REST, the appliance does a dry run.
 """
 
 from dataclasses import dataclass, replace
@@ -24,7 +23,7 @@ from rosmop.tool.terminal import printable
 
 @dataclass(frozen=True)
 class PolicyImpact:
-    """The errors and warnings of a policy, and the live connections that it would end."""
+    """`ends` are the live connections that the policy would end."""
 
     findings: list[PolicyFinding]
     ends: list[Ending]
@@ -33,7 +32,7 @@ class PolicyImpact:
 def impact_of(
     appliance: Appliance, file: Path, robot: list[str] | None, enrolled: list[str] | None
 ) -> PolicyImpact:
-    """Check a policy; `robot` and `enrolled` override what the appliance knows. Raises `NotRunningError`."""
+    """`robot` and `enrolled` override what the appliance knows. Raises `NotRunningError`."""
     if appliance.place is not None:
         return _by_dry_run(appliance, file)
     known = known_of(robot, enrolled, PolicyContext.of(asdict(appliance.ask(PolicyWanted()).given())))

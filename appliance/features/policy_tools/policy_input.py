@@ -43,7 +43,7 @@ Enrolled = Annotated[
 
 
 def read_text(file: Path) -> str:
-    """Return a file's text. Invalid UTF-8 becomes U+FFFD, which policies allow only in comments."""
+    """Invalid UTF-8 becomes U+FFFD, which policies allow only in comments."""
     try:
         return read_given_text(file, errors="replace")
     except OSError as error:
@@ -53,14 +53,14 @@ def read_text(file: Path) -> str:
 def known_of(
     robot: list[str] | None, enrolled: list[str] | None, running: PolicyContext | None = None
 ) -> PolicyContext:
-    """Return the known hosts; options override the hosts of the running appliance."""
+    """Options override the hosts of the running appliance."""
     known = running or PolicyContext()
     hosts = dict(_enrolled(text) for text in enrolled or ())
     return replace(known, hosts={**known.hosts, **hosts}, robot=networks_of(robot) or known.robot)
 
 
 def networks_of(robot: list[str] | None) -> list[Network]:
-    """Return the networks given with `--robot`. Exits with status 2 for an invalid network."""
+    """Exits with status 2 for an invalid network."""
     return [_network(text) for text in robot or ()]
 
 
@@ -82,7 +82,7 @@ def _enrolled(text: str) -> tuple[str, Address]:
 def policy_in_force(
     appliance: Appliance, robot: list[str] | None, enrolled: list[str] | None
 ) -> tuple[str, str, PolicyContext]:
-    """Return the text of the policy in force, its file, and the appliance's hosts, which the options override.
+    """Return text, file and the known hosts, which the options override.
 
     Exits with status 2 if no appliance answers.
     """
@@ -100,7 +100,7 @@ def policy_in_force(
 
 
 def running_robot(appliance: Appliance) -> list[Network]:
-    """Return the group `robot` of the running appliance. Raises `NotRunningError`."""
+    """Raises `NotRunningError`."""
     body = appliance.ask(PolicyWanted()).given() if appliance.place is None else _over_rest(appliance)
     return [canonical_network(ipaddress.ip_network(place)) for place in body.robot]
 
@@ -118,7 +118,7 @@ def _over_rest(appliance: Appliance) -> PolicyInForce:
 
 
 def asking_host(text: str, policy: Policy) -> Address:
-    """Resolve an address or the name of one host to an address. Raises `BadWordError`."""
+    """`text` may be the name of one host. Raises `BadWordError`."""
     try:
         return find_host(text, policy)
     except BadWordError as error:
@@ -133,7 +133,7 @@ def asking_host(text: str, policy: Policy) -> Address:
 
 
 def requests_of_file(file: Path) -> Iterator[Request]:
-    """Yield requests from NDJSON with `host`, `caller_id`, `category`, `resource`."""
+    """The file is NDJSON with `host`, `caller_id`, `category`, `resource`."""
     for number, line in enumerate(read_text(file).split("\n"), start=1):
         if not line.strip():
             continue
@@ -146,19 +146,19 @@ def requests_of_file(file: Path) -> Iterator[Request]:
 
 
 def request_of(host: str, caller_id: str, category: str, resource: str) -> Request:
-    """Parse a request. Raises `ValueError`."""
+    """Raises `ValueError`."""
     address = canonical_address(ipaddress.ip_address(host))
     return Request(address, str(caller_id or ""), Category(category), str(resource))
 
 
 def live_now(appliance: Appliance) -> list[LiveRight]:
-    """Return the running appliance's live connections and registrations. Raises `NotRunningError`."""
+    """Raises `NotRunningError`."""
     answer = appliance.ask(RegistrationsWanted())
     return [LiveRight.of(asdict(row)) for row in answer.given().registrations] if answer.ok else []
 
 
 def requests_of_audit_log(appliance: Appliance) -> Iterator[Request]:
-    """Yield the decided requests in the audit log. Folded records are left out: they do not name their requests."""
+    """Folded records are left out: they do not name their requests."""
     decided = Filter(decision=("allow", "deny", "would deny"))
     try:
         for entry in appliance.audit().export(decided):

@@ -1,4 +1,4 @@
-"""List the hosts that have the rights for an action: each network that the policy names, and all other hosts."""
+"""List the hosts that may do something: each network that the policy names, and all other hosts."""
 
 import functools
 import ipaddress
@@ -14,7 +14,7 @@ from appliance.policy.rights import decide, decide_right, rights_of
 
 @dataclass(frozen=True, slots=True)
 class HostAnswer:
-    """The decision for all hosts of a network; None: for the hosts that no network of the policy contains.
+    """`network` is None for all hosts that no network of the policy contains.
 
     `names` are the names of the network: `robot`, `host:NAME`. `through` are the words of the deciding rule that
     include the hosts. `near`: only a further right is missing, such as the one on the command.
@@ -28,7 +28,7 @@ class HostAnswer:
 
     @property
     def hosts(self) -> str:
-        """Return the address, the network, or `every other host`."""
+        """The address, the network, or `every other host`."""
         if self.network is None:
             return "every other host"
         return str(
@@ -39,10 +39,10 @@ class HostAnswer:
 
 
 def who_may(policy: Policy, category: Category, resource: str, node: str = "") -> Iterator[HostAnswer]:
-    """Yield the answer for each network in order of addresses, then for all other hosts.
+    """Yield networks in order of addresses, then all other hosts.
 
-    Without the name of a `node`, the right to a node's name is not decided. Blocks of hosts, approvals, and
-    the holders of groups are ignored.
+    Without the name of a `node`, the right to a node's name is not decided. Blocks of hosts, approvals, and the
+    holders of groups are ignored.
     """
     policy = replace(policy, blocks={}, holders=None, approved=None)
     networks = sorted(policy.hosts.networks(), key=lambda one: (one.version, one))
@@ -75,9 +75,9 @@ def _names(policy: Policy, network: Network | None) -> tuple[str, ...]:
 
 
 def _only_in(policy: Policy, network: Network, later: list[Network]) -> Address | None:
-    """Return an address that no smaller network of the policy contains, or None if they cover the network.
+    """Return an address that no smaller network contains, or None if they cover this one.
 
-    In the order of addresses, the smaller networks follow the network.
+    `later` are in order of addresses, so smaller networks follow.
     """
     smaller = itertools.takewhile(functools.partial(_within, network), later)
     starts = itertools.chain([network.network_address], _ends(smaller))

@@ -30,7 +30,7 @@ _U32, _U64, _STAMP = struct.Struct("<I"), struct.Struct("<Q"), struct.Struct("<I
 
 
 class MessagePosition(NamedTuple):
-    """The position of a message: its time, its chunk's offset in the file, and its own offset in the chunk."""
+    """`chunk` and `offset` are offsets in the file and in the chunk."""
 
     time: int
     chunk: int
@@ -45,7 +45,7 @@ class MessagePosition(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """A chunk: the times of its first and last message, and its offset in the file."""
+    """Times of the first and last message, and the offset in the file."""
 
     first: int
     last: int
@@ -53,7 +53,7 @@ class Chunk(NamedTuple):
 
 
 class BagReader:
-    """An open bag: the headers of its `connections` by number, and its `chunks` in the order of their first times."""
+    """An open bag: `connections` by number, and `chunks` in the order of their first times."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -80,7 +80,7 @@ class BagReader:
     @classmethod
     @contextmanager
     def of(cls, path: Path) -> Iterator[Self]:
-        """Open a bag in a `with` block. Raises `OSError` and `ValueError`, also while the bag is read in the block."""
+        """Raises `OSError` and `ValueError`, even while the bag is read in the block."""
         with path.open("rb") as file:
             try:
                 yield cls(file)
@@ -88,7 +88,7 @@ class BagReader:
                 raise ValueError(f"not a bag that the recorder wrote: {error!r}") from None
 
     def index(self, chunk: Chunk) -> Iterator[tuple[int, bytes]]:
-        """Yield each connection's number and its entries in a chunk (`INDEX_ENTRY`: seconds, nanoseconds, offset)."""
+        """An entry is an `INDEX_ENTRY`: seconds, nanoseconds, offset."""
         self._file.seek(chunk.place)
         if read_fields(self._file)["op"] != CHUNK:
             raise ValueError("a chunk is not at the offset in the index")
@@ -103,14 +103,14 @@ class BagReader:
             self._file.seek(after)
 
     def places(self, chunk: Chunk, connections: Collection[int]) -> Iterator[tuple[MessagePosition, int]]:
-        """Yield the positions of these connections' messages in a chunk, each with its connection."""
+        """Yield positions, each with its connection."""
         for number, entries in self.index(chunk):
             if number in connections:
                 for seconds, nanoseconds, offset in INDEX_ENTRY.iter_unpack(entries):
                     yield MessagePosition(seconds * _SECOND + nanoseconds, chunk.place, offset), number
 
     def messages(self, connections: Collection[int], since: int = 0) -> Iterator[tuple[MessagePosition, int]]:
-        """Yield the positions of these connections' messages from a time on, in order, each with its connection."""
+        """Yield positions in order, each with its connection."""
         waiting: list[tuple[MessagePosition, int]] = []
         for chunk in (chunk for chunk in self.chunks if chunk.last >= since):
             while waiting and waiting[0][0].time < chunk.first:
@@ -124,7 +124,7 @@ class BagReader:
     def before(
         self, place: MessagePosition, connections: Collection[int], most: int
     ) -> list[tuple[MessagePosition, int]]:
-        """Return at most `most` messages of these connections before a position, the last ones, in order."""
+        """Return the last ones before a position, in order."""
         found: list[tuple[MessagePosition, int]] = []
         for chunk in sorted(self.chunks, key=lambda chunk: -chunk.last):
             if len(found) == most and chunk.last < found[-1][0].time:
@@ -135,7 +135,7 @@ class BagReader:
         return found[::-1]
 
     def body(self, place: MessagePosition, most: int) -> tuple[int, bytes]:
-        """Return the size of a message, and at most `most` of its first bytes."""
+        """Return the whole size, and at most `most` of the first bytes."""
         self._file.seek(place.chunk)
         read_fields(self._file)
         self._file.seek(4 + place.offset, 1)

@@ -23,7 +23,7 @@ _BILLION = 1_000_000_000
 
 
 class BagMessage(NamedTuple):
-    """A message of a connection; `time` is nanoseconds since the epoch."""
+    """`time` is nanoseconds since the epoch."""
 
     connection: int
     time: int
@@ -31,10 +31,10 @@ class BagMessage(NamedTuple):
 
 
 class BagWriter:
-    """Writes the bag at `path`, behind its first `size` bytes (0: a new bag)."""
+    """Writes behind the first `size` bytes of the file."""
 
     def __init__(self, path: Path, connections: Mapping[int, Mapping[str, str]], size: int = 0) -> None:
-        """Open the bag, and cut it after `size` bytes. `connections` are the headers of the connections so far."""
+        """The bag is cut after `size` bytes. `connections` are the headers so far."""
         self._connections = dict(connections)
         self._file: BinaryIO = path.open("r+b" if size and path.exists() else "w+b")
         whole = self._whole(size)
@@ -46,13 +46,13 @@ class BagWriter:
             self._file.write(MAGIC + _bag_header(0, 0, 0))
 
     def connect(self, header: Mapping[str, str]) -> int:
-        """Begin a connection with this header (topic, type, md5sum, …); return its number."""
+        """The header has topic, type, md5sum, …"""
         number = len(self._connections)
         self._connections[number] = dict(header)
         return number
 
     def write(self, messages: Iterable[BagMessage]) -> int:
-        """Write messages as one chunk, if there are any; return the length of the file."""
+        """Write messages as one chunk; return the length of the file."""
         chunk, index = bytearray(), dict[int, list[bytes]]()
         first, last = 1 << 63, 0
         for message in messages:
@@ -99,7 +99,7 @@ class BagWriter:
         )
 
     def _whole(self, size: int) -> int:
-        """Return how many of the first `size` bytes hold complete chunks with all their indexes."""
+        """Return how many of the first `size` bytes hold complete chunks with their indexes."""
         whole, at, there = 0, _FIRST, self._file.seek(0, os.SEEK_END)
         try:
             for place, fields, length in self._records(min(size, there)):
@@ -111,7 +111,7 @@ class BagWriter:
         return size if at == size <= there else whole
 
     def _records(self, end: int) -> Iterator[tuple[int, dict[str, bytes], int]]:
-        """Yield each record's position, fields and length of data; the file's position is then at the data."""
+        """Yield each record's position, fields and length of data; the file is then at the data."""
         at = _FIRST
         while at < end:
             self._file.seek(at)
@@ -122,7 +122,7 @@ class BagWriter:
             at = following
 
     def _chunk_infos(self, end: int) -> list[bytes]:
-        """Return a record for each chunk: its position, its times, and its number of messages by connection."""
+        """A record has the position of its chunk, times, and number of messages by connection."""
         chunks: list[tuple[int, list[tuple[int, int]], list[tuple[int, int]]]] = []
         for at, fields, size in self._records(end):
             if fields["op"] == CHUNK:
@@ -151,7 +151,7 @@ class BagWriter:
 
 
 def read_fields(file: BinaryIO) -> dict[str, bytes]:
-    """Read the fields of the record at the file's position; afterwards the position is at the length of its data."""
+    """Afterwards the position is at the length of the record's data."""
     data = file.read(_U32.unpack(file.read(4))[0])
     return fields_of(data)
 

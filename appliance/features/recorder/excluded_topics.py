@@ -1,8 +1,8 @@
 """Exclude topics from recordings: `recorder.never` has globs for names of topics and types.
 
-The policy checks a topic's name, but its type is only a claim of the publisher. If the type's definition is known and
-the md5sum in the publisher's header differs from it, the topic is recorded anyway. A claim with the right md5sum may
-still be false, so each recording lists the topics that it left out because of a publisher's claim.
+The policy checks a topic's name, but its type is only a claim of the publisher. A topic whose md5sum differs from the
+known definition of the type is recorded anyway. A claim with the right md5sum may still be false, so each recording
+lists the topics that it left out because of a publisher's claim.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -17,11 +17,11 @@ _SHIPPED = {
     "audio_common_msgs/AudioData": "f43a8e1b362b75baa741461b46adc7e0",
     "audio_common_msgs/AudioDataStamped": "3cdd84a06846af0dca4d0434908f9d96",
 }
-"""The md5sums of the types in the default of `never`."""
+"""The MD5 sums of the types in the default of `never`."""
 
 
 def known_sums(never: Collection[str]) -> dict[str, str]:
-    """Return the md5sums of the types that a glob of `never` matches, if their definitions are known."""
+    """Only types with known definitions have a sum."""
     if all(glob in _SHIPPED or glob.startswith("/") for glob in never):
         return {name: md5sum for name, md5sum in _SHIPPED.items() if name in never}
     from roswire.standard import standard_definitions  # noqa: PLC0415  only where it is configured

@@ -1,4 +1,4 @@
-"""Convert a bag to MCAP, piece by piece, for tools that cannot read bags.
+"""Convert a bag to MCAP, for tools that cannot read bags.
 
 Messages are copied unchanged (profile `ros1`), in order of time, to uncompressed chunks with indexes.
 """
@@ -18,7 +18,7 @@ _OF_SENDER = ("md5sum", "callerid", "host", "latching")
 
 
 def as_mcap(bag: Path) -> Iterator[bytes]:
-    """Yield the pieces of an MCAP file with a bag's messages; the bag may be removed during the iteration.
+    """The bag may be removed during the iteration.
 
     Raises `OSError`, and `ValueError` for an invalid bag; either may also come during the iteration.
     """
@@ -27,7 +27,7 @@ def as_mcap(bag: Path) -> Iterator[bytes]:
 
 
 class _Pieces(BytesIO):
-    """The bytes that were written since the last `take`; `tell` counts all bytes of the file."""
+    """The bytes since the last `take`; `tell` counts all bytes of the file."""
 
     _taken = 0
 

@@ -1,7 +1,7 @@
 """Run the recorder process: its lifeline, its link to control, and a thread that does the work.
 
-The process has no network. It reads the relays' memory and the audit log, and writes recordings. The recorder outlives
-control; without control, its reports wait in the recording store.
+The process has no network. It reads the relays' memory and the audit log, and writes recordings. It outlives control;
+until a new control runs, its reports wait in the recording store.
 """
 
 import asyncio
@@ -32,8 +32,6 @@ def main(lifeline_fd: int, config: Path) -> None:
 
 
 class _Process:
-    """Connects the supervisor, control and the recorder's work."""
-
     def __init__(self, settings: Settings, lifeline_fd: int) -> None:
         self._settings = settings
         self._child = Child(

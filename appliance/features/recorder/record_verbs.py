@@ -252,7 +252,7 @@ def remove(appliance: Appliance, recording: _Id) -> None:
 
 
 def bag_of(appliance: Appliance, recording: str, part: Path) -> Path:
-    """Audit the request; return the bag's path in the state directory. Over REST, fill `part`. Raises `OSError`."""
+    """Audit the request. Over REST, fill `part`. Raises `OSError`."""
     way = appliance.way
     if isinstance(way, AdminSocket):
         return _bag(way, appliance.ask_or_exit(recording_requests.RecordingFetch(recording)))
@@ -272,7 +272,7 @@ def _bag(way: AdminSocket, recording: Recording) -> Path:
 
 
 def _asked(way: "RestWay", path: str, query: dict[str, Any], kind: type[_T]) -> _T:
-    """Return REST's answer. Exits with status 1 for a rejected request, and 2 for bad input or without an answer."""
+    """Exits with status 1 for a rejected request, and 2 for bad input or without an answer."""
     from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
 
     given = {name: value for name, value in query.items() if value is not None}
@@ -287,7 +287,7 @@ def _asked(way: "RestWay", path: str, query: dict[str, Any], kind: type[_T]) -> 
 
 
 def _read(what: Callable[[], _T]) -> _T:
-    """Return the result of reading a bag. Exits with status 2 if the bag cannot be read."""
+    """Exits with status 2 if the bag cannot be read."""
     try:
         return what()
     except OSError as error:
@@ -309,7 +309,7 @@ def _sender(sender: Sender, host_in_words: HostInWords) -> str:
 
 
 def _drawn(found: Timeline, host_in_words: HostInWords) -> Iterator[str]:
-    """Yield a line of bars for each topic and kind of event, then the events."""
+    """Yield bars for each topic and kind of event, then the events."""
     yield f"{found.id}  {_moment(found.since)} to {_moment(found.until)}"
     lanes = [(flow.topic, flow.counts, "message", flow.senders) for flow in found.topics]
     lanes += [(mark.kind, mark.counts, "event", []) for mark in found.marks]
@@ -333,12 +333,12 @@ def _drawn(found: Timeline, host_in_words: HostInWords) -> Iterator[str]:
 
 
 def _private(path: Path) -> int:
-    """Create a file that only its owner can read, because messages are private. Raises `OSError`."""
+    """Messages are private. Raises `OSError`."""
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
 
 
 def _convert(bag: Path, target: Path) -> None:
-    """Write the bag as MCAP. Raises `OSError`; exits with status 1 if a message type is invalid."""
+    """Raises `OSError`; exits with status 1 if a message type is invalid."""
     made = name_to_make(target)
     with os.fdopen(_private(made), "wb") as file:
         try:

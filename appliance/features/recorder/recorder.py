@@ -1,14 +1,15 @@
-"""Follow the audit log, and make a recording of the relays' memory when a record is a trigger.
+"""Make a recording of the relays' memory when an audit record is a trigger.
 
 `step` does all work that is due and returns the messages for control. This module never waits and uses no socket.
 
 Invariants:
 
-1. Each host has one recording at a time (`recording_plan`). A trigger during the recording extends it, up to `longest`;
-   a later trigger begins another recording. Control plans the recording, and the trigger's audit record names it.
+1. Each host has one recording at a time (`recording_plan`). A trigger during the recording extends it, up to
+   `longest`; a later one begins another recording. Control plans the recording, and the trigger's audit record names
+   it.
 2. Recordings never exceed their part of the disk, and never use space that is reserved for the audit log.
-3. After a crash, the next recorder finishes each recording: completely if the memory still exists, otherwise as far as
-   it was written. The recording's description reports what is missing.
+3. After a crash, the next recorder finishes each recording: completely if the memory still exists, otherwise as far
+   as it was written. The recording's description reports what is missing.
 """
 
 import shutil
@@ -34,7 +35,7 @@ from appliance.features.recorder.settings import RecorderRules
 from appliance.features.recorder.triggers import trigger_of
 
 SETTLE_SECONDS = 0.5
-"""The wait after a recording's end for messages and audit records that arrive late."""
+"""Messages and audit records may arrive late."""
 
 _IDLE_SECONDS, _BUSY_SECONDS = 0.5, 0.25
 _PAGES = 20  # pages of the log in one step
@@ -46,7 +47,7 @@ _log = structlog.get_logger()
 
 
 class Recorder:
-    """The flight recorder: records `rings` (created at the time `memory`) when the audit log at `log` has a trigger.
+    """Records `rings`, which were created at the time `memory`.
 
     Times are nanoseconds since the epoch; `reserve` bytes of the disk stay free.
     """
@@ -80,7 +81,7 @@ class Recorder:
         self._take_up()
 
     def step(self, said: Iterable[Any] = ()) -> list[messages.Message]:
-        """Carry out control's messages, follow the log, and continue recordings; return the messages for control."""
+        """Return the messages for control."""
         for message in said:
             try:
                 self._obey(message)
@@ -106,7 +107,7 @@ class Recorder:
 
     @property
     def pause(self) -> float:
-        """Return the seconds until the next step is due."""
+        """Seconds until the next step is due."""
         return _BUSY_SECONDS if self._making else _IDLE_SECONDS
 
     # --- messages of control ------------------------------------------------------------------------------
@@ -193,7 +194,7 @@ class Recorder:
     # --- triggers -----------------------------------------------------------------------------------------
 
     def _new_triggers(self) -> list[tuple[Trigger, str]]:
-        """Return the new triggers, each with the id of the recording that control has planned (empty: none)."""
+        """A trigger comes with the id of the recording that control has planned, if any."""
         follower = self._follower or self._begin_to_follow()
         found: list[tuple[Trigger, str]] = []
         for _page in range(_PAGES):
@@ -211,7 +212,7 @@ class Recorder:
         return found
 
     def _begin_to_follow(self) -> Follower:
-        """Follow the log from the start of the memory: an earlier recorder may not have read the log since then."""
+        """An earlier recorder may not have read the log since the start of the memory."""
         since = max(self._memory, self._clock() - int(self._rules.before * _SECOND))
         first = search(self._log, Filter(since=since), "0", 1, newest_first=False).entries
         self._follower = Follower(self._log, Filter(), first[0].sequence - 1 if first else None)
@@ -236,7 +237,7 @@ class Recorder:
             self._missed(trigger, why_not, planned)
 
     def _missed(self, trigger: Trigger, why: str, planned: str = "") -> None:
-        """Report that a trigger made no recording; if none was planned, repeat the report only every ten minutes."""
+        """Report that a trigger made no recording. Unless one was planned, repeat this only every ten minutes."""
         now, kind = self._clock(), (trigger.charged_to, trigger.what)
         if (
             planned or abs(now - self._told.get(kind, -_TELL_AGAIN)) >= _TELL_AGAIN
@@ -249,7 +250,7 @@ class Recorder:
     def _record(
         self, trigger: Trigger, before: float | None = None, after: float | None = None, planned: str = ""
     ) -> tuple[RecordingInProgress | None, str]:
-        """Extend or begin a recording for a trigger; return it, or None and the reason."""
+        """Extend or begin a recording; return None and the reason if neither is possible."""
         charged_to, now = trigger.charged_to, trigger.time
         for making in tuple(self._making):
             progress = making.progress
@@ -351,7 +352,7 @@ class Recorder:
         self._asked_for.discard(making.progress.id)
 
     def _take_up(self) -> None:
-        """Continue or finish the recordings that an earlier recorder began; discard those without readable progress."""
+        """Discard recordings of an earlier recorder without readable progress."""
         for folder in self._store.parts():
             try:
                 progress = load_progress(folder)
@@ -378,7 +379,7 @@ class Recorder:
             _log.error("a recording cannot be removed", reason=str(error))
 
     def _make_room(self, charged_to: str) -> str:
-        """Remove recordings until a new one of this host fits; return the reason if it cannot, else an empty string."""
+        """Remove recordings until a new one of this host fits; return the reason if it cannot."""
         while True:
             try:
                 found, why = self._store.in_the_way(

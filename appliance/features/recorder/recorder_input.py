@@ -25,7 +25,7 @@ _SECOND = 1_000_000_000
 
 
 class Span(NamedTuple):
-    """A period in nanoseconds since the epoch, both ends included."""
+    """In nanoseconds since the epoch, both ends included."""
 
     since: int
     until: int
@@ -36,17 +36,17 @@ class Span(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """A bag of the recorder, its name, and the period to read from the bag. Periods of pieces do not overlap."""
+    """A bag, and the period to read from it. Periods of pieces do not overlap."""
 
     name: str
     bag: Path
     span: Span
     why_not: str
-    """Why the bag is incomplete; empty if it is complete."""
+    """Why the bag is incomplete."""
 
 
 def span_of(since: str | None, until: str | None) -> Span:
-    """Return the period of --since and --until. Exits with status 2 if it is invalid."""
+    """Exits with status 2 for an invalid period."""
     now = clock.wall_ns()
     try:
         span = Span(
@@ -74,10 +74,10 @@ def require_recorded(known: Recordings, topics: Mapping[str, str]) -> None:
 
 @contextmanager
 def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[list[Piece]]:
-    """Fetch the recordings of a period and the recorder's memory, oldest first. The audit log records it.
+    """Fetch the recordings of a period and the recorder's memory, oldest first, with an audit record.
 
-    The files stay open in the block, so that a recording that is removed remains readable.
-    Exits with status 1 if nothing was recorded or the appliance rejects the request.
+    The files stay open in the block, so that a recording that is removed remains readable. Exits with status 1 if
+    nothing was recorded or the appliance rejects the request.
     """
     found: list[tuple[Span, Recording]] = []
     for row in sorted(known.recordings, key=lambda row: row.began):
@@ -113,9 +113,9 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[l
 def recorded_messages(
     appliance: Appliance, since: str | None, until: str | None, topics: Mapping[str, str]
 ) -> Iterator[list[tuple[str, Path, tuple[int, int]]]]:
-    """Give the bags with these topics (name to type) from --since to --until, and print what is missing.
+    """Yield bags with these topics (name to type), each with a name and the period to read; print what is missing.
 
-    Each bag has a name, and the period to read. Exits with status 2 for a mistake, 1 if nothing was recorded.
+    Exits with status 2 for a mistake, 1 if nothing was recorded.
     """
     span = span_of(since, until)
     recorded = appliance.ask_or_exit(RecordingsWanted())
@@ -128,7 +128,7 @@ def recorded_messages(
 def _cover(
     pieces: Sequence[Piece], span: Span, in_progress: Sequence[OpenRecording], *, as_json: bool
 ) -> None:
-    """Print the gaps; messages of a recording that is still being made are not readable yet."""
+    """Messages of a recording that is still being made are not readable yet."""
     # Without --since, the time before the first piece is not a gap.
     began = span.since or pieces[0].span.since
     for gap in gaps([piece.span for piece in pieces], Span(began, span.until)):
@@ -150,7 +150,7 @@ def _cover(
 
 
 def gaps(parts: Sequence[Span], span: Span) -> Iterator[Span]:
-    """Yield the periods of the span that the ordered parts do not cover."""
+    """Parts are ordered."""
     at = span.since
     for part in parts:
         if part.since > at:
@@ -161,7 +161,7 @@ def gaps(parts: Sequence[Span], span: Span) -> Iterator[Span]:
 
 
 def _lent(appliance: Appliance, span: Span) -> Recording | None:
-    """Return the recorder's memory of a period as a recording, or None. Exits with status 1 for a rejected request."""
+    """Return the recorder's memory of a period as a recording. Exits with status 1 for a rejected request."""
     try:
         answer = appliance.ask(recording_requests.RecordingOfMemory(*span))
     except NotRunningError as error:

@@ -1,4 +1,4 @@
-"""The recorder's link to control, and the terms of the shared memory that the supervisor gives relays and recorder."""
+"""The link control <-> recorder, and the terms of the shared memory that the supervisor gives relays and recorder."""
 
 import msgspec
 
@@ -7,11 +7,11 @@ from appliance.features.recorder.recording_answers import OpenRecording, Recordi
 
 
 class RingTerms(msgspec.Struct, frozen=True):
-    """The terms of the shared memory in which relay `index` stores received messages for the recorder.
+    """The terms of the memory of relay `index`, made at `since` (nanoseconds since the epoch).
 
-    The memory was made at `since` (nanoseconds since the epoch). The relay keeps the last `seconds` of each topic whose
-    name matches a glob of `topics`, unless its name or type matches a glob of `never`. `sums` lists the known md5sums
-    of types that match a glob of `never`. A topic that claims such a type must have its md5sum.
+    The relay keeps the last `seconds` of each topic whose name matches a glob of `topics`, unless its name or type
+    matches a glob of `never`. `sums` lists the known md5sums of types that match a glob of `never`; a topic that
+    claims such a type must have its md5sum.
     """
 
     index: int
@@ -23,11 +23,11 @@ class RingTerms(msgspec.Struct, frozen=True):
 
 
 class RecordingsAsked(Message, frozen=True):
-    """Control asks for the list of recordings, and for a new report of each recording that it has not noted."""
+    """Control asks for the list, and for a new report of each recording that it has not noted."""
 
 
 class RecordingsStated(Message, frozen=True):
-    """The recorder lists all kept recordings, oldest first, and those that it is making."""
+    """All kept recordings, oldest first, and those in progress."""
 
     recordings: list[Recording]
     in_progress: list[OpenRecording] = msgspec.field(default_factory=list)
@@ -44,7 +44,7 @@ class RevisionsWanted(Message, frozen=True):
 
 
 class RevisionsStated(Message, frozen=True):
-    """Control states the revisions of policy and specifications in force."""
+    """The revisions in force."""
 
     policy: int
     monitors: int
@@ -63,7 +63,7 @@ class RecordingNoted(Message, frozen=True):
 
 
 class RecordingRequested(Message, frozen=True):
-    """Control asks for a recording from `before` seconds before the trigger to `after` seconds after it."""
+    """Control asks for a recording around a trigger, in seconds."""
 
     number: int
     trigger: Trigger
@@ -72,7 +72,7 @@ class RecordingRequested(Message, frozen=True):
 
 
 class RecordingStarted(Message, frozen=True):
-    """The recorder began the recording `id` for request `number`. It covers `began` to `ends` (ns) or later."""
+    """Request `number` began the recording `id`, from `began` to `ends` (ns) or later."""
 
     number: int
     id: str
@@ -81,7 +81,7 @@ class RecordingStarted(Message, frozen=True):
 
 
 class RecordingRemovalWanted(Message, frozen=True):
-    """Control asks to remove a recording for `who`."""
+    """Control asks for a removal by `who`."""
 
     number: int
     id: str
@@ -89,7 +89,7 @@ class RecordingRemovalWanted(Message, frozen=True):
 
 
 class RecordingRemoved(Message, frozen=True):
-    """A recording was removed by order `number` of `who`, or because of `reason`.
+    """Removed by order `number` of `who`, or because of `reason`.
 
     The recorder repeats this report until control has noted it.
     """
@@ -101,7 +101,7 @@ class RecordingRemoved(Message, frozen=True):
 
 
 class MemoryWanted(Message, frozen=True):
-    """Control asks for a temporary recording of the data in memory from `since` to `until` (ns)."""
+    """Control asks for a temporary recording of the memory from `since` to `until` (ns)."""
 
     number: int
     trigger: Trigger
@@ -110,14 +110,14 @@ class MemoryWanted(Message, frozen=True):
 
 
 class MemoryLent(Message, frozen=True):
-    """The data of request `number` can be read as `recording`. It expires, or is removed for later ones."""
+    """`recording` can be read. It expires, or is removed for later ones."""
 
     number: int
     recording: Recording
 
 
 class RecordingRefused(Message, frozen=True):
-    """Request `number` was refused; `unknown`: there is no such recording."""
+    """`unknown`: there is no such recording."""
 
     number: int
     reason: str
@@ -125,7 +125,7 @@ class RecordingRefused(Message, frozen=True):
 
 
 class RecordingMissed(Message, frozen=True):
-    """A trigger made no recording, for this reason. The recorder sends only some of these reports.
+    """The recorder sends only some of these reports.
 
     `planned` is the recording that the trigger's audit record promised, if any.
     """

@@ -1,7 +1,8 @@
-"""Write a recording from the memory of the relays to a bag, step by step.
+"""Write a recording from the memory of the relays to a bag.
 
 1. After each step, the file `progress` stores the bag's length and all data needed to continue; the file is replaced
-   atomically. A new recorder cuts the bag at that length and continues: the memory still holds the unwritten messages.
+   atomically. A new recorder cuts the bag at that length and continues: the memory still holds the unwritten
+   messages.
 2. Missing messages are reported: as a count by topic if the numbers of messages have a gap, otherwise in words.
 3. A bag has at most `largest` bytes, not counting the audit records.
 4. The headers of its connections have at most `_MOST_HEADERS` bytes, because publishers choose their content.
@@ -46,7 +47,7 @@ _LEVELS = {Severity.WARNING: WARN, Severity.ALARM: ERROR}
 
 
 class TopicCount(msgspec.Struct):
-    """The numbers of written and missed messages of one topic with one type."""
+    """By topic and type."""
 
     topic: str
     type: str
@@ -57,11 +58,11 @@ class TopicCount(msgspec.Struct):
 
 
 class Progress(msgspec.Struct):
-    """The progress of a recording; times are nanoseconds since the epoch.
+    """Times are nanoseconds since the epoch.
 
-    `memory` is the time when the rings were created. `size` is the length of the bag, `connections` are the headers in
-    it. For each ring, `places` has the position in each stream, and `following` the number of each stream's next
-    message. `not_there` has the counts of messages and streams that the ring had lost when the recording began.
+    `memory` is when the rings were created. `size` is the length of the bag, `connections` are the headers in it. For
+    each ring, `places` has the position in each stream, and `following` the number of each stream's next message.
+    `not_there` has the counts of messages and streams that the ring had lost when the recording began.
     """
 
     id: str
@@ -77,31 +78,31 @@ class Progress(msgspec.Struct):
     topics: list[TopicCount] = []
     torn: list[str] = []
     unconnected: int = 0
-    """The number of messages left out because their connections' headers exceed `_MOST_HEADERS`."""
+    """Messages left out because headers exceed `_MOST_HEADERS`."""
     why_not: str = ""
     """Why the recording ended early, or is incomplete."""
     charged_to: str = OPERATORS
     hold: int = 0
-    """Nanoseconds by which the recording continues after a trigger."""
+    """In nanoseconds, after a trigger."""
     latest: int = 0
-    """The latest time at which the recording may end."""
+    """The recording ends at this time at the latest."""
     left_out: list[LeftOutTopic] = []
     claims: int = 0
-    """The number of topics that were left out because of their publishers' claims."""
+    """Topics left out because of their publishers' claims."""
 
 
 def load_progress(folder: Path) -> Progress:
-    """Return the progress of the recording in `folder`. Raises `OSError` and `ValueError`."""
+    """Raises `OSError` and `ValueError`."""
     return msgspec.msgpack.decode((folder / PROGRESS).read_bytes(), type=Progress)
 
 
 class RecordingInProgress:
-    """A recording of `rings` that is written to `folder` and continues from `progress`."""
+    """A recording in `folder` that continues from `progress`."""
 
     def __init__(
         self, folder: Path, progress: Progress, rings: Sequence[memoryview], *, largest: int
     ) -> None:
-        """Open or create the bag. Raises `OSError`."""
+        """Raises `OSError`."""
         folder.mkdir(mode=0o750, exist_ok=True)
         folder.chmod(0o750)
         self.progress = progress
@@ -194,7 +195,7 @@ class RecordingInProgress:
         self._bag.leave()
 
     def finish(self, records: Iterable[LogEntry], revisions: RevisionsStated) -> Recording:
-        """Close the bag with its audit records, write the description to disk and return it. Raises `OSError`."""
+        """Write the description to disk and return it. Raises `OSError`."""
         progress = self.progress
         self._write_records(records)
         self._bag.close()
@@ -224,7 +225,7 @@ class RecordingInProgress:
         return recording
 
     def _missing(self) -> str:
-        """Return which messages are missing in the bag, and why; empty if it is complete."""
+        """Return which messages are missing, and why; empty if the bag is complete."""
         progress = self.progress
         reasons = [progress.why_not] if progress.why_not else []
         missed = sum(row.missed for row in progress.topics)
@@ -250,7 +251,7 @@ class RecordingInProgress:
         return "; ".join(reasons)
 
     def _write_records(self, records: Iterable[LogEntry]) -> None:
-        """Write audit records, each as JSON and as a log message for rqt_console."""
+        """Each is written as JSON, and as a log message for rqt_console."""
         definitions = standard_definitions()
         numbers = {
             topic: self._connection({

@@ -1,4 +1,4 @@
-"""Pass operators' orders to the flight recorder. Record these orders and the recorder's reports in the audit log."""
+"""Pass operators' orders to the flight recorder; the audit log has these orders and the recorder's reports."""
 
 import asyncio
 from collections.abc import Callable
@@ -38,10 +38,10 @@ _M = TypeVar("_M", recorder_link.RecordingStarted, recorder_link.RecordingRemove
 
 
 class RecordingOrders:
-    """The link to the recorder. Its methods raise `UnavailableError`, `UnknownThingError` and `SenselessError`.
+    """The methods raise `UnavailableError`, `UnknownThingError` and `SenselessError`.
 
-    `in_force()` returns the revisions of policy and specifications in force. `plan` finds the recording that covers an
-    event.
+    `in_force()` returns the revisions of policy and specifications in force. `plan` finds the recording that covers
+    an event.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class RecordingOrders:
         self._notes: set[asyncio.Future[None]] = set()
 
     def state(self) -> RecorderState | None:
-        """Return the state for `rosrv status` and the metrics; None if the recorder is off."""
+        """None if the recorder is off."""
         if not self._rules.enabled:
             return None
         sizes = [recording.size for recording in self._kept.values()]
@@ -101,7 +101,7 @@ class RecordingOrders:
         return RecordingBegun(begun.id, begun.ends)
 
     async def called(self, call: messages.OwnServiceCalled) -> messages.OwnServiceAnswered:
-        """Begin a recording for a node's service call. Answer with its id, or the reason if none was begun."""
+        """Answer a node's service call with the id of a new recording, or with the reason."""
         try:
             self._require()
             text = f"{call.caller_id} of {call.host} called {call.service}"
@@ -121,7 +121,7 @@ class RecordingOrders:
     async def _begin(
         self, what: TriggerKind, reason: str, text: str, who: str, span: tuple[float, float], **caller: Any
     ) -> recorder_link.RecordingStarted:
-        """Record who ordered a recording, then begin it. `span` is the number of seconds before and after now."""
+        """The order is recorded first. `span` is seconds before and after now."""
         before, after = span
         record = self._trail.happened(
             "recording ordered", reason, who=who, before=before, after=after, **caller
@@ -139,7 +139,7 @@ class RecordingOrders:
         return await self._given_out(request.id, "recording fetched", f"by {who}", who)
 
     async def read(self, request: recording_requests.RecordingRead, who: str) -> Recording:
-        """Record who reads messages of a recording. Repetitions within a few seconds are only counted."""
+        """Record who reads messages; repetitions within a few seconds are only counted."""
         topics = request.topics
         if len(topics) > _MOST_TOPICS or any(len(topic) > _LONGEST_NAME for topic in topics):
             raise SenselessError(f"at most {_MOST_TOPICS} topics at once, of {_LONGEST_NAME} characters each")
@@ -167,7 +167,6 @@ class RecordingOrders:
         return recording
 
     async def of_memory(self, request: recording_requests.RecordingOfMemory, who: str) -> Recording:
-        """Make a temporary recording of the messages in memory."""
         self._require()
         now = clock.wall_ns()
         since, until = request.since or 0, now if request.until is None else request.until
@@ -213,7 +212,7 @@ class RecordingOrders:
         return known[recording_id]
 
     async def _ask(self, order: Callable[[int], messages.Message], kind: type[_M]) -> _M:
-        """Send an order with a new number, and return the recorder's answer. The answer must be of this kind."""
+        """Send an order with a new number; the answer must be of this kind."""
         try:
             answer: _M | recorder_link.RecordingRefused = await self.link.ask(order, _PATIENCE_SECONDS)
         except ChannelClosedError:
@@ -268,7 +267,7 @@ class RecordingOrders:
                 self.link.answered(number, message)
 
     def _note(self, recording_id: str) -> None:
-        """Once the audit record of the recorder's report is on disk, notify the recorder."""
+        """Notify the recorder once the audit record of its report is on disk."""
 
         async def note() -> None:
             if await self._trail.durable() is None:

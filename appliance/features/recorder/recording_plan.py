@@ -3,9 +3,9 @@ I/O.
 
 Times are nanoseconds since the epoch.
 
-The control process makes the plan together with the audit record of the act. So the record names the recording, or the
-reason why there is none. The recorder reads the log and carries out the plan. A recording is charged to the cause of
-its first trigger: `ROBOT`, a host or network as the policy names it, `UNKNOWN` for all other hosts together,
+The control process makes the plan together with the audit record of the act. So the record names the recording, or
+the reason why there is none. The recorder reads the log and carries out the plan. A recording is charged to the cause
+of its first trigger: `ROBOT`, a host or network as the policy names it, `UNKNOWN` for all other hosts together,
 `OPERATORS` for orders, or `APPLIANCE` for an act without a host (such as a monitor's timer).
 
 Invariants:
@@ -13,9 +13,9 @@ Invariants:
 1. Each host has at most one open recording; the robot, operators and the appliance share one (`recording_owner`). An
    act during a recording extends it, up to `longest`.
 2. Each host may begin `per_hour` recordings an hour for each kind of trigger.
-3. Recordings of one host do not overlap, unless an order requests one. A recording that would overlap begins at the end
-   of the previous one, and lasts for the length of the memory after an act. Therefore recurring acts after the first
-   one share a recording.
+3. Recordings of one host do not overlap, unless an order requests one. A recording that would overlap begins at the
+   end of the previous one, and lasts for the length of the memory after an act. Therefore recurring acts after the
+   first one share a recording.
 4. All other hosts together have at most `_MOST_AT_ONCE` open recordings.
 """
 
@@ -30,7 +30,7 @@ from appliance.features.recorder.settings import RecorderRules
 from appliance.features.recorder.triggers import kinds_of
 
 KEPT = frozenset({ROBOT, OPERATORS})
-"""Recordings charged to these are never removed for another host's recording."""
+"""These are never removed for another host's recording."""
 
 _OURS = KEPT | {APPLIANCE}
 _MOST_AT_ONCE = 2
@@ -40,13 +40,13 @@ _MOST_HOSTS = 4096  # hosts whose last recording's end is remembered
 
 
 def recording_owner(charged_to: str) -> str:
-    """Return the owner of the open recording for an act; the robot, operators and the appliance are one owner."""
+    """The robot, operators and the appliance are one owner."""
     return ROBOT if charged_to in _OURS else charged_to
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingSpan:
-    """The period of a recording; an act extends it to `hold` nanoseconds after the act, but never beyond `latest`."""
+    """An act extends it to `hold` nanoseconds after the act, but never beyond `latest`."""
 
     began: int
     ends: int
@@ -60,7 +60,7 @@ class RecordingSpan:
 def span(
     rules: RecorderRules, now: int, ended: int, before: float | None = None, after: float | None = None
 ) -> RecordingSpan:
-    """Return the period of a recording for an act at `now`; the host's last recording ended at `ended`.
+    """Return the period for an act at `now`; the host's last recording ended at `ended`.
 
     `before` and `after` are the seconds of an order; an order's period may overlap the last recording.
     """
@@ -73,10 +73,10 @@ def span(
 
 
 class HourlyLimit:
-    """A limit of `most` recordings an hour for each host and kind of trigger."""
+    """At most `most` recordings an hour for each host and kind of trigger."""
 
     def __init__(self, most: int, kept: Iterable[Recording]) -> None:
-        """Count the recordings in `kept`, so that a restart does not reset the limit."""
+        """`kept` counts, so that a restart does not reset the limit."""
         self._most = most
         self._begun: dict[tuple[str, str], deque[int]] = {}
         for recording in kept:
@@ -84,7 +84,7 @@ class HourlyLimit:
                 self._begun.setdefault((recording.charged_to, trigger.what), deque()).append(trigger.time)
 
     def take(self, charged_to: str, what: TriggerKind, now: int) -> bool:
-        """Count a recording that begins now; return False if the limit does not permit it."""
+        """Return False beyond the limit."""
         for key, begun in list(self._begun.items()) if len(self._begun) > _MOST_HOSTS else []:
             if begun[-1] + _HOUR <= now:
                 del self._begun[key]
@@ -103,7 +103,7 @@ class HourlyLimit:
 
 
 class RecordingPlan:
-    """The plan: for each audit record that is a trigger, the recording, or the reason why there is none.
+    """For each audit record that is a trigger, the recording, or the reason why there is none.
 
     `charged_to(host)` returns the name that is charged for a host's acts; `new_id` returns an id for a recording.
     """
@@ -122,7 +122,7 @@ class RecordingPlan:
     def detail(
         self, event: str, decision: str | None, severity: Severity, host: str | None, now: int
     ) -> dict[str, str]:
-        """Return the fields about recordings for an event's audit record; empty if it is not a trigger."""
+        """Return an empty mapping if the event is not a trigger."""
         wanted = [kind for kind in kinds_of(event, decision, severity) if kind in self._rules.triggers]
         if not wanted:
             return {}
@@ -158,7 +158,7 @@ class RecordingPlan:
     # --- messages of the recorder ---
 
     def stated(self, recordings: Iterable[Recording], in_progress: Iterable[OpenRecording]) -> None:
-        """Take the recorder's recordings into account, also after a restart of control."""
+        """Include the recorder's recordings, even after a restart of control."""
         kept = list(recordings)
         self._limit = HourlyLimit(self._rules.per_hour, kept)
         for recording in kept:
@@ -171,7 +171,7 @@ class RecordingPlan:
         return next((open_span.ends for name, open_span in self._open.values() if name == recording_id), None)
 
     def opened(self, charged_to: str, recording_id: str, began: int, ends: int) -> None:
-        """Note a recording that the recorder began or extended for an order or a call."""
+        """For an order or a call."""
         latest = began + int(self._rules.longest * _SECOND)
         self._open[recording_owner(charged_to)] = (
             recording_id,
@@ -186,7 +186,7 @@ class RecordingPlan:
             del self._ended[next(iter(self._ended))]
 
     def missed(self, charged_to: str, recording_id: str, why: str, now: int) -> None:
-        """Note a recording that the recorder could not make; for the next minute, acts get the same reason."""
+        """For the next minute, acts get the same reason."""
         self._close(recording_owner(charged_to), recording_id)
         self._obstacle = why, now + 60 * _SECOND
 

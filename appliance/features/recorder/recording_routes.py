@@ -91,7 +91,7 @@ def _add_reading(router: Routes, services: Services) -> None:
         bearer: Bearer,
         what: _Reading[_T],
     ) -> _T:
-        """Read from the bag of the recording that control returns; only one bag is read at a time."""
+        """Only one bag is read at a time."""
         recording = answered(await services.control.ask(asked, bearer))
         async with reading.turn(bearer):
             try:
@@ -155,7 +155,7 @@ def _add_reading(router: Routes, services: Services) -> None:
 
 
 async def bag_response(services: Services, recording_id: str, bearer: Bearer, *, mcap: bool) -> Response:
-    """Answer with the file, after the audit log has recorded which bearer fetches it."""
+    """The audit log first records which bearer fetches the file."""
     found = answered(await services.control.ask(recording_requests.RecordingFetch(recording_id), bearer))
     try:  # open it before the answer begins: a recording that is then removed is still sent completely
         pieces = await asyncio.to_thread(as_mcap if mcap else _pieces_of, _bag_of(services, found.id))

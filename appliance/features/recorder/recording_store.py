@@ -50,7 +50,7 @@ _log = structlog.get_logger()
 
 
 class RecordingStore:
-    """The recordings in `folder`: at most `disk` bytes, each removed after `seconds` of `clock` (None: never)."""
+    """Each recording is removed after `seconds` of `clock`."""
 
     def __init__(self, folder: Path, *, disk: int, seconds: float | None, clock: Callable[[], int]) -> None:
         self._folder = folder
@@ -77,7 +77,7 @@ class RecordingStore:
                     _log.error("a recording cannot be read", recording=path.name, error=str(error))
 
     def _kept_since(self, recording: Recording) -> int:
-        """Return when a recording was stored, by the age clock; if that is unknown, return the recording's end."""
+        """Return when it was stored, by the age clock, or else its end."""
         with suppress(OSError, ValueError):
             return int((self._folder / recording.id / _SINCE).read_bytes())
         return recording.ended
@@ -103,7 +103,7 @@ class RecordingStore:
         return sorted(path for path in self._folder.iterdir() if kind.fullmatch(path.name))
 
     def _discard(self, folder: Path) -> None:
-        """Remove a folder without a record in the audit log. Raises `OSError`."""
+        """The audit log gets no record. Raises `OSError`."""
         rest = self._folder / f".{folder.name.strip('.')[:20]}.rest"
         folder.rename(rest)
         shutil.rmtree(rest)
@@ -113,7 +113,7 @@ class RecordingStore:
             self._discard(self.part(recording_id))
 
     def keep(self, recording: Recording) -> None:
-        """Store a finished recording, which is completely on disk."""
+        """The recording is completely on disk."""
         kept = self._folder / recording.id
         with suppress(OSError):  # the disk is full: the recording's age then counts from its end
             (self.part(recording.id) / _SINCE).write_bytes(b"%d" % self._clock())
@@ -124,22 +124,22 @@ class RecordingStore:
         self._described[recording.id] = self._length(recording)
 
     def mark_temporary(self, recording_id: str) -> None:
-        """Mark a recording as temporary before it is made. Raises `OSError`."""
+        """Call this before the recording is made. Raises `OSError`."""
         self.part(recording_id).mkdir(mode=0o750, exist_ok=True)
         (self.part(recording_id) / _TEMPORARY).touch()
 
     def has_temporary_room(self, now: int) -> bool:
-        """Make room for a temporary recording; return False if all are too new to remove. Raises `OSError`."""
+        """Make room; return False if all are too new to remove. Raises `OSError`."""
         self._expire(now, MOST_TEMPORARY - 1, _OPENING_SECONDS)
         return len(self._temporary) < MOST_TEMPORARY
 
     def publish_temporary(self, recording: Recording) -> None:
-        """Publish a temporary recording for `TEMPORARY_SECONDS`, or until another replaces it. Raises `OSError`."""
+        """It is kept for `TEMPORARY_SECONDS`, or until another replaces it. Raises `OSError`."""
         self.part(recording.id).rename(self._folder / recording.id)
         self._temporary.append(recording)
 
     def _expire(self, now: int, most: int, seconds: float) -> None:
-        """Remove the oldest temporary recordings until `most` are left; keep those younger than `seconds`."""
+        """Keep those younger than `seconds`."""
         while (
             len(self._temporary) > most and abs(now - self._temporary[0].triggers[0].time) > seconds * _SECOND
         ):
@@ -153,7 +153,7 @@ class RecordingStore:
         return self.find(recording_id) is not None or self._gone(recording_id).exists()
 
     def remove(self, recording: Recording, who: str, reason: str) -> None:
-        """Remove a recording; `who` and `reason` are stored for the audit log. Raises `OSError`."""
+        """The audit log gets `who` and `reason`. Raises `OSError`."""
         kept, gone = self._folder / recording.id, self._gone(recording.id)
         with suppress(OSError):  # the disk may be full, since recordings are then removed
             (kept / _REMOVED).write_bytes(msgspec.json.encode((who, reason)))
@@ -166,7 +166,7 @@ class RecordingStore:
         return self._folder / f".{recording_id}.gone"
 
     def removed(self) -> Iterator[tuple[Recording, str, str]]:
-        """Yield recordings whose removal may not be in the audit log yet, each with the removal's author and reason."""
+        """Yield removals that may not be in the audit log yet."""
         for folder in self._named(_GONE):
             try:
                 recording = msgspec.json.decode((folder / ABOUT).read_bytes(), type=Recording)
@@ -178,7 +178,7 @@ class RecordingStore:
             yield recording, who, reason
 
     def note(self, recording_id: str) -> None:
-        """Note that a recording, or its removal, is in the audit log. Raises `OSError`."""
+        """The audit log has the recording or its removal. Raises `OSError`."""
         if self.find(recording_id) is not None:
             (self._folder / recording_id / _NOTED).touch()
         elif self._gone(recording_id).exists():
@@ -188,9 +188,9 @@ class RecordingStore:
         return [found for found in self.recordings if not (self._folder / found.id / _NOTED).exists()]
 
     def outdated(self, now: int) -> Iterator[tuple[Recording, str]]:
-        """Remove old temporary recordings; yield other recordings that are too old, with the reason.
+        """Remove old temporary recordings; yield others that are too old, with the reason.
 
-        The caller must remove each yielded recording before continuing.
+        The caller must remove each before continuing.
 
         `now` is nanoseconds since the epoch. Raises `OSError`.
         """
@@ -204,8 +204,8 @@ class RecordingStore:
     def in_the_way(self, charged_to: str, making: Sequence[str] = ()) -> tuple[Recording | None, str]:
         """Return the next recording to remove in favour of a new one of this host, and the reason.
 
-        None with a reason means that no recording may be removed; None without a reason means that there is room.
-        `making` has the hosts of the recordings in progress.
+        None with a reason means that none may be removed; None without one means that there is room. `making` has the
+        hosts of the recordings in progress.
         """
         held = self._sizes(lambda found: found.charged_to)
         held.update({name: number * self.largest for name, number in Counter((*making, charged_to)).items()})

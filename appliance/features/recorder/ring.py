@@ -3,28 +3,29 @@
 The supervisor holds the memory, one relay writes it (`RingWriter`), and one recorder reads it (`RingReader`). The
 memory consists of blocks of one size. Each connection to a publisher is a *stream*: a chain of header blocks (the
 connection's TCPROS header, with the definition of the type) and a chain of data blocks. The blocks of each chain are
-numbered from 0. The data chain is a sequence of records, which may span blocks. A record contains the number of frames,
-their size in bytes, the time, the number of the first frame, and the frames.
+numbered from 0. The data chain is a sequence of records, which may span blocks. A record contains the number of
+frames, their size in bytes, the time, the number of the first frame, and the frames.
 
 Invariants:
 
 1. A block is valid up to `used`, a word in the block's row of the table that is stored after the data. A row is valid
    while its word `birth` is not 0; this word is stored last. So a writer that is killed at any instruction leaves
    complete records, and at most one torn record at the end of a chain. The reader ignores a torn record.
-2. Before a block is reused, its `birth` is set to 0. The reader copies a block and then reads `birth` again. If `birth`
-   has changed, the reader discards the copy.
-3. While blocks are free, every stream may take them. When none is free, the first of these is reused: the oldest block,
-   if it is too old; the oldest of the writing topic or host, if that topic or host has used its quota; the oldest of a
-   topic or host above its quota; the oldest of all. So a flood replaces its own data. A block that an active stream is
-   filling counts as new.
-4. The reader trusts no content: it derives all sizes from the memory's own size, and bounds every number by that size.
-5. Header blocks stay while their stream is open or has data. They take at most a quarter of the memory, and the header
-   blocks of one host at most a quarter of its quota. If a new header has no room, closed streams are removed, the
-   oldest first. A stream whose header still has no room is counted (`REFUSED`) and not recorded. Messages in a record
-   larger than its topic's quota are counted (`MISSED`) and not recorded.
+2. Before a block is reused, its `birth` is set to 0. The reader copies a block and then reads `birth` again. If
+   `birth` has changed, the reader discards the copy.
+3. While blocks are free, every stream may take them. When none is free, the first of these is reused: the oldest
+   block, if it is too old; the oldest of the writing topic or host, if that topic or host has used its quota; the
+   oldest of a topic or host above its quota; the oldest of all. So a flood replaces its own data. A block that an
+   active stream is filling counts as new.
+4. The reader trusts no content: it derives all sizes from the memory's own size, and bounds every number by that
+   size.
+5. Header blocks stay while their stream is open or has data. They take at most a quarter of the memory, and the
+   header blocks of one host at most a quarter of its quota. If a new header has no room, closed streams are removed,
+   the oldest first. A stream whose header still has no room is counted (`REFUSED`) and not recorded. Messages in a
+   record larger than its topic's quota are counted (`MISSED`) and not recorded.
 
 `used` and `birth` are aligned words of 64 bits. If the processor reorders stores (ARM), the reader may see a record's
-data only at its next check. This is harmless: the reader reads data that is some milliseconds old.
+data only at its next check, which is harmless.
 """
 
 import struct
@@ -37,10 +38,10 @@ from appliance.base import clock
 from roswire.tcpros import encode_header
 
 SMALLEST = 1 << 20
-"""The smallest size of a ring in bytes."""
+"""In bytes."""
 
 LEFT_OUT = "left_out"
-"""The field of a stream's header with the reason why its messages are not recorded; a publisher cannot set it."""
+"""A header's reason why its messages are not recorded; a publisher cannot set this field."""
 
 HEADER, DATA = 1, 2
 RECORD = struct.Struct("<IIQQQ")  # mark, frames, bytes of the frames, time, number of the first frame
@@ -60,7 +61,7 @@ _MOST_HEADERS = 4  # headers may take a quarter
 
 
 class Geometry(NamedTuple):
-    """The layout of a ring: bytes of a block, number of blocks, offset of the first block."""
+    """`data` is the offset of the first block."""
 
     block: int
     blocks: int
@@ -68,7 +69,7 @@ class Geometry(NamedTuple):
 
 
 def geometry(size: int) -> Geometry:
-    """Return the layout of a ring of this size. Raises `ValueError` if it is too small."""
+    """Raises `ValueError` if the size is too small."""
     if size < SMALLEST:
         raise ValueError(f"a ring of {size} bytes is too small: use at least {SMALLEST}")
     block = _SMALLEST_BLOCK
@@ -90,7 +91,7 @@ class BlockRow(NamedTuple):
 
     @property
     def sound(self) -> bool:
-        """Whether the row is in use and plausible; numbers of a compromised writer must not overflow a word."""
+        """In use and plausible; numbers of a compromised writer must not overflow a word."""
         return (
             0 < self.birth < _MOST_NUMBER
             and 0 < self.stream < _MOST_NUMBER
@@ -101,7 +102,7 @@ class BlockRow(NamedTuple):
 
 @dataclass(eq=False, slots=True)
 class _Share:
-    """The data blocks of a topic or host, oldest first, and the numbers of its header blocks and streams."""
+    """`blocks` are the data blocks of a topic or host, oldest first."""
 
     most: int
     blocks: OrderedDict[int, None] = field(default_factory=OrderedDict)
@@ -111,7 +112,7 @@ class _Share:
 
 @dataclass(eq=False, slots=True)
 class _Chain:
-    """The blocks of one stream, and the topic and host whose quotas they use."""
+    """The blocks of one stream, and whose quotas they use."""
 
     shares: tuple[_Share, ...] = ()
     names: tuple[str, str] = ("", "")
@@ -121,12 +122,12 @@ class _Chain:
 
 
 def words_of(memory: memoryview) -> memoryview:
-    """Return the memory as words of 64 bits, which are loaded and stored atomically."""
+    """Words of 64 bits are loaded and stored atomically."""
     return memory[: len(memory) // 8 * 8].cast("Q")
 
 
 def rows(memory: memoryview) -> list[tuple[int, BlockRow]]:
-    """Return a copy of the table: each block's number with its row."""
+    """Return a copy of the table."""
     table = bytes(memory[_COUNTERS : _COUNTERS + geometry(len(memory)).blocks * _ROW.size])
     return [(block, BlockRow._make(row)) for block, row in enumerate(_ROW.iter_unpack(table))]
 
@@ -143,7 +144,7 @@ class RingStream:
     """The open stream of one connection to a publisher."""
 
     keeps = True
-    """Whether the stream stores the messages written to it."""
+    """The stream stores messages."""
 
     __slots__ = ("_chain", "_end", "_number", "_place", "_ring", "_stream", "_used", "block", "written")
 
@@ -158,7 +159,7 @@ class RingStream:
         self._used = 0  # the index of the block's word
 
     def write(self, frames: memoryview, messages: int, first: int, judged: int = 0) -> None:
-        """Append frames; `first` is the first frame's number, `judged` the time when monitors got the frames, or 0."""
+        """`first` is the first frame's number, `judged` the time when monitors got the frames, or 0."""
         ring = self._ring
         size = len(frames)
         now = self.written = ring.clock(judged)
@@ -175,11 +176,11 @@ class RingStream:
             self._append(memoryview(RECORD.pack(MARK, messages, size, now, first)), frames)
 
     def close(self) -> None:
-        """End the stream; its blocks stay until others need them."""
+        """The blocks stay until others need them."""
         self._ring.close_chain(self._stream, self._chain)
 
     def lose_block(self) -> None:
-        """Begin a new block with the next record, because another stream reuses the current block."""
+        """Another stream reuses the current block."""
         self.block, self._place, self._end = -1, 0, 0
 
     def _append(self, head: memoryview, frames: memoryview) -> None:
@@ -215,10 +216,10 @@ class RingStream:
 
 
 class RingWriter:
-    """Writes `memory` (shared, writable), and keeps the data of earlier writers.
+    """Writes shared memory, and keeps the data of earlier writers.
 
-    `topic_share` and `host_share` are the parts of the memory that one topic and one host may keep when others need it.
-    Blocks older than `seconds` are reused first.
+    `topic_share` and `host_share` are the parts of the memory that one topic and one host may keep when others need
+    it. Blocks older than `seconds` are reused first.
     """
 
     def __init__(
@@ -251,7 +252,7 @@ class RingWriter:
         self._inherit()
 
     def open(self, topic: str, host: str, header: Mapping[str, str]) -> RingStream | None:
-        """Begin a stream; return None if its header has no room."""
+        """Return None if the header has no room."""
         text = memoryview(encode_header({**header, "topic": topic, "host": host}))
         needed = -(-len(text) // self.block)
         shares = tuple(
@@ -283,7 +284,7 @@ class RingWriter:
         self.words[counter] = (self.words[counter] + by) % (1 << 64)
 
     def take(self, stream: int, number: int, kind: int, begins: int, chain: _Chain, *, now: int) -> int:
-        """Assign a block to a stream and return it; if none is free, reuse one (invariant 3)."""
+        """If no block is free, reuse one (invariant 3)."""
         if not self._free:
             self._give_up(chain, now - self._keep)
         block = self._free.pop()
@@ -309,7 +310,7 @@ class RingWriter:
             self._forget(stream, chain)
 
     def _give_up(self, chain: _Chain, old: int) -> None:
-        """Free a block for this stream by invariant 3; blocks written before the time `old` are too old."""
+        """Blocks written before the time `old` are too old (invariant 3)."""
         oldest = self._oldest(old)
         if self._order[oldest][1] >= old or self._in_use(oldest, old):
             full = (share for share in chain.shares if len(share.blocks) >= share.most)
@@ -318,12 +319,12 @@ class RingWriter:
         self._push_out(oldest)
 
     def _in_use(self, block: int, old: int) -> bool:
-        """Whether a stream is filling this block and has written lately; a slow stream may have all its data in it."""
+        """A stream is filling the block and has written lately; a slow stream may have all its data in it."""
         writer = self._chains[self._order[block][0]].writer
         return writer is not None and writer.block == block and writer.written >= old
 
     def _oldest(self, old: int) -> int:
-        """Return the oldest block; blocks that are being filled count as new."""
+        """Blocks that are being filled count as new."""
         for _ in range(len(self._order)):
             block = next(iter(self._order))
             if not self._in_use(block, old):
@@ -346,7 +347,7 @@ class RingWriter:
             loser.writer.lose_block()
 
     def _room_for_header(self, needed: int, host: _Share) -> bool:
-        """Return whether a header has room in the ring and in the host's part; remove closed streams if needed."""
+        """Remove closed streams if needed."""
 
         def crowded(*, of_host: bool) -> bool:
             has, whole = (
@@ -384,7 +385,7 @@ class RingWriter:
         self._free.append(block)
 
     def _inherit(self) -> None:
-        """Take over an earlier writer's blocks as the oldest ones, and its streams as closed ones."""
+        """An earlier writer's blocks count as the oldest ones, and its streams as closed."""
         left = sorted((row, block) for block, row in rows(self.memory) if row.sound)
         with_data = {row.stream for row, _block in left if row.kind == DATA}
         for row, block in left:

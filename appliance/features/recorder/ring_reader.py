@@ -28,20 +28,20 @@ _LONGEST_HEADER = 256 << 10
 _NEEDED = frozenset({"topic", "type", "md5sum", "message_definition", "callerid", "host"})
 _LONGEST_TYPE = 256
 MOST_MESSAGES = 1 << 53
-"""An upper bound for the number of messages in a stream."""
+"""The limit of one stream."""
 
 _Blocks = dict[int, tuple[int, BlockRow]]
 
 
 class ReadPosition(NamedTuple):
-    """The position up to which a stream was read: a block of its chain, and a byte in it."""
+    """A block of the chain, and a byte in it."""
 
     number: int
     offset: int
 
 
 class RecordedFrames(NamedTuple):
-    """Frames of one batch, without their lengths; `time` is nanoseconds since the epoch, and `first` counts from 1."""
+    """One batch. `time` is nanoseconds since the epoch, and `first` counts from 1."""
 
     time: int
     first: int
@@ -49,7 +49,7 @@ class RecordedFrames(NamedTuple):
 
 
 class StreamFrames(NamedTuple):
-    """The new frames of a stream. `torn`: frames before or between them were overwritten or are damaged."""
+    """`torn`: frames before or between them were overwritten or are damaged."""
 
     stream: int
     header: dict[str, str]
@@ -59,7 +59,7 @@ class StreamFrames(NamedTuple):
 
 @dataclass(slots=True)
 class _Run:
-    """Consecutive blocks of a chain, and their data."""
+    """Consecutive blocks of a chain."""
 
     number: int
     begins: int
@@ -68,7 +68,7 @@ class _Run:
 
 
 class RingReader:
-    """A reader of one ring; `places` are the positions up to which the streams were read."""
+    """`places` are the positions up to which streams were read."""
 
     def __init__(self, memory: memoryview, places: dict[int, ReadPosition] | None = None) -> None:
         self._memory = memory
@@ -78,14 +78,15 @@ class RingReader:
 
     @property
     def not_there(self) -> tuple[int, int]:
-        """Return how many messages were too long, and how many streams had no room, since the ring was created."""
+        """Messages that were too long, and streams without room, since the ring was created."""
         return self._words[MISSED], self._words[REFUSED]
 
     def read(self, since: int, until: int) -> Iterator[StreamFrames]:
-        """Yield the messages since the last call that were received from `since` to `until`.
+        """Yield messages since the last call that were received from `since` to `until` (nanoseconds since the
+        epoch).
 
-        Times are nanoseconds since the epoch. Messages after `until` are left for a later call. Such a message is
-        skipped if the stream continues with an earlier one, because then the clock was set back.
+        Later messages are left for a later call. Such a message is skipped if the stream continues with an earlier
+        one, because then the clock was set back.
         """
         headers: dict[int, _Blocks] = {}
         data: dict[int, _Blocks] = {}
@@ -115,17 +116,16 @@ class RingReader:
         return _readable(header) if header.keys() >= _NEEDED else None
 
     def _copy(self, block: int, row: BlockRow) -> bytes | None:
-        """Return the used part of a block; None if the block was reused.
+        """Return None if the block was reused.
 
-        Use the current `used`, not the one in the copied table: while the table was copied, the block may have been
-        filled and the next one begun.
+        Use the current `used`: while the table was copied, the block may have been filled and the next one begun.
         """
         start = self._geometry.data + block * self._geometry.block
         part = bytes(self._memory[start : start + min(self._words[used_at(block)], self._geometry.block)])
         return part if self._words[birth_at(block)] == row.birth else None
 
     def _runs(self, blocks: _Blocks, place: ReadPosition | None) -> Iterator[_Run]:
-        """Yield the runs to read from `place` on; a missing block begins a new run."""
+        """A missing block begins a new run."""
         run: _Run | None = None
         broken = False
         for number in sorted(blocks):
@@ -188,7 +188,7 @@ class RingReader:
 
 
 def _readable(header: dict[str, str]) -> dict[str, str]:
-    """Return the header with undecodable bytes replaced and long fields cut, so that tools can read it."""
+    """Undecodable bytes are replaced and long fields cut, so that tools can read the header."""
     definition = header["message_definition"].encode("utf-8", "surrogateescape").decode("utf-8", "replace")
     plain = {name: header[name][:_LONGEST_TYPE] for name in ("type", "md5sum")}
     if "latching" in header:
@@ -197,7 +197,7 @@ def _readable(header: dict[str, str]) -> dict[str, str]:
 
 
 def _frames(view: memoryview, messages: int) -> list[memoryview] | None:
-    """Return the messages of a record; None if their lengths do not match it."""
+    """Return None if lengths do not match the record."""
     found: list[memoryview] = []
     at = 0
     while at + _LENGTH.size <= len(view) and len(found) < messages:

@@ -1,8 +1,8 @@
 """Keep the memory (rings) in which relays store the last messages; the memory survives a relay.
 
-Each relay writes to its own ring. The recorder gets read-only descriptors, and no process can shrink a ring, so reading
-never fails. This module reads no messages. All memory is allocated at the start. So a lack of memory shows at the start
-and not during an incident, and a relay never waits for pages.
+Each relay writes to its own ring. The recorder gets read-only descriptors, and no process can shrink a ring, so
+reading never fails. All memory is allocated at the start, so a lack of memory shows then and not during an incident,
+and a relay never waits for pages.
 """
 
 import fcntl
@@ -26,7 +26,7 @@ USED_BY = "appliance.features.recorder.recorder_ring:open_ring"
 
 
 class RecorderRings:
-    """One ring per relay; `rules` has their total size. Raises `StartError` (not enough memory), `OSError`."""
+    """`rules` has the total size of the rings. Raises `StartError` (not enough memory), `OSError`."""
 
     def __init__(self, rules: RecorderRules, relays: int) -> None:
         if rules.memory > (left := _left()):

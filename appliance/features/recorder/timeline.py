@@ -1,10 +1,10 @@
-"""Compute a recording's timeline, and find its messages around a time, for the analysis of an incident.
+"""Compute a recording's timeline, and find its messages around a time.
 
 The numbers of columns, topics, events and messages are limited, however large the recording is. Omissions are
 reported.
 
-Events come from the audit records in the bag, because retention may have removed them from the log since. In the bag, a
-publisher's header has a host, and the recorder's own header has none.
+Events come from the audit records in the bag, because retention may have removed them from the log since. In the bag,
+a publisher's header has a host, and the recorder's own header has none.
 """
 
 import re
@@ -55,8 +55,6 @@ _NOTABLE = (Severity.NOTICE, Severity.WARNING, Severity.ALARM)
 
 
 class _Said(msgspec.Struct):
-    """The fields of an audit record that are used here."""
-
     id: str
     event: str
     severity: Severity
@@ -69,7 +67,7 @@ class _Said(msgspec.Struct):
 
 
 class _Columns:
-    """Columns of equal length that divide the time from `since` to `until` (both inclusive)."""
+    """The columns divide the time from `since` to `until` (both inclusive)."""
 
     def __init__(self, since: int, until: int, number: int) -> None:
         self.since, self.until, self.number = since, until, number
@@ -81,7 +79,7 @@ class _Columns:
                 counts[(time - self.since) // self._width] += 1
 
     def spread(self, first: int, last: int, number: int, counts: list[int]) -> None:
-        """Count `number` events that happened between `first` and `last`, as if at equal distances."""
+        """Count `number` events as if at equal distances."""
         first, last = min(first, last), max(first, last)
         for column in range(self._column(first), self._column(last) + 1):
             begin = self.since + column * self._width
@@ -92,7 +90,7 @@ class _Columns:
         return (min(max(time, self.since), self.until) - self.since) // self._width
 
     def only(self, first: int, last: int) -> int | None:
-        """Return the column that contains both times; None if no column does."""
+        """Return the column that contains both times."""
         if first < self.since or last > self.until:
             return None
         column = (first - self.since) // self._width
@@ -113,7 +111,7 @@ def timeline(
     record: str = "",
     log: Path | None = None,
 ) -> Timeline:
-    """Return the timeline from `since` to `until` (nanoseconds since the epoch; None: the recording's start or end).
+    """`since` and `until` are nanoseconds since the epoch (None: the recording's start or end).
 
     It lists the first events, or those around the event of the audit record with the id `record`. `log` is the audit
     log, for repetitions that it counted only after the recording's end. Raises `OSError`, `LogUnreadableError`, and
@@ -147,7 +145,7 @@ def timeline(
 
 
 class _Listed:
-    """The first `MOST_EVENTS` events, or if the event of `record` comes later, those around it."""
+    """The first `MOST_EVENTS` events, or those around the event of `record` if it comes later."""
 
     def __init__(self, record: str) -> None:
         self._record = record
@@ -195,7 +193,7 @@ def _flows(reader: BagReader, wanted: _Columns) -> list[RecordedFlow]:
 
 
 def _counted_later(log: Path, recording: Recording) -> list[tuple[_Said | AuditRecord, int]]:
-    """Return the records after a recording's end that count repetitions during it. Raises `LogUnreadableError`."""
+    """Records after a recording's end may count repetitions during it. Raises `LogUnreadableError`."""
     ended = recording.ended
     written = Filter(since=ended + 1, until=ended + int((FoldSettings().seconds + 1) * _SECOND))
     found = (entry.record for entry in islice(export(log, written), _MOST_LATER))
@@ -209,7 +207,7 @@ def _is_before(time: object, end: int) -> bool:
 def _events(
     records: Iterable[tuple[_Said | AuditRecord, int]],
 ) -> Iterator[tuple[RecordedEvent, int, int]]:
-    """Yield the events of records; a record may count several, between a first and a last time."""
+    """A record may count several events, between a first and a last time."""
     for said, time in records:
         kind = _kind(said)
         if kind is None:
@@ -266,10 +264,10 @@ def messages_around(
     topics: Collection[str] = (),
     neighbours: int = NEIGHBOURS,
 ) -> RecordedMessages:
-    """Return the message of a time, position or audit record (its id), with at most `neighbours` on each side.
+    """`at` is a time, a position or the id of an audit record; at most `neighbours` messages are on each side.
 
-    The message of a time is the last one at or before it; that of a record is the message that the record is about, or
-    else the message of its time. `topics` limits the result to these topics (empty: all). Raises `OSError`, and
+    The message of a time is the last one at or before it; that of a record is the message that the record is about,
+    or else the message of its time. `topics` limits the result to these topics (empty: all). Raises `OSError`, and
     `ValueError` if the recording has no such record or the bag is invalid.
     """
     with BagReader.of(bag) as reader:
@@ -315,7 +313,7 @@ def _last_until(reader: BagReader, time: int, wanted: Collection[int]) -> Messag
 def _place_of_record(
     reader: BagReader, recording: Recording, record: str, wanted: Collection[int]
 ) -> MessagePosition | int:
-    """Return the position of the message that a record is about; the record's time if the bag does not have it.
+    """Return the record's time if the bag does not have the message.
 
     A record of a monitor has the time at which the monitor judged the message, and so has the message. Messages that
     were received together have the same time, so their first bytes are compared as well.

@@ -1,6 +1,6 @@
 """Decide which audit records trigger a recording.
 
-The recorder finds triggers by reading the audit log. So the log proves each trigger, and none is missed while control
+The recorder finds triggers in the audit log, so the log proves each trigger, and none is missed while control
 restarts.
 """
 

@@ -84,7 +84,7 @@ def _audit(appliance: Appliance) -> Iterator[SelftestFinding]:
 
 
 def _reachable(appliance: Appliance, master: str) -> str:
-    """Return RVMaster's URI for this machine; REST's host replaces a loopback address."""
+    """REST's host replaces a loopback address."""
     place = appliance.place
     parts = urlsplit(master)
     if place is None or parts.hostname not in ("127.0.0.1", "::1", "localhost"):
@@ -95,7 +95,7 @@ def _reachable(appliance: Appliance, master: str) -> str:
 
 
 def check_call(appliance: Appliance, master: str) -> Iterator[SelftestFinding]:
-    """Make a ROS master API call; the appliance must answer and audit it."""
+    """The appliance must answer the call and audit it."""
     before = _last(appliance)
     caller = f"{_CALLER}_{secrets.token_hex(4)}"
     began, refusal = clock.now(), ""
@@ -133,7 +133,7 @@ def _last(appliance: Appliance) -> int | None:
 
 
 def _recorded(appliance: Appliance, before: int, caller: str, refusal: str) -> bool:
-    """Whether our call is recorded: by a record after the sequence `before`, or by the record that `refusal` names.
+    """The record comes after the sequence `before`, or is named by `refusal`.
 
     Poll for some seconds, with growing pauses. Raises `LogUnreadableError` or `NotRunningError` if the last query
     failed.

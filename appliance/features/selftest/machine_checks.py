@@ -1,7 +1,7 @@
 """Check whether this machine can run the appliance: programs, users, namespaces, firewall, tunnels, ports.
 
-The checks create a network namespace, try firewall rules and interfaces in it, and delete it again. They change nothing
-outside the namespace.
+The checks create a network namespace, try firewall rules and interfaces in it, and delete it again. They change
+nothing outside it.
 """
 
 import os
@@ -32,7 +32,7 @@ _CHARON = Path("/usr/sbin/charon-systemd")
 
 
 def machine(settings: Settings, *, running: bool) -> Iterator[SelftestFinding]:
-    """Check this machine. `running`: whether an appliance with these settings already uses its ports."""
+    """`running`: an appliance with these settings already uses its ports."""
     yield from run_check("python", _python)
     yield from run_check("programs", _programs)
     yield from run_check("users", _users)

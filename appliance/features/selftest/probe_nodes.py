@@ -24,18 +24,16 @@ _SECONDS = 10.0
 
 
 class ProbeError(Exception):
-    """Report a call that RVMaster or a proxy endpoint denied; the text is the reason."""
+    """RVMaster or a proxy endpoint denied a call; the text is the reason."""
 
 
 class _Transport(xmlrpc.client.Transport):
-    """A transport that connects with a time limit."""
-
     def make_connection(self, host: Any) -> http.client.HTTPConnection:
         return http.client.HTTPConnection(str(host), timeout=_SECONDS)
 
 
 def call(uri: str, method: str, *arguments: Any) -> Any:
-    """Make an XML-RPC call of ROS and return its value. Raises `ProbeError`, `OSError`."""
+    """Raises `ProbeError`, `OSError`."""
     try:
         with xmlrpc.client.ServerProxy(uri, _Transport()) as server:
             answer = getattr(server, method)(*arguments)  # how the library calls a method by its name
@@ -57,7 +55,7 @@ def own_address(master: str) -> str:
 
 
 def message_through_the_relay(master: str) -> bytes:
-    """Publish one message and receive it through the appliance. Raises `ProbeError`, `OSError`."""
+    """Raises `ProbeError`, `OSError`."""
     host = own_address(master)
     with _node(host) as publisher, _node(host) as subscriber:
         try:
@@ -107,7 +105,7 @@ def _fields(node: str) -> dict[str, str]:
 
 
 class _Node:
-    """A node with its API and its TCPROS port, which sends each client one message."""
+    """Has its API and its TCPROS port, and sends each client one message."""
 
     def __init__(self, host: str) -> None:
         self._messages = socket.create_server((host, 0), family=_family(host))

@@ -63,7 +63,7 @@ def _private(file: Path) -> Ed25519PrivateKey:
 
 
 def _text(file: Path) -> str:
-    """Return the file's text. Exits with status 2 unless it is UTF-8 with LF, the only format the appliance reads."""
+    """Exits with status 2 unless the text is UTF-8 with LF, the only format the appliance reads."""
     try:
         text = read_given(file).decode("utf-8")
     except OSError as error:

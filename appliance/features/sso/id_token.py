@@ -2,8 +2,8 @@
 
 Invariants:
 
-1. Only a key of the provider that fits the token's algorithm verifies it: the kind, the curve, the use. The token never
-   names or brings a key (`jwk`, `jku` and `x5u` are ignored), and a symmetric key is never used.
+1. Only a key of the provider that fits the token's algorithm verifies it: the kind, the curve, the use. The token
+   never names or brings a key (`jwk`, `jku` and `x5u` are ignored), and a symmetric key is never used.
 2. Only allowed algorithms are accepted. All of them are signatures by a private key.
 3. Issuer, audience, nonce, subject, expiry and time of issue are required.
 """
@@ -32,7 +32,7 @@ _PUBLIC = ("kty", "crv", "n", "e", "x", "y")
 
 @dataclass(frozen=True)
 class Expected:
-    """The values that an ID token must have; `skew` is in seconds."""
+    """`skew` is in seconds."""
 
     issuer: str
     client_id: str
@@ -42,12 +42,12 @@ class Expected:
 
 
 def key_id_of(token: str, algorithms: Sequence[str]) -> str | None:
-    """Return the id of the key that the token names, or None. Raises `SignOnRefusedError` for an unusable token."""
+    """The token may name no key. Raises `SignOnRefusedError` for an unusable token."""
     return _header_of(token, algorithms).get("kid")
 
 
 def verify(token: str, keys: Sequence[dict[str, Any]], expected: Expected, now: float) -> dict[str, Any]:
-    """Return the claims of a valid token. Raises `SignOnRefusedError`."""
+    """Raises `SignOnRefusedError`."""
     header = _header_of(token, expected.algorithms)
     key = _key_for(header, keys)
     registry = JWSRegistry(algorithms=list(expected.algorithms), strict_check_header=False)
@@ -108,7 +108,7 @@ def _header_of(token: str, algorithms: Sequence[str]) -> dict[str, Any]:
 
 
 def _key_for(header: dict[str, Any], keys: Sequence[dict[str, Any]]) -> RSAKey | ECKey:
-    """Return the only key of the provider that can have signed the token."""
+    """Only one key of the provider can have signed the token."""
     algorithm = header["alg"]
     curve = _CURVES.get(algorithm)
     fitting = [
@@ -133,7 +133,7 @@ def _key_for(header: dict[str, Any], keys: Sequence[dict[str, Any]]) -> RSAKey |
 
 
 def _decoded(text: str) -> bytes:
-    """Return the bytes of base64url without padding. Raises `ValueError`."""
+    """base64url without padding. Raises `ValueError`."""
     return base64.urlsafe_b64decode(text + "=" * (-len(text) % 4))
 
 

@@ -1,4 +1,4 @@
-"""The link control <-> sso: sign-ons that begin, and the identities of those that the provider confirmed."""
+"""The link control <-> sso."""
 
 import msgspec
 
@@ -15,7 +15,7 @@ class SessionKeys(msgspec.Struct, frozen=True):
 
 
 class SignedInPerson(msgspec.Struct, frozen=True):
-    """A person whom the provider identified, and their rights; `ends` is seconds since the epoch.
+    """`ends` is seconds since the epoch.
 
     `subject` is the provider's `sub`. `name` is unique among the people of the provider. `mail` is empty unless it is
     verified. `doors` are groups of doors.
@@ -39,7 +39,7 @@ class SignOnWanted(Message, frozen=True):
 
 
 class SignOnBegun(Message, frozen=True):
-    """The browser is sent to this URL, and returns with `state`."""
+    """The browser goes to this URL, and returns with `state`."""
 
     number: int
     url: str
@@ -56,7 +56,7 @@ class SignOnReturned(Message, frozen=True):
 
 
 class SignOnConfirmed(Message, frozen=True):
-    """The provider identified the person who began with these keys at this address."""
+    """The person who began with these keys at this address is identified."""
 
     number: int
     identity: SignedInPerson
@@ -65,7 +65,7 @@ class SignOnConfirmed(Message, frozen=True):
 
 
 class SignOnFailed(Message, frozen=True):
-    """Request `number` failed. `refused`: the person or the browser is not accepted; otherwise, the provider fails."""
+    """`refused`: the person or the browser is not accepted; otherwise, the provider fails."""
 
     number: int
     reason: str

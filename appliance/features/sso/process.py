@@ -1,6 +1,6 @@
 """Run the client of the provider as a process of the appliance: lifeline, link to control, and sign-ons.
 
-Only this process has the client's secret, and the firewall lets only it reach the provider, and the provider only. It
+Only this process has the client's secret, and the firewall lets only it reach the provider, and nothing else. It
 reads no state of the appliance. Control trusts it for who a person is.
 """
 
@@ -46,7 +46,7 @@ def make_sign_ons(wanted: Sso) -> SignOns:
 
 
 class _Process:
-    """The process: it answers control's requests, each in a task."""
+    """Answers each of control's requests in a task."""
 
     def __init__(self, wanted: Sso, lifeline_fd: int) -> None:
         lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
@@ -94,7 +94,7 @@ class _Process:
 
 
 def _secret(file: Path | None) -> str | None:
-    """Return the first line of the file; it is read for each use, so that a replaced file applies. Raises `OSError`."""
+    """The file is read for each use, so that a replaced one applies. Raises `OSError`."""
     if file is None:
         return None
     lines = read_given(file, _LONGEST_SECRET).decode().splitlines()

@@ -28,7 +28,7 @@ _OK = 200
 
 
 class ProviderEndpoints(msgspec.Struct, frozen=True):
-    """The parts of the discovery document that are used."""
+    """The used parts of the discovery document."""
 
     issuer: str
     authorization_endpoint: str
@@ -51,7 +51,7 @@ class Provider:
         self._tried = float("-inf")
 
     async def endpoints(self) -> ProviderEndpoints:
-        """Return the endpoints, at most an hour old. Raises `ProviderError`."""
+        """The endpoints are at most an hour old. Raises `ProviderError`."""
         if self._endpoints is None or clock.now() - self._endpoints[0] >= _FRESH_SECONDS:
             url = self.issuer.removesuffix("/") + _DISCOVERY
             try:
@@ -71,7 +71,7 @@ class Provider:
         return self._endpoints[1]
 
     async def keys(self, kid: str | None) -> Sequence[dict[str, Any]]:
-        """Return the keys; fetch them again if none has this id. Raises `ProviderError`."""
+        """Fetch the keys again if none has this id. Raises `ProviderError`."""
         now = clock.now()
         known = self._keys
         age = float("inf") if known is None else now - known[0]
@@ -90,7 +90,7 @@ class Provider:
         return self._keys[1]
 
     async def post(self, url: str, headers: Sequence[tuple[str, str]], body: bytes) -> tuple[int, bytes]:
-        """Send a form. Raises `ProviderError`."""
+        """Raises `ProviderError`."""
         return await self._exchange("POST", url, headers, body)
 
     async def _fetch_keys(self) -> list[dict[str, Any]]:

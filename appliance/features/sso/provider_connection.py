@@ -35,18 +35,18 @@ Pool = httpcore.AsyncConnectionPool | httpcore.AsyncHTTPProxy
 
 
 class ProviderAnswer(NamedTuple):
-    """The status and the body of an answer."""
+    """An answer of the provider."""
 
     status: int
     body: bytes
 
 
 Exchange = Callable[[str, str, Headers, bytes], Awaitable[ProviderAnswer]]
-"""Send a request (method, URL, headers, body) and return the answer. Raises `ProviderError`."""
+"""Sends a request (method, URL, headers, body). Raises `ProviderError`."""
 
 
 class ProviderConnection:
-    """The way to the provider; each exchange has a connection of its own."""
+    """Each exchange has its own connection."""
 
     def __init__(self, wanted: Sso) -> None:
         self._wanted = wanted
@@ -55,7 +55,7 @@ class ProviderConnection:
     async def exchange(
         self, method: str, url: str, headers: Headers = (), body: bytes = b""
     ) -> ProviderAnswer:
-        """Send a request and return the answer, whatever its status is. Raises `ProviderError`."""
+        """The answer may have any status. Raises `ProviderError`."""
         try:
             origin = origin_of(url)
         except ValueError as error:
@@ -80,7 +80,7 @@ class ProviderConnection:
             ) from error
 
     def _pool(self) -> Pool:
-        """Return a pool of connections that all go to the one destination. Raises `OSError`."""
+        """All connections go to the one destination. Raises `OSError`."""
         context = _tls(self._wanted)
         network = _OneDestination(*self._wanted.destination)
         if self._wanted.proxy is not None:
@@ -94,8 +94,6 @@ class ProviderConnection:
 
 
 class _OneDestination(httpcore.AsyncNetworkBackend):
-    """The network of httpcore; every connection goes to one address and port."""
-
     def __init__(self, address: str, port: int) -> None:
         self._address, self._port = address, port
         self._network = httpcore.AnyIOBackend()
@@ -114,7 +112,7 @@ class _OneDestination(httpcore.AsyncNetworkBackend):
 
 
 def _tls(wanted: Sso) -> ssl.SSLContext:
-    """Return the context, made for each exchange, so that a replaced file applies to the next. Raises `OSError`."""
+    """Made for each exchange, so that a replaced file applies to the next. Raises `OSError`."""
     if wanted.ca is None:
         context = ssl.create_default_context()
     else:
@@ -131,7 +129,7 @@ def _tls(wanted: Sso) -> ssl.SSLContext:
 
 
 async def _bounded(url: str, answer: httpcore.Response) -> bytes:
-    """Return the body. Raises `ProviderError` if it is compressed or too large."""
+    """Raises `ProviderError` if the body is compressed or too large."""
     for name, value in answer.headers:
         if name.lower() == b"content-encoding" and value.lower() != b"identity":
             raise ProviderError(f"{url}: the provider compresses its answer, which was not requested")

@@ -54,7 +54,7 @@ class Returned(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Limits:
-    """The limits of calls that need no token."""
+    """Apply to calls that need no token."""
 
     def __init__(self, per_minute: int) -> None:
         self._buckets = Buckets(per_minute / 60, per_minute)
@@ -62,7 +62,7 @@ class _Limits:
 
     @contextmanager
     def place(self, peer: str) -> Iterator[None]:
-        """Take one of the places during the block. Raises `ProblemError` (429, 503)."""
+        """Raises `ProblemError` (429, 503)."""
         seconds = self._buckets.take(peer, clock.now())
         if seconds:
             raise too_many("too-many-failures", "too many sign-ins from this host", seconds)

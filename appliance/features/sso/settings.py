@@ -21,7 +21,7 @@ _PORTS = {"https": 443, "http": 80}
 
 
 def origin_of(url: str) -> Origin:
-    """Return protocol, host and port of an https URL; http only on the loopback. Raises `ValueError`."""
+    """`http` is allowed only on the loopback. Raises `ValueError`."""
     try:
         parts = urlsplit(url)
         port = parts.port or _PORTS.get(parts.scheme, 0)
@@ -208,7 +208,7 @@ class Sso(FeatureSection):
         return {"proxy" if self.proxy else "address": (self.proxy or self.address, self.destination[0])}
 
     def role_of(self, values: frozenset[str]) -> TokenRole | None:
-        """Return the highest role that these values of `roles_claim` give; None: none."""
+        """Return the highest role that these values of `roles_claim` give."""
         return next((role for role in _RANKING if values.intersection(self.roles.get(role, ()))), None)
 
     def door_groups_of(self, values: frozenset[str]) -> tuple[str, ...]:

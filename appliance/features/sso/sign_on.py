@@ -44,7 +44,7 @@ class _Pending(NamedTuple):
 
 
 class SignOns:
-    """The unfinished sign-ons. `secret()` returns the client's secret, or None; it may raise `OSError`."""
+    """`secret()` returns the client's secret, if any; it may raise `OSError`."""
 
     def __init__(self, wanted: Sso, provider: Provider, secret: Callable[[], str | None]) -> None:
         self._wanted = wanted
@@ -53,7 +53,7 @@ class SignOns:
         self._pending: dict[str, _Pending] = {}  # by state, oldest first
 
     async def begin(self, keys: SessionKeys, address: str, *, again: bool) -> tuple[str, str]:
-        """Begin a sign-on; return the URL at the provider, and the state. Raises `ProviderError`."""
+        """Return the URL at the provider, and the state. Raises `ProviderError`."""
         endpoints = await self._provider.endpoints()
         state, nonce, verifier = (secrets.token_urlsafe(32) for _ in range(3))
         self._make_room(address)
@@ -73,7 +73,7 @@ class SignOns:
         return f"{url}{'&' if '?' in url else '?'}{urlencode(asked, quote_via=quote)}", state
 
     async def finish(self, state: str, code: str, issuer: str) -> tuple[SignedInPerson, SessionKeys, str]:
-        """Return the identity, the keys and the address of the sign-on with this state.
+        """Return identity, keys and address.
 
         `issuer` is the parameter `iss` of the response (RFC 9207), or empty. Raises `SignOnRefusedError` and
         `ProviderError`.

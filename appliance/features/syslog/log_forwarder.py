@@ -39,7 +39,7 @@ _log = structlog.get_logger()
 
 
 class ForwardingPosition(msgspec.Struct, frozen=True):
-    """The sequence of the last record and the number of the last checkpoint that the receiver has of log `log`.
+    """The last record and checkpoint that the receiver has of log `log`.
 
     The position is stored after the receiver has both, so after a crash some records are sent again. `record` is the
     id of the last record: if the log was restored from a copy, another record may have the same sequence.
@@ -52,7 +52,7 @@ class ForwardingPosition(msgspec.Struct, frozen=True):
 
 
 def load_position(path: Path) -> ForwardingPosition | None:
-    """Return the stored position, or None. Raises `ValueError` and `OSError` if the file cannot be read."""
+    """Raises `ValueError` and `OSError` if the file cannot be read."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=ForwardingPosition)
     except FileNotFoundError:
@@ -62,13 +62,13 @@ def load_position(path: Path) -> ForwardingPosition | None:
 
 
 def save_position(path: Path, position: ForwardingPosition) -> None:
-    """Write the position to the disk. Raises `OSError`."""
+    """Raises `OSError`."""
     write_whole(path, msgspec.json.encode(position), 0o600)
 
 
 @dataclass(slots=True)
 class LogForwarder:
-    """A forwarder of the database `log` to `receiver`; it stores its position in the file `kept`. Not thread-safe."""
+    """The position is in the file `kept`. Not thread-safe."""
 
     log: Path
     kept: Path
@@ -95,7 +95,6 @@ class LogForwarder:
         return 0.0 if more else _IDLE_SECONDS
 
     def close(self) -> None:
-        """Store the position and close the connection."""
         self.receiver.close()
         try:
             self._save(0.0)
@@ -182,7 +181,7 @@ def _extent(path: Path) -> tuple[int, int, str]:
 
 
 def _in_log(path: Path, position: ForwardingPosition) -> ForwardingPosition:
-    """Return the position, moved back if the log was restored from a copy. Raises `LogUnreadableError`.
+    """Move the position back if the log was restored from a copy. Raises `LogUnreadableError`.
 
     A restored log continues with sequences that were already used. Ids are ordered by time, so every record with a
     later id than the last sent record is new, even if its sequence is not.

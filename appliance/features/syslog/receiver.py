@@ -35,14 +35,13 @@ class Receiver(Protocol):
     """A receiver of messages."""
 
     def send(self, messages: Sequence[bytes]) -> None:
-        """Send all messages in order, as the module's invariants say. Raises `OSError`."""
+        """Send in order, as the module's invariants say. Raises `OSError`."""
 
-    def close(self) -> None:
-        """Close the connection, if there is one."""
+    def close(self) -> None: ...
 
 
 class DatagramReceiver:
-    """A UDP receiver: one datagram per message. A closed port is not always reported, so messages may be lost."""
+    """A closed port is not always reported, so messages may be lost."""
 
     def __init__(self, host: str, port: int) -> None:
         self._place = (host, port)
@@ -64,7 +63,7 @@ class DatagramReceiver:
 
 
 class StreamReceiver:
-    """A TCP receiver with a lasting connection; `context` returns a new connection's TLS context (None: clear text)."""
+    """The connection lasts; `context` returns a new connection's TLS context (None: clear text)."""
 
     def __init__(
         self,
@@ -79,7 +78,7 @@ class StreamReceiver:
         self._socket: socket.socket | None = None
 
     def send(self, messages: Sequence[bytes]) -> None:
-        """Send each message after its length, and wait until all bytes are acknowledged."""
+        """Each message follows its length. Wait until all bytes are acknowledged."""
         connection = self._socket
         if connection is None:
             connection = self._socket = self._connect()
@@ -108,7 +107,7 @@ class StreamReceiver:
 
 
 def tls_context(ca: Path | None, certificate: Path | None, key: Path | None) -> ssl.SSLContext:
-    """Return a TLS context that verifies the receiver with `ca` (None: the system's CAs) and presents our certificate.
+    """Without `ca`, the system's authorities verify the receiver.
 
     Raises `OSError`, which names the unreadable file.
     """
@@ -130,7 +129,7 @@ def tls_context(ca: Path | None, certificate: Path | None, key: Path | None) -> 
 
 
 def _await_objection(connection: socket.socket) -> None:
-    """Raise `OSError` if the server rejects our certificate; with TLS 1.3 the rejection arrives after our handshake."""
+    """With TLS 1.3 the server rejects our certificate after our handshake. Raises `OSError`."""
     select.select([connection], [], [], _OBJECTION_SECONDS)
     _require_open(connection)
 
@@ -159,6 +158,6 @@ def _await_acknowledgement(connection: socket.socket) -> None:
 
 
 def _unacknowledged(connection: socket.socket) -> int:
-    """Return the number of bytes that the receiver's kernel has not acknowledged (`SIOCOUTQ`, tcp(7))."""
+    """`SIOCOUTQ`, tcp(7)."""
     answer = fcntl.ioctl(connection.fileno(), termios.TIOCOUTQ, b"\0\0\0\0")
     return int(struct.unpack("i", answer)[0])

@@ -37,7 +37,7 @@ _CUT = "..."
 
 
 class Formatter:
-    """A formatter of messages from `host_name` with a facility (0 to 23), each at most `longest` bytes."""
+    """The facility is 0 to 23; a message has at most `longest` bytes."""
 
     def __init__(self, *, facility: int, longest: int, host_name: str | None = None) -> None:
         self._facility = facility
@@ -61,7 +61,7 @@ class Formatter:
         return _message(head, ELEMENT, named, _shortened(text, room))
 
     def checkpoint(self, signed: SignedCheckpoint) -> bytes:
-        """Format a signed checkpoint so that `rosrv audit verify --checkpoints` finds it in the receiver's file."""
+        """`rosrv audit verify --checkpoints` must find it in the receiver's file."""
         head = self._head(Severity.NOTICE, signed.time, "checkpoint signed")
         fields = {
             name: str(value) for name, value in msgspec.structs.asdict(signed).items() if value is not None
@@ -81,7 +81,7 @@ def _message(head: str, element: str, fields: dict[str, str], text: str) -> byte
 
 
 def _value(value: str, room: int) -> str:
-    """Return a parameter's value, escaped, in at most `room` bytes."""
+    """Escape and cut to `room` bytes."""
     pieces = [f"\\{character}" if character in '\\"]' else character for character in _ascii(value)]
     if sum(map(len, pieces)) <= room:
         return "".join(pieces)
@@ -105,12 +105,12 @@ def _shortened(text: str, room: int) -> str:
 
 
 def _name(text: str, longest: int) -> str:
-    """Return a field of the header: printable ASCII without space, or `-` if nothing is left (RFC 5424, 6)."""
+    """Printable ASCII without space, or `-` (RFC 5424, 6)."""
     return "".join(character for character in text if "!" <= character <= "~")[:longest] or "-"
 
 
 def _time(time: int) -> str:
-    """Return the time in RFC 3339 with microseconds, as RFC 5424 allows; `-` if it is out of range."""
+    """RFC 3339 with microseconds, as RFC 5424 allows; `-` if it is out of range."""
     seconds, fraction = divmod(time, 1_000_000_000)
     try:
         moment = datetime.fromtimestamp(seconds, UTC)

@@ -14,10 +14,8 @@ _COUNTED = "repetitions folded"
 
 @dataclass(frozen=True, slots=True)
 class PastPublisher:
-    """A node that was registered as a publisher.
-
-    `since` is nanoseconds since the epoch, and `sequence` the record of the registration or of the node's return. Both
-    are None if the log only has the end of the registration.
+    """`since` is nanoseconds since the epoch, and `sequence` the record of the registration or of the node's return.
+    Both are None if the log only has the end of the registration.
     """
 
     node: str
@@ -28,7 +26,7 @@ class PastPublisher:
 
 @dataclass(frozen=True, slots=True)
 class PastPublishers:
-    """The publishers, ordered by name, and sentences on what the log does not show."""
+    """Ordered by name, with sentences on what the log does not show."""
 
     publishers: tuple[PastPublisher, ...]
     unknown: tuple[str, ...]
@@ -37,9 +35,9 @@ class PastPublishers:
 def publishers_at(
     export: Callable[[Filter], Iterable[LogEntry]], first: LogEntry | None, topic: str, at: int
 ) -> PastPublishers:
-    """Return the publishers of a topic at a time (nanoseconds since the epoch).
+    """`at` is nanoseconds since the epoch.
 
-    `export` yields the records that match a filter; `first` is the first record of the log, None if it is empty.
+    `export` yields the records that match a filter; `first` is the first record of the log.
     """
     registrations = (Filter(event=event, category="publication", resource=topic) for event in _REGISTRATIONS)
     others = (Filter(event=event, until=at + 1) for event in (*_NODES, *_LOG))
@@ -88,7 +86,7 @@ def _registered(past: Iterable[LogEntry]) -> list[PastPublisher]:
 def _ended_later(
     later: Iterable[LogEntry], seen: set[tuple[str | None, str | None]]
 ) -> Iterator[PastPublisher]:
-    """Yield the nodes whose registration ended later, and of which the log does not have the beginning.
+    """Yield nodes whose registration ended later, and of which the log lacks the beginning.
 
     After a loss of records, the beginning may be among the lost ones.
     """
@@ -103,7 +101,7 @@ def _ended_later(
 
 
 def _counts(entry: LogEntry, topic: str, at: int) -> bool:
-    """Whether a summary counts repeated registrations of the topic, or changes of nodes, at or before this time."""
+    """A summary may count repeated registrations of the topic, or changes of nodes."""
     detail, resource = entry.record.detail, entry.record.resource
     return (
         entry.record.event == _COUNTED

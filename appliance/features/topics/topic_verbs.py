@@ -125,7 +125,7 @@ def publishers(
 
 
 def _to_seconds(text: str) -> str:
-    """Leave out the fractions of a second of the times in a text."""
+    """Times in a text lose the fractions of a second."""
     return re.sub(r"(T\d\d:\d\d:\d\d)\.\d++Z", r"\1Z", text)
 
 
@@ -158,7 +158,7 @@ def _show(message: TopicMessage, field: str | None, *, as_json: bool) -> None:
 
 
 def part_of(fields: Any, path: str) -> Any:
-    """Return a nested field, or the mark of left-out values (`… 704 more`). Exits with status 2 without either."""
+    """Exits with status 2 if the field is neither there nor left out."""
     value = fields
     for name in path.split("."):
         if isinstance(value, Mapping) and name in value:
@@ -174,7 +174,7 @@ def part_of(fields: Any, path: str) -> Any:
 
 
 def _left_out(value: Any, name: str) -> str:
-    """Return the mark of left-out values if the field may be among these values; otherwise an empty string."""
+    """Return the mark of left-out values if the field may be among them."""
     if isinstance(value, Mapping):
         return str(value.get(CUT, ""))
     last = value[-1] if isinstance(value, list) and value else value

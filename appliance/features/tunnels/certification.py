@@ -33,9 +33,9 @@ _SERVED_SECONDS = 10.0
 
 
 class Certification:
-    """The steps shared by enrolment by an operator and enrolment by the host itself.
+    """The steps shared by enrolment by an operator and by the host itself.
 
-    `changed()` is called after a change of the enrolled hosts; it returns the number of rights that the change revoked.
+    `changed()` is called after a change of the hosts; it returns the number of rights that this revoked.
     """
 
     def __init__(
@@ -78,14 +78,14 @@ class Certification:
 
     @contextlib.contextmanager
     def unless_revoked(self, name: str) -> Iterator[None]:
-        """Raise `HostForbiddenError` at the end of the block if the name was revoked during the block."""
+        """Raise `HostForbiddenError` at the end of the block if the name was revoked in it."""
         before = self._revocations[name]
         yield
         if self._revocations[name] != before:
             raise HostForbiddenError(f"{name} was revoked in the meantime")
 
     async def require_authority(self) -> None:
-        """Raise `HostRefusedError`, with the remedy, if this appliance does not have the authority's key."""
+        """Raise `HostRefusedError`, with the remedy, without the authority's key."""
         try:
             await self._authority.require_key()
         except AuthorityError as error:
@@ -94,7 +94,7 @@ class Certification:
     async def issue(
         self, name: str, request: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> CertificateMade:
-        """Return a new certificate from the authority. Raises `HostRefusedError`."""
+        """Raises `HostRefusedError`."""
         self.table.require_room(name)
         try:
             return await self._authority.issue(request.encode(), name, days, proof=proof, former=former)
@@ -102,7 +102,7 @@ class Certification:
             raise HostRefusedError(str(error), ours=not error.refused) from error
 
     def enrolled(self, name: str, address: str, made: CertificateMade, who: str, **more: Any) -> None:
-        """Store and record a host's first certificate, or its first certificate after a revocation."""
+        """The certificate is the host's first one, or the first after a revocation."""
         self.awaited.forget(name)
         self.keep(name, address, made)
         self.trail.happened(
@@ -133,10 +133,10 @@ class Certification:
         self.changed()
 
     async def finish(self, name: str, kept: dict[str, str] | None = None) -> KitParts:
-        """Wait until an enrolment is on disk and charon has confirmed it; return the kit's parts.
+        """Wait until an enrolment is on disk and charon has confirmed it.
 
-        If charon does not confirm in time, the kit has a warning. `kept` are the options stored with the host's token.
-        Raises `HostRefusedError`, `StoreError`.
+        If charon does not confirm in time, the kit has a warning. `kept` are the options stored with the host's
+        token. Raises `HostRefusedError`, `StoreError`.
         """
         taken = (
             await self.tunnels.until_taken()
@@ -150,7 +150,7 @@ class Certification:
         return await self.kit(name, warning, kept)
 
     async def kit(self, name: str, warning: str | None, kept: dict[str, str] | None = None) -> KitParts:
-        """Return the parts of a host's kit. Raises `HostRefusedError`."""
+        """Raises `HostRefusedError`."""
         if self.rest.inner_port is not None and not await self.until_served():
             warning = warning or "REST is not running: the kit cannot renew its certificate automatically"
         authority = await self.authority_certificate()
@@ -183,7 +183,7 @@ class Certification:
         )
 
     async def revocations(self, _request: host_requests.RevocationsWanted) -> RevocationList:
-        """Return the authority's list of revoked certificates, in PEM. Raises `HostRefusedError`."""
+        """In PEM. Raises `HostRefusedError`."""
         try:
             listed = await self.tunnels.revocations.signed()
         except AuthorityError as error:
@@ -191,18 +191,18 @@ class Certification:
         return RevocationList(listed.decode())
 
     async def authority(self, _request: host_requests.AuthorityWanted) -> AuthorityCertificate:
-        """Return the authority's certificate, in PEM. Raises `HostRefusedError`."""
+        """In PEM. Raises `HostRefusedError`."""
         return AuthorityCertificate((await self.authority_certificate()).decode())
 
     async def authority_certificate(self) -> bytes:
-        """Return the authority's own certificate, in PEM. Raises `HostRefusedError`."""
+        """In PEM. Raises `HostRefusedError`."""
         try:
             return await self._authority.certificate()
         except AuthorityError as error:
             raise HostRefusedError(str(error), ours=True) from error
 
     async def until_served(self) -> bool:
-        """Wait for the api, which starts after control; return False if it does not connect in time."""
+        """The api starts after control; return False if it does not connect in time."""
         try:
             async with asyncio.timeout(_SERVED_SECONDS):
                 await self._served.wait()

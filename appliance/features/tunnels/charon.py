@@ -1,4 +1,4 @@
-"""Provision and watch charon over vici, with blocking calls, one at a time.
+"""Provision and watch charon over vici, with blocking calls.
 
 Only differences are applied: new hosts are loaded, removed hosts are unloaded and their tunnels closed. When a host's
 certificate is replaced, its tunnel is also closed, and opens again with the new certificate. charon's confirmation is
@@ -28,11 +28,11 @@ _FAULTS = (
 
 
 class CharonError(Exception):
-    """Report that charon cannot be used; the message gives the reason and the remedy."""
+    """The message gives the reason and the remedy."""
 
 
 class ViciClient:
-    """A connection to a running charon. Raises `CharonError`."""
+    """Raises `CharonError`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -46,12 +46,12 @@ class ViciClient:
         self._session.transport.close()
 
     def load_key(self, key: bytes) -> None:
-        """Load the appliance's private key (PEM)."""
+        """The key is in PEM."""
         with self._said("the appliance's key"):
             self._session.load_key({"type": "any", "data": key})
 
     def provision(self, stated: TunnelsStated) -> None:
-        """Make charon's tunnels exactly those in `stated`. Revoked tunnels are closed before new ones are loaded."""
+        """Revoked tunnels are closed before new ones are loaded."""
         before = self._stated
         if before is None or before.authority != stated.authority:
             with self._said("the authority's certificate"):
@@ -113,7 +113,7 @@ class ViciClient:
         return [str(name) for group in ("ke", "dh") for name in found.get(group, {})]
 
     def listen(self) -> Iterator[tuple[str, bool, str]]:
-        """Yield changes of tunnels (host, up, real address) until charon ends; uses a separate connection."""
+        """Yield changes of tunnels (host, up, real address) until charon ends, over a separate connection."""
         session = self._connect(timeout=None)
         try:
             for _kind, event in session.listen(["child-updown"]):
@@ -169,12 +169,12 @@ class ViciClient:
 
 
 def _der_of(pem: bytes) -> bytes:
-    """Return a list in DER, which is a quarter shorter than PEM, because vici's limit is 65,535 bytes."""
+    """DER is a quarter shorter than PEM, and vici's limit is 65,535 bytes."""
     return base64.b64decode(b"".join(pem.split(b"-----")[2:3]))
 
 
 def _hidden(found: list[tuple[str, Any]]) -> set[str]:
-    """Return the connections whose tunnel a list lacks, because their keys were replaced while charon made the list."""
+    """Return tunnels that a list lacks because their keys were replaced while charon made it."""
     rekeyed = {name for name, row in found if _text(row, "state") == "REKEYED"}
     return rekeyed - {name for name, row in found if _seen(name, row) is not None}
 
@@ -196,7 +196,7 @@ def _seen(name: str, row: Any) -> TunnelSeen | None:
 
 
 def _parts(row: Any) -> set[bytes]:
-    """Return charon's unique ids of a tunnel and its children. A rekeying changes only one of the two kinds."""
+    """A rekeying changes only one of the two kinds of ids."""
     carried = row.get("child-sas", {}).values()
     return {b"ike " + row["uniqueid"], *(b"child " + child["uniqueid"] for child in carried)}
 

@@ -1,4 +1,4 @@
-"""Keep the results of port checks from other machines: are a machine's ROS ports closed to all but the appliance?"""
+"""Keep the results of port checks from other machines."""
 
 import ipaddress
 from collections.abc import Callable
@@ -17,7 +17,7 @@ _MOST_PORTS = 100
 
 
 class PortChecks:
-    """The results of port checks; `machines()` returns the number of nodes by address."""
+    """`machines()` returns the number of nodes by address."""
 
     def __init__(
         self, certification: Certification, view: HostView, machines: Callable[[], dict[str, int]]
@@ -30,7 +30,7 @@ class PortChecks:
         self._machines = machines
 
     async def tell(self, request: host_requests.HostPorts, who: str) -> PortsReport:
-        """Store and record the result of a check. Raises `HostRefusedError`, `HostsChangedError`."""
+        """Raises `HostRefusedError`, `HostsChangedError`."""
         self._table.require(request.expected)
         key, state = self._known_machine(request.name), request.state
         now = clock.wall()
@@ -53,7 +53,7 @@ class PortChecks:
         return PortsReport(self._view.ports(key), self._table.revision, key)
 
     def in_clear_text(self) -> dict[str, int]:
-        """Return the number of nodes on each machine that connects without a tunnel, by address."""
+        """The number of nodes, by address."""
         pool = self._table.pool
         return {
             address: nodes

@@ -1,11 +1,12 @@
-"""Answer the requests that a host makes for itself, without a bearer token: enrolment, renewal, authority, revocations.
+"""Answer a host's own requests, without a bearer token: enrolment, renewal, authority, revocations.
 
 Invariants:
 
 1. Enrolment needs only a one-time token. A host that sends wrong tokens must wait, and all such hosts also share one
-   limit. A host that sent no wrong token never waits, so an attacker with many addresses cannot keep out a valid token.
-2. Only a host in its tunnel can renew. Control compares the peer's address with the virtual address of the name, which
-   the firewall accepts only through IPsec. The signer checks the signature by the host's present key.
+   limit. A host that sent no wrong token never waits, so an attacker with many addresses cannot keep out a valid
+   token.
+2. Only a host in its tunnel can renew. Control compares the peer's address with the virtual address of the name,
+   which the firewall accepts only through IPsec. The signer checks the signature by the host's present key.
 3. This module does not parse signing requests.
 """
 
@@ -162,7 +163,7 @@ def _add_renewal(router: Routes, services: Services) -> None:
 
 
 class _Patience:
-    """The limits on wrong tokens: one for each host, and one for all hosts together."""
+    """Limits wrong tokens of each host, and of all hosts together."""
 
     def __init__(self, per_minute: int) -> None:
         self._one = Buckets(per_minute / 60, per_minute)

@@ -1,7 +1,5 @@
 """Carry out operators' requests about hosts with a tunnel: enrol, issue kits and one-time tokens, revoke.
 
-Each request is answered by a method of `HostEnrolment`, its `itself` or `ports`, or of `Certification`.
-
 Invariants:
 
 1. Before its first `await`, a revocation removes the host from the policy, and removes its registrations.
@@ -38,7 +36,7 @@ from appliance.store.host_tables import EnrolmentTokenRow
 
 
 class HostEnrolment(TunnelHosts):
-    """The operators' requests about hosts; `itself` serves the requests of hosts.
+    """`itself` serves the requests of hosts.
 
     `expel(address, reason)` removes a host's registrations and grants and returns their number. `find_endpoint()`
     returns the address at which hosts reach the appliance; `machines()` returns the number of nodes by address.
@@ -72,7 +70,6 @@ class HostEnrolment(TunnelHosts):
     # --- queries ---
 
     async def listed(self, _request: host_requests.HostList) -> answers.Hosts:
-        """Return every host and machine, and the state of the tunnels."""
         machines = self.ports.in_clear_text()
         status = self._view.status(machines)
         return answers.Hosts(
@@ -101,14 +98,14 @@ class HostEnrolment(TunnelHosts):
         return await self._find_endpoint()
 
     async def kit(self, request: host_requests.HostKit) -> answers.KitParts:
-        """Return the parts of an enrolled host's kit. Raises `HostRefusedError`."""
+        """Raises `HostRefusedError`."""
         self._table.enrolled_row(request.name)
         return await self._certification.kit(request.name, None)
 
     # --- changes by operators ---
 
     async def add(self, request: host_requests.HostAdd, who: str) -> answers.KitParts:
-        """Enrol a host; return its kit's parts. Raises `HostRefusedError`, `HostsChangedError`, `StoreError`."""
+        """Raises `HostRefusedError`, `HostsChangedError`, `StoreError`."""
         name = request.name
         async with self._certification.changing:
             self._table.require(request.expected)
@@ -123,7 +120,7 @@ class HostEnrolment(TunnelHosts):
             return await self._certification.finish(name)
 
     async def renew(self, request: host_requests.HostRenew, who: str) -> answers.KitParts:
-        """Replace and revoke a host's certificate; return the parts of its kit. Raises as `add`."""
+        """Raises as `add`."""
         name = request.name
         async with self._certification.changing:
             self._table.require(request.expected)
@@ -137,7 +134,7 @@ class HostEnrolment(TunnelHosts):
             return await self._certification.finish(name)
 
     async def token(self, request: host_requests.HostToken, who: str) -> answers.EnrolmentToken:
-        """Return a one-time token for a host. Raises as `add`."""
+        """Raises as `add`."""
         name = request.name
         found = answers.Endpoint(request.endpoint, "") if request.endpoint else await self._find_endpoint()
         async with self._certification.changing:
@@ -198,7 +195,7 @@ class HostEnrolment(TunnelHosts):
             )
 
     async def revoke(self, request: host_requests.HostRevoke, who: str) -> answers.Revoked:
-        """Revoke an enrolled host and close its connections, or revoke an awaited host's token. Raises as `add`."""
+        """Close the connections of an enrolled host, or revoke an awaited host's token. Raises as `add`."""
         name = request.name
         self._table.require(request.expected)
         self._certification.revoked(name)
@@ -226,7 +223,7 @@ class HostEnrolment(TunnelHosts):
         return answers.Revoked(self._table.revision, name, row.address, row.serial, taken)
 
     async def reload(self, request: host_requests.HostsReload, who: str) -> answers.Reloaded:
-        """Read hosts.yaml again and open or close tunnels. Raises as `add`; an invalid file changes nothing."""
+        """Raises as `add`; an invalid file changes nothing."""
         self._table.require(request.expected)
         return await self._declare(self._table.declared.reload, who)
 
@@ -234,7 +231,7 @@ class HostEnrolment(TunnelHosts):
         await self.reload(host_requests.HostsReload(), who)
 
     async def take_bundle(self, text: str, who: str) -> answers.Reloaded:
-        """Use a bundle's text instead of hosts.yaml (empty: the file again). Raises as `reload`."""
+        """An empty text stands for hosts.yaml. Raises as `reload`."""
         declared = self._table.declared
         return await self._declare(partial(declared.take, text) if text else declared.reload, who)
 
@@ -316,7 +313,7 @@ _ENDPOINT_SECONDS = 20.0
 
 
 async def find_endpoint(settings: Settings, look: Callable[[], Awaitable[EndpointFound]]) -> Endpoint:
-    """Return the configured address at which hosts reach the appliance; without one, the supervisor finds the address.
+    """Without a configured address, the supervisor finds one.
 
     Raises `HostRefusedError`; if no address is found, its text lists the options that set the address.
     """

@@ -21,10 +21,9 @@ _SCRIPTS = ("join.sh", "leave.sh", "keep.sh", "renew.sh", "README")
 
 @dataclass(frozen=True)
 class Kit:
-    """The parts of a kit.
+    """`endpoint` is the address or name by which the host reaches the appliance; `protect` is an nftables file.
 
-    `endpoint` is the address or name by which the host reaches the appliance; `protect` is an nftables file. `key` is
-    None if the host made its own key. `host.second` is the address of the other appliance of two.
+    `key` is None if the host made its own key. `host.second` is the address of the other appliance of two.
     """
 
     host: KitParts
@@ -39,7 +38,7 @@ class Kit:
 
 
 def members(kit: Kit) -> list[tuple[str, str, int]]:
-    """Return the files of a kit: path, text, mode."""
+    """Path, text, mode."""
     host = kit.host
     found = [
         ("swanctl/swanctl.conf", swanctl_conf(kit), 0o644),
@@ -64,14 +63,14 @@ def members(kit: Kit) -> list[tuple[str, str, int]]:
 
 
 def filled(script: str, values: Mapping[str, str]) -> str:
-    """Return a script of `kit_files` with its values filled in; `@stop@` is `stop.inc`."""
+    """`@stop@` is `stop.inc`."""
     folder = files("appliance.features.tunnels").joinpath("kit_files")
     text, stop = (folder.joinpath(name).read_text(encoding="utf-8") for name in (script, "stop.inc"))
     return _Template(text.replace("@stop@\n", stop)).substitute(values)
 
 
 def archive(kit: Kit) -> bytes:
-    """Return the kit as `.tar.gz`: one folder, `rosrv-NAME`."""
+    """A `.tar.gz` of one folder, `rosrv-NAME`."""
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w:gz") as tar:
         for path, content, mode in members(kit):
@@ -83,7 +82,7 @@ def archive(kit: Kit) -> bytes:
 
 
 def swanctl_conf(kit: Kit) -> str:
-    """Return the host's tunnel in swanctl's format, to each of two appliances if there are two."""
+    """Include a tunnel to each of two appliances."""
     # charon opens no tunnel: keep.sh notices a lost one in seconds (charon with its own settings in minutes), and opens
     # only one if there are two appliances.
     connections = "".join(_connection(kit, name, remote) for name, remote in kit.remotes.items())
@@ -131,7 +130,7 @@ def _connection(kit: Kit, name: str, remote: str) -> str:
 
 
 class _Template(Template):
-    """A template with `@name@` for values, so that the scripts keep their `$`."""
+    """Values are `@name@`, so that the scripts keep their `$`."""
 
     delimiter = "@"
     pattern = r"""

@@ -23,11 +23,11 @@ MOST = 1000
 
 
 class BadEnrolmentTokenError(Exception):
-    """Report an invalid token; the text does not reveal why the token is invalid."""
+    """The text does not reveal why the token is invalid."""
 
 
 class EnrolmentTokens:
-    """The unused tokens; expired tokens are removed. `ends` keeps their ends although the clock may step back."""
+    """Expired tokens are removed. `ends` keeps their ends although the clock may step back."""
 
     def __init__(self, tables: HostTables, ends: Deadlines) -> None:
         self._tables = tables
@@ -47,7 +47,7 @@ class EnrolmentTokens:
     def add(
         self, name: str, *, seconds: float, address: str, days: float, kit: dict[str, str], who: str
     ) -> tuple[EnrolmentTokenRow, str]:
-        """Make a token; return its row and its text. The text cannot be read again."""
+        """The text of the token cannot be read again."""
         token_id, now = secrets.token_hex(6), clock.wall()
         secret = secrets.token_urlsafe(32)
         row = EnrolmentTokenRow(name, token_id, _hash(secret), now, now + seconds, address, days, kit, who)
@@ -57,7 +57,7 @@ class EnrolmentTokens:
         return row, f"rosrv-enrol_{token_id}_{secret}"
 
     def take(self, text: str) -> EnrolmentTokenRow:
-        """Use up a token and return its row. Raises `BadEnrolmentTokenError`."""
+        """Use up the token. Raises `BadEnrolmentTokenError`."""
         found = _FORM.fullmatch(text)
         rows = {row.id: row for row in self.rows().values()}
         row = rows.get(found[1]) if found is not None else None
@@ -69,7 +69,7 @@ class EnrolmentTokens:
         return row
 
     def give_back(self, row: EnrolmentTokenRow) -> None:
-        """Make a used token valid again if no certificate was issued, unless its name has a newer token."""
+        """No certificate was issued, so the token is valid again, unless its name has a newer one."""
         if row.name not in self._rows:
             self._rows[row.name] = row
             self._tables.save_awaited(row)

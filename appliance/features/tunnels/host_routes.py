@@ -37,7 +37,6 @@ OneName = Annotated[
 
 
 def add_host_routes(router: Routes, services: Services) -> None:
-    """Add the routes that are not derived from the table of operations."""
     control = services.control
 
     @router.get("/v1/hosts/{name}", responses=_UNKNOWN)
@@ -83,7 +82,7 @@ async def _enrol(call: OperationCall[Any]) -> Response:
 
 
 async def _kit(call: OperationCall[Any]) -> Response:
-    """Answer with a kit; make its key here unless the host has its own key."""
+    """Make the key here unless the host has its own."""
     wishes, key, order = _wishes(call.body), None, call.order
     if not order.request:
         made = await asyncio.to_thread(make_key)

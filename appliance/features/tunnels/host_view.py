@@ -18,14 +18,14 @@ _NEVER = PortsSeen("unknown", None, [], "")
 
 
 def soon(table: HostTable, row: HostRow, now: float) -> bool:
-    """Return whether a certificate ends within 14 days, or within a third of its life if a third is shorter."""
+    """A certificate ends within 14 days, or within a third of its life if that is shorter."""
     certificate = table.certificates.get(row.name)
     life = row.expires - certificate.made if certificate is not None else SOON_SECONDS * 3
     return row.expires - now < min(SOON_SECONDS, life / 3)
 
 
 class HostView:
-    """The operators' view of table, tokens and tunnels. `machines` counts, by address, nodes that use no tunnel."""
+    """`machines` counts, by address, nodes that use no tunnel."""
 
     def __init__(self, table: HostTable, awaited: EnrolmentTokens, tunnels: Tunnels) -> None:
         self._table = table
@@ -68,7 +68,7 @@ class HostView:
         )
 
     def divergence(self, name: str) -> str | None:
-        """Return a host's difference from hosts.yaml; None if there is none, or if hosts.yaml declares no hosts."""
+        """None if there is no difference, or if hosts.yaml declares no hosts."""
         if not self._table.declared.there:
             return None
         declared, row = self._table.declared.hosts.get(name), self._table.rows.get(name)
@@ -89,7 +89,7 @@ class HostView:
         return PortsSeen(cast(PortsState, row.state), row.checked, row.open, row.who)
 
     def status(self, machines: Mapping[str, int]) -> IpsecState:
-        """Return the state of the tunnels, and what needs a person's attention."""
+        """Include what needs a person's attention."""
         charon = self._tunnels.charon
         return IpsecState(
             esp=self._tunnels.esp,
@@ -107,7 +107,7 @@ class HostView:
         )
 
     def machines(self, machines: Mapping[str, int]) -> list[Machine]:
-        """Return machines with nodes that connect in clear text, and other machines whose ports were checked."""
+        """Return machines with nodes in clear text, and others whose ports were checked."""
         told = self._table.ports.keys() - self._table.rows.keys() - self._table.declared.hosts.keys()
         return [
             Machine(address, machines.get(address, 0), self.ports(address))

@@ -21,10 +21,7 @@ _LONGEST_REQUEST = 16 << 10
 
 
 def wishes_of(appliance: str | None, ports: str, opened: list[str] | None) -> KitOptions:
-    """Return the kit's options; the endpoint is empty if the appliance must choose it.
-
-    Exits with status 2 for invalid options.
-    """
+    """The endpoint is empty if the appliance must choose it. Exits with status 2 for invalid options."""
     if appliance is not None and not _ENDPOINT.fullmatch(appliance):
         raise usage_error(f"--appliance {appliance!r} is neither an address nor a name")
     try:
@@ -34,10 +31,7 @@ def wishes_of(appliance: str | None, ports: str, opened: list[str] | None) -> Ki
 
 
 def placed(running: Appliance, wishes: KitOptions) -> tuple[KitOptions, str]:
-    """Return the options with an endpoint, and the reason for an endpoint that the appliance chose.
-
-    Exits with status 1 if the appliance cannot choose one.
-    """
+    """Return also the reason for an endpoint that the appliance chose. Exits with status 1 if it cannot."""
     if wishes.endpoint:
         return wishes, ""
     found = running.ask_or_exit(HostEndpoint())
@@ -45,7 +39,7 @@ def placed(running: Appliance, wishes: KitOptions) -> tuple[KitOptions, str]:
 
 
 def key_and_request(csr: Path | None) -> tuple[str | None, str]:
-    """Return a new key and its signing request, in PEM; with `csr`, return None and the request in that file."""
+    """In PEM. With `csr`, return None and the request in that file."""
     if csr is not None:
         return None, _read_request(csr)
     key = make_key()
@@ -55,7 +49,7 @@ def key_and_request(csr: Path | None) -> tuple[str | None, str]:
 def write_kit(
     output: Output, body: KitParts, key: str | None, wishes: KitOptions, reason: str, *, as_json: bool
 ) -> None:
-    """Write the archive. If the appliance chose the endpoint, `reason` explains the choice; otherwise it is empty."""
+    """`reason` explains an endpoint that the appliance chose."""
     again = (
         f"{body.name} is enrolled, but its kit was not written; run:"
         f" rosrv host kit {body.name} --appliance {wishes.endpoint} --output FILE"
@@ -95,7 +89,6 @@ def _chosen(endpoint: str, reason: str) -> str:
 
 
 def write_script(output: Output, made: EnrolmentToken, *, as_json: bool) -> None:
-    """Write the script of a host with a one-time token, and print the token."""
     output.write(made.script.encode(), "the token is lost: create another one")
     if as_json:
         shown = {

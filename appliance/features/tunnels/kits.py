@@ -10,14 +10,14 @@ from appliance.network.close_ports import parse_ports, parse_services, protectio
 
 @dataclass(frozen=True)
 class KitOptions:
-    """The options of a kit: the appliance's address, the host's ports, and the services that stay open."""
+    """`opened` are services that stay open."""
 
     endpoint: str
     ports: str = "32768-60999"
     opened: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        """Raise `ValueError`, with the option's name, if an option is invalid."""
+        """Raise `ValueError`, with the option's name."""
         parse_ports(self.ports)
         parse_services(self.opened)
 
@@ -27,6 +27,6 @@ class KitOptions:
 
 
 def kit_of(body: KitParts, wishes: KitOptions, key: str | None) -> Kit:
-    """Return the kit of an enrolled host. If `key` is None, the host has its own key."""
+    """If `key` is None, the host has its own."""
     ports, opened = parse_ports(wishes.ports), parse_services(wishes.opened)
     return Kit(body, wishes.endpoint, protection([body.appliance], ports, opened, tunnelled=True), key)

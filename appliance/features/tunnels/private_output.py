@@ -23,7 +23,7 @@ _RESERVED = 64 << 10  # bytes; a kit needs about ten thousand
 
 
 class Output:
-    """A new file, or standard output. `written`: whether the data is written. `name`: the file's name on the host."""
+    """`name` is the file's name on the host."""
 
     def __init__(self, path: Path, name: str, file: BinaryIO) -> None:
         self.path = path
@@ -36,7 +36,7 @@ class Output:
         return self.path == STANDARD_OUTPUT
 
     def write(self, data: bytes, lost: str) -> None:
-        """Write all data, once. If writing fails, print `lost`, which has the remedy, and exit with status 1."""
+        """If writing fails, print `lost`, which has the remedy, and exit with status 1."""
         try:
             self._file.write(data)
             if not self.is_standard:
@@ -47,7 +47,7 @@ class Output:
         self.written = True
 
     def say(self, line: str) -> None:
-        """Print a line to standard output, or to standard error if the data goes to standard output."""
+        """Use standard error if the data goes to standard output."""
         if self.is_standard:
             typer.echo(printable(line), err=True)
         else:
@@ -56,9 +56,9 @@ class Output:
 
 @contextlib.contextmanager
 def new_output(out: Path | None, default: str, *, as_json: bool) -> Iterator[Output]:
-    """Open `out`, or the file `default`. Existing files are never replaced.
+    """Existing files are never replaced. A file that the block did not write is removed.
 
-    Exits with status 2 if the file cannot be created. If the block did not write the file, it is removed.
+    Exits with status 2 if the file cannot be created.
     """
     name = default.replace("/", "_")
     if out == STANDARD_OUTPUT:

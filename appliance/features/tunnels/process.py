@@ -1,4 +1,4 @@
-"""Run charon, the IPsec daemon of the tunnels. Only this process talks to charon.
+"""Run charon, the IPsec daemon of the tunnels, which only this process talks to.
 
 This process makes the appliance's key for the tunnels once, and requests a certificate from the control process. The
 control process sends the complete wanted state (`TunnelsStated`) after each change; charon is started when the first
@@ -8,7 +8,8 @@ earlier run.
 1. The private key stays in this process's own directory (mode 0600) and in charon.
 2. charon has the privileges of this process: its own user, and the capabilities to change the network and to bind the
    ports 500 and 4500. It dies with this process.
-3. The only untrusted input parsed here is charon's log, as lines of text; at most `REFUSALS_PER_SECOND` are passed on.
+3. The only untrusted input parsed here is charon's log, as lines of text; at most `REFUSALS_PER_SECOND` are passed
+   on.
 4. Calls to charon are made one at a time: two calls on one session would read each other's answers.
 """
 
@@ -54,7 +55,7 @@ _log = structlog.get_logger()
 
 
 class TunnelProcess:
-    """Handles messages of the supervisor (the lifeline) and of control until it is stopped or charon dies."""
+    """Handles messages of the supervisor and of control."""
 
     def __init__(self, lifeline: Channel, directory: Path, key: bytes) -> None:
         self._child = Child(lifeline, messages.TunnelLink, said=self._control_said, linked=self._linked)
@@ -77,7 +78,7 @@ class TunnelProcess:
         self.failed = False
 
     async def run(self) -> None:
-        """Serve until the process is stopped or charon dies; set `failed` unless the end was orderly."""
+        """Serve until stopped or charon dies; set `failed` unless the end was orderly."""
         self._loop = asyncio.get_running_loop()
         self._child.attach(messages.Ready())
         self._spawn(self._provision())
@@ -207,7 +208,7 @@ class TunnelProcess:
                 await self._say_how_it_stands(self._vici)
 
     async def _say_how_it_stands(self, vici: ViciClient) -> None:
-        """Report all tunnels. If one changed since charon listed them, it lists them again: the list may be older."""
+        """If a tunnel changed since charon listed them, list again: the list may be older."""
         for _ in range(_LISTINGS):
             changes = self._changes
             seen = await self._in_turn(vici.seen)
@@ -253,7 +254,7 @@ def main(lifeline_fd: int, directory: Path) -> None:
 
 
 def tun_obstacle() -> str:
-    """Return why this process cannot open the TUN device, and what to do; empty if it can."""
+    """Return why the TUN device cannot be opened, and what to do."""
     try:
         os.close(os.open(TUN, os.O_RDWR | os.O_CLOEXEC))
     except OSError as error:

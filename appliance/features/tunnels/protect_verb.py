@@ -143,7 +143,7 @@ def _remove(as_json: bool) -> None:
 
 @dataclass(frozen=True)
 class _CheckTarget:
-    """The target of a check; the result is reported under `name`, or under the address if `name` is None."""
+    """`name` is what the result is reported under, or the address."""
 
     host: str
     name: str | None
@@ -189,7 +189,7 @@ def _check(checked: _CheckTarget, running: Appliance) -> None:
 
 
 def _own(running: Appliance) -> str:
-    """Return the address of the appliance on this machine. Raises `ValueError`."""
+    """Raises `ValueError`."""
     hint = "give its address as this machine sees it: --appliance 192.168.1.20"
     if running.place is not None:
         raise ValueError(f"REST does not know the appliance's address on this machine's network; {hint}")

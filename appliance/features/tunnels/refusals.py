@@ -1,8 +1,8 @@
-"""Parse refusals in charon's log. No I/O.
+"""Parse refusals in charon's log, which reports refused tunnels only there. No I/O.
 
-charon reports refused tunnels only in its log. One worker thread handles a packet from arrival to answer, so the lines
-of that thread in between belong to the packet. If ESP runs in charon, the log also has packets that a tunnel dropped:
-replays, and packets with an address that the tunnel does not permit.
+One worker thread handles a packet from arrival to answer, so the lines of that thread in between belong to the
+packet. If ESP runs in charon, the log also has packets that a tunnel dropped: replays, and packets with an address
+that the tunnel does not permit.
 """
 
 import re
@@ -43,7 +43,7 @@ _LONGEST = 400
 
 @dataclass(frozen=True)
 class Refusal:
-    """A refused host: its address and charon's reasons. `packet`: a tunnel's packet was dropped, not a request."""
+    """An address and charon's reasons. `packet`: a tunnel's packet was dropped, not a request."""
 
     remote: str
     reason: str
@@ -57,13 +57,13 @@ class _Packet:
 
 
 class RefusalParser:
-    """A parser of the log, line by line."""
+    """Reads the log line by line."""
 
     def __init__(self) -> None:
         self._packets: dict[str, _Packet] = {}  # by worker thread; charon has 16 threads
 
     def read(self, line: str) -> Refusal | None:
-        """Return the refusal that this line completes, or None."""
+        """Return the refusal that this line completes."""
         found = _LINE.match(line)
         if found is None:
             return None
@@ -88,7 +88,6 @@ class RefusalParser:
 
 
 def _packet(text: str) -> Refusal | None:
-    """Return the packet that ESP dropped, from the line with its addresses."""
     again = _SENT_AGAIN.match(text)
     if again is not None:
         return Refusal(again[1], "a packet of a tunnel was replayed", packet=True)

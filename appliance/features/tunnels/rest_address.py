@@ -1,4 +1,4 @@
-"""Derive from the configuration the ports at which other machines, and hosts in tunnels, reach REST. No I/O."""
+"""Derive from the configuration where other machines, and hosts in tunnels, reach REST. No I/O."""
 
 from dataclasses import dataclass
 
@@ -13,10 +13,8 @@ NO_TUNNELS = (
 
 @dataclass(frozen=True)
 class RestAddress:
-    """The ports of REST.
-
-    `port` is for other machines; if it is None, `trouble` gives the reason and the remedy. `inner_port` is for hosts in
-    tunnels, at the appliance's tunnel address; None if these hosts cannot reach REST.
+    """`port` is for other machines; if it is None, `trouble` gives the reason and the remedy. `inner_port` is for
+    hosts in tunnels, at the appliance's tunnel address; None if these hosts cannot reach REST.
     """
 
     port: int | None
@@ -39,7 +37,7 @@ def rest_address(settings: Settings) -> RestAddress:
 
 
 def _trouble_outside(settings: Settings, host: str, port: int, *, everywhere: bool) -> str:
-    """Return why other machines cannot reach REST, and what to do; empty if they can."""
+    """Return why other machines cannot reach REST, and what to do."""
     if not everywhere and is_loopback(host):
         return f"REST listens on {host} only: for hosts to enrol themselves set `api: 0.0.0.0:{port}`"
     if not settings.api_published:

@@ -1,7 +1,7 @@
-"""Remove the key of the hosts' authority of a stopped appliance, so that its next start makes another one.
+"""Remove the key of the hosts' authority of a stopped appliance; its next start makes another one.
 
-For a stolen or possibly stolen key: with it, anyone can make certificates of trusted hosts. The key file is overwritten
-first, as by `purge`.
+For a stolen or possibly stolen key: with it, anyone can make certificates of trusted hosts. The key file is
+overwritten first, as by `purge`.
 """
 
 import os
@@ -18,7 +18,7 @@ from appliance.supervisor.state_directory import StateDirectory, foreign
 
 
 def rotate_authority(state: Path) -> None:
-    """Remove key and certificate. Raises `BackupError` if an appliance runs, is one of two, or has no authority."""
+    """Raises `BackupError` if an appliance runs, is one of two, or has no authority."""
     state = state.absolute()
     folder = state / "signer"
     try:

@@ -44,7 +44,7 @@ class HostSelfService:
         }
 
     async def enrol(self, request: host_requests.HostEnrol) -> KitParts:
-        """Enrol a host by its one-time token and a signing request. Raises `HostRefusedError`."""
+        """Raises `HostRefusedError`."""
         async with self._certification.changing:
             try:
                 awaited = self._certification.awaited.take(request.token)
@@ -68,7 +68,7 @@ class HostSelfService:
             return await self._certification.finish(name, awaited.kit)
 
     async def renew(self, request: host_requests.HostRenewItself) -> NewCertificate:
-        """Issue the next certificate to a host that requests it through its tunnel. Raises `HostRefusedError`."""
+        """Raises `HostRefusedError`."""
         name = request.name
         async with self._certification.changing:
             row = self._in_its_tunnel(name, request.peer)
@@ -95,7 +95,7 @@ class HostSelfService:
             )
 
     async def renewed(self, request: host_requests.HostRenewed) -> Renewed:
-        """Replace a host's certificate by the next one, which the host has installed. Raises `HostRefusedError`."""
+        """Raises `HostRefusedError`."""
         name = request.name
         before = self._in_its_tunnel(name, request.peer).serial
         # Without the authority's key the previous certificate could not be put on the list of revoked certificates.
