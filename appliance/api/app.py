@@ -85,7 +85,7 @@ def build_app(services: Services) -> FastAPI:
 
 
 async def _only_known(request: Request) -> None:
-    """Raise `ProblemError` (422) for query parameters that the contract lacks.
+    """Raise `ProblemError` (422) for parameters that the contract lacks.
 
     Pages outside the contract, such as the console, accept any query parameters.
     """
@@ -146,7 +146,7 @@ async def _of_http(request: Request, error: Exception) -> Response:
 
 
 def _methods(request: Request) -> set[str]:
-    """Return the methods that a request's path supports; GET if no route matches."""
+    """Return GET if no route matches."""
     matching = [
         route
         for route in iter_route_contexts(request.app.routes)

@@ -1,7 +1,7 @@
 """Run the api process: its lifeline, its link to control, its certificate, and the listener.
 
-The process ends when the supervisor sends `Stop` or has ended. It outlives control; while control is away, calls that
-need control get 503. If control does not come back, or closed the link because of an invalid message, the api ends and
+The process ends when the supervisor sends `Stop` or has ended. It outlives control; until a new control runs, calls
+that need it get 503. If control does not come back, or closed the link because of an invalid message, the api ends and
 the supervisor starts a new one. Routes and contract are made when the first request passes the gate, so an unused api
 needs little memory.
 """
@@ -52,7 +52,7 @@ def main(lifeline_fd: int, config: Path) -> None:
 
 
 class _Application:
-    """The ASGI application, made at its first call."""
+    """Made at its first call."""
 
     def __init__(self, services: Services) -> None:
         self._services = services
@@ -72,8 +72,6 @@ class _Application:
 
 
 class _Api:
-    """The process: it connects the gate, the application, the listener and the link to control."""
-
     def __init__(self, settings: Settings, lifeline_fd: int) -> None:
         self._settings = settings
         self._lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)

@@ -1,14 +1,14 @@
 """Name the authors of revisions and records, including programs, and the hosts that are charged."""
 
 DISK = "disk"
-"""The author of a change that was read from the disk, at a start or by a signal to the appliance."""
+"""Read from the disk, at a start or by a signal to the appliance."""
 UNCONFIRMED = "not confirmed in time"
 """The author of an automatic rollback. No token has this name or that of `DISK`."""
 
 ROBOT, APPLIANCE, UNKNOWN = "robot", "appliance", "unknown hosts"
-"""An act is charged to these, or to a host or network as the policy names it."""
+"""Acts are charged to these, or to a host or network as the policy names it."""
 
 
 def actor(who: str) -> str:
-    """Return an author as text. The appliance is the author of what no person did."""
+    """The appliance is the author of what no person did."""
     return f"the appliance ({who})" if who in (DISK, UNCONFIRMED) else who

@@ -5,8 +5,7 @@ that trusted the system clock would then delete everything at once.
 
 Invariants:
 
-1. While the process runs, the age clock follows the monotonic clock. It ignores changes of the system clock and never
-   goes back.
+1. While the process runs, the age clock follows the monotonic clock. It ignores changes of the system clock.
 2. Only the system clock shows how long the process was off. A gap of up to `_AT_ONCE` is added at once.
 3. A longer gap is added after the system clock has been ahead for `_STANDS` of running time. The smallest gap seen in
    that time is added. A system clock that is behind adds nothing until someone corrects it.
@@ -32,7 +31,7 @@ _log = structlog.get_logger()
 
 
 class _Kept(msgspec.Struct):
-    """The stored state of the clock; all fields are in nanoseconds."""
+    """In nanoseconds."""
 
     lived: int  # running time of the machine while the process ran
     credited: int  # time since the epoch that counts in addition to `lived`
@@ -43,10 +42,10 @@ class _Kept(msgspec.Struct):
 
 
 class AgeClock:
-    """A callable clock that returns nanoseconds since the epoch, as if the system clock had never been wrong.
+    """Returns nanoseconds since the epoch, as if the system clock had never been wrong.
 
-    The state is stored in the file `path`. Without this file, the clock starts at `begin()`, or at the system time if
-    `begin()` returns None. Raises `OSError` if the file exists but cannot be opened.
+    The state is in the file `path`. Without it, the clock starts at `begin()`, or at the system time. Raises
+    `OSError` if the file exists but cannot be opened.
     """
 
     def __init__(
@@ -72,7 +71,6 @@ class AgeClock:
             self._kept = _Kept(0, begin() or now, now)
 
     def __call__(self) -> int:
-        """Return the current time of this clock."""
         kept, seen = self._kept, self._monotonic()
         kept.lived += seen - self._seen
         self._seen = seen
@@ -90,7 +88,7 @@ class AgeClock:
         return kept.lived + kept.credited
 
     def _was_off(self, ahead: int) -> None:
-        """Add the gap of the system clock as time off, once the gap is credible."""
+        """Add the gap of the system clock, once it is credible."""
         kept, counts = self._kept, 0
         if abs(ahead) <= _AT_ONCE:
             kept.step, counts = 0, max(0, ahead)

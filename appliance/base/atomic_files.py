@@ -10,20 +10,20 @@ from mmap import mmap
 from pathlib import Path
 
 _UNFINISHED = re.compile(r".{1,255}\.[0-9a-f]{8}\.new(-journal)?")
-"""Match the names that `name_to_make` returns, and the journals of databases with such names."""
+"""Names that `name_to_make` returns, and journals of databases with such names."""
 
 
 class NotLastingError(OSError):
-    """A file was replaced but may not be on the disk yet. After a power cut, the old file may be back."""
+    """The file is replaced, but after a power cut the old one may be back."""
 
 
 def name_to_make(path: Path) -> Path:
-    """Return a unique temporary name beside `path`; the finished file is renamed to `path`."""
+    """Unique; the finished file is renamed to `path`."""
     return path.with_name(f"{path.name}.{secrets.token_hex(4)}.new")
 
 
 def remove_unfinished(folder: str, place: int) -> None:
-    """Remove the temporary files of killed writers in `folder`, relative to the descriptor `place`, and below it.
+    """Remove files of killed writers in `folder`, relative to the descriptor `place`, and below it.
 
     No writer may be active. Files that cannot be removed stay; they do not block writers.
     """
@@ -35,7 +35,7 @@ def remove_unfinished(folder: str, place: int) -> None:
 
 
 def write_whole(path: Path, data: bytes | mmap, mode: int, owner: tuple[int, int] | None = None) -> None:
-    """Replace a file and sync it to the disk. Raises `OSError`, which leaves the old file unchanged.
+    """Raises `OSError`, which leaves the old file unchanged.
 
     `owner` (user and group; default: the writer) is set before the file gets its final name. With concurrent writers,
     one complete file remains. Raises `NotLastingError` if the file is replaced but perhaps not on the disk.
@@ -71,7 +71,7 @@ def write_whole(path: Path, data: bytes | mmap, mode: int, owner: tuple[int, int
 
 
 def write_where_told(path: Path, data: bytes | mmap) -> None:
-    """Write data to a path that a person chose. Raises `OSError`.
+    """Raises `OSError`.
 
     A regular file is replaced atomically and keeps its mode and owner, even if `path` is a symbolic link. A pipe, a
     device, or a file with an owner that this process cannot set is written in place. If `path` is the process's own

@@ -11,7 +11,7 @@ _log = structlog.get_logger()
 
 
 async def run_always(what: str, work: Callable[[], Awaitable[object]]) -> None:
-    """Run `work` until it returns or is cancelled; start it again a second after each error.
+    """Start again a second after each error, until `work` returns or is cancelled.
 
     An expected error is handled in `work`. Any other is a defect, which must not end other work of the process: its
     traceback is logged as a fault in `what`.

@@ -1,8 +1,8 @@
 """The clocks of the machine: one that only advances, the system time, and the time since the boot.
 
-Every reading asks the source of the present context. It is the operating system's, unless `using` replaces it: a test
-sets the time, and a simulation of several machines gives each its own. A task, a `call_later` and `asyncio.to_thread`
-keep the source of their creator; a `threading.Thread` begins with the operating system's.
+Every reading asks the source of the present context: the operating system, unless `using` replaces it. A task, a
+`call_later` and `asyncio.to_thread` keep the source of their creator; a `threading.Thread` begins with the operating
+system's.
 """
 
 import time
@@ -16,16 +16,16 @@ _SECOND = 1e9
 
 
 class ClockSource(Protocol):
-    """Where readings come from; all are in nanoseconds."""
+    """All readings are in nanoseconds."""
 
     def now_ns(self) -> int:
-        """Return the monotonic time, which only advances and begins anywhere."""
+        """Only advances; begins anywhere."""
 
     def wall_ns(self) -> int:
-        """Return the system time since the epoch, which people and time services set."""
+        """Since the epoch; people and time services set it."""
 
     def since_boot_ns(self) -> int:
-        """Return the time since the boot, which also counts while the machine is suspended."""
+        """Also counts while the machine is suspended."""
 
 
 class SystemClock:
@@ -45,7 +45,7 @@ _source: ContextVar[ClockSource] = ContextVar("clock", default=_SYSTEM)
 
 @contextmanager
 def using(source: ClockSource) -> Iterator[None]:
-    """Take all readings of the block, and of the tasks that it creates, from this source."""
+    """Tasks that the block creates use the source too."""
     before = _source.set(source)
     try:
         yield
@@ -58,7 +58,7 @@ def source() -> ClockSource:
 
 
 def now() -> float:
-    """Return the monotonic time in seconds: for durations, timeouts and the order of events."""
+    """Monotonic seconds: for durations, timeouts and the order of events."""
     return _source.get().now_ns() / _SECOND
 
 
@@ -67,12 +67,12 @@ def now_ns() -> int:
 
 
 def wall() -> float:
-    """Return the system time in seconds since the epoch: for people, and for dates that others have set."""
+    """Seconds since the epoch: for people, and for dates that others have set."""
     return _source.get().wall_ns() / _SECOND
 
 
 def wall_ns() -> int:
-    """Return the system time in nanoseconds since the epoch."""
+    """Since the epoch."""
     return _source.get().wall_ns()
 
 

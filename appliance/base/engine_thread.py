@@ -15,27 +15,27 @@ Turn = Callable[[float], float | None]
 
 
 class Driver(Protocol):
-    """Calls the turns of one engine. All methods are thread-safe."""
+    """Calls the turns of one engine. Thread-safe."""
 
     def wake(self) -> None:
-        """Call a turn soon, because there is new work."""
+        """There is new work."""
 
     def hurry(self) -> None:
-        """Call a turn at once, because a caller waits."""
+        """A caller waits."""
 
     def end(self, seconds: float | None) -> bool:
-        """Call the last turns at once; return whether the engine ended within `seconds` (None: no limit)."""
+        """Return whether the engine ended within `seconds`."""
 
 
 Drive = Callable[[str, Turn, float], Driver]
-"""Makes a driver of the engine with this name and `turn`, and returns it after the first turn.
+"""Returns a driver of the engine with this name after its first turn.
 
 After `wake`, the driver gathers work for the given number of seconds.
 """
 
 
 class EngineThread:
-    """A thread that calls the turns of an engine until the last one, or until a defect ends a turn."""
+    """A defect also ends the thread."""
 
     def __init__(self, name: str, turn: Turn, gather: float) -> None:
         self._turn = turn
@@ -49,7 +49,7 @@ class EngineThread:
         self._begun.wait()
 
     def wake(self) -> None:
-        """Call a turn after the time for gathering."""
+        """After the time for gathering."""
         if not self._wake.is_set():  # `set` takes a lock
             self._wake.set()
 
@@ -78,15 +78,14 @@ class EngineThread:
 
 
 class InCaller:
-    """Calls the turns of an engine in the thread of its only caller: first, last, and when the caller waits."""
+    """First, last, and when the only caller waits, in its thread."""
 
     def __init__(self, _name: str, turn: Turn, _gather: float) -> None:
         self._turn = turn
         self.due: float | None = None
         self.hurry()
 
-    def wake(self) -> None:
-        """Leave new work to a later turn."""
+    def wake(self) -> None: ...
 
     def hurry(self) -> None:
         time = now()

@@ -7,11 +7,11 @@ import os
 import stat
 
 _SMALL = 64 << 10
-"""The size in bytes up to which a file is overwritten."""
+"""In bytes."""
 
 
 def write_over(name: str, folder: int) -> bool:
-    """Overwrite a small file of an open folder; return False for other files. Raises `OSError`."""
+    """Return False for other files. Raises `OSError`."""
     found = os.stat(name, dir_fd=folder, follow_symlinks=False)
     if not stat.S_ISREG(found.st_mode) or found.st_nlink != 1 or not 0 < found.st_size <= _SMALL:
         return False

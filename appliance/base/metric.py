@@ -6,14 +6,14 @@ BOUNDS = (0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1,
 
 
 class Metric(NamedTuple):
-    """A metric; `name` is its name in Prometheus."""
+    """`name` is that in Prometheus."""
 
     name: str
     kind: Literal["counter", "gauge", "histogram"]
     labels: tuple[str, ...]
     help: str
     bounds: tuple[float, ...] = BOUNDS
-    """The bounds of a histogram in seconds."""
+    """The upper bounds of a histogram, in seconds."""
 
 
 def counter(name: str, help: str, *labels: str) -> Metric:  # noqa: A002  as Prometheus's own client calls it

@@ -1,4 +1,4 @@
-"""Options that several verbs share: the parameters of one function, which makes a value of them."""
+"""Options that several verbs share: the parameters of one function."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class OptionGroup(Generic[T]):
-    """The options that typer reads from the signature of a function."""
+    """typer reads the options from the signature of a function."""
 
     function: Callable[..., T]
 
@@ -28,13 +28,13 @@ class OptionGroup(Generic[T]):
         return tuple(self._command.params)
 
     def value(self, given: Mapping[str, Any]) -> T:
-        """Return the function's value for the parameters of a call; the context has them as `params`."""
+        """`given` are the `params` of the context."""
         made: T = self._command.callback(**{option.name: given[option.name] for option in self.options})
         return made
 
 
 class GroupedCommand(TyperCommand):
-    """A verb with further options before and after its own; its function gets its own, and reads the others' group."""
+    """Options before and after its own are read by the group's function."""
 
     def __init__(
         self,
@@ -54,7 +54,7 @@ class GroupedCommand(TyperCommand):
 
 @dataclass(frozen=True)
 class GroupedVerb:
-    """A verb's function, and a function that makes its command as typer does with a command's class."""
+    """`command` makes the command as typer does with a command's class."""
 
     function: Callable[..., None]
     command: Callable[..., GroupedCommand]

@@ -1,10 +1,10 @@
-"""Open a file that an operator names where only its owner may reach it: in a home of mode 0700, or under umask 077.
+"""Open a file that an operator names where only its owner may reach it.
 
 1. A process first uses its own rights.
 2. Root then acts as the owner of the folder, and after that as the owner of the file. In a container, root lacks
    CAP_DAC_OVERRIDE, so permissions also stop root. The rights of the folder's owner also decide about symbolic links:
-   users cannot have root open another user's file by a link in their own folder. As the owner of the file, root follows
-   no link.
+   users cannot have root open another user's file by a link in their own folder. As the owner of the file, root
+   follows no link.
 3. A role of the appliance asks the supervisor, which opens only the files of the role's row in the table
    (`supervisor/input_lender.py`).
 """
@@ -20,29 +20,29 @@ from typing import ClassVar
 from appliance.base.user_errors import UserError
 
 OPENING = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
-"""The flags with which a named file is opened: a pipe or a device does not block the caller."""
+"""A pipe or a device does not block the caller."""
 
 _PASSING = os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC
 
 
 class MissingRightError(UserError, PermissionError):
-    """Root lacks a right that a container can take away, and nothing else can replace it."""
+    """A container has taken a right from root, and nothing else can replace it."""
 
 
 class FileLender:
-    """The supervisor, as a role sees it: `open` returns an open file, or None if the role may not ask for it."""
+    """`open` returns an open file, or None if the role may not ask for it."""
 
     # A setting of the process, as its user is: each reader of a named file would otherwise have to pass it on.
     open: ClassVar[Callable[[Path], int | None]] = lambda _path: None
 
     @classmethod
     def install(cls, opened: Callable[[Path], int | None]) -> None:
-        """Open files by this function from now on if the process has no right to."""
+        """Used from now on if the process has no right."""
         cls.open = opened
 
 
 def open_named(path: Path) -> int:
-    """Return a descriptor of a file or folder that an operator names. Raises `OSError`."""
+    """Raises `OSError`."""
     try:
         return os.open(path, OPENING)
     except PermissionError:
@@ -56,7 +56,7 @@ def open_named(path: Path) -> int:
 
 
 def is_named_there(path: Path) -> bool:
-    """Return whether a file or folder that an operator names exists, also where root may not look as itself."""
+    """Root may not be able to look as itself."""
     try:
         os.close(open_named(path))
     except (FileNotFoundError, NotADirectoryError):
@@ -67,12 +67,12 @@ def is_named_there(path: Path) -> bool:
 
 
 def open_as_owner(path: Path) -> int:
-    """Open a file or folder with the rights of its folder's owner, or of its own. Raises `OSError`."""
+    """Use the rights of the folder's owner, or of the file's. Raises `OSError`."""
     return _open_in(_folder(path.absolute().parent), path.name, path)
 
 
 def open_below(folder: Path, path: Path) -> int:
-    """Open a path below a folder as `open_as_owner` does; no folder in between may be a link. Raises `OSError`."""
+    """No folder in between may be a link. Raises `OSError`."""
     place = _folder(folder)
     for name in path.relative_to(folder).parent.parts:
         place = _next(place, name, os.O_NOFOLLOW)
@@ -81,7 +81,7 @@ def open_below(folder: Path, path: Path) -> int:
 
 @contextlib.contextmanager
 def acting_as(uid: int) -> Iterator[None]:
-    """Let this thread, and no other, use files and make sockets as another user; without root, change nothing."""
+    """Only this thread; without root, nothing changes."""
     # seteuid would also take root from the other threads.
     if os.geteuid() != 0 or uid == 0:
         yield
@@ -97,7 +97,7 @@ def acting_as(uid: int) -> Iterator[None]:
 
 
 def _folder(path: Path) -> int:
-    """Return a descriptor to pass through a folder, with the rights of the owners of the folders above it."""
+    """For passing through, with the rights of the owners of the folders above."""
     try:
         return os.open(path, _PASSING)
     except PermissionError:

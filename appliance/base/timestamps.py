@@ -8,14 +8,14 @@ _UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86_400, "w": 604_800}
 
 
 class TimestampError(ValueError):
-    """A time cannot be parsed; the message lists the valid forms."""
+    """The message lists the valid forms."""
 
 
 def parse_timestamp(text: str, now: int) -> int:
-    """Return nanoseconds since the epoch. `1h` means one hour before `now`; a time without a zone is UTC.
+    """Return nanoseconds since the epoch; `1h` means one hour before `now`, and a time without a zone is UTC.
 
-    `10:32` is the most recent 10:32; `today` and `yesterday` begin at midnight. A time outside the log's range becomes
-    the nearest end of that range. Raises `TimestampError`.
+    `10:32` is the most recent 10:32; `today` and `yesterday` begin at midnight. A time outside the log's range
+    becomes the nearest end of that range. Raises `TimestampError`.
     """
     ago = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)([smhdw])", text, re.ASCII)
     if ago is not None:
@@ -30,7 +30,7 @@ def parse_timestamp(text: str, now: int) -> int:
 
 
 def _dated(text: str, now: int) -> str:
-    """Replace `today` or `yesterday` by its date, and put a date before a bare time."""
+    """Replace `today` or `yesterday`, and put a date before a bare time."""
     found = re.fullmatch(r"(?:(today|yesterday)(?:[ T](?=.)|$))?(\d\d:\d\d(?::\d\d)?)?", text, re.ASCII)
     if not text or found is None:
         return text
@@ -42,7 +42,7 @@ def _dated(text: str, now: int) -> str:
 
 
 def parse_date(text: str) -> int:
-    """Return the nanoseconds since the epoch of a date or an RFC 3339 time. Raises `ValueError`."""
+    """Nanoseconds since the epoch, of a date or an RFC 3339 time. Raises `ValueError`."""
     # datetime keeps only microseconds. The log prints nanoseconds, and every printed time must be valid input.
     fraction = re.search(r"\.(\d{1,9})", text)
     whole = text if fraction is None else text.replace(fraction[0], "", 1)

@@ -37,7 +37,7 @@ _MUST_BE = {
     "too_long": "{max_length} at most in number",
     "too_short": "{min_length} at least in number",
 }
-"""Descriptions of valid values. The key is pydantic's error type, its first word, or msgspec's type name."""
+"""The key is pydantic's error type, its first word, or msgspec's type name."""
 _BOUNDS = {">=": "at least", "<=": "at most", ">": "more than", "<": "less than"}
 _PARTS = {"str": "characters", "array": "entries", "object": "fields"}
 _BODY: dict[str, Callable[..., str]] = {
@@ -53,7 +53,7 @@ _BODY: dict[str, Callable[..., str]] = {
     r"(?s)Object contains unknown field `(.*)`": lambda name: f"there is no field `{name}`",
     r"Number out of range": lambda: "must be a smaller number",
 }
-"""Patterns of msgspec's messages, and the messages for users."""
+"""msgspec's messages, and those for users."""
 
 
 _YAML = {
@@ -67,7 +67,7 @@ _YAML = {
 
 
 def not_yaml(problem: object) -> str:
-    """Return `is not YAML: ` with the parser's message and advice."""
+    """`is not YAML: ` with the parser's message and advice."""
     said = " ".join(str(problem).split())
     return "; ".join(
         [f"is not YAML: {said}", *[do for what, do in _YAML.items() if re.search(what, said)][:1]]
@@ -75,7 +75,7 @@ def not_yaml(problem: object) -> str:
 
 
 def nearest(word: str, candidates: Collection[str]) -> str | None:
-    """Return the candidate most similar to `word`, or None if no candidate is similar or there are too many."""
+    """None if no candidate is similar or there are too many."""
     if len(candidates) > _MAXIMUM_CANDIDATES or len(word) > 100:
         return None
     folded = {candidate.casefold(): candidate for candidate in candidates}
@@ -84,20 +84,20 @@ def nearest(word: str, candidates: Collection[str]) -> str | None:
 
 
 def meant(word: str, candidates: Collection[str]) -> str:
-    """Return `; did you mean X?` for the nearest candidate, or an empty string."""
+    """`; did you mean X?`, or an empty string."""
     found = nearest(word, candidates)
     return f"; did you mean {found}?" if found else ""
 
 
 def must_be(error: Mapping[str, Any]) -> str:
-    """Return what a value must be, from one of pydantic's `errors()`."""
+    """`error` is one of pydantic's `errors()`."""
     kind, context = str(error["type"]), error.get("ctx") or {}
     wanted = _MUST_BE.get(kind) or _MUST_BE.get(kind.partition("_")[0]) or f"of another type ({kind})"
     return wanted.format(**{name: _plain(value) for name, value in context.items()})
 
 
 def refusal(error: Mapping[str, Any]) -> str:
-    """Return the error message for a command line or query value, from one of pydantic's `errors()`."""
+    """For the command line or a query; `error` is one of pydantic's `errors()`."""
     if error["type"] == "missing":
         return "must be given"
     if error["type"] == "value_error":  # raised by the appliance's own validator, with a complete message
@@ -106,7 +106,7 @@ def refusal(error: Mapping[str, Any]) -> str:
 
 
 def body_refusal(text: str, choices: Collection[str] = ()) -> str:
-    """Return the error message for a part of a body, from msgspec's `ValidationError` without its path.
+    """`text` is msgspec's `ValidationError` without its path.
 
     `choices`: the valid strings of an enumeration.
     """
@@ -128,5 +128,5 @@ def _typed(types: str) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Format a whole number without a fraction; libraries store bounds as `1.0`."""
+    """Libraries store whole bounds as `1.0`."""
     return int(value) if isinstance(value, float) and value.is_integer() else value

@@ -23,14 +23,14 @@ WITHDRAWN = (
 
 
 class WithdrawnError(Exception):
-    """The client gave up before the order took effect; nothing was changed."""
+    """Nothing was changed."""
 
     def __init__(self) -> None:
         super().__init__(WITHDRAWN)
 
 
 class _Order:
-    """An order. `given_up()` returns whether the client stopped waiting; it no longer matters once `begun` is true."""
+    """`given_up()` no longer matters once `begun` is true."""
 
     def __init__(self, given_up: Callable[[], bool]) -> None:
         self.given_up = given_up
@@ -42,7 +42,7 @@ _PRESENT: ContextVar[_Order | None] = ContextVar("order", default=None)
 
 @contextlib.contextmanager
 def awaited(given_up: Callable[[], bool]) -> Iterator[None]:
-    """Run the work for one request as an order; `given_up()` returns whether its client stopped waiting."""
+    """`given_up()`: the client stopped waiting."""
     order = _Order(given_up)
     before = _PRESENT.set(order)
     try:
@@ -60,7 +60,7 @@ def require_awaited() -> None:
 
 
 def take_effect() -> None:
-    """Mark the order as taking effect now. Raises `WithdrawnError` if the client gave up."""
+    """Raises `WithdrawnError` if the client gave up."""
     require_awaited()
     order = _PRESENT.get()
     if order is not None:

@@ -82,7 +82,7 @@ class WaitingRequest(AdminRequest[A], Generic[A], frozen=True):
 
 
 def verb_of(request: AdminRequest[Any]) -> str:
-    """Return the name of a request, which is its `verb` in JSON."""
+    """The name is the `verb` in JSON."""
     return str(type(request).__struct_config__.tag)
 
 
@@ -421,11 +421,11 @@ class ChallengeWanted(AdminRequest[token_answers.Challenge], frozen=True, tag="c
 
 
 CORE_REQUESTS: tuple[type[AdminRequest[Any]], ...] = (TokenAdd, TokenRotate, *rows())
-"""The requests of this module. `channel/operations.py` adds those of features."""
+"""`channel/operations.py` adds the requests of features."""
 
 
 def operation_of(request: AdminRequest[Any]) -> Operation | None:
-    """Return the row of a request, or None if REST does not have the request."""
+    """None if REST does not have the request."""
     given = msgspec.structs.asdict(request)
     for operation in rows().get(type(request), ()):
         if all(given[name] == value for name, value in operation.fixed.items()):
@@ -472,5 +472,5 @@ def answer_to(kind: type[AdminRequest[A]]) -> type[A]:
 
 
 def decode(document: bytes, request: AdminRequest[A]) -> AdminAnswer[A]:
-    """Decode the answer to a request. Raises `ValueError`."""
+    """Raises `ValueError`."""
     return _decoder(type(request)).decode(document)

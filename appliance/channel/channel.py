@@ -4,11 +4,11 @@ A frame is a 4-byte big-endian length, followed by a MessagePack document of thi
 SCM_RIGHTS with the first byte of their frame. The kernel never merges two sends with descriptors, so received
 descriptors are queued in order and assigned to frames in this order.
 
-The channel has no event loop. Its owner waits on `fileno()`, calls `receive()` when it is readable, and `flush()` when
-it is writable. So the same class works with asyncio (`attach`) and with the relay's epoll loop.
+The channel has no event loop. Its owner waits on `fileno()`, calls `receive()` when it is readable, and `flush()`
+when it is writable. So the same class works with asyncio (`attach`) and with the relay's epoll loop.
 
-If the peer does not read, `send` raises `ChannelFullError` beyond `limit` bytes of backlog. Both ends belong to the
-appliance, so this is a defect and not high load.
+If the peer does not read, `send` raises `ChannelFullError` beyond `limit` bytes of backlog: a defect, because both
+ends belong to the appliance.
 """
 
 import os
@@ -43,12 +43,12 @@ class ChannelFullError(Exception):
 
 
 class Channel:
-    """One end of a link. It accepts the messages of `union`, a union of `Message` structs."""
+    """`union` is a union of `Message` structs."""
 
     def __init__(
         self, sock: socket.socket, union: Any, *, limit: int = 64 << 20, longest: int = 64 << 20
     ) -> None:
-        """Wrap a socket. `limit` bounds the unsent backlog, and `longest` each received message, in bytes."""
+        """`limit` bounds the unsent backlog, and `longest` each received message, in bytes."""
         sock.setblocking(False)
         self._socket = sock
         self._encoder = msgspec.msgpack.Encoder()
@@ -70,7 +70,7 @@ class Channel:
         return bool(self._outgoing)
 
     def send(self, message: Message, descriptors: tuple[int, ...] = (), *, soon: bool = False) -> None:
-        """Queue a message, and write as much as the socket accepts. Raises `ChannelFullError`.
+        """Raises `ChannelFullError`.
 
         Descriptors are duplicated; the caller keeps its own. `soon`: an attached channel writes the message within
         `SOON_SECONDS`, together with other messages.
@@ -124,10 +124,10 @@ class Channel:
         return self._outgoing[0]
 
     def receive(self) -> list[tuple[Any, tuple[int, ...]]]:
-        """Return all messages that have arrived completely, with their descriptors. The caller owns the descriptors.
+        """Return all complete messages. The caller owns the descriptors.
 
-        Raises `ChannelClosedError` if the other end is gone. Raises `ValueError` if a message does not belong
-        to this link, is too long, or lacks its descriptors. The link is unusable after this error.
+        Raises `ChannelClosedError` if the other end is gone. Raises `ValueError`, and leaves the link unusable, if a
+        message does not belong to this link, is too long, or lacks its descriptors.
         """
         closed = False
         for _turn in range(_MAX_READS):
@@ -178,9 +178,9 @@ class Channel:
         closed: Callable[[], None],
         refused: Callable[[str], None] | None = None,
     ) -> None:
-        """Serve this end from an asyncio loop: call `received(message, descriptors)` for each message.
+        """Serve this end from an asyncio loop.
 
-        When the other end is gone, `closed()` is called once, after the last message. `send` no longer raises
+        When the other end is gone, `closed()` is called once, after the last message. `send` then raises no
         `ChannelClosedError`. An invalid message closes the channel: `refused(reason)` is called, or `closed()` if
         `refused` is None.
         """
@@ -207,7 +207,7 @@ class Channel:
         self._watch_writable()
 
     def detach(self) -> None:
-        """Leave all further messages in the socket, until the next `attach`."""
+        """Messages stay in the socket until the next `attach`."""
         if self._loop is not None:
             self._loop.remove_reader(self.fileno())
             self._loop.remove_writer(self.fileno())
@@ -241,7 +241,7 @@ class Channel:
         self._backlog = 0
 
     def close(self) -> None:
-        """Close this end, and all received descriptors that no message has claimed."""
+        """Descriptors that no message has claimed are closed too."""
         if self._socket.fileno() < 0:
             return
         if self._loop is not None:

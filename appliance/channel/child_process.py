@@ -1,4 +1,4 @@
-"""The lifeline and the link to control, for all children of the supervisor that serve control.
+"""The lifeline and the link to control, for all children that serve control.
 
 A child answers the supervisor's pings, uses each new link instead of the previous one, and closes unexpected
 descriptors. It ends when the supervisor sends `Stop` or is gone.
@@ -16,7 +16,7 @@ from appliance.channel.messages import Failed, LinkOpened, MemoryGiven, Message,
 
 
 class Child:
-    """The two channels of a child. `said(message)` gets control's messages; `linked()` is called for each new link."""
+    """`said(message)` gets control's messages; `linked()` is called for each new link."""
 
     def __init__(
         self,
@@ -29,7 +29,7 @@ class Child:
         took: Callable[[Any, tuple[int, ...]], None] | None = None,
         memory_given: Callable[[MemoryGiven, int], None] = lambda _given, descriptor: os.close(descriptor),
     ) -> None:
-        """Make the channels. `link` is the union of the messages on the link to control.
+        """`link` is the union of the messages on the link to control.
 
         `lost(reason)` is called when control closes the link or ends. `took(message, descriptors)` gets control's
         messages with descriptors. `memory_given` takes over the descriptor.
@@ -46,7 +46,7 @@ class Child:
         self._answer(ready)
 
     def tell(self, message: Message) -> bool:
-        """Send a message to control. Return False if there is no link.
+        """Return False if there is no link.
 
         If control does not read, close the link and return False: control asks again over its next link.
         """
@@ -57,7 +57,7 @@ class Child:
             return False
 
     def fail(self, reason: str, output: list[str]) -> None:
-        """Report to the supervisor why this process ends, and the last output of the program that it ran."""
+        """`output` is that of the program that this process ran."""
         self._answer(Failed(reason, output))
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""One end of a link to a process that may be restarted. Each life of the process has its own channel."""
+"""One end of a link to a process that may be restarted; each life of the process has its own channel."""
 
 import asyncio
 import itertools
@@ -11,7 +11,7 @@ from appliance.channel.messages import Message
 
 
 class Link:
-    """The link to the present process. `heard(message)` gets its messages, but no messages of an earlier process.
+    """`heard(message)` gets messages of the present process only.
 
     `took(message, descriptors)` gets the messages with descriptors, which it then owns; without it, they are closed.
 
@@ -37,7 +37,6 @@ class Link:
         return len(self._asked)
 
     def attach(self, channel: Channel) -> None:
-        """Use a new channel, and close the present one."""
         self.close()
         self.channel = channel
 
@@ -58,7 +57,7 @@ class Link:
         channel.attach(asyncio.get_running_loop(), received, ended, ended)
 
     def send(self, message: Message, descriptors: tuple[int, ...] = (), *, soon: bool = False) -> bool:
-        """Send a message like `Channel.send`. Return False if the link is not connected. Raises `ChannelFullError`."""
+        """Return False if the link is not connected. Raises `ChannelFullError`."""
         if self.channel is None:
             return False
         self.channel.send(message, descriptors, soon=soon)
@@ -67,7 +66,7 @@ class Link:
     async def ask(
         self, question: Callable[[int], Message], seconds: float, descriptors: tuple[int, ...] = ()
     ) -> Any:
-        """Send a question with a new number, and return the answer. Wait at most `seconds`.
+        """Return the answer to a question with a new number; wait at most `seconds`.
 
         Raises `TimeoutError`, `ChannelFullError`, and `ChannelClosedError` if the process is gone.
         """
@@ -82,20 +81,20 @@ class Link:
             del self._asked[number]
 
     def answered(self, number: int, answer: Any) -> None:
-        """Pass on the answer to the question with this number, unless the question has ended."""
+        """Ignore the answer if its question has ended."""
         future = self._asked.get(number)
         if future is not None and not future.done():
             future.set_result(answer)
 
     def release(self) -> Channel | None:
-        """Return the channel for another link, which gets all further messages; None: not connected."""
+        """The other link gets all later messages; None if not connected."""
         channel, self.channel = self.channel, None
         if channel is not None:
             channel.detach()
         return channel
 
     def close(self) -> None:
-        """Close the channel. Open questions fail."""
+        """Open questions fail."""
         if self.channel is None:
             return
         self.channel.close()

@@ -9,10 +9,10 @@ from appliance.features.table import FEATURES
 REQUESTS = (*CORE_REQUESTS, *(request for feature in FEATURES for request in feature.operations()))
 OPERATIONS = tuple(operation for request in REQUESTS for operation in rows().get(request, ()))
 CHANGES = frozenset(operation.request for operation in OPERATIONS if operation.is_change)
-"""Requests that change something in the name of a token. Control requires the client's HTTP request for each."""
+"""In the name of a token: control requires the client's HTTP request for each."""
 
 ORDERS = CHANGES | {operation.request for operation in OPERATIONS if operation.changes}
-"""All requests that change something over REST, in the name of a token or of a host."""
+"""All changes over REST, in the name of a token or of a host."""
 
 if TYPE_CHECKING:
     RestRequest = AdminRequest[Any]

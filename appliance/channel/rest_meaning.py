@@ -1,7 +1,7 @@
 """Convert HTTP requests to orders, and orders to HTTP requests, by the table of operations.
 
-The api makes an order from each HTTP request. Control derives the order again from the client's HTTP request, and
-carries it out only if both orders are equal. So a compromised api cannot use a proof for another order.
+The api makes an order from each HTTP request, and control derives it again from the client's request and carries it
+out only if both are equal. So a compromised api cannot use a proof for another order.
 
 The api may only fill in the fields in `Operation.filled`. Other fields that a request omits have the defaults in
 `docs/reference/rest.md`.
@@ -28,7 +28,7 @@ _SECOND = 1_000_000_000
 
 
 class NoOrderError(ValueError):
-    """The HTTP request does not define an order; the message gives the reason."""
+    """The message gives the reason."""
 
 
 class BadTagError(NoOrderError):
@@ -36,7 +36,7 @@ class BadTagError(NoOrderError):
 
 
 class RestCall(NamedTuple):
-    """An HTTP request to REST. `match`: it is sent with `If-Match: *`, so it changes any revision in force."""
+    """`match`: it is sent with `If-Match: *`, so it changes any revision in force."""
 
     method: str
     target: str
@@ -49,10 +49,7 @@ def is_dry_run(query: str) -> bool:
 
 
 def meant(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[Any]:
-    """Return the order that an HTTP request defines. With `dry_run`, the request must be a dry run.
-
-    Raises `NoOrderError`.
-    """
+    """With `dry_run`, the request must be a dry run. Raises `NoOrderError`."""
     path, _mark, text = asked.target.partition("?")
     if is_dry_run(text) is not dry_run:
         raise NoOrderError("a dry run changes nothing")
@@ -73,7 +70,7 @@ def meant(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[Any]:
 
 
 def filled_in(order: AdminRequest[Any], given: AdminRequest[Any]) -> AdminRequest[Any]:
-    """Return the order; copy unset fields that the appliance may fill in (`Operation.filled`) from `given`."""
+    """Copy unset fields that the appliance may fill in (`Operation.filled`) from `given`."""
     operation = operation_of(order)
     if operation is None or type(order) is not type(given):
         return order
@@ -83,7 +80,7 @@ def filled_in(order: AdminRequest[Any], given: AdminRequest[Any]) -> AdminReques
 
 
 def call_of(order: AdminRequest[Any], operation: Operation) -> RestCall:
-    """Return the HTTP request for an order, by a row of the table: the inverse of `meant`."""
+    """The inverse of `meant`."""
     values = msgspec.structs.asdict(order)
     path, query = operation.path, []
     for name, field in operation.fields().items():
@@ -119,7 +116,7 @@ def _order(
     *,
     dry_run: bool,
 ) -> AdminRequest[Any] | None:
-    """Return the order, or None if the body belongs to another operation."""
+    """Return None if the body belongs to another operation."""
     fields: dict[str, Any] = dict(operation.fixed)
     for name, field in operation.fields().items():
         if name in named:
@@ -143,7 +140,7 @@ def _order(
 
 
 def _read(kind: Any, given: list[str]) -> Any:
-    """Return the value of a parameter. If the parameter is repeated, the last value counts."""
+    """The last one of a repeated parameter counts."""
     kind = plain(kind)
     if get_origin(kind) is list:
         return given
@@ -153,7 +150,7 @@ def _read(kind: Any, given: list[str]) -> Any:
 
 
 def _moment(field: msgspec.structs.FieldInfo, value: Any) -> Any:
-    """Convert a value of the body. A date in a numeric field becomes seconds or nanoseconds since the epoch."""
+    """A date in a numeric field becomes seconds or nanoseconds since the epoch."""
     kind = plain(field.type)
     if not isinstance(value, str) or kind not in (int, float):
         return value
@@ -177,7 +174,7 @@ def _body(asked: ClientRequest) -> dict[str, Any]:
 
 
 def _tag(operation: Operation, if_match: str) -> str | None:
-    """Return the tag in `If-Match`, or None for `*`. Raises `BadTagError`."""
+    """Return None for `*`. Raises `BadTagError`."""
     assert operation.of is not None  # noqa: S101  a request with `expected` changes something that has an ETag
     given = if_match.strip()
     if given == "*":

@@ -19,19 +19,19 @@ R = TypeVar("R", bound=msgspec.Struct)
 
 
 class RequestParameter(NamedTuple):
-    """The description, bounds and name of a field in the path or the query, for FastAPI."""
+    """For FastAPI: the description, bounds and name of a field in the path or the query."""
 
     name: str
     rules: Mapping[str, Any]
 
 
 def parameter(description: str = "", *, name: str = "", **rules: Any) -> RequestParameter:
-    """Annotate a field that is sent in the path or the query. `name` is its name there, if it differs."""
+    """Annotates a field that is sent in the path or the query; `name` is its name there, if it differs."""
     return RequestParameter(name, {**({"description": description} if description else {}), **rules})
 
 
 def parameter_of(kind: Any) -> RequestParameter:
-    """Return the `RequestParameter` in a field's annotation, or an empty one if the annotation has none."""
+    """Return an empty one if the annotation has none."""
     if get_origin(kind) is Annotated:
         return next(
             (one for one in kind.__metadata__ if isinstance(one, RequestParameter)), RequestParameter("", {})
@@ -40,7 +40,7 @@ def parameter_of(kind: Any) -> RequestParameter:
 
 
 def plain(kind: Any) -> Any:
-    """Return a type without its annotation and without `| None`."""
+    """Remove the annotation, and `| None`."""
     while True:
         if get_origin(kind) is Annotated:
             kind = get_args(kind)[0]
@@ -51,7 +51,7 @@ def plain(kind: Any) -> Any:
 
 
 class Versioned(NamedTuple):
-    """A resource with an ETag. A change of the resource must name the ETag in `If-Match`.
+    """A resource with an ETag, which a change must name in `If-Match`.
 
     `where` is the path that returns the ETag. `changed` describes status 412 in the contract. A change takes at most
     `seconds`.
@@ -69,8 +69,8 @@ class Operation:
 
     A field of the request is sent in the path, in the query, in `If-Match` (`expected`), or otherwise in the body.
 
-    An object is used as a decorator of a request class, and adds a row for this request. If a class has several
-    decorators, the top row is first.
+    As a decorator of a request class, it adds a row for the request. If a class has several decorators, the top row
+    is first.
     """
 
     role: TokenRole | None
@@ -120,7 +120,7 @@ class Operation:
         return bool(self.path) and self.method != "GET"
 
     def fields(self) -> Mapping[str, msgspec.structs.FieldInfo]:
-        """Return the fields of the request by their names in the path and the query."""
+        """By their names in the path and the query."""
         return _fields(self.request)
 
     def in_body(self) -> list[msgspec.structs.FieldInfo]:
@@ -131,7 +131,7 @@ class Operation:
         ]
 
     def least(self, given: Mapping[str, Any], *, dry_run: bool = False) -> tuple[TokenRole, str]:
-        """Return the least role that may send these fields, and the reason if it is not the row's role."""
+        """Return the least role for these fields, and the reason if it is not the row's role."""
         for name, doing in self.admin_with.items():
             if given.get(name):
                 return "admin", f"{doing} is for admins"

@@ -1,4 +1,4 @@
-"""Define the verbs for revisions and commit-confirm, for `rosrv policy` and `rosrv monitor`."""
+"""The verbs for revisions and commit-confirm, for `rosrv policy` and `rosrv monitor`."""
 
 import datetime
 from collections.abc import Callable
@@ -28,12 +28,12 @@ ConfirmWithin = Annotated[
 
 
 def seconds_within(text: str | None, noun: str) -> float | None:
-    """Return the seconds given with --confirm-within of `rosrv noun`. Exits with status 2 if it is not a duration."""
+    """--confirm-within of `rosrv noun`. Exits with status 2 if it is not a duration."""
     return None if text is None else span_given("--confirm-within", text, "30s, 5m or 1h", f"rosrv {noun}")
 
 
 def say_deadline(confirm_by: float | None, noun: str) -> None:
-    """Print when a change rolls back without `rosrv noun confirm`; print nothing for a permanent change."""
+    """Print nothing for a permanent change."""
     if confirm_by is not None:
         say(f"rolls back at {_time(confirm_by)} unless you run: rosrv {noun} confirm", "yellow")
 
@@ -46,7 +46,7 @@ def verbs_of(
     back: Callable[[int | None], AdminRequest[_Done]],
     say_done: Callable[[_Done], None],
 ) -> tuple[GroupedVerb, GroupedVerb, GroupedVerb]:
-    """Return the verbs `revisions`, `rollback` and `confirm` of `rosrv noun`.
+    """`revisions`, `rollback` and `confirm` of `rosrv noun`.
 
     `listed`, `confirmation` and `back(revision)` are their requests; `say_done` prints the result of a rollback.
     """

@@ -36,7 +36,7 @@ topics = _names(admin.GraphWanted(), lambda body: [row.name for row in body.topi
 
 
 def _names_of_feature(verb: str, of: Callable[[Any], Iterable[str]]) -> Complete:
-    """Return a function that completes names with the request of a feature; without the feature there are none."""
+    """Without the feature there are no names."""
 
     def complete(context: typer.Context, incomplete: str) -> list[str]:
         from appliance.channel.operations import request_named  # noqa: PLC0415  only completion needs all features

@@ -19,7 +19,6 @@ _SECONDS = 4.0
 
 
 def main() -> None:
-    """Print why nodes are not served and exit with 1; otherwise print nothing."""
     state = Path(os.environ.get("ROSRV_STATE", _STATE))
     try:
         answer = AdminSocket(state, _SECONDS).ask(StatusWanted())

@@ -28,9 +28,9 @@ def application(
     callback: Callable[..., None] | None = None,
     **settings: Any,
 ) -> typer.Typer:
-    """Return a typer application with these verbs; `callback` takes the options before the verb.
+    """`callback` takes the options before the verb.
 
-    `further` returns more verbs. It is called for the help, for completion and for a name that `verbs` lacks.
+    `further` returns more verbs; it is called for the help, for completion and for a name that `verbs` lacks.
     """
     app = typer.Typer(
         cls=_group_of(verbs, further),
@@ -49,7 +49,7 @@ def _nothing() -> None:
 
 def _group_of(verbs: Verbs, further: Callable[[], Verbs]) -> type[TyperGroup]:
     class _Lazy(TyperGroup):
-        """A group whose commands are imported when they are run."""
+        """Commands are imported when they are run."""
 
         # click sets it
         commands = property(lambda self: self.all_commands, lambda _self, _given: None)
@@ -67,11 +67,11 @@ def _group_of(verbs: Verbs, further: Callable[[], Verbs]) -> type[TyperGroup]:
             return _without_type_of_flags(super().get_params(ctx))
 
         def get_command(self, ctx: Any, cmd_name: str) -> Any:
-            """Return a command; import features only for a command that the core lacks."""
+            """Features are imported only for a command that the core lacks."""
             return self.own_commands.get(cmd_name) or super().get_command(ctx, cmd_name)
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-            """Return the verb. For an unknown name without a close match, list all verbs."""
+            """For an unknown name without a close match, list all verbs."""
             name = args[0]
             if name in self.own_commands:
                 return super().resolve_command(ctx, args)
@@ -105,8 +105,6 @@ def _named(command: Any, name: str) -> Any:
 
 
 class _Deferred(TyperCommand):
-    """A verb that is not imported yet."""
-
     help = property(lambda self: self._verb.help, lambda _self, _given: None)  # click sets it
 
     def __init__(self, verb: Verb, name: str) -> None:
@@ -126,7 +124,6 @@ class _Deferred(TyperCommand):
 
 
 def loaded(verb: Verb, name: str) -> Any:
-    """Import a verb and return its command."""
     found = pkgutil.resolve_name(verb.path)
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     function, kind = (
@@ -142,7 +139,7 @@ def loaded(verb: Verb, name: str) -> Any:
 
 
 def _without_type_of_flags(options: list[Any]) -> list[Any]:
-    """Remove the `<bool>` that typer prints for a flag, which takes no value."""
+    """typer prints `<bool>` for a flag, which takes no value."""
     for option in options:
         if isinstance(option, TyperOption) and option.is_flag:
             option.metavar = ""

@@ -129,7 +129,7 @@ app = application(
 
 
 def main() -> None:
-    """Run the command; print errors as text, never as a traceback."""
+    """Errors are text, never a traceback."""
     _open_closed_streams()
     sys.argv[1:] = _asking_for_help(_without_old_flags(sys.argv[1:]))
     try:
@@ -150,7 +150,7 @@ def main() -> None:
 
 
 def _open_closed_streams() -> None:
-    """Open closed standard streams (`>&-`) on /dev/null, so that no other file gets their descriptors."""
+    """Open closed streams (`>&-`) on /dev/null, so that no other file gets their descriptors."""
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(descriptor, True)
     os.close(descriptor)
@@ -160,17 +160,17 @@ def _open_closed_streams() -> None:
 
 
 _OLD_FLAGS = {"-list": "list", "-rvstate": "rvstate", "-enable": "enable", "-disable": "disable"}
-"""Flags of the original ROSRV, and the verbs of `rosrv monitor` that replace them."""
+"""The flags of the original ROSRV."""
 
 
 def _without_old_flags(arguments: list[str]) -> list[str]:
-    """Translate `rosrv -enable M…` to `rosrv monitor enable M…`."""
+    """`rosrv -enable M…` becomes `rosrv monitor enable M…`."""
     verb = _OLD_FLAGS.get(arguments[0]) if arguments else None
     return arguments if verb is None else ["monitor", verb, *arguments[1:]]
 
 
 def _asking_for_help(arguments: list[str]) -> list[str]:
-    """Translate `rosrv help policy check` and `rosrv policy help check` to `rosrv policy check --help`."""
+    """`rosrv help policy check` and `rosrv policy help check` become `rosrv policy check --help`."""
     if "help" not in arguments[:2]:
         return arguments
     return [*(word for word in arguments[:2] if word != "help"), *arguments[2:], "--help"]

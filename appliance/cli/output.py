@@ -26,12 +26,11 @@ Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one
 
 
 def moment(seconds: float) -> str:
-    """Format a time (seconds since the epoch) for lists: to the minute, in UTC."""
+    """To the minute, in UTC."""
     return datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%MZ")
 
 
 def loaded_by(who: str, seconds: float | None) -> str:
-    """Return who loaded a policy or specifications, and when; those of the disk were read."""
     match who:
         case actors.DISK:
             how = "read from disk"
@@ -43,13 +42,13 @@ def loaded_by(who: str, seconds: float | None) -> str:
 
 
 def usage_error(text: str, verb: str = "rosrv") -> typer.Exit:
-    """Print an error of the command line; the caller raises the result (exit status 2)."""
+    """The caller raises the result (exit status 2)."""
     typer.echo(f"{verb}: {printable(text)}", err=True)
     return typer.Exit(2)
 
 
 def write_told(path: Path, data: bytes | mmap) -> None:
-    """Write to a path that the user chose; warn if the data may not survive a power cut. Raises `OSError`."""
+    """Warn if the data may not survive a power cut. Raises `OSError`."""
     try:
         write_where_told(path, data)
     except NotLastingError as error:
@@ -61,13 +60,13 @@ def say_json(fields: msgspec.Struct | Mapping[str, Any] | tuple[Any, ...]) -> No
 
 
 def say_diff(lines: Iterable[str]) -> None:
-    """Print the lines of a unified diff: additions green, removals red, positions cyan."""
+    """Additions are green, removals red, positions cyan."""
     for line in lines:
         terminal.say(line, {"+": "green", "-": "red", "@": "cyan"}.get(line[:1], ""))
 
 
 def by_host(rows: Iterable[_T], host: Callable[[_T], str]) -> list[tuple[str, list[_T]]]:
-    """Group rows by host: the host with the most rows first, the rows of each host in their order."""
+    """The host with the most rows comes first."""
     found: dict[str, list[_T]] = {}
     for row in rows:
         found.setdefault(host(row), []).append(row)
@@ -75,7 +74,7 @@ def by_host(rows: Iterable[_T], host: Callable[[_T], str]) -> list[tuple[str, li
 
 
 def say_row(parts: Iterable[str], style: str = "") -> None:
-    """Print a row: one line in a pipe; on a terminal, parts that it has no room for are on further, indented lines."""
+    """One line in a pipe; on a terminal, parts without room are on more, indented lines."""
     first, *rest = parts
     width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
     line = first

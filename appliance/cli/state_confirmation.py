@@ -14,7 +14,7 @@ Confirm = Annotated[
 
 
 def confirm_state(state: Path, given: str | None, consequence: str) -> None:
-    """Return if the operator types the state directory, or has given it. Exit with status 1 otherwise.
+    """Exit with status 1 unless the operator types the state directory, or has given it.
 
     `consequence` is what the order does, as a sentence.
     """

@@ -84,7 +84,7 @@ def status(
 
 
 def _look(appliance: Appliance) -> StatusView:
-    """Return the present status. Raises `NotRunningError` also for an appliance that cannot give it now."""
+    """Raises `NotRunningError` also for an appliance that cannot give its status now."""
     answer = _answer(appliance)
     if not answer.ok:
         raise NotRunningError(answer.error)
@@ -92,7 +92,7 @@ def _look(appliance: Appliance) -> StatusView:
 
 
 def _answer(appliance: Appliance) -> AdminAnswer[StatusView]:
-    """Return the status; on a standby, which has none, the state of both appliances. Raises `NotRunningError`."""
+    """A standby has no status: return the state of both appliances. Raises `NotRunningError`."""
     answer = appliance.ask(StatusWanted())
     if answer.trouble == "standby":
         pair = pair_view()
@@ -116,12 +116,12 @@ def _view(body: Status, appliance: Appliance) -> StatusView:
 
 
 def _is_attention(alarm: Alarm, body: Status) -> bool:
-    """Return whether an alarm is shown without being a trouble: recent denials and drops, and silenced alarms."""
+    """Recent denials and drops, and silenced alarms, are shown without being a trouble."""
     return alarm in activity(body) or (alarm.severity == "notice" and alarm.handled != "")
 
 
 def troubles_of(body: Status) -> list[str]:
-    """Return the problems that need attention, most urgent first: alarms except notices, and audit-only sections."""
+    """Most urgent first: alarms except notices, and audit-only sections."""
     return [
         alarm.text
         for alarm in open_alarms(body)
@@ -131,7 +131,7 @@ def troubles_of(body: Status) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class StatusScreen:
-    """A status as text, problems first, then recent denials and drops; its tables have the width of the terminal."""
+    """Problems come first, then recent denials and drops."""
 
     body: Status
     troubles: list[str]
@@ -240,7 +240,7 @@ def _ports(known: dict[str, PortsSeen], host_in_words: HostInWords) -> str:
 
 
 def _others_rules(firewall: FirewallState) -> Iterator[tuple[str, str]]:
-    """Yield rows about other programs' firewall chains on the host (isolation netns); --json lists their names."""
+    """For isolation netns; --json lists the chains' names."""
     translating, dropping = firewall.translations or [], firewall.obstacles or []
     words = []
     if translating:
@@ -263,7 +263,7 @@ def _isolation(body: Status) -> str:
 
 
 def processes_table(rows: Sequence[ProcessInfo], width: int, now: float | None = None) -> Table:
-    """Return the processes in as many columns as fit, read downwards; processes of one role are numbered from 0."""
+    """As many columns as fit, read downwards; processes of one role are numbered from 0."""
     across = max(1, min(3, width // _COLUMN))
     high = -(-len(rows) // across)
     table = table_of(*["process", "pid", "for", "restarts"] * across)
@@ -283,7 +283,7 @@ def _cells(row: ProcessInfo, name: str, now: float | None) -> list[Text]:
 
 
 def missing_sandbox(rows: Sequence[ProcessInfo]) -> str | None:
-    """Return one line with the sandbox limits that this kernel lacks; None if it supports all of them."""
+    """None if this kernel supports all sandbox limits."""
     lacking = [f"{row.role}: {what}" for row in rows for what in row.lacks]
     if not lacking:
         return None
@@ -291,7 +291,7 @@ def missing_sandbox(rows: Sequence[ProcessInfo]) -> str | None:
 
 
 def doubted_clock(clock: ClockState) -> str | None:
-    """Return why the times of records are unreliable; None if they are reliable."""
+    """Why the times of records are unreliable."""
     if clock.before_program_seconds:
         days = clock.before_program_seconds / 86_400
         return f"wrong: {days:.0f} days before this program was built; set it before hosts get certificates"

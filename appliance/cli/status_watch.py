@@ -29,7 +29,7 @@ _MINUTES = slice(11, 19)  # the time of day in RFC 3339
 
 
 class StatusView(NamedTuple):
-    """One status: its exit status, how a terminal shows it, and its JSON object."""
+    """Exit status, how a terminal shows it, and the JSON object."""
 
     exit_status: int
     screen: RenderableType
@@ -40,7 +40,7 @@ Look = Callable[[], StatusView]
 
 
 class _Looks:
-    """Looks at the appliance; while it does not answer, the view has the reason and the time since when."""
+    """While the appliance does not answer, the view has the reason and the time since when."""
 
     def __init__(self, look: Look) -> None:
         self._look = look
@@ -74,7 +74,7 @@ class _Looks:
 
 
 def watched(look: Look, seconds: float, *, as_json: bool) -> int:
-    """Show the status every `seconds` until it is interrupted; return the exit status of the last one.
+    """Show the status until it is interrupted; return the exit status of the last one.
 
     `look` raises `NotRunningError` while the appliance does not answer. Raises `AccessDeniedError`.
     """
@@ -107,7 +107,7 @@ def _print_each(looks: _Looks, seconds: float, console: Console, *, as_json: boo
 
 
 def _redraw(looks: _Looks, seconds: float, console: Console) -> None:
-    """Redraw on the terminal's other screen, also when its size changes; leave the last status on the normal one."""
+    """Redraw on the terminal's other screen; leave the last status on the normal one."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGWINCH})
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # else the terminal would keep the other screen
     view = None

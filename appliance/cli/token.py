@@ -99,7 +99,7 @@ def _say_new(body: NewToken) -> None:
 
 
 def _forget_first(appliance: Appliance, ended: Token) -> None:
-    """Remove the file with the text of the first token if this token, which has ended, is that one."""
+    """Remove the file with the text of the first token if that one has ended."""
     if not isinstance(appliance.way, AdminSocket):
         return
     file = appliance.way.state / "first-token"
@@ -135,7 +135,7 @@ def list_tokens(appliance: Appliance) -> None:
 
 
 def _use(row: Token, since: float | None) -> str:
-    """Return when a token was last used; uses before `since` are unknown."""
+    """Uses before `since` are unknown."""
     if row.last_used is not None:
         return f"last used {moment(row.last_used)}"
     if since is None:

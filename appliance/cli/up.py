@@ -139,7 +139,7 @@ def _write(line: str, *, as_json: bool) -> None:
 
 
 def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
-    """Print that nodes may connect. If the first token cannot be stored, print nothing and raise `StartError`."""
+    """If the first token cannot be stored, print nothing and raise `StartError`."""
     rest = _rest_url(settings)
     more: list[str] = []
     if as_json:
@@ -194,7 +194,7 @@ def _rest_url(settings: Settings) -> str | None:
 
 
 def _keep_token(state: Path, token: str) -> Path:
-    """Write the first token to a file that only its owner can read. Raises `StartError`; no file is then left."""
+    """Only the owner can read the file. Raises `StartError`; no file is then left."""
     path = state / "first-token"
     try:
         path.unlink(missing_ok=True)

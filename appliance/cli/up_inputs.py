@@ -1,8 +1,8 @@
 """Validate the policy and the specifications before `rosrv up` starts anything.
 
-RVMaster reads both again and decides. If an operator loaded a policy or specifications, these survive a restart.
-RVMaster then does not read the file or the folder, so the file or the folder may be invalid. The file of the policy may
-also be invalid if the store has a revision: this one then stays in force.
+RVMaster reads both again and decides. A policy or monitor that an operator loaded survives a restart; RVMaster then
+does not read the file or the folder, which may be invalid. The file of the policy may also be invalid if the store
+has a revision, which then stays in force.
 """
 
 import contextlib
@@ -34,7 +34,7 @@ _LAST_POLICY = """
 
 
 def read_inputs(settings: Settings, robot: str | None = None) -> range:
-    """Validate policy and specifications; return the range of ports that the policy gives to nodes.
+    """Return the range of ports that the policy gives to nodes.
 
     One of two appliances, which knows the address of the `robot`, starts with what was in force on the active one.
 
@@ -48,7 +48,7 @@ def read_inputs(settings: Settings, robot: str | None = None) -> range:
 
 
 def read_node_ports(settings: Settings, robot: str | None = None) -> range:
-    """Return the range of ports that the policy gives to nodes: the policy that RVMaster will bring into force.
+    """Read the policy that RVMaster will bring into force.
 
     Raises `StartError` with every error of the policy file, if there is no policy but this.
     """
@@ -68,7 +68,7 @@ def read_node_ports(settings: Settings, robot: str | None = None) -> range:
 
 
 class _Stored(NamedTuple):
-    """The stored policy and hosts; not `complete`: an earlier run left changes that are not in the database."""
+    """Not `complete`: an earlier run left changes that are not in the database."""
 
     policy: KeptPolicy | None
     hosts: Mapping[str, Address]
@@ -90,9 +90,10 @@ def _stored_in(state: Path) -> _Stored:
 
 
 def _require_specifications(folder: Path, site_keys: Sequence[str], *, kept: bool) -> None:
-    """Raise `StartError` for invalid specifications, unless a revision is kept, which then stays in force.
+    """Raise `StartError` unless a revision is kept, which then stays in force.
 
-    Compile in a child process, because this process becomes the supervisor and would keep the compiler's memory."""
+    A child process compiles, because this process becomes the supervisor and would keep the compiler's memory.
+    """
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
@@ -141,7 +142,7 @@ def _errors_in(folder: Path, site_keys: Sequence[str], *, kept: bool) -> str:
 
 
 def _last_author(state: Path) -> str:
-    """Return the author of the last stored specifications; `DISK` if they were read from the folder, empty without any.
+    """`DISK` means that they were read from the folder.
 
     A question mark means unknown: an earlier run may have left changes that are not in the database yet.
     """

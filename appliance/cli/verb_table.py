@@ -1,4 +1,4 @@
-"""Define the rows of the tables of verbs, without importing a verb."""
+"""The rows of the tables of verbs, without importing a verb."""
 
 import functools
 from collections.abc import Mapping
@@ -8,10 +8,10 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True)
 class Verb:
-    """A verb's function (`module:function`); in the help, `first` precedes its docstring.
+    """`place` is `module:function`; in the help, `first` precedes its docstring.
 
-    `module` is relative to this folder; a feature gives its whole name. The help lists a feature's verb `after` another
-    one.
+    `module` is relative to this folder; a feature gives its whole name. The help lists a feature's verb `after`
+    another one.
     """
 
     place: str
@@ -25,7 +25,7 @@ class Verb:
 
     @property
     def help(self) -> str:
-        """Return the first sentence of the help, read without importing the module."""
+        """The module is not imported."""
         module, _colon, function = self.path.partition(":")
         file = _PACKAGES.joinpath(*module.split(".")).with_suffix(".py")
         return self.first or _first_sentence(file, function)
@@ -33,7 +33,7 @@ class Verb:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """A command with its own verbs, such as `rosrv audit`. The help lists a feature's command `after` another one.
+    """A command with its own verbs, such as `rosrv audit`; `after` as in `Verb`.
 
     A feature adds verbs to a command of the core with a group of the same name, and leaves `help` empty.
     """
@@ -45,12 +45,11 @@ class Group:
 
 Verbs = Mapping[str, Verb | Group]
 FIRST = "(first)"
-"""In place of the name in `after`: before all others."""
+"""For `after`: before all others."""
 _PACKAGES = Path(__file__).parents[2]
 
 
 def joined(core: Verbs, features: Verbs) -> Verbs:
-    """Return a table with the verbs of features, each at its place."""
     table = list(core.items())
     for name, added in features.items():
         names = [known for known, _verb in table]

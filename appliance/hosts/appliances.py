@@ -8,7 +8,7 @@ CERTIFICATE_DAYS = 90.0
 
 
 class Appliances:
-    """This appliance, and for one of two also the `other` one (`paired`)."""
+    """One of two appliances also has the `other` one (`paired`)."""
 
     paired = False
 
@@ -20,22 +20,20 @@ class Appliances:
 
     @property
     def other(self) -> ApplianceRow | None:
-        """Return the other appliance; None if it has not introduced itself."""
+        """None if it has not introduced itself."""
         return None
 
     async def until_introduced(self) -> None:
         """Wait a moment for the other appliance of two."""
 
     def certificate(self, key: str) -> bytes:
-        """Return the stored valid certificate for an appliance's tunnel key, in PEM; empty if there is none."""
+        """Valid for the tunnel key, in PEM; empty if there is none."""
         del key
         return b""
 
     def is_served(self, pin: str) -> None:
-        """Note the pin of this appliance's REST server."""
+        """`pin` is that of this appliance's REST server."""
 
-    def note_own(self, key: str) -> None:
-        """Note which tunnel key is this appliance's own."""
+    def note_own(self, key: str) -> None: ...
 
-    def certified(self, key: str, made: CertificateMade) -> None:
-        """Take the new certificate for this appliance's own key."""
+    def certified(self, key: str, made: CertificateMade) -> None: ...

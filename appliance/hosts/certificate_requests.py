@@ -13,7 +13,7 @@ M = TypeVar("M", messages.AuthorityStated, messages.CertificateMade, messages.Re
 
 
 class AuthorityError(Exception):
-    """Report a request without a result. `refused`: the authority rejected the request; otherwise it did not answer."""
+    """`refused`: the authority rejected the request; otherwise it did not answer."""
 
     def __init__(self, reason: str, *, refused: bool = False) -> None:
         super().__init__(reason)
@@ -21,7 +21,7 @@ class AuthorityError(Exception):
 
 
 class Authority:
-    """A client of the authority; every method raises `AuthorityError` for a rejection or a missing answer."""
+    """Every method raises `AuthorityError` for a rejection or a missing answer."""
 
     def __init__(self, signer: Link) -> None:
         self._signer = signer
@@ -32,7 +32,7 @@ class Authority:
     async def issue(
         self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> messages.CertificateMade:
-        """Return a certificate in this name for the key of a signing request.
+        """`request` is a signing request.
 
         If `former` (a certificate in PEM) is given, `proof` must be a signature over the request by that
         certificate's key.
@@ -43,7 +43,7 @@ class Authority:
         )
 
     async def revocations(self, revoked: list[tuple[str, float]]) -> bytes:
-        """Return the signed list (PEM) of these serial numbers and times of revocation."""
+        """PEM, of serial numbers and times."""
         rows = [messages.RevokedCertificate(serial, moment) for serial, moment in revoked]
         made = await self._ask(
             lambda number: messages.RevocationsRequest(number, rows), messages.RevocationsMade

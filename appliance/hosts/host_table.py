@@ -33,7 +33,7 @@ MOST_MACHINES = 1024
 
 
 class HostRefusedError(Exception):
-    """Report a rejected request, with the reason. `ours`: the appliance, not the request, is the cause."""
+    """The text has the reason. `ours`: the appliance, not the request, is the cause."""
 
     def __init__(self, reason: str, *, ours: bool = False) -> None:
         super().__init__(reason)
@@ -41,19 +41,19 @@ class HostRefusedError(Exception):
 
 
 class UnknownHostError(HostRefusedError):
-    """Report an unknown host."""
+    """No host has this name."""
 
 
 class HostForbiddenError(HostRefusedError):
-    """Report a request that the caller may not make."""
+    """The caller may not make this request."""
 
 
 class HostsChangedError(Exception):
-    """Report a change that expects another revision of the table."""
+    """A change expects another revision of the table."""
 
 
 class HostTable:
-    """All hosts that were ever enrolled; `own_address` is the appliance's, the first of the pool."""
+    """`own_address` is the appliance's, the first of the pool."""
 
     def __init__(self, store: StateStore, pool: ipaddress.IPv4Network, declared: DeclaredHosts) -> None:
         self._store = store
@@ -71,7 +71,7 @@ class HostTable:
         return str(self.pool.network_address + 1)
 
     def require(self, expected: int | None) -> None:
-        """Raise `HostsChangedError` if a change expects another revision of the table."""
+        """Raise `HostsChangedError` for another revision."""
         if expected not in (None, self.revision):
             raise HostsChangedError(f"the table of hosts has revision {self.revision}, not {expected}")
 
@@ -88,11 +88,11 @@ class HostTable:
         return [row for row in self.enrolled() if self.declared.wants(row.name)]
 
     def addresses(self) -> dict[str, Address]:
-        """Return the addresses that `host:NAME` means in the policy while the tunnels are open."""
+        """`host:NAME` means these in the policy while the tunnels are open."""
         return {row.name: ipaddress.ip_address(row.address) for row in self.admitted()}
 
     def enrolled_row(self, name: str) -> HostRow:
-        """Return an enrolled host. Raises `UnknownHostError`."""
+        """Raises `UnknownHostError`."""
         row = self.rows.get(name)
         if row is None or row.revoked is not None:
             known = ", ".join(host.name for host in self.enrolled()[:20]) or "none"
@@ -106,11 +106,11 @@ class HostTable:
         return self.revoked.listed(self._enrolled_names())
 
     def missing_as_revoked(self) -> int:
-        """Return the number of enrolled hosts' revoked certificates that do not fit on the list."""
+        """Revoked certificates of enrolled hosts that do not fit on the list."""
         return self.revoked.missing(self._enrolled_names())
 
     def require_room(self, name: str) -> None:
-        """Raise `HostRefusedError` if the list of revoked certificates has no room for another entry of this name."""
+        """Raise `HostRefusedError` if the list of revoked certificates is full."""
         if name not in self.rows:
             return
         until = self.revoked.wait_for_room(self._enrolled_names() | {name})
@@ -127,7 +127,7 @@ class HostTable:
     # --- names and addresses ---
 
     def require_name(self, name: str) -> None:
-        """Raise `HostRefusedError` if a host cannot have this name, or there are too many hosts."""
+        """Raise `HostRefusedError` for an unusable name, or too many hosts."""
         if not _NAME.fullmatch(name) or name.lower() == APPLIANCE_NAME:
             raise HostRefusedError(
                 f"{name[:80]!r} is not a valid host name: letters, digits and . _ -, beginning and ending with a"
@@ -140,7 +140,7 @@ class HostTable:
             raise HostRefusedError(f"the table is full: {MOST_HOSTS} hosts, including revoked ones")
 
     def address_for(self, name: str, wanted: str | None, awaited: dict[str, str]) -> str:
-        """Return the address for a host; `awaited` maps addresses that tokens reserve to the names of their hosts.
+        """`awaited` maps addresses that tokens reserve to names.
 
         Raises `HostRefusedError`.
         """
@@ -185,7 +185,7 @@ class HostTable:
         return row
 
     def keep_next(self, name: str, made: CertificateMade) -> None:
-        """Store the certificate that will follow a host's present one."""
+        """It will follow the present certificate."""
         row = self.certificates.get(name)
         before = row.certificate if row is not None else ""
         since = row.made if row is not None else clock.wall()
@@ -196,7 +196,7 @@ class HostTable:
         self.changed()
 
     def take_next(self, name: str) -> HostRow | None:
-        """Replace a host's certificate with its stored successor; return None if no successor is stored."""
+        """None if no successor is stored."""
         row, certificate = self.rows[name], self.certificates.get(name)
         if certificate is None or certificate.next is None:
             return None
@@ -214,7 +214,7 @@ class HostTable:
         return self._set(row._replace(revoked=clock.wall()))
 
     def keep_ports(self, row: PortsRow) -> None:
-        """Keep the result of a check of a machine's ports. Raises `HostRefusedError`."""
+        """Raises `HostRefusedError`."""
         if row.name not in self.ports and len(self.ports) >= MOST_MACHINES:
             raise HostRefusedError(f"the limit of {MOST_MACHINES} machines with known ports is reached")
         self.ports[row.name] = row

@@ -40,12 +40,12 @@ _GROUP = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 
 
 class DeclaredHostsError(Exception):
-    """Report an invalid file; the text has each location, its mistake, and a valid value to write."""
+    """The text has each location, its mistake, and a valid value."""
 
 
 @dataclass(frozen=True)
 class DeclaredHost:
-    """A declared host; `wanted`: its tunnel may be open."""
+    """`wanted`: the tunnel may be open."""
 
     name: str
     address: str | None
@@ -54,9 +54,9 @@ class DeclaredHost:
 
 
 class DeclaredHosts:
-    """The file's last valid content, or that of a bundle; `error` is the reason if the text is invalid now.
+    """`error` is the reason if the text is invalid now.
 
-    `bundled` is the text of a bundle; empty: the file is in use. `text` is the file's last valid text. At a start it is
+    `bundled` is the text of a bundle, in place of the file. `text` is the file's last valid text. At a start it is
     the stored one, which is used if the file is invalid now.
     """
 
@@ -77,11 +77,11 @@ class DeclaredHosts:
 
     @property
     def there(self) -> bool:
-        """Whether any host is declared. Without declared hosts, none can diverge from the file."""
+        """Without declared hosts, none can diverge from the file."""
         return bool(self.hosts)
 
     def reload(self) -> None:
-        """Read the file again. Raises `DeclaredHostsError`; the earlier content is then kept."""
+        """Raises `DeclaredHostsError`; the earlier content is then kept."""
         try:
             self.text, self.hosts = _read(self.path)
         except DeclaredHostsError as error:
@@ -90,7 +90,7 @@ class DeclaredHosts:
         self.error = self.bundled = ""
 
     def take(self, text: str) -> None:
-        """Use the text of a bundle instead of the file. Raises `DeclaredHostsError`; then nothing changes."""
+        """The text is that of a bundle. Raises `DeclaredHostsError`; then nothing changes."""
         self.hosts = parse_declared(text, IN_BUNDLE)
         self.error, self.bundled = "", text or "\n"
 
@@ -104,7 +104,7 @@ class DeclaredHosts:
 
 
 def read_declared(path: Path) -> dict[str, DeclaredHost]:
-    """Return the declared hosts by name; none without a file. Raises `DeclaredHostsError`."""
+    """By name; none without a file. Raises `DeclaredHostsError`."""
     return _read(path)[1]
 
 
@@ -120,7 +120,7 @@ def _read(path: Path) -> tuple[str, dict[str, DeclaredHost]]:
 
 
 def parse_declared(text: str, path: str) -> dict[str, DeclaredHost]:
-    """Return the hosts that a text declares, by name; `path` is its name in errors. Raises `DeclaredHostsError`."""
+    """By name; `path` is the name in errors. Raises `DeclaredHostsError`."""
     if len(text) > _LARGEST:
         raise DeclaredHostsError(f"{path}: longer than {_LARGEST} characters")
     reading = _Reading()
@@ -180,7 +180,7 @@ _KEYS: dict[str, Callable[[object], object]] = {
 
 
 class _Reading:
-    """The hosts found in the file, and each mistake with its line and column."""
+    """Each mistake has its line and column."""
 
     def __init__(self) -> None:
         self.found: dict[str, DeclaredHost] = {}

@@ -1,4 +1,4 @@
-"""Use the authority of hosts' certificates, and store its certificate, so that another authority is noticed."""
+"""Use the authority of hosts' certificates, and notice if it is replaced."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ from appliance.store.host_tables import AuthorityRow, HostTables
 
 
 class StoredAuthority:
-    """The authority, by the signer of this appliance. `replaced()` is called if it is another one than before.
+    """`replaced()` is called if the authority is another one than before.
 
     Every method raises `AuthorityError`.
     """
@@ -23,7 +23,7 @@ class StoredAuthority:
 
     @property
     def waits(self) -> str:
-        """Return what cannot be done without the authority's key, and until when tunnels open; empty: nothing."""
+        """The text says what needs the authority's key, and until when tunnels open."""
         return ""
 
     async def certificate(self) -> bytes:
@@ -40,7 +40,7 @@ class StoredAuthority:
         return kept.certificate == own.decode()
 
     async def obstacle(self) -> str:
-        """Return why this appliance cannot issue certificates; empty if it can."""
+        """Why this appliance cannot issue certificates."""
         await self.certificate()
         return ""
 
@@ -51,7 +51,7 @@ class StoredAuthority:
         return await self._signer.issue(request, name, days, proof=proof, former=former)
 
     async def require_key(self) -> None:
-        """Raise `AuthorityError`, with the remedy, if this appliance cannot issue certificates."""
+        """Raise `AuthorityError`, with the remedy."""
         if obstacle := await self.obstacle():
             raise AuthorityError(obstacle)
 

@@ -12,11 +12,11 @@ class TunnelHosts:
 
     @property
     def bundled(self) -> str:
-        """Return the bundle's text that is used instead of hosts.yaml; empty if there is none."""
+        """The bundle's text that is used instead of hosts.yaml."""
         return self._text
 
     async def take_bundle(self, text: str, who: str) -> object:
-        """Use a bundle's text instead of hosts.yaml (empty: the file again). Raises `HostRefusedError`."""
+        """An empty text stands for the file. Raises `HostRefusedError`."""
         del who
         if text.strip():
             raise HostRefusedError("the bundle declares hosts, and this appliance has no tunnels")
@@ -24,18 +24,17 @@ class TunnelHosts:
         return None
 
     async def read_again(self, who: str) -> None:
-        """Read hosts.yaml again. Raises `HostRefusedError` and `StoreError`."""
+        """Read hosts.yaml. Raises `HostRefusedError` and `StoreError`."""
 
     def status(self) -> IpsecState:
-        """Return the state of the tunnels for `rosrv status`."""
         return IpsecState(
             esp=None, key_exchange=[], post_quantum=None, charon=None, pool="", address="", hosts_file="",
             enrolled=0, awaited=0, up=0, troubles=[], ports={},
         )  # fmt: skip
 
     def rows(self) -> list[Host]:
-        """Return every host, enrolled, awaited or declared."""
+        """Enrolled, awaited or declared."""
         return []
 
     def served_by(self, pin: str) -> None:
-        """Store the pin by which hosts recognise the api."""
+        """Hosts recognise the api by the pin."""

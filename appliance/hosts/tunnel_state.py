@@ -36,10 +36,7 @@ _SIGNED_SECONDS = 60.0
 
 
 class SignedRevocations:
-    """The signed list of revoked certificates.
-
-    It is signed again when it is requested and the table of hosts has changed or a new minute has begun.
-    """
+    """Signed again when it is requested and the table of hosts has changed or a new minute has begun."""
 
     def __init__(self, table: HostTable, authority: StoredAuthority) -> None:
         self._table = table
@@ -49,7 +46,7 @@ class SignedRevocations:
         self._signed = b""
 
     async def signed(self) -> bytes:
-        """Return the list in PEM. Raises `AuthorityError`."""
+        """PEM. Raises `AuthorityError`."""
         async with self._one_at_a_time:
             state = (self._table.revision, int(clock.wall() // _SIGNED_SECONDS))
             if state != self._state:
@@ -106,7 +103,7 @@ class Tunnels:
 
     @property
     def esp(self) -> messages.Esp | None:
-        """Return where ESP runs; None if no tunnels are open."""
+        """None if no tunnels are open."""
         return None if self._enclosed is None else self._enclosed.esp
 
     @property
@@ -122,7 +119,7 @@ class Tunnels:
         return self._table.addresses() if self.enclosed else {}
 
     async def start(self) -> None:
-        """Open tunnels if hosts are enrolled; log a failure. Call this before nodes are served."""
+        """Log a failure. Call this before nodes are served."""
         if not self._table.admitted():
             return
         try:
@@ -135,7 +132,7 @@ class Tunnels:
         self._answered.set()
 
     async def open(self) -> None:
-        """Make the supervisor block clear text for the pool, unless it does already. Raises `HostRefusedError`."""
+        """The supervisor blocks clear text for the pool. Raises `HostRefusedError`."""
         async with self._opening:
             if self.enclosed:
                 return
@@ -158,7 +155,7 @@ class Tunnels:
     # --- the process that runs charon ---
 
     def attach(self, link: Channel, needed: messages.CertificateNeeded | None = None) -> None:
-        """Serve a new process for charon; the process first requests its certificate, unless it already `needed` it."""
+        """A new process first requests its certificate, unless it already `needed` it."""
         self._certificate = self.charon = None
         self._link.attach(link)
         if needed is not None:
@@ -169,7 +166,7 @@ class Tunnels:
         self._dirty.set()
 
     async def run(self, each_hour: Callable[[], None]) -> None:
-        """Send charon its configuration: after a change, when a certificate ends, and every hour with a new list.
+        """After a change, when a certificate ends, and every hour with a new list.
 
         `each_hour()` is called before each update.
         """
@@ -187,13 +184,13 @@ class Tunnels:
                 asyncio.get_running_loop().call_later(self._again(), self._dirty.set)
 
     def _until_it_changes(self) -> float:
-        """Return the seconds until the next certificate ends, at most an hour. charon does not close its tunnel."""
+        """Seconds, at most an hour. charon does not close the tunnel of an ended certificate."""
         now = clock.wall()
         ends = [row.expires - now for row in self._table.admitted() if row.expires > now]
         return min([_RESTATE_SECONDS, *(end + _JUST_AFTER_SECONDS for end in ends)])
 
     async def until_taken(self) -> bool:
-        """Wait until charon has confirmed the last `state_anew`; return False if it does not in time."""
+        """Return False if charon does not confirm the last `state_anew` in time."""
         wanted = self._changes
         deadline = clock.now() + _TAKEN_SECONDS
         while self._taken_changes < wanted:
@@ -267,7 +264,7 @@ class Tunnels:
         return _AGAIN_SECONDS[min(self._failures, len(_AGAIN_SECONDS)) - 1]
 
     async def _own_certificate(self, needed: messages.CertificateNeeded) -> bytes:
-        """Return a new certificate; without the authority's key, the one that the other appliance issued before."""
+        """Without the authority's key, return the one that the other appliance issued before."""
         obstacle = await self._authority.obstacle()
         kept = self._appliances.certificate(needed.key) if obstacle else b""
         if kept:
@@ -310,7 +307,7 @@ class Tunnels:
             self.seen[name] = row
 
     def _look_where(self, row: messages.TunnelSeen) -> None:
-        """Record a host whose outer address changed. The tunnel stays open, but a stolen kit would look the same."""
+        """The tunnel of a moved host stays open, but a stolen kit would look the same."""
         before = self.seen[row.name].remote
         if row.remote != before:
             self._trail.happened(

@@ -14,7 +14,7 @@ FOLDER = "joined"  # of the signer's directory
 
 
 def open_authority(directory: Path, kind: Kind, passphrase: bytes | None) -> tuple[CertificateAuthority, str]:
-    """Return the joined authority if its key can be used, else the appliance's own, with the reason (empty: none).
+    """Without a usable key, return the appliance's own authority with the reason.
 
     Raises `SignerKeyError` and `OSError` if the appliance's own authority cannot be used.
     """

@@ -5,11 +5,11 @@ from pathlib import Path
 
 
 class SignerKeyError(Exception):
-    """Report an unusable key file; the message has its path, the reason and the remedy."""
+    """The message has the path, the reason and the remedy."""
 
 
 def require_private(path: Path) -> None:
-    """Raise `SignerKeyError` if others may read a private key."""
+    """Raise `SignerKeyError` if others may read the key."""
     mode = path.stat().st_mode
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
         raise SignerKeyError(

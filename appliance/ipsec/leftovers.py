@@ -17,11 +17,11 @@ _PORT = "4500"
 
 
 class LeftoversError(Exception):
-    """Report states or policies that could not be removed from the kernel."""
+    """The kernel did not remove states or policies."""
 
 
 def clear_leftovers(own: str) -> int:
-    """Remove the leftovers in the calling thread's network namespace, where charon must not run; return their number.
+    """In the calling thread's network namespace, where charon must not run; return their number.
 
     `own` is the appliance's address in the tunnels. Raises `LeftoversError`.
     """
@@ -35,7 +35,7 @@ def clear_leftovers(own: str) -> int:
 
 
 def state_orders(listed: str) -> list[str]:
-    """Return the commands that delete charon's states, from the output of `ip xfrm state list nokeys`."""
+    """Delete charon's states in the output of `ip xfrm state list nokeys`."""
     starts = [*(found.start() for found in re.finditer(r"^src ", listed, re.MULTILINE)), len(listed)]
     orders = []
     for begin, end in itertools.pairwise(starts):
@@ -47,7 +47,7 @@ def state_orders(listed: str) -> list[str]:
 
 
 def policy_orders(listed: str, own: str) -> list[str]:
-    """Return the commands that delete the policies from and to `own`, from the output of `ip xfrm policy`."""
+    """Delete the policies from and to `own` in the output of `ip xfrm policy`."""
     return [
         f"xfrm policy delete src {source} dst {destination} dir {direction}"
         for source, destination, direction in _POLICY.findall(listed)

@@ -12,7 +12,7 @@ LONGEST_PROOF = 1024  # bytes
 
 
 class RequestRefusedError(Exception):
-    """Report why no certificate is issued."""
+    """No certificate is issued."""
 
 
 def require_proof(
@@ -24,7 +24,7 @@ def require_proof(
     authority: x509.Certificate,
     now: datetime.datetime,
 ) -> None:
-    """Raise `RequestRefusedError` unless the key of `former` (PEM) signed the bytes of the request.
+    """Raise `RequestRefusedError` unless the key of `former` (PEM) signed the request.
 
     `former` must be a valid certificate of the authority in this name. ECDSA signs with SHA-384.
     """

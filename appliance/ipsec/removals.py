@@ -16,13 +16,13 @@ from appliance.ipsec.signed_checkpoints import CheckpointMemory, read_checkpoint
 from appliance.signing.log_proof import Checkpoint, Removal, checkpoint_hash
 
 LARGEST_RECORD = 64 << 10
-"""Bytes of a record with the largest details; the average is smaller."""
+"""Bytes, with the largest details; the average is smaller."""
 
 _DAY = 86_400_000_000_000
 
 
 class RemovalRefusedError(Exception):
-    """Report a removal that does not follow from the settings. `early`: it may be permitted later."""
+    """`early`: the removal may be permitted later."""
 
     def __init__(self, reason: str, *, early: bool = False) -> None:
         super().__init__(reason)
@@ -31,14 +31,14 @@ class RemovalRefusedError(Exception):
 
 @dataclass(frozen=True)
 class RetentionLimits:
-    """The configured limits of age (days) and size (bytes); None: no limit."""
+    """Age in days, size in bytes."""
 
     days: float | None = None
     size: int | None = None
 
 
 class RemovalApprover:
-    """Approves removals by the memory of signatures `signed` and the limits `kept`."""
+    """By the memory of signatures `signed` and the limits `kept`."""
 
     def __init__(self, signed: CheckpointMemory, kept: RetentionLimits, clock: Callable[[], int]) -> None:
         self._signed = signed
@@ -46,7 +46,7 @@ class RemovalApprover:
         self._clock = clock
 
     def approve(self, checkpoint: bytes, newest: bytes) -> bytes:
-        """Return the text to sign for the removal of all records up to `checkpoint`.
+        """Return the text to sign.
 
         `checkpoint` and `newest`, the last signed checkpoint, are checkpoint texts. Raises `RemovalRefusedError`,
         `CheckpointRefusedError`, `OSError`.

@@ -24,11 +24,11 @@ _NUMBER = 8
 
 
 class CheckpointRefusedError(Exception):
-    """Report why a checkpoint must not be signed."""
+    """The checkpoint must not be signed."""
 
 
 def read_checkpoint(text: bytes) -> Checkpoint:
-    """Parse a checkpoint. Raises `CheckpointRefusedError`."""
+    """Raises `CheckpointRefusedError`."""
     try:
         return parse_checkpoint(text)
     except ValueError:
@@ -36,7 +36,7 @@ def read_checkpoint(text: bytes) -> Checkpoint:
 
 
 def newest_signing(directory: Path) -> int | None:
-    """Return the time of the last signature (ns since the epoch), or None."""
+    """In nanoseconds since the epoch."""
     times = (path.read_bytes() for path in directory.glob("*.times"))
     return max(
         (int.from_bytes(kept[-_NUMBER:], "big") for kept in times if len(kept) > _NUMBER), default=None
@@ -44,14 +44,14 @@ def newest_signing(directory: Path) -> int | None:
 
 
 class CheckpointMemory:
-    """The memory of one signer, in its directory; `clock` gives nanoseconds since the epoch."""
+    """`clock` gives nanoseconds since the epoch."""
 
     def __init__(self, directory: Path, clock: Callable[[], int]) -> None:
         self._directory = directory
         self._clock = clock
 
     def approve(self, text: bytes) -> None:
-        """Remember a checkpoint as signed. Raises `CheckpointRefusedError`, `OSError`."""
+        """Raises `CheckpointRefusedError`, `OSError`."""
         wanted = read_checkpoint(text)
         path = self._path(wanted.log, "signed")
         if not path.exists():
@@ -73,7 +73,7 @@ class CheckpointMemory:
             os.close(descriptor)
 
     def signed_at(self, checkpoint: Checkpoint) -> int | None:
-        """Return the time of this checkpoint's signing, or None. Without a stored time, return the checkpoint's own."""
+        """Without a stored time, return the checkpoint's own."""
         path = self._path(checkpoint.log, "signed")
         if not path.exists():
             return None
@@ -88,7 +88,7 @@ class CheckpointMemory:
         return int.from_bytes(moment, "big") if len(moment) == _NUMBER else checkpoint.time
 
     def removed(self, log: str) -> int | None:
-        """Return the sequence of the last record whose removal was approved; None if none is stored for the log."""
+        """The sequence of the last record whose removal was approved."""
         path = self._path(log, "removed")
         return int.from_bytes(path.read_bytes(), "big") if path.exists() else None
 
@@ -151,7 +151,7 @@ def _extent(descriptor: int) -> tuple[int, int]:
 
 
 def _is_known(descriptor: int, wanted: Checkpoint, first: int, count: int) -> bool:
-    """Whether a checkpoint was approved before. Raises `CheckpointRefusedError` if it does not follow the last one."""
+    """Raises `CheckpointRefusedError` if the checkpoint does not follow the last one."""
     index = wanted.number - first
     if index < 0 or index > count:
         raise CheckpointRefusedError(f"checkpoint {wanted.number} does not follow number {first + count - 1}")

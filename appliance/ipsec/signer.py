@@ -53,15 +53,13 @@ class _Ipsec(msgspec.Struct):
 
 
 class _Settings(msgspec.Struct):
-    """The part of the supervisor's settings that the signer needs."""
-
     state: str
     audit: _Audit
     ipsec: _Ipsec
 
 
 def load_or_create_key(directory: Path) -> Ed25519PrivateKey:
-    """Load the audit key in `directory`; create it if missing. Raises `SignerKeyError` or `OSError`."""
+    """Raises `SignerKeyError` or `OSError`."""
     path = directory / KEY_FILE
     if not path.exists():
         _create_key(directory)
@@ -90,7 +88,7 @@ def _create_key(directory: Path) -> None:
 
 
 class Signer:
-    """Handles messages of the supervisor (the lifeline) and of control until it is stopped."""
+    """Handles messages of the supervisor and of control."""
 
     def __init__(
         self,

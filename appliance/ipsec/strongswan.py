@@ -28,13 +28,13 @@ _PREFIX = "host-"
 
 
 def plugins(esp: Esp) -> str:
-    """Return the plugins that charon loads, in order."""
+    """In the order in which charon loads them."""
     kernel = ("kernel-libipsec",) if esp == "user space" else ()
     return " ".join((*_PLUGINS, *kernel, "kernel-netlink", "socket-default", "vici"))
 
 
 def configuration(directory: Path, esp: Esp) -> str:
-    """Return `strongswan.conf` of the appliance's charon, with its socket in `directory` and its log on stderr."""
+    """`strongswan.conf`, with the socket in `directory` and the log on stderr."""
     return f"""\
 charon-systemd {{
   load = {plugins(esp)}
@@ -64,20 +64,20 @@ charon-systemd {{
 
 @dataclass(frozen=True)
 class Proposals:
-    """The offered and accepted proposals, the best first."""
+    """The best first."""
 
     ike: tuple[str, ...] = IKE_PROPOSALS
     esp: tuple[str, ...] = ESP_PROPOSALS
 
     @property
     def key_exchange(self) -> list[str]:
-        """Return the key exchange methods for status: `x25519+mlkem768`, `x25519`, `ecp384`."""
+        """For status: `x25519+mlkem768`, `x25519`, `ecp384`."""
         words = [proposal.removeprefix("aes256gcm16-prfsha384-") for proposal in self.ike]
         return [word.replace("-ke1_", "+") for word in words]
 
 
 def proposals_of(key_exchanges: Iterable[str]) -> Proposals:
-    """Return the proposals for a charon with these key exchanges (its own names)."""
+    """The names are charon's own."""
     if _ML_KEM_ALGORITHM not in key_exchanges:
         return Proposals()
     return Proposals(
@@ -90,17 +90,17 @@ def connection_name(host: str) -> str:
 
 
 def host_of(connection: str) -> str | None:
-    """Return the host of a connection; None for other connections, such as a handshake before its host is known."""
+    """None for other connections, such as a handshake before its host is known."""
     return connection.removeprefix(_PREFIX) if connection.startswith(_PREFIX) else None
 
 
 def pool(host: TunnelHost) -> dict[str, Any]:
-    """Return the pool with the one address of a host, for vici's `load-pool`."""
+    """For vici's `load-pool`, with the one address of a host."""
     return {connection_name(host.name): {"addrs": f"{host.address}-{host.address}"}}
 
 
 def connection(host: TunnelHost, stated: TunnelsStated, proposals: Proposals) -> Mapping[str, Any]:
-    """Return the tunnel of a host, for vici's `load-conn`."""
+    """For vici's `load-conn`."""
     child = {
         "local_ts": [f"{stated.address}/32"],
         "remote_ts": ["dynamic"],

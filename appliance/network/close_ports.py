@@ -1,8 +1,7 @@
 """Close the ROS ports of the machine that the nodes run on, with an nftables file.
 
-For its API, TCPROS and UDPROS, a ROS node listens on ports that the kernel picks from the local port range. The
-appliance does not reveal these ports, but a port scanner finds them. The file closes the range to all but loopback and
-the appliance:
+For its API, TCPROS and UDPROS, a ROS node listens on ports of the local port range. The appliance does not reveal
+these ports, but a port scanner finds them. The file closes the range to all but loopback and the appliance:
 
 1. A TCP connection is refused at its SYN, without the connection tracker. Older connections, and connections that the
    machine itself opens, continue.
@@ -37,7 +36,7 @@ _SERVICE = re.compile(r"(tcp|udp)/(\d{1,5})(?:-(\d{1,5}))?")
 
 @dataclass(frozen=True)
 class OpenService:
-    """A service whose ports stay open to all hosts."""
+    """The ports stay open to all hosts."""
 
     protocol: Literal["tcp", "udp"]
     ports: PortRange
@@ -47,7 +46,7 @@ class OpenService:
 
 
 def parse_services(texts: Sequence[str]) -> tuple[OpenService, ...]:
-    """Parse services such as `tcp/22,udp/123,tcp/8000-8010`. Raises `ValueError` with the invalid service."""
+    """`tcp/22,udp/123,tcp/8000-8010`. Raises `ValueError` with the invalid service."""
     return tuple(_service(part.strip()) for text in texts for part in text.split(","))
 
 
@@ -59,7 +58,7 @@ def parse_ports(text: str) -> PortRange:
 
 
 def parse_address(text: str) -> str:
-    """Parse the address of an appliance; networks and names are rejected."""
+    """Networks and names are rejected."""
     try:
         address = ipaddress.ip_address(text)
     except ValueError:
@@ -72,7 +71,7 @@ def parse_address(text: str) -> str:
 
 
 def local_port_range() -> PortRange:
-    """Return the range of local ports that the kernel picks from, for IPv4 and IPv6."""
+    """For IPv4 and IPv6."""
     try:
         first, last = RANGE_FILE.read_text(encoding="ascii").split()
     except (OSError, ValueError) as error:
@@ -83,7 +82,7 @@ def local_port_range() -> PortRange:
 def protection(
     appliances: Sequence[str], ports: PortRange, services: Sequence[OpenService], *, tunnelled: bool = False
 ) -> str:
-    """Return the nftables file that closes `ports` to all but loopback and the appliances.
+    """Return the nftables file.
 
     `tunnelled`: the appliances' addresses are accepted only through IPsec, where they cannot be forged. The file then
     has a rule for ESP in the kernel and one for ESP in user space; only one of them ever matches.
@@ -128,7 +127,7 @@ def _indented(rules: Sequence[str]) -> str:
 
 
 def apply(text: str) -> None:
-    """Apply an nftables file from `protection` on this machine; it replaces an earlier one."""
+    """The file of `protection` replaces an earlier one."""
     _nft(["-f", "-"], text)
 
 

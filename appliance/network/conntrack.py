@@ -20,7 +20,7 @@ _FAMILIES = (socket.AF_INET, socket.AF_INET6)
 
 
 def forget(namespace: Namespace, ports: Iterable[int]) -> int:
-    """Delete the entries of UDP packets to these ports of the namespace's own addresses; return their number.
+    """Delete the entries of these UDP ports of the namespace's own addresses; return their number.
 
     Entries of forwarded packets stay. Raises `NetworkError`.
     """

@@ -19,7 +19,7 @@ _STATE = ("src", "192.0.2.1", "dst", "192.0.2.2", "proto", "esp", "spi")
 
 
 def choose_esp(namespace: Namespace) -> Esp:
-    """Return where ESP can run in this namespace. Raises `NetworkError` with the remedy."""
+    """Raises `NetworkError` with the remedy."""
     refusal = _try_kernel(namespace)
     if refusal is None:
         return "kernel"
@@ -32,7 +32,7 @@ def choose_esp(namespace: Namespace) -> Esp:
 
 
 def lend_tun(uid: int, gid: int, tun: Path | None = None) -> None:
-    """Let a user open the TUN device; if needed, add an entry to the device's access control list.
+    """If needed, add an entry to the device's access control list.
 
     Raises `NetworkError` with the remedy.
     """
@@ -58,7 +58,7 @@ _NOBODY, _READ_WRITE = 0xFFFFFFFF, 6
 
 
 def _entries_of(device: Path, mode: int) -> list[tuple[int, int, int]]:
-    """Return the entries of the device's access control list; without a list, the entries that the mode implies."""
+    """Without a list, return the entries that the mode implies."""
     try:
         return list(_ENTRY.iter_unpack(os.getxattr(device, _ACL)[len(_VERSION) :]))
     except OSError as error:
@@ -68,7 +68,7 @@ def _entries_of(device: Path, mode: int) -> list[tuple[int, int, int]]:
 
 
 def _with_user(entries: list[tuple[int, int, int]], uid: int) -> bytes:
-    """Return the list with read and write access for this user; its mask permits the rights of all entries."""
+    """The mask permits the rights of all entries."""
     kept = [row for row in entries if row[0] != _MASK and row[::2] != (_USER, uid)]
     mask = _READ_WRITE
     for tag, rights, _id in kept:
@@ -78,7 +78,7 @@ def _with_user(entries: list[tuple[int, int, int]], uid: int) -> bytes:
 
 
 def _try_kernel(namespace: Namespace) -> str | None:
-    """Return why the kernel rejects an IPsec state with the tunnels' cipher; None if it accepts the state."""
+    """Return why the kernel rejects an IPsec state with the tunnels' cipher."""
     spi = f"0x{secrets.randbelow(0x7FFFFFFF) + 0x1000:x}"
     key = "0x" + secrets.token_hex(36)  # 256 bits and the salt
     cipher = ("reqid", "1", "mode", "tunnel", "aead", "rfc4106(gcm(aes))", key, "128")

@@ -33,7 +33,7 @@ class ProcessActivity:
         self._since = clock.now()
 
     def stalled_seconds(self) -> float:
-        """Return the seconds since it last progressed or waited for processor or disk; call this every second or so."""
+        """Since it last progressed or waited for processor or disk; call this every second or so."""
         now = clock.now()
         try:
             fields = self._stat.read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
@@ -46,7 +46,7 @@ class ProcessActivity:
 
 
 def run_program(program: Start, text: str, what: str) -> tuple[int, str, str]:
-    """Start a program, send its input and wait for its end; return exit status, standard output and standard error.
+    """Return exit status, standard output and standard error.
 
     `program` gets the pipes as arguments of `subprocess.Popen`. Raises `TimeoutError`, `OSError`.
     """
@@ -57,7 +57,7 @@ def run_program(program: Start, text: str, what: str) -> tuple[int, str, str]:
 
 
 def communicate(process: "subprocess.Popen[str]", text: str, what: str) -> tuple[str, str]:
-    """Send a program its input and wait for its end; return standard output and error. Log long waits for `what`.
+    """Return standard output and error. Log long waits for `what`.
 
     Raises `TimeoutError` if it hangs, after it is killed.
     """

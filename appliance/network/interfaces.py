@@ -1,7 +1,7 @@
 """Change interfaces, addresses and routes in a namespace, over netlink.
 
-Every function waits until the kernel is done. Addresses have the form `10.77.0.10/24` or `fd77::10/64`. IPv6 addresses
-skip duplicate address detection, because the networks made here have no other hosts, so they are usable at once.
+Every function waits until the kernel is done. Addresses have the form `10.77.0.10/24` or `fd77::10/64`. IPv6
+addresses are usable at once: duplicate address detection is skipped, because the networks have no other hosts.
 """
 
 import ipaddress
@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 
 def create_veth(near: Namespace, near_name: str, far: Namespace, far_name: str) -> None:
-    """Make a veth pair with one end in each namespace, and set both ends up."""
+    """One end in each namespace; both are set up."""
     for name in (near_name, far_name):
         if not 0 < len(name) <= IFNAMSIZ:
             raise ValueError(f"interface name {name!r} must have 1 to {IFNAMSIZ} characters")
@@ -43,7 +43,7 @@ def create_veth(near: Namespace, near_name: str, far: Namespace, far_name: str) 
 
 
 def create_bridge(namespace: Namespace, name: str) -> None:
-    """Make a bridge without spanning tree, and set it up."""
+    """Without spanning tree; it is set up."""
     _netlink(
         namespace,
         f"creating the bridge {name}",
@@ -53,7 +53,6 @@ def create_bridge(namespace: Namespace, name: str) -> None:
 
 
 def attach(namespace: Namespace, name: str, bridge: str) -> None:
-    """Make the interface `name` a port of `bridge`."""
     _netlink(
         namespace,
         f"attaching {name} to {bridge}",
@@ -62,7 +61,6 @@ def attach(namespace: Namespace, name: str, bridge: str) -> None:
 
 
 def set_link(namespace: Namespace, name: str, *, up: bool) -> None:
-    """Set an interface up or down (`lo` included)."""
     _netlink(
         namespace,
         f"setting {name} {'up' if up else 'down'}",
@@ -71,7 +69,7 @@ def set_link(namespace: Namespace, name: str, *, up: bool) -> None:
 
 
 def delete_link(namespace: Namespace, name: str) -> None:
-    """Delete an interface (of a veth pair: both ends), if it exists."""
+    """The other end of a veth pair is deleted too."""
 
     def delete(route: Any) -> None:
         for index in route.link_lookup(ifname=name):
@@ -109,7 +107,7 @@ def delete_address(namespace: Namespace, name: str, address: str) -> None:
 
 
 def add_route(namespace: Namespace, destination: str, via: str) -> None:
-    """Route `destination` (a network, or "default") through the address `via`."""
+    """`destination` is a network, or "default"."""
     family = _family(via)
     everywhere = "::/0" if family == socket.AF_INET6 else "0.0.0.0/0"
     where = everywhere if destination == "default" else destination
@@ -121,7 +119,7 @@ def add_route(namespace: Namespace, destination: str, via: str) -> None:
 
 
 def add_near_route(namespace: Namespace, name: str, destination: str, *, source: str, hop_limit: int) -> None:
-    """Route the address `destination` to the interface `name`; packets leave with `source` and this TTL."""
+    """Packets leave with `source` and this TTL."""
     length = 128 if _family(destination) == socket.AF_INET6 else 32
     _netlink(
         namespace,
@@ -139,7 +137,7 @@ def add_near_route(namespace: Namespace, name: str, destination: str, *, source:
 
 
 def add_local_route(namespace: Namespace, network: str) -> None:
-    """Make all addresses of a network this machine's own, without an interface for each."""
+    """No interface is needed for each address."""
     _netlink(
         namespace,
         f"adding the own network {network}",
@@ -148,7 +146,6 @@ def add_local_route(namespace: Namespace, network: str) -> None:
 
 
 def delete_local_route(namespace: Namespace, network: str) -> None:
-    """Remove what `add_local_route` added."""
     _netlink(
         namespace,
         f"removing the own network {network}",
@@ -166,12 +163,12 @@ def links(namespace: Namespace) -> list[str]:
 
 
 def addresses(namespace: Namespace) -> list[str]:
-    """Return every address of every interface, with its prefix length; link-local ones included."""
+    """Include link-local ones, with prefix lengths."""
     return _netlink(namespace, "listing addresses", _held)
 
 
 def addresses_by_interface(namespace: Namespace) -> dict[str, list[str]]:
-    """Return the addresses of each interface, with their prefix lengths."""
+    """With prefix lengths."""
 
     def read(route: Any) -> dict[str, list[str]]:
         names = _names(route)
@@ -187,7 +184,7 @@ def addresses_by_interface(namespace: Namespace) -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class DefaultRoute:
-    """A default route; `source` is its preferred source address, if it has one."""
+    """`source` is the preferred source address, if any."""
 
     interface: str
     gateway: str | None
@@ -195,7 +192,7 @@ class DefaultRoute:
 
 
 def default_route(namespace: Namespace, version: int) -> DefaultRoute | None:
-    """Return the default route of IPv4 or IPv6 with the lowest metric in the main table."""
+    """The lowest metric in the main table counts; `version` is 4 or 6."""
 
     def read(route: Any) -> DefaultRoute | None:
         family = socket.AF_INET if version == 4 else socket.AF_INET6
@@ -217,7 +214,7 @@ def default_route(namespace: Namespace, version: int) -> DefaultRoute | None:
 
 
 def networks(namespace: Namespace) -> list[str]:
-    """Return the network of every route and address of the namespace, except default routes."""
+    """The networks of every route and address, without default routes."""
 
     def read(route: Any) -> list[str]:
         routes = [
@@ -231,7 +228,7 @@ def networks(namespace: Namespace) -> list[str]:
 
 
 def source_address_for(namespace: Namespace, peer: str) -> str:
-    """Return the source address that the routing table gives packets to `peer`. Raises `NetworkError` if no route."""
+    """By the routing table. Raises `NetworkError` if no route."""
     family = _family(peer)
 
     def look_up(route: Any) -> str:
@@ -245,7 +242,7 @@ def source_address_for(namespace: Namespace, peer: str) -> str:
 
 
 def _netlink(namespace: Namespace, what: str, work: Callable[[Any], T]) -> T:
-    """Run `work` with a netlink socket of the namespace; errors name the operation `what` and the namespace."""
+    """Errors name the operation `what` and the namespace."""
     from pyroute2 import IPRoute  # noqa: PLC0415  a hundred modules, only needed to change a network
     from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415  likewise
 

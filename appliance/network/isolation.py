@@ -83,7 +83,7 @@ class IsolationSettings:
 
 @dataclass(frozen=True)
 class LinkAddresses:
-    """The two addresses of a subnet, the host's and the appliance's, without prefix length."""
+    """The addresses have no prefix length."""
 
     network: str
     host: str
@@ -95,7 +95,7 @@ class LinkAddresses:
 
 
 class _IpForwarding:
-    """The forwarding settings of one host: enable them, and restore them.
+    """The forwarding settings of one host.
 
     The kernel copies the global setting to every interface, so the value of each interface is also recorded. A host
     gets its IPv6 routes from router advertisements; if it forwards, it ignores them unless `accept_ra` is 2.
@@ -110,11 +110,11 @@ class _IpForwarding:
         return self._host.sysctl("net/ipv6/conf/all/disable_ipv6") == "0"
 
     def before(self, family: Family) -> bool:
-        """Return whether the host forwards packets of a family, before `enable` changes that."""
+        """Before `enable` changes that."""
         return self._host.sysctl(_GLOBAL[family]) != "0"
 
     def record(self) -> dict[str, str]:
-        """Return the settings that `enable` may change, in the order to restore them."""
+        """In the order to restore them."""
         families: tuple[Family, ...] = (4, 6) if self.has_ipv6() else (4,)
         keys = [_GLOBAL[family] for family in families]
         for name in (*interfaces.links(self._host), "default"):
@@ -155,7 +155,7 @@ class Isolation:
         self._lock: int | None = None
 
     def up(self) -> None:
-        """Remove leftovers of a crash; make the namespace, its addresses and its forwarding.
+        """Remove leftovers of a crash first.
 
         Raises `PrivilegeError`, or `NetworkError` with the obstacle; the host is then left unchanged.
         """
@@ -172,7 +172,7 @@ class Isolation:
             raise
 
     def down(self) -> None:
-        """Remove everything and restore the host's settings, if the isolation is up."""
+        """Restore the host's settings."""
         if self._lock is None:
             return
         try:
@@ -190,11 +190,11 @@ class Isolation:
         return interfaces.source_address_for(self._host, peer)
 
     def endpoint(self) -> PublicAddress:
-        """Return the address at which other networks' hosts reach this host. Raises `NetworkError` if unknown."""
+        """For hosts of other networks. Raises `NetworkError` if unknown."""
         return outward_address(self._host, without=("lo", self.settings.link))
 
     def obstacles(self) -> tuple[str, ...]:
-        """Return chains of other programs on the host that drop forwarded packets by default.
+        """Chains of other programs on the host that drop forwarded packets by default.
 
         Our rules cannot override them; the owner of such a chain must accept the appliance's link.
         """
@@ -205,14 +205,14 @@ class Isolation:
         )
 
     def translations(self) -> tuple[str, ...]:
-        """Return chains of other programs on the host that translate addresses of machines or containers.
+        """Chains of other programs on the host that translate addresses of machines or containers.
 
         These translations do not apply to connections to the appliance.
         """
         return (*self._backend.foreign_translations(), *iptables.foreign_translations(self._host))
 
     def forward_tunnels(self) -> None:
-        """Also forward IKE and ESP (UDP 500 and 4500). Raises `NetworkError` if the host uses these ports."""
+        """UDP 500 and 4500. Raises `NetworkError` if the host uses these ports."""
         if self._udp == _TUNNELS:
             return
         used = self._host.run(udp_ports_in_use) & {port.first for port in _TUNNELS}
@@ -226,7 +226,7 @@ class Isolation:
         self._install(self._wanted())
 
     def require_free(self, ports: Iterable[int]) -> None:
-        """Raise `NetworkError` if a program of the host listens on one of these TCP ports that is not forwarded."""
+        """Raise `NetworkError` if a program of the host listens on a TCP port that is not forwarded."""
         used = self._host.run(listening_ports) & ({*ports} - {one.first for one in self._tcp})
         if used:
             raise NetworkError(
@@ -368,7 +368,7 @@ def isolation_rules(
     tcp: tuple[PortRange, ...] = (),
     udp: tuple[PortRange, ...] = (),
 ) -> tuple[PacketRule, ...]:
-    """Return the rules on the host; `routers` are the address families for which the host was already a router.
+    """`routers` are the families for which the host was already a router.
 
     `tcp` and `udp` ports are forwarded besides those of the settings.
     """
@@ -426,7 +426,7 @@ def _true_sources(family: Family, end: LinkAddresses, inward: Interface) -> tupl
 
 
 def _loopback(family: Family, inward: Interface) -> PacketRule:
-    """Forward 127.0.0.1 under the veth's address; ::1 cannot leave a host, so it stays refused."""
+    """127.0.0.1 gets the veth's address; ::1 cannot leave a host, so it stays refused."""
     if family == 4:
         local = partial(PacketRule, chain=Chain.KEPT_SOURCE, source="127.0.0.0/8", leaves_on=inward)
         return local("from the host's own loopback", PacketVerdict.MASQUERADE)

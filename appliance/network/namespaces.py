@@ -1,7 +1,7 @@
 """Make network namespaces, run code and programs in them, and delete them.
 
-A namespace is a name under `/run/netns`, as with `ip netns`. A *thread*, not a process, is in a namespace. So each call
-gets its own thread, which moves into the namespace and ends there:
+A namespace is a name under `/run/netns`, as with `ip netns`. A *thread*, not a process, is in a namespace, so each
+call gets its own thread, which moves into the namespace and ends there:
 
 1. No other thread of this process is in the namespace, and no thread has to return from it, which could fail.
 2. A program started with `popen` is inside the namespace before its first instruction. Only `subprocess` runs between
@@ -46,15 +46,15 @@ T = TypeVar("T")
 
 
 class NetworkError(UserError):
-    """Report an obstacle in this machine's network; the message has the cause, the place and the remedy."""
+    """The message has the cause, the place and the remedy."""
 
 
 class PrivilegeError(NetworkError):
-    """Report that this process may not change the network of this machine."""
+    """This process may not change the network of this machine."""
 
 
 def has_privileges() -> bool:
-    """Return whether this process has CAP_SYS_ADMIN and CAP_NET_ADMIN, which making namespaces needs."""
+    """Making namespaces needs CAP_SYS_ADMIN and CAP_NET_ADMIN."""
     return _has_capabilities(1 << _CAP_NET_ADMIN | 1 << _CAP_SYS_ADMIN)
 
 
@@ -83,7 +83,7 @@ def require_privileges(what: str) -> None:
 
 
 class Namespace:
-    """A network namespace by name; the object itself does not create it."""
+    """The object itself does not create the namespace."""
 
     def __init__(self, name: str) -> None:
         if not _VALID_NAME.fullmatch(name):
@@ -95,7 +95,7 @@ class Namespace:
 
     @classmethod
     def own(cls) -> "Namespace":
-        """Return the namespace of this process; the object can neither create nor delete it."""
+        """The object can neither create nor delete the namespace of this process."""
         return _OwnNamespace()
 
     def __repr__(self) -> str:
@@ -108,7 +108,7 @@ class Namespace:
         return hash(self.path)
 
     def exists(self) -> bool:
-        """Return whether a namespace is mounted under this name (not a bare file from a crash)."""
+        """A bare file from a crash does not count."""
         try:
             here, above = self.path.stat(), self.path.parent.stat()
         except OSError:
@@ -116,7 +116,7 @@ class Namespace:
         return here.st_dev != above.st_dev
 
     def create(self) -> "Namespace":
-        """Create the namespace; it has only `lo`, which is down.
+        """The namespace has only `lo`, which is down.
 
         Raises `PrivilegeError`, or `NetworkError` if the name exists.
         """
@@ -139,7 +139,7 @@ class Namespace:
         _mount(_HERE, self.path, _MS_BIND)
 
     def delete(self) -> None:
-        """Delete the name, if it exists; the kernel's namespace ends with its last process."""
+        """The kernel's namespace ends with its last process."""
         if self.exists():
             require_privileges(f"deleting the network namespace {self.name}")
             if _libc().umount2(os.fsencode(self.path), _MNT_DETACH) != 0:
@@ -148,7 +148,7 @@ class Namespace:
 
     @contextlib.contextmanager
     def entered(self) -> Iterator[None]:
-        """Move the calling thread into the namespace for the block, and back afterwards.
+        """Move the calling thread for the block.
 
         For short synchronous work (open a socket, start a program); do not await in the block.
         """
@@ -164,7 +164,7 @@ class Namespace:
             os.close(home)
 
     def run(self, function: Callable[[], T]) -> T:
-        """Call `function` in a thread inside the namespace; return its result or raise its exception."""
+        """The function runs in a thread inside the namespace."""
 
         def inside() -> T:
             self._enter()
@@ -173,11 +173,11 @@ class Namespace:
         return _in_thread(inside)
 
     def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
-        """Start a program inside the namespace; `options` are passed to `subprocess.Popen`."""
+        """`options` are those of `subprocess.Popen`."""
         return self.run(lambda: subprocess.Popen(args, **options))
 
     def sysctl(self, key: str, value: str | None = None) -> str:
-        """Return the value of the kernel setting `key`, after setting it to `value` if given.
+        """Return the value, after setting it to `value` if given.
 
         `key` has the form `net.ipv4.ip_forward`; use slashes instead of dots if it has an interface name with a dot.
         """
@@ -194,14 +194,14 @@ class Namespace:
             raise NetworkError(f"sysctl {key} in {self.name}: {error.strerror}") from error
 
     def lacks_syn_cookies(self) -> bool:
-        """Return whether forged first packets can fill a listener's queue of half-open connections."""
+        """Forged first packets could fill a listener's queue of half-open connections."""
         try:
             return self.sysctl("net.ipv4.tcp_syncookies") == "0"
         except NetworkError:  # the kernel was built without SYN cookies
             return True
 
     def processes(self) -> list[int]:
-        """Return the ids of the processes in the namespace, without this one."""
+        """Without this one."""
         if not self.exists():
             return []
         mark = self.path.stat()
@@ -215,7 +215,7 @@ class Namespace:
         return sorted(found)
 
     def open(self) -> int:
-        """Return a new descriptor of the namespace, for netlink; the caller closes it."""
+        """For netlink; the caller closes the descriptor."""
         try:
             return os.open(self.path, os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
@@ -232,8 +232,6 @@ class Namespace:
 
 
 class _OwnNamespace(Namespace):
-    """The namespace of this process."""
-
     def __init__(self) -> None:
         self.name = "(own)"
         self.path = Path(f"/proc/{os.getpid()}/ns/net")
@@ -242,7 +240,7 @@ class _OwnNamespace(Namespace):
         return True
 
     def _enter(self) -> None:
-        """Enter the namespace, unless the thread is already in it, because containers may not call setns."""
+        """Do nothing if the thread is already there, because containers may not call setns."""
         if not os.path.samestat(_HERE.stat(), self.path.stat()):
             super()._enter()
 
@@ -254,7 +252,7 @@ class _OwnNamespace(Namespace):
 
 
 def namespaces(prefix: str = "") -> list[Namespace]:
-    """Return the namespaces whose name begins with `prefix`, including names whose namespace no longer exists."""
+    """Include names whose namespace no longer exists."""
     if not DIRECTORY.is_dir():
         return []
     names = sorted(entry.name for entry in DIRECTORY.iterdir())
@@ -278,7 +276,7 @@ def _in_thread(function: Callable[[], T]) -> T:
 
 @contextlib.contextmanager
 def _directory_lock() -> Iterator[None]:
-    """Make `/run/netns` a shared mount, as `ip netns add` does; hold its lock during the block."""
+    """`/run/netns` must be a shared mount, as `ip netns add` makes it."""
     DIRECTORY.mkdir(mode=0o755, exist_ok=True)
     lock = os.open(DIRECTORY.parent / "rosrv-netns.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
@@ -292,7 +290,7 @@ def _directory_lock() -> Iterator[None]:
 
 
 def _is_mount_point(path: Path) -> bool:
-    """Return whether `path` is a mount point (`os.path.ismount` misses a bind mount onto itself)."""
+    """`os.path.ismount` misses a bind mount onto itself."""
     with Path("/proc/thread-self/mountinfo").open(encoding="utf-8", errors="replace") as lines:
         return any(line.split(" ", 5)[4] == str(path) for line in lines)
 
@@ -322,7 +320,7 @@ def lives_on_the_machines_network(proc: Path = Path("/proc")) -> bool:
 
 
 def is_contained(root: Path = Path("/")) -> bool:
-    """Return whether this process is in a container, with or without its own network."""
+    """The container may have its own network or not."""
     if any((root / mark).exists() for mark in _CONTAINER_MARKS):
         return True
     try:
@@ -332,12 +330,12 @@ def is_contained(root: Path = Path("/")) -> bool:
 
 
 def bridges(classes: Path = Path("/sys/class/net")) -> list[str]:
-    """Return the bridges of this namespace. A container has none; a machine that runs containers has at least one."""
+    """A container has none; a machine that runs containers has at least one."""
     return sorted(link.name for link in classes.glob("*") if (link / "bridge").is_dir())
 
 
 def end_processes(pids: Sequence[int]) -> None:
-    """End processes by id with SIGTERM, and with SIGKILL after `_END_SECONDS`.
+    """SIGKILL follows SIGTERM after `_END_SECONDS`.
 
     A descriptor refers to each process, so a reused id is never signalled.
     """

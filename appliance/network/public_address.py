@@ -16,14 +16,14 @@ _VERSIONS = (4, 6)  # IPv4 first, because every ROS 1 host has it
 
 @dataclass(frozen=True)
 class PublicAddress:
-    """An address at which other hosts reach this machine, and the reason for this choice."""
+    """With the reason for this choice."""
 
     address: str
     reason: str
 
 
 def outward_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAddress:
-    """Return the address towards the default route; without such a route, the only address.
+    """Prefer the address towards the default route; without one, there must be only one address.
 
     Interfaces in `without` do not count. Raises `NetworkError` if there is no such address or more than one.
     """
@@ -38,7 +38,7 @@ def outward_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAd
 
 
 def only_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAddress:
-    """Return the only IPv4 address of all interfaces except `without`; without IPv4, the only IPv6 address.
+    """Prefer IPv4. Interfaces in `without` do not count.
 
     Raises `NetworkError` if there is no such address or more than one.
     """
@@ -58,7 +58,7 @@ def only_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAddre
 
 
 def _first(namespace: Namespace, route: interfaces.DefaultRoute, version: int) -> str | None:
-    """Return the source address of packets to the gateway; without one (a modem), the interface's first address."""
+    """The source address of packets to the gateway; without one (a modem), the interface's first address."""
     if route.gateway is not None:
         return interfaces.source_address_for(namespace, route.gateway)
     held = interfaces.addresses_by_interface(namespace).get(route.interface, [])

@@ -1,10 +1,10 @@
-"""Scan a machine's TCP ports: find the ports that accept a connection from here.
+"""Find the TCP ports of a machine that accept a connection from here.
 
-Many connections are tried at once, each with its own time limit, so the scan takes at most
-`len(ports) / AT_ONCE * seconds`. A connection that opens is reset at once without data.
+Many connections are tried at once, each with its own time limit, so the scan takes at most `len(ports) / AT_ONCE *
+seconds`. A connection that opens is reset at once without data.
 
-If a connection fails before a packet leaves (no route, a rule of this machine), it is unknown whether the port is open.
-Only the result of `connect` shows such a failure; the socket reports no error later.
+If a connection fails before a packet leaves (no route, a rule of this machine), it is unknown whether the port is
+open. Only the result of `connect` shows this; the socket reports no error later.
 """
 
 import errno
@@ -27,7 +27,7 @@ _SILENT = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ETIMEDOUT, errno.EACCES,
 
 @dataclass(frozen=True)
 class ScanResult:
-    """The result of a scan of one address."""
+    """The ports of one address."""
 
     address: str
     open: tuple[int, ...]
@@ -42,7 +42,7 @@ class ScanResult:
 
 
 def addresses_of(host: str) -> tuple[str, ...]:
-    """Return the addresses of another machine. Raises `NetworkError` for an unknown name or an own address."""
+    """Raises `NetworkError` for an unknown name or an own address."""
     try:
         found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
     except socket.gaierror as error:
@@ -58,7 +58,7 @@ def addresses_of(host: str) -> tuple[str, ...]:
 
 
 def scan(address: str, ports: Iterable[int], seconds: float) -> ScanResult:
-    """Try to connect to each port, at most `seconds` each. Raises `NetworkError` for an unusable address."""
+    """At most `seconds` for each port. Raises `NetworkError` for an unusable address."""
     wanted = list(ports)
     opened: list[int] = []
     refused = silent = untried = 0
@@ -86,13 +86,13 @@ def scan(address: str, ports: Iterable[int], seconds: float) -> ScanResult:
 
 
 def _at_once() -> int:
-    """Return the number of connections to try at once: `AT_ONCE`, limited by the files the process may still open."""
+    """`AT_ONCE`, limited by the files that the process may still open."""
     used = len(os.listdir("/proc/self/fd"))  # noqa: PTH208  only their number counts
     return max(1, min(AT_ONCE, resource.getrlimit(resource.RLIMIT_NOFILE)[0] - used))
 
 
 def _try(address: str, port: int, seconds: float) -> tuple[bool, int]:
-    """Return whether a packet left, and the error number of the connection (0: open). Raises `OSError`."""
+    """Return whether a packet left, and the error number (0: open). Raises `OSError`."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as client:
         client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
@@ -107,7 +107,7 @@ def _try(address: str, port: int, seconds: float) -> tuple[bool, int]:
 
 
 def _is_own(address: str) -> bool:
-    """Return whether an address is this machine's own: packets to it would have the same address as source."""
+    """Packets to an own address would have the same address as source."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     try:
         with socket.socket(family, socket.SOCK_DGRAM) as probe:

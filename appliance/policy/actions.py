@@ -19,11 +19,11 @@ VERBS = {"use-node" if category is Category.NODE else category.value: category f
 
 
 class BadWordError(ValueError):
-    """A host or action is invalid; the message gives the reason and the remedy."""
+    """The message gives the reason and the remedy."""
 
 
 def parse_action(text: str) -> tuple[Category, str]:
-    """Parse `VERB NAME`; return the category and the resource. Raises `BadWordError`."""
+    """Parse `VERB NAME`. Raises `BadWordError`."""
     verb, _, name = text.strip().partition(" ")
     category = VERBS.get(verb)
     if category is None:
@@ -33,7 +33,7 @@ def parse_action(text: str) -> tuple[Category, str]:
 
 
 def check_resource(category: Category, name: str) -> str:
-    """Return a resource unchanged. Raises `BadWordError` if a request of this category cannot have such a resource."""
+    """Raises `BadWordError` if a request of this category cannot have such a resource."""
     if category is Category.COMMAND:
         if ALIASES.get(name, name) not in COMMANDS:
             elsewhere = DECIDED_ELSEWHERE.get(name)
@@ -45,7 +45,7 @@ def check_resource(category: Category, name: str) -> str:
 
 
 def find_hosts(text: str, policy: Policy) -> tuple[Address, ...]:
-    """Return the addresses that an address or a name means in this policy; of a group's network the first host.
+    """Return the first host of a group's network.
 
     Raises `BadWordError`.
     """
@@ -62,7 +62,7 @@ def find_hosts(text: str, policy: Policy) -> tuple[Address, ...]:
 
 
 def find_host(text: str, policy: Policy) -> Address:
-    """Return the address of one host (of `robot` the first). Raises `BadWordError`, also for a group of several."""
+    """Return the first address of `robot`. Raises `BadWordError`, also for a group of several."""
     found = find_hosts(text, policy)
     if len(found) > 1 and text != ROBOT:
         some = ", ".join(map(str, found[:_MOST_NAMED]))

@@ -32,7 +32,7 @@ _MOST = 100
 
 
 class Claim(StrEnum):
-    """The claim of a host to a group: take it if it is free, take it from its holder, or only ask for it."""
+    """Take a group if it is free, take it from its holder, or only ask for it."""
 
     TAKE = "take"
     OVERRIDE = "override"
@@ -45,7 +45,7 @@ _OPTIONS = (*Claim, _LEASE)
 
 @dataclass(frozen=True, slots=True)
 class AuthorityGroup:
-    """One group: its topics and services, the hosts with each claim, and the seconds after which silence ends it."""
+    """`lease` is the seconds after which silence ends it."""
 
     name: str
     names: frozenset[str]
@@ -54,7 +54,7 @@ class AuthorityGroup:
     lease: float = DEFAULT_LEASE
 
     def claim(self, atoms: frozenset[Atom]) -> Claim | None:
-        """Return the strongest claim of a host with these atoms; None if it may not even ask."""
+        """Return the strongest claim of a host with these atoms."""
         claims = {claim for claim, hosts in self.hosts if not hosts.isdisjoint(atoms)}
         return next((claim for claim in (Claim.OVERRIDE, Claim.TAKE, Claim.ASK) if claim in claims), None)
 
@@ -62,7 +62,7 @@ class AuthorityGroup:
 def read_authority(
     section: SectionText | None, file: str, groups: HostGroups, findings: Findings
 ) -> dict[str, AuthorityGroup]:
-    """Return the groups by name. Invalid lines are left out and reported in `findings`."""
+    """Invalid lines are left out and reported in `findings`."""
     found: dict[str, AuthorityGroup] = {}
     options: list[tuple[str, str, Entry]] = []
     first_lines: dict[str, int] = {}

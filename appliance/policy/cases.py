@@ -41,7 +41,7 @@ _Pairs = dict[str, tuple[_Node, _Node]]
 
 @dataclass(frozen=True, slots=True)
 class CaseResult:
-    """The result of one check. The case wants the answer `expected` for `request`. `line` and `column` count from 1."""
+    """`line` and `column` count from 1."""
 
     file: str
     line: int
@@ -52,7 +52,7 @@ class CaseResult:
 
     @property
     def passed(self) -> bool:
-        """Whether the rules decide as expected. A request that passes only because of audit-only mode is denied."""
+        """A request that passes only because of audit-only mode counts as denied."""
         verdict = self.decision.verdict
         return self.expected == ("deny" if verdict == "would deny" else verdict)
 
@@ -67,7 +67,8 @@ class CaseResult:
 
 
 def run_cases(policy: Policy, text: str, file: str) -> list[CaseResult]:
-    """Run every case in `text`; `file` is its name in the results. Raises `PolicyError` with all mistakes in the text.
+    """`file` is the name of `text` in the results. Raises `PolicyError` with all mistakes in the text. Raises
+    `PolicyError` with all mistakes in the text.
 
     A file without cases is a mistake, because it would pass with every policy.
     """
@@ -98,7 +99,7 @@ def _compose(text: str, findings: Findings) -> _Node | None:
 
 
 class _CaseReader:
-    """Read the cases from YAML nodes, which know their line and column."""
+    """YAML nodes know their line and column."""
 
     def __init__(self, policy: Policy, findings: Findings) -> None:
         self._policy = policy
@@ -185,7 +186,7 @@ class _CaseReader:
     # --- YAML with places ---
 
     def _mapping(self, node: _Node, what: str, keys: tuple[str, ...] | None) -> _Pairs:
-        """Return the pairs of a mapping by key. Unknown and repeated keys are errors; `keys` None permits any key."""
+        """Unknown and repeated keys are errors; without `keys`, any key is permitted."""
         pairs: _Pairs = {}
         if not isinstance(node, yaml.MappingNode):
             expected = f" with {', '.join(keys)}" if keys else ""

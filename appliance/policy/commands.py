@@ -90,7 +90,7 @@ CALLS: dict[str, PolicyCall] = {
 }
 
 COMMANDS = frozenset(name for name, call in CALLS.items() if not call.elsewhere)
-"""Every call that `[Commands]` may grant."""
+"""Calls that `[Commands]` may grant."""
 
 NAMED_ONLY = frozenset(name for name, call in CALLS.items() if call.named_only)
 DECIDED_ELSEWHERE = {name: call.elsewhere for name, call in CALLS.items() if call.elsewhere}
@@ -98,5 +98,5 @@ ALIASES = {call.wire: name for name, call in CALLS.items() if call.wire}
 
 
 def policy_call(name: str) -> PolicyCall:
-    """Return the row of a call; for an unknown call, the row of a command."""
+    """An unknown call has the row of a command."""
     return CALLS.get(name, _COMMAND)

@@ -20,7 +20,7 @@ _VERDICTS = {
 
 @dataclass(frozen=True, slots=True)
 class OverruledRule:
-    """A rule that matches the resource but does not decide, with the reason. `grants`: it would grant the request."""
+    """A rule that matches the resource but does not decide. `grants`: it would grant the request."""
 
     rule: Rule
     grants: bool
@@ -32,10 +32,10 @@ class DecisionExplanation:
     """The decision on one category of a request.
 
     `through` lists the words of the deciding rule that include the host (empty for a denial). `lost` lists the
-    overruled rules. `also` explains the other rights that the request needs (`policy/rights`); `allowed` covers all of
-    them. `namespace` is the denial that an allowed parameter gets if it contains other parameters at the time of the
-    call. `told` is the text of a denial for the host, as `[Options] tell` requires. `blocked`: an operator's block of
-    the host denies it, so no rule matters.
+    overruled rules. `also` explains the other rights that the request needs (`policy/rights`); `allowed` covers all
+    of them. `namespace` is the denial that an allowed parameter gets if it contains other parameters at the time of
+    the call. `told` is the text of a denial for the host, as `[Options] tell` requires. `blocked`: an operator's
+    block of the host denies it, so no rule matters.
     """
 
     request: Request
@@ -46,17 +46,17 @@ class DecisionExplanation:
     namespace: Decision | None = None
     told: str | None = None
     limit: str = ""
-    """The rate limit of an allowed request, and its line in `[Limits]`."""
+    """With its line in `[Limits]`."""
     blocked: bool = False
 
     @property
     def allowed(self) -> bool:
-        """Whether the request has all rights that it needs, without an approval."""
+        """The request has all rights that it needs, without an approval."""
         return self.together == "allow"
 
     @property
     def together(self) -> str:
-        """Return the answer on all rights: allow, ask or deny."""
+        """Allow, ask or deny, for all rights together."""
         verdicts = {each.decision.verdict for each in (self, *self.also)}
         return "deny" if "deny" in verdicts else "ask" if "ask" in verdicts else "allow"
 
@@ -73,7 +73,7 @@ class DecisionExplanation:
 
 
 def explain(policy: Policy, request: Request) -> DecisionExplanation:
-    """Explain each right that the request needs. The resource must be a resolved name, as for `decide`."""
+    """The resource must be a resolved name, as for `decide`."""
     first, *others = (_explain(policy, right) for right in rights_of(request))
     return replace(first, also=tuple(others))
 
@@ -101,7 +101,7 @@ def _explain(policy: Policy, right: Right) -> DecisionExplanation:
 
 
 def render(explanation: DecisionExplanation) -> Iterator[str]:
-    """Yield the explanation as lines of text. For a blocked host the block is the whole reason."""
+    """For a blocked host the block is the whole reason."""
     yield from _render_one(explanation)
     if explanation.blocked:
         return
@@ -145,7 +145,7 @@ def _limit(policy: Policy, request: Request) -> str:
 
 
 def _matching(policy: Policy, request: Request) -> list[CompiledRule]:
-    """Return all rules that match the resource: the most specific rule first, `default` last."""
+    """The most specific rule comes first, `default` last."""
     command = request.category is Category.COMMAND
     name = commands.ALIASES.get(request.resource, request.resource) if command else request.resource
     rules = policy.rules(request.category)

@@ -10,23 +10,23 @@ from appliance.policy.rights import decide, rights_of
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A request that the two policies decide or limit differently; `count` is its number of occurrences."""
+    """`count` is the number of occurrences of the request."""
 
     request: Request
     old: Decision
     new: Decision
     count: int
     limited: int = 0
-    """If both policies allow the request: -1 for a stricter limit, 1 for a weaker one. Otherwise 0."""
+    """If both policies allow the request: -1 for a stricter limit, 1 for a weaker one."""
 
     @property
     def granted(self) -> bool:
-        """Whether the new policy grants a request that the old policy denied, or limits it less."""
+        """The new policy grants a request that the old one denied, or limits it less."""
         return self.new.rank > self.old.rank or self.limited > 0
 
     @property
     def word(self) -> str:
-        """Return the change: granted, denied, needs approval, limited, or limited less."""
+        """Granted, denied, needs approval, limited, or limited less."""
         if self.limited:
             return "limited" if self.limited < 0 else "limited less"
         if self.new.verdict == "ask":
@@ -35,7 +35,7 @@ class Difference:
 
 
 def diff(old: Policy, new: Policy, requests: Iterable[Request]) -> list[Difference]:
-    """Return each request that `new` decides or limits differently, in order of first occurrence.
+    """Return the requests in order of first occurrence.
 
     Audit-only counts: a request that passes only because of this mode is not the same as a granted request.
     """

@@ -30,12 +30,12 @@ _MOST_LINES = 8  # the most lines that one grant may change, besides one for eac
 
 
 class UngrantableError(Exception):
-    """No line of a policy can grant the request; the message gives the reason."""
+    """The message gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class DecidedRequest:
-    """A decided request and the rights that it needs. `takeover`: it needs a node name that another host has."""
+    """`takeover`: the request needs a node name that another host has."""
 
     request: Request
     rights: list[Right]
@@ -47,7 +47,7 @@ class DecidedRequest:
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """A policy text that grants the request, and the lines that were changed or added (none: it was granted before)."""
+    """`added` are the lines that were changed or added (none: it was granted before)."""
 
     text: str
     added: tuple[str, ...]
@@ -62,13 +62,12 @@ class Grant:
         return []
 
     def diff(self, before: str, file: str) -> list[str]:
-        """Return the change, as a unified diff."""
         old, new = before.splitlines(), self.text.splitlines()
         return list(difflib.unified_diff(old, new, file, f"{file} (granted)", lineterm=""))
 
 
 def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> Grant:
-    """Return the smallest change of a policy that grants the host all rights of the request.
+    """Change as few lines as possible.
 
     Raises `UngrantableError`, and `PolicyError` if the text is not a valid policy.
     """
@@ -105,7 +104,7 @@ def _granted(policy: Policy, right: Right) -> bool:
 
 
 def _word(text: str, known: PolicyContext, host: Address) -> str:
-    """Return the policy's word for the host: `host:NAME`, a group of this host alone, `robot`, or its address."""
+    """`host:NAME`, a group of this host alone, `robot`, or the address."""
     enrolled = next((name for name, address in known.hosts.items() if address == host), None)
     if enrolled is not None:
         return word_of(enrolled)
@@ -160,7 +159,7 @@ def _key(request: Request) -> str:
 
 
 def _below(name: str, rule: Rule | None) -> str:
-    """Return the key for everything below a parameter: the key of the rule (`write /*/max`), or `NAME/**`."""
+    """Return the key of the rule (`write /*/max`), or `NAME/**`."""
     of_rule = rule.key.split(" ", 1)[-1] if rule is not None else DEFAULT
     own = of_rule[1:].split("/")[len(levels(name)) :] if of_rule != DEFAULT else []
     return "/".join([name.rstrip("/"), *(own or ["**"])])
@@ -219,7 +218,7 @@ def _with_line(text: str, section: SectionText | None, name: str, line: str) -> 
 def asked(
     host: str, caller_id: str, category: str, resource: str, detail: Mapping[str, object]
 ) -> DecidedRequest:
-    """Return the request of a recorded decision. Raises `UngrantableError` for other records."""
+    """Raises `UngrantableError` for records without a decision."""
     try:
         request = Request(ipaddress.ip_address(host), caller_id, Category(category), resource)
     except ValueError:

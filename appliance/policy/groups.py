@@ -20,7 +20,7 @@ _SHOWN_LIMIT = 80
 
 @dataclass(slots=True)
 class HostGroup:
-    """One line of `[Groups]`. `used`: a rule or another group names this group."""
+    """`used`: a rule or another group names this group."""
 
     atom: Atom
     word: Word | None
@@ -29,7 +29,7 @@ class HostGroup:
 
 
 class HostGroups:
-    """The groups of one file. `read(words)` returns the hosts of a value, and adds its mistakes to the findings."""
+    """Mistakes are added to the findings."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class HostGroups:
         table.put((table.network(network) for network in self.robot), self.groups[ROBOT].atom)
 
     def define(self, section: SectionText | None) -> None:
-        """Read `[Groups]`. A group may name groups that are defined later."""
+        """A group may name groups that are defined later."""
         if section is None:
             return
         for entry in section.entries:
@@ -79,7 +79,7 @@ class HostGroups:
             self.groups[word.text] = HostGroup(self._table.group(), word, entry.values)
 
     def read(self, words: Iterable[Word]) -> tuple[tuple[str, Atom], ...]:
-        """Return the words of a value with their atoms; an invalid word is an error, a repetition a warning."""
+        """An invalid word is an error, a repetition a warning."""
         atoms: dict[Atom, str] = {}
         for word in words:
             if self._findings.full:
@@ -136,7 +136,7 @@ class HostGroups:
         return network
 
     def _robot_instead(self) -> str:
-        """Return the hint to write `robot` for the robot's nodes, where loopback is the appliance itself."""
+        """Loopback is the appliance itself, so suggest `robot` for the robot's nodes."""
         if not self.robot:
             return "(unless isolation is none): write robot if you mean the nodes of its machine"
         robot = ", ".join(str(member).removesuffix("/32").removesuffix("/128") for member in self.robot)
@@ -189,7 +189,7 @@ class HostGroups:
             self._findings.error(word.line, word.column, text)
 
     def shown(self, words: Iterable[Word]) -> str:
-        """Return a value as text for messages; groups with few addresses are spelled out."""
+        """Groups with few addresses are spelled out."""
         parts: list[str] = []
         length = 0
         for word in words:

@@ -21,19 +21,19 @@ from appliance.policy.policy_findings import Findings, quoted
 from appliance.policy.sections import GROUPS
 
 HostInWords = Callable[[str], str]
-"""A function that returns a host as text for people: `tablet (10.0.0.7)`, or the address alone if it has no name."""
+"""Returns a host as text for people: `tablet (10.0.0.7)`, or the address alone."""
 
 _MOST_NAMED = 20
 _EVERY = tuple(map(ipaddress.ip_network, ("0.0.0.0/0", "::/0")))
 
 
 class UnknownHostNameError(ValueError):
-    """No host or group has this name; the message names the nearest one."""
+    """The message names the nearest known name."""
 
 
 @dataclass(frozen=True)
 class HostNames:
-    """The groups of a policy in force (`robot` is one), and the addresses of enrolled hosts."""
+    """`robot` is one of the groups."""
 
     groups: Mapping[str, tuple[Network, ...]]
     enrolled: Mapping[str, Address]
@@ -52,7 +52,7 @@ class HostNames:
         return cls(groups, enrolled)
 
     def networks(self, text: str) -> tuple[Network, ...]:
-        """Return the networks that an address, a network or a name means. Raises `UnknownHostNameError`."""
+        """Raises `UnknownHostNameError`."""
         try:
             return (canonical_network(ipaddress.ip_network(text)),)
         except ValueError:
@@ -76,7 +76,7 @@ class HostNames:
         return f"{quoted(text)} is not an address, nor the name of a group or an enrolled host{guess}"
 
     def labels(self) -> list[tuple[Network, str]]:
-        """Return networks with their names; of several networks that contain an address, the first names it."""
+        """The first network that contains an address names it."""
         rows = [(-1, _network_of(address), name) for name, address in self.enrolled.items()]
         rows += [
             (0 if name == ROBOT else len(some), one, name)
@@ -91,7 +91,7 @@ class HostNames:
 
 
 def label_of(address: str, labels: Iterable[tuple[Network, str]]) -> str:
-    """Return the label of an address, from `HostNames.labels`; empty if it has none, or is not an address."""
+    """`labels` are from `HostNames.labels`. Return an empty text if none applies, or if `address` is not one."""
     try:
         found = canonical_address(ipaddress.ip_address(address))
     except ValueError:
@@ -100,7 +100,6 @@ def label_of(address: str, labels: Iterable[tuple[Network, str]]) -> str:
 
 
 def in_words(address: str, labels: Iterable[tuple[Network, str]]) -> str:
-    """Return a host as text for people, as `HostInWords` does."""
     name = label_of(address, labels)
     return f"{name} ({address})" if name else address
 
@@ -111,7 +110,7 @@ def _define(
     groups: dict[str, tuple[Network, ...]],
     enrolled: Mapping[str, Address],
 ) -> tuple[Network, ...]:
-    """Return the networks of a group, after those that it names; an invalid word has none."""
+    """Networks that it names come first; an invalid word has none."""
     if name not in groups:
         groups[name] = ()  # a valid policy has no cycle
         found: dict[Network, None] = {}

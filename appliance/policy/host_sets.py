@@ -2,7 +2,7 @@
 
 Every network and every group has a number (an *atom*). A rule has the atoms of its value. A host has the atoms of all
 networks that contain its address, and of all groups that contain these networks. A rule includes a host if they share
-an atom. So memory and time do not grow with the number of rules times the size of groups.
+an atom, so memory and time do not grow with the number of rules times the size of groups.
 
 Invariants:
 1. An IPv4-mapped IPv6 address (::ffff:a.b.c.d) equals the IPv4 address.
@@ -19,21 +19,21 @@ Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 Atom = int
 
 EVERYONE: Final[Atom] = 0
-"""The atom of `*`, which every host has."""
+"""Every host has the atom of `*`."""
 
 _KEPT_HOSTS = 1024
 _BITS = {4: 32, 6: 128}
 
 
 def canonical_address(address: Address) -> Address:
-    """Return the IPv4 address of an IPv4-mapped IPv6 address; any other address as it is."""
+    """An IPv4-mapped IPv6 address becomes IPv4."""
     if isinstance(address, ipaddress.IPv6Address):
         return address.ipv4_mapped or address
     return address
 
 
 def canonical_network(network: Network) -> Network:
-    """Return the IPv4 network of a network within ::ffff:0:0/96; any other network as it is."""
+    """A network within ::ffff:0:0/96 becomes IPv4."""
     if isinstance(network, ipaddress.IPv6Network) and network.prefixlen >= 96:
         mapped = network.network_address.ipv4_mapped
         if mapped is not None:
@@ -42,7 +42,7 @@ def canonical_network(network: Network) -> Network:
 
 
 class HostSets:
-    """The networks and groups of one policy. They do not change after the policy is compiled."""
+    """The networks and groups of a policy do not change after it is compiled."""
 
     __slots__ = ("_lengths", "_named", "_networks", "_parents", "_tables", "kept")
 
@@ -56,7 +56,7 @@ class HostSets:
         self._named: dict[Address, tuple[Network, str, bool]] = {}
 
     def network(self, network: Network) -> Atom:
-        """Return the atom of a network; add the network if it is new."""
+        """Add the network if it is new."""
         network = canonical_network(network)
         atom = self._networks.get(network)
         if atom is None:
@@ -83,7 +83,7 @@ class HostSets:
         return self._parents[atom]
 
     def atoms_of(self, address: Address) -> frozenset[Atom]:
-        """Return every atom that contains the address, always including `EVERYONE`."""
+        """Include `EVERYONE`."""
         key = (address.version, int(address))
         kept = self.kept.get(key)
         if kept is None:
@@ -102,15 +102,15 @@ class HostSets:
         return self.above(waiting)
 
     def narrowest(self, address: Address) -> Network:
-        """Return the smallest network of the policy that contains the address, or the address itself as a network."""
+        """The address itself counts as a network."""
         return self._named_as(address)[0]
 
     def alike(self, address: Address) -> str:
-        """Return `narrowest` as text. It is the same for all addresses that the policy names as one network."""
+        """The text of `narrowest`: the same for all addresses that the policy names as one network."""
         return self._named_as(address)[1]
 
     def names(self, address: Address) -> bool:
-        """Return whether the policy names the address or a network that contains it; `*` does not count."""
+        """`*` does not count."""
         return self._named_as(address)[2]
 
     def _named_as(self, address: Address) -> tuple[Network, str, bool]:
@@ -133,7 +133,7 @@ class HostSets:
         return network((number >> shift << shift, bits - shift))
 
     def above(self, atoms: Iterable[Atom]) -> frozenset[Atom]:
-        """Return the atoms and every group that contains one of them, at any depth."""
+        """Include every group that contains one of the atoms, at any depth."""
         waiting = list(atoms)
         found = set(waiting)
         while waiting:

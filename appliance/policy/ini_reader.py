@@ -2,8 +2,7 @@
 
 The text has sections `[Name]`, entries `key = value`, and comments from `#` or `;` to the end of the line. It has no
 continuation lines, no interpolation and no quotes. The reader does not know the meaning of sections and keys.
-
-configparser cannot be used, because it does not report columns. Every error of a policy has a column.
+configparser cannot be used, because it does not report columns.
 """
 
 import re
@@ -12,7 +11,7 @@ from dataclasses import dataclass, field
 from appliance.policy.policy_findings import Findings, quoted
 
 MAXIMUM_CHARACTERS = 2 * 1024 * 1024
-"""The most characters of a policy. A policy with 10,000 rules has about 600,000."""
+"""A policy with 10,000 rules has about 600,000 characters."""
 
 _WORD = re.compile(r"[^\s,]++", re.ASCII)
 _COMMENT = re.compile(r"[#;]")
@@ -21,7 +20,7 @@ _FOREIGN = re.compile(r"[^\t\x20-\x7e]")
 
 @dataclass(frozen=True, slots=True)
 class Word:
-    """A piece of text and its position; line and column count from 1."""
+    """`line` and `column` count from 1."""
 
     text: str
     line: int
@@ -30,7 +29,7 @@ class Word:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line `key = value value …`; blanks or commas separate the words of the value."""
+    """`key = value value …`; blanks or commas separate words."""
 
     key: Word
     values: tuple[Word, ...]
@@ -38,14 +37,14 @@ class Entry:
 
 @dataclass(slots=True)
 class SectionText:
-    """One `[Name]` and the entries below it."""
+    """One `[Name]` and its entries."""
 
     name: Word
     entries: list[Entry] = field(default_factory=list)
 
 
 def read(text: str, findings: Findings) -> list[SectionText]:
-    """Return the sections in the order of the file. Unreadable lines are skipped and reported in `findings`."""
+    """Unreadable lines are skipped and reported in `findings`."""
     if len(text) > MAXIMUM_CHARACTERS:
         findings.error(1, 1, f"the file has {len(text)} characters; the limit is {MAXIMUM_CHARACTERS}")
         return []

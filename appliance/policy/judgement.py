@@ -20,12 +20,11 @@ def approvals_of(rows: Iterable[Iterable[str]]) -> frozenset[Approval]:
 
 @dataclass(frozen=True, slots=True)
 class PolicyContext:
-    """The context of a policy: the addresses of `host:NAME` and `robot`, and the text of its test cases.
+    """The addresses of `host:NAME` and `robot`, and the text of the test cases.
 
     `cases` is None if the policy has no test cases. `cases_error` is the reason if they could not be read; it rejects
-    the policy. If `site_keys` is not empty, one of these keys must have signed the policy. `blocks` has the hosts that
-    an operator blocks (`Policy.blocks`), `holders` the hosts that hold groups (`Policy.holders`), and `approved` the
-    approvals that last (`Policy.approved`); none of them affects checks and test cases.
+    the policy. If `site_keys` is not empty, one of these keys must have signed the policy. `blocks`, `holders` and
+    `approved` are those of `Policy`; none of them affects checks and test cases.
     """
 
     hosts: Mapping[str, Address] = field(default_factory=dict)
@@ -40,7 +39,7 @@ class PolicyContext:
 
     @classmethod
     def of(cls, fields: Mapping[str, Any]) -> Self:
-        """Make a context from the mapping of `fields()`; unknown fields are ignored."""
+        """Unknown fields are ignored."""
         return cls(
             {name: ipaddress.ip_address(address) for name, address in fields["hosts"].items()},
             [ipaddress.ip_network(place) for place in fields["robot"]],
@@ -65,14 +64,14 @@ class PolicyContext:
 
 
 class PolicyJudgement(NamedTuple):
-    """A policy without errors in its text, the results of its test cases, and the name of the key that signed it."""
+    """A policy without errors in its text."""
 
     policy: Policy
     results: list[CaseResult]
     signed_by: str
 
     def accepted(self) -> Policy:
-        """Return the policy. Raises `PolicyError` with every failed test case."""
+        """Raises `PolicyError` with every failed test case."""
         failed = [result.finding for result in self.results if not result.passed]
         if failed:
             raise PolicyError(failed)
@@ -80,10 +79,9 @@ class PolicyJudgement(NamedTuple):
 
 
 def judge(text: str, file: str, known: PolicyContext, signature: str = "") -> PolicyJudgement:
-    """Compile a policy, verify its signature and run its test cases. `file` is its name in findings and rules.
+    """`file` is the name in findings and rules.
 
-    Raises `PolicyError` with all errors in the text. If there are none, the errors of the signature or the test cases
-    are raised.
+    Raises `PolicyError` with all errors in the text, or if there are none, of the signature or the test cases.
     """
     policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot)
     try:

@@ -16,16 +16,16 @@ from roswire.errors import InvalidNameError
 from roswire.names import is_global_name, resolve_parameter
 
 Step = tuple[str, bool]
-"""One level of a key: its text, and whether a star follows it."""
+"""The text of one level, and whether a star follows it."""
 
 
 class BadKeyError(ValueError):
-    """The string is not a valid key; the message gives the reason and the correct form."""
+    """The message gives the reason and the correct form."""
 
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A parsed key: its text, its levels, and whether it includes everything below the last level (`/**`)."""
+    """`subtree`: the key includes everything below the last level (`/**`)."""
 
     text: str
     steps: tuple[Step, ...]
@@ -41,12 +41,12 @@ class Key:
 
     @property
     def specificity(self) -> tuple[bool, int, bool]:
-        """Return the rank of the key. If two keys match a name, the key with the greater specificity decides."""
+        """If two keys match a name, the one with the greater specificity decides."""
         return (self.exact, len(self.literal), not self.subtree)
 
     @property
     def inner_star(self) -> bool:
-        """Whether the key has a star before its end (`/*/state`, `/arm*/**`). Only such keys can tie."""
+        """A star before the end (`/*/state`, `/arm*/**`): only such keys can tie."""
         return any(star for _, star in (self.steps if self.subtree else self.steps[:-1]))
 
     def matches(self, name: str) -> bool:
@@ -61,7 +61,7 @@ class Key:
         )
 
     def ties_with(self, other: "Key") -> bool:
-        """Return whether the keys are equally specific and some name matches both."""
+        """The keys are equally specific and some name matches both."""
         if self.specificity != other.specificity:
             return False
         if len(self.steps) != len(other.steps) and not self.subtree:
@@ -76,12 +76,12 @@ def _compatible(one: Step, other: Step) -> bool:
 
 
 def levels(name: str) -> list[str]:
-    """Return the levels of a resolved name; `/` has none."""
+    """`/` has none."""
     return name[1:].split("/") if name != "/" else []
 
 
 def parse_key(text: str, *, parameter: bool = False) -> Key:
-    """Parse a key. The names of parameters have a wider grammar than those of topics. Raises `BadKeyError`."""
+    """Names of parameters have a wider grammar than those of topics. Raises `BadKeyError`."""
     if not text.startswith("/"):
         raise BadKeyError(f"names here are resolved and begin with a slash: /{text.lstrip('~')}")
     if "//" in text:
@@ -102,12 +102,12 @@ def parse_key(text: str, *, parameter: bool = False) -> Key:
 
 
 def command_key(name: str) -> Key:
-    """Return the key of a rule in `[Commands]`: the name of a call, which is not a ROS name."""
+    """The name of a call is not a ROS name."""
     return Key(name, (), subtree=False)
 
 
 def is_parameter_key(text: str) -> bool:
-    """Return whether `text` is a parameter's name, or `/`, in canonical spelling."""
+    """`/` is one; the spelling must be canonical."""
     try:
         return text.startswith("/") and resolve_parameter(text, "") == text
     except InvalidNameError:

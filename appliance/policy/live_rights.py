@@ -1,7 +1,7 @@
 """Find the live rights of hosts, such as publications, that a policy would end.
 
-A call gave each live right. A reload (`master/graph/revocation`) and a dry run ask the same question: may the host make
-this call now, under this policy? `policy/rights` lists the rights that the call needs.
+A reload (`master/graph/revocation`) and a dry run ask: may the host make the call that gave the right now, under this
+policy? `policy/rights` lists the rights that the call needs.
 """
 
 import ipaddress
@@ -17,7 +17,7 @@ from roswire.parameter_tree import Tree, holds_others, standing_at
 
 
 class LiveRight(NamedTuple):
-    """A live right of a host, such as a publication: `call` gave it for `resource`.
+    """A right that `call` gave for `resource`, such as a publication.
 
     `namespace`: the resource is a parameter that now contains other parameters.
     """
@@ -36,7 +36,7 @@ class LiveRight(NamedTuple):
         return {**self._asdict(), "host": str(self.host)}
 
     def requests(self) -> list[Request]:
-        """Return the requests to explain to a person: access to the parameter, if there is one, and the call."""
+        """Explain access to the parameter, if there is one, and the call."""
         asked = [request_of(self.call, self.host, self.caller_id, self.resource)]
         touch = policy_call(self.call).touches
         return asked if touch is None else [Request(self.host, self.caller_id, touch, self.resource), *asked]
@@ -44,7 +44,7 @@ class LiveRight(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """A live right that a policy would end: `what`, such as "publication", for `resource`."""
+    """`what` is a word such as "publication"."""
 
     host: str
     caller_id: str
@@ -54,7 +54,7 @@ class Ending:
 
 
 def live_by(call: str, host: Address, caller_id: str, resource: str, tree: Tree) -> LiveRight:
-    """Return the live right that this call gave; `tree` is the present parameter tree."""
+    """`tree` is the present parameter tree."""
     namespace = policy_call(call).touches is not None and holds_others(standing_at(tree, resource)[0])
     return LiveRight(host, caller_id, call, resource, namespace)
 
@@ -65,7 +65,7 @@ def may_keep(policy: Policy, live: LiveRight) -> Decision:
 
 
 def deprived(policy: Policy, things: Iterable[LiveRight]) -> dict[Address, set[str]]:
-    """Return the hosts that have live rights and keep none of them under a policy, with the names of their nodes."""
+    """Return hosts that keep none of their live rights, with the names of their nodes."""
     lost: dict[Address, set[str]] = {}
     kept: set[Address] = set()
     for live in things:

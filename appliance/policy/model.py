@@ -1,6 +1,6 @@
 """Define the policy's questions (`Request`) and answers (`Decision`).
 
-RVMaster, the `rosrv policy` commands, REST and the console all use these two classes, so all show the same text.
+RVMaster, `rosrv policy`, REST and the console all use these two classes, so all show the same text.
 """
 
 import enum
@@ -13,7 +13,7 @@ Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 class _Stored:
-    """Store properties of an address that the standard library computes at each use."""
+    """The standard library computes these properties at each use."""
 
     is_loopback = False
 
@@ -38,11 +38,11 @@ class _IPv6(_Stored, ipaddress.IPv6Address):
 
 
 HOST, DOOR = "host:", "door:"
-"""The beginnings of the words for enrolled hosts and for doors. Mappings of names have doors as `door:NAME`."""
+"""Mappings of names have doors as `door:NAME`."""
 
 
 def known_name(word: str) -> str | None:
-    """Return the name that `host:NAME` or `door:NAME` has in mappings of names; None for any other word."""
+    """`host:NAME` or `door:NAME` in mappings of names; None for any other word."""
     if word.startswith(DOOR):
         return word
     return word.removeprefix(HOST) if word.startswith(HOST) else None
@@ -54,7 +54,7 @@ def word_of(name: str) -> str:
 
 @lru_cache(4096)
 def address_of(text: str) -> Address:
-    """Parse the address of a host. Return the same object for the same text, to speed up the look-ups of every call.
+    """Return the same object for the same text, to speed up the look-ups of every call.
 
     The result equals the address that `ipaddress` makes, and has the same hash. Raises `ValueError`.
     """
@@ -62,7 +62,7 @@ def address_of(text: str) -> Address:
 
 
 class Category(enum.StrEnum):
-    """The kind of access in a request. Each category has its own section, but both for parameters share one."""
+    """The kind of access. Each category has its own section, but both for parameters share one."""
 
     NODE = "node"  # use a node name                [Nodes]
     PUBLISH = "publish"  # publish a topic          [Publishers]
@@ -98,7 +98,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """The position of a rule in the policy."""
+    """The position of a rule."""
 
     section: str  # as written in the documentation: "Publishers"
     key: str  # as written in the file: "/arm/**", "default", "read /ns/**"
@@ -116,10 +116,10 @@ class Decision:
 
     `rule` is the rule that decided, or None if no rule matches the request. `reason` is a sentence for audit records,
     `rosrv policy explain` and the console. `told` is the reason without names and addresses of other hosts, for the
-    answer to the caller; it is None if `reason` contains none (`text_for_caller`). In audit-only mode, `would_deny` is
-    true if the rules deny the request, and `allowed` is true. `needs` names the further right that decided, such as
-    `write /arm/**`; it is empty if the request itself decided. `asks` is the request that needs an operator's approval,
-    also while it has one. A call of a service that asks passes the gate, and the relay holds each of its requests.
+    caller; None if `reason` contains none (`text_for_caller`). In audit-only mode, `would_deny` is true if the rules
+    deny the request, and `allowed` is true. `needs` names the further right that decided, such as `write /arm/**`; it
+    is empty if the request itself decided. `asks` is the request that needs an operator's approval, also while it has
+    one. A call of a service that asks passes the gate, and the relay holds each of its requests.
     """
 
     allowed: bool
@@ -132,26 +132,26 @@ class Decision:
 
     @property
     def rank(self) -> int:
-        """Return how much the rules grant: nothing, with an approval, only in audit-only mode, or all."""
+        """How much the rules grant: nothing, with an approval, only in audit-only mode, or all."""
         return 2 if self.would_deny else 1 if self.asks is not None else 3 if self.allowed else 0
 
     @property
     def verdict(self) -> Literal["allow", "deny", "would deny", "ask"]:
-        """Return the answer in the words of the policy's tools, which also know `ask`."""
+        """The policy's tools also know `ask`."""
         return "ask" if self.rank == 1 else self.word
 
     @property
     def word(self) -> Literal["allow", "deny", "would deny"]:
-        """Return the answer in the audit log's words."""
+        """In the audit log's words."""
         return "would deny" if self.would_deny else "allow" if self.allowed else "deny"
 
 
 TELLS = ("rule", "full", "id")
-"""The values of `[Options] tell`, which limits the text for a denied caller. The first value is the default."""
+"""`[Options] tell` limits the text for a denied caller; the first value is the default."""
 
 
 def text_for_caller(decision: Decision, tell: str) -> str:
-    """Return the text for a denied caller: the reason (`full`), no other hosts (`rule`), or only the denial (`id`)."""
+    """The reason (`full`), no other hosts (`rule`), or only the denial (`id`)."""
     if tell == "full":
         return decision.reason
     return "denied" if tell == "id" else decision.told or decision.reason

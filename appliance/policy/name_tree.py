@@ -1,11 +1,11 @@
-"""Find the most specific key that matches a name. Exact names are found by hash, patterns in a tree of levels.
+"""Find the most specific key that matches a name: exact names by hash, patterns in a tree of levels.
 
-If stars are only at the end of keys, a look-up takes one step per level of the name, whatever the number of keys. A key
-with an earlier star makes the search branch; the compiler limits the number of such keys.
+If stars are only at the end of keys, a look-up takes one step per level of the name, whatever the number of keys. A
+key with an earlier star makes the search branch; the compiler limits the number of such keys.
 
 Invariants:
 
-1. `find` returns the value of the matching key with the greatest `specificity`. The tests compare both.
+1. `find` returns the value of the matching key with the greatest `specificity` (compared by tests).
 2. The caller does not add a key twice, and does not add a key that ties with another key.
 """
 
@@ -20,7 +20,7 @@ Value = TypeVar("Value")
 
 @dataclass(slots=True)
 class _Node(Generic[Value]):
-    """A node of the tree. `value` belongs to a key that ends here, `subtree` to a key that ends here with `/**`."""
+    """`value` belongs to a key that ends here, `subtree` to one that ends here with `/**`."""
 
     names: dict[str, "_Node[Value]"] = field(default_factory=dict)
     # The literal beginnings of levels with a star: one table for each length, longest first.
@@ -29,7 +29,7 @@ class _Node(Generic[Value]):
     subtree: tuple[Key, Value] | None = None
 
     def starred(self, level: str) -> Iterator["_Node[Value]"]:
-        """Yield the nodes behind stars that match a level; the longest literal beginning comes first."""
+        """The longest literal beginning comes first."""
         for length, table in self.stars:
             node = table.get(level[:length])
             if node is not None:
@@ -42,7 +42,7 @@ class _Node(Generic[Value]):
 
 
 class KeyTree(Generic[Value]):
-    """A tree that finds the value of the most specific key that matches a name."""
+    """Finds the value of the most specific key that matches a name."""
 
     __slots__ = ("_exact", "_root")
 
@@ -62,7 +62,7 @@ class KeyTree(Generic[Value]):
             node.value = (key, value)
 
     def find(self, name: str) -> Value | None:
-        """Return the value of the most specific key that matches a resolved name. Only `/**` matches `/`."""
+        """The name is resolved; only `/**` matches `/`."""
         found = self._exact.get(name)
         if found is not None:
             return found
@@ -77,7 +77,7 @@ class KeyTree(Generic[Value]):
         return pattern[1] if pattern is not None else None
 
     def below(self, name: str) -> list[Value]:
-        """Return the values of all keys that decide only some of the names below `name`."""
+        """These keys decide only some of the names below `name`."""
         inherited, ends = self._walk(name)
         prefix = "/" if name == "/" else name + "/"
         found = [pair for end in ends for child in end.children() for pair in _everything(child)]
@@ -88,7 +88,7 @@ class KeyTree(Generic[Value]):
         return [value for _, value in found]
 
     def inherited(self, name: str) -> Value | None:
-        """Return the value of the key that decides a name below `name` if no more specific key matches it."""
+        """The key decides names below `name` that no more specific key matches."""
         inherited, _ = self._walk(name)
         return inherited[1] if inherited is not None else None
 
@@ -131,10 +131,10 @@ def _everything(node: _Node[Value]) -> Iterator[tuple[Key, Value]]:
 
 
 def _find(path: list[_Node[Value]], parts: list[str]) -> tuple[Key, Value] | None:
-    """Return the best pattern for a name whose first levels lead through `path` without a star.
+    """The first levels of the name lead through `path` without a star.
 
-    Literal beginnings grow along the path, so the end of the path is tried first. In each node, stars are tried before
-    `subtree`, because a longer literal beginning beats a shorter one, and /x/* beats /x/**.
+    Literal beginnings grow along the path, so the end of the path is tried first. In each node, stars are tried
+    before `subtree`, because a longer literal beginning beats a shorter one, and /x/* beats /x/**.
     """
     for depth in range(len(path) - 1, -1, -1):
         node = path[depth]
@@ -149,7 +149,7 @@ def _find(path: list[_Node[Value]], parts: list[str]) -> tuple[Key, Value] | Non
 
 
 def _find_behind_star(node: _Node[Value], parts: list[str], depth: int) -> tuple[Key, Value] | None:
-    """Return the best pattern behind a star, or None.
+    """Return the best pattern behind a star.
 
     All patterns here have the same literal beginning. So at most one pattern with `/**` matches, and at most one
     without.

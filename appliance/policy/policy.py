@@ -34,16 +34,15 @@ _KEPT_NAME = 256
 _LONGEST_REASON = 299
 
 Approval = tuple[Address, Category, str]
-"""An operator's approval: this host may publish this topic, or write this parameter."""
+"""A host may publish a topic, or write a parameter."""
 
 
 @dataclass(frozen=True, slots=True)
 class CompiledRule:
     """One line of a deciding section.
 
-    `key` is None for `default`. `atoms` is the value as atoms, `words` the value as written, and `shown` the value as
-    text for messages. `place` is the rule's position as text; `column` is the column of its key. `asked` has the atoms
-    of hosts that need an approval.
+    `key` is None for `default`. `words` is the value as written, `shown` as text for messages. `place` is the rule's
+    position as text; `column` is the column of its key. `asked` has the atoms of hosts that need an approval.
     """
 
     rule: Rule
@@ -60,7 +59,6 @@ class CompiledRule:
         return self.atoms | self.asked
 
     def asks(self, atoms: frozenset[Atom]) -> bool:
-        """Return whether a host with these atoms needs an approval."""
         return self.atoms.isdisjoint(atoms) and not self.asked.isdisjoint(atoms)
 
     def grants(self, atoms: frozenset[Atom]) -> bool:
@@ -72,7 +70,7 @@ class CompiledRule:
 
 @dataclass(slots=True)
 class RuleTable:
-    """The rules of one category. `audit_only`: requests that these rules deny still pass."""
+    """`audit_only`: requests that these rules deny still pass."""
 
     tree: KeyTree[CompiledRule] = field(default_factory=KeyTree)
     default: CompiledRule | None = None
@@ -81,7 +79,7 @@ class RuleTable:
 
 
 class HostStanding(NamedTuple):
-    """The answers of a policy about a host: `Policy.knows`, `names` and `alike`."""
+    """`Policy.knows`, `names` and `alike`."""
 
     known: bool
     named: bool
@@ -90,16 +88,16 @@ class HostStanding(NamedTuple):
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class Policy:
-    """A compiled policy; only `compile_policy` makes it.
+    """Only `compile_policy` makes it.
 
-    `text` and `file` are its source. `warnings` are the findings of the lint. `named` has the atoms of all hosts that a
-    rule names. `present` lists the categories that have a section. `ports` are the ports for proxy endpoints and relay.
-    `monitored_topics` and `monitored_services` are the names in `[Monitor]`. `takeover` is `same-host` or `granted`.
-    `enrolled` and `robot` are the given addresses of `host:NAME` and `robot`. `blocks` has the hosts that an operator
-    blocks, by canonical address: the end of a sentence, such as `blocked by ann`. `authority` has the groups of
-    `[Authority]`, and `holders` the host that holds each of them; a group without an entry is free. Without `holders`
-    (for checks of a text), each host with a claim counts as the holder. `approved` has the approvals that last, as
-    host, category and name. Without it, no request that needs an approval passes.
+    `text` and `file` are its source. `named` has the atoms of all hosts that a rule names. `present` lists the
+    categories that have a section. `monitored_topics` and `monitored_services` are the names in `[Monitor]`.
+    `takeover` is `same-host` or `granted`; `ports` are for proxy endpoints and relay. `enrolled` and `robot` are the
+    given addresses of `host:NAME` and `robot`. `blocks` has the hosts that an operator blocks, by canonical address:
+    the end of a sentence, such as `blocked by ann`. `authority` has the groups of `[Authority]`, and `holders` the
+    host that holds each of them; a group without an entry is free. Without `holders` (for checks of a text), each
+    host with a claim counts as the holder. `approved` has the approvals that last, as host, category and name.
+    Without it, no request that needs an approval passes.
     """
 
     text: str
@@ -133,7 +131,7 @@ class Policy:
         self._commanded = {name: group for group in self.authority.values() for name in group.names}
 
     def decide(self, request: Request) -> Decision:
-        """Decide by the rules of the request's own category whether the host may access the resource.
+        """Decide by the rules of the request's own category.
 
         A call may need further rights: `policy/rights` lists them and decides on all of them.
         """
@@ -149,7 +147,7 @@ class Policy:
         return decision
 
     def decide_parameter(self, request: Request, *, namespace: bool = False) -> Decision:
-        """Decide on a parameter and everything below it. If a rule for a name below denies the host, deny the call.
+        """A rule for a name below that denies the host denies the call.
 
         `namespace`: the parameter contains other parameters. Then the rule for contained parameters without their own
         key must also grant the host, because an exact key `/arm` does not match `/arm/speed`.
@@ -169,7 +167,7 @@ class Policy:
         return kept
 
     def _decide_below(self, request: Request, namespace: bool) -> Decision | None:
-        """Return the decision by a key below the resource that does not grant the host; None: all of them do."""
+        """Return None if all keys below grant the host."""
         table = self.tables[request.category]
         atoms = self.hosts.atoms_of(request.host)
         deciding = table.tree.below(request.resource)
@@ -193,19 +191,19 @@ class Policy:
         return self.limits.find(topic)
 
     def limit(self, part: LimitScope, topic: str, host: Address | None = None) -> Rate:
-        """Return the limit of a publisher or subscriber on `host`, or of all publishers of a topic together."""
+        """Without `host`, the limit is that of all publishers of a topic together."""
         rule = self.limits.find(topic)
         if rule is None:
             return NO_LIMIT
         return rule.rate(part, self.hosts.atoms_of(host) if host is not None else frozenset())
 
     def limit_on(self, request: Request) -> Rate:
-        """Return the rate limit of a request to publish or subscribe; other requests have no limit."""
+        """Other requests than to publish or subscribe have no limit."""
         part = _LIMITED.get(request.category)
         return NO_LIMIT if part is None else self.limit(part, request.resource, request.host)
 
     def standing(self, address: Address) -> HostStanding:
-        """Return the answers that every call of a host needs. They are kept, because a policy never changes."""
+        """Every call of a host needs these answers; they are kept, because a policy never changes."""
         standing = self._standings.get(address)
         if standing is None:
             if len(self._standings) >= _KEPT_DECISIONS:
@@ -215,7 +213,7 @@ class Policy:
         return standing
 
     def knows(self, address: Address) -> bool:
-        """Return whether any rule includes this address and the host is not blocked. Other hosts are unknown hosts.
+        """A rule includes this address, and the host is not blocked. Other hosts are unknown hosts.
 
         In audit-only mode without a rule that names a host, every host is known, because a robot is being learned.
         """
@@ -225,11 +223,11 @@ class Policy:
         return learned or not self.named.isdisjoint(self.hosts.atoms_of(address))
 
     def serves(self, address: Address) -> bool:
-        """Whether requests of this address are read: it is known, or a section in audit-only mode lets them pass."""
+        """Requests of this address are read: it is known, or a section in audit-only mode lets them pass."""
         return self.knows(address) or (self._any_audit_only and self.blocked(address) is None)
 
     def blocked(self, address: Address) -> Decision | None:
-        """Return the denial of every request of a host that an operator blocks; None for any other host."""
+        """The denial of every request of a blocked host."""
         if not self.blocks or (block := self.blocks.get(host := canonical_address(address))) is None:
             return None
         return Decision(False, None, f"{host} is {block}", told=f"{host} is blocked by an operator")
@@ -238,7 +236,7 @@ class Policy:
         return self._commanded.get(name)
 
     def may_command(self, name: str, host: Address) -> bool:
-        """Whether messages and calls of this host reach a topic or service: it holds the group, or there is none."""
+        """Messages and calls of this host reach a topic or service: it holds the group, or there is none."""
         group = self._commanded.get(name)
         if group is None:
             return True
@@ -247,14 +245,14 @@ class Policy:
         return self.holder(group) == canonical_address(host)
 
     def holder(self, group: AuthorityGroup) -> Address | None:
-        """Return the host that holds a group and still has a claim to it; None: the group is free."""
+        """The holder must still have a claim; None means that the group is free."""
         host = (self.holders or {}).get(group.name)
         if host is None or self.blocked(host) is not None or group.claim(self.atoms_of(host)) is None:
             return None
         return host
 
     def asks_for(self, category: Category, name: str) -> bool:
-        """Return whether some hosts need an approval to access this name."""
+        """Some hosts need an approval to access this name."""
         rule = self.tables[category].tree.find(name) or self.tables[category].default
         return rule is not None and bool(rule.asked)
 
@@ -265,18 +263,18 @@ class Policy:
         return self.hosts.alike(address)
 
     def counted_as(self, address: Address) -> str:
-        """Return the key for counting a host: `alike`, or one empty string for all unknown hosts."""
+        """`alike`, or one empty string for all unknown hosts."""
         return self.alike(address) if self.knows(address) else ""
 
     def names(self, address: Address) -> bool:
-        """Whether the policy names this address or a network that contains it; `*` and blocked hosts do not count."""
+        """The policy names this address or a network that contains it; `*` and blocked hosts do not count."""
         return self.hosts.names(address) and self.blocked(address) is None
 
     def has_section(self, category: Category) -> bool:
         return category in self.present
 
     def audit_only(self, category: Category) -> bool:
-        """Return whether requests of this category pass although the rules deny them."""
+        """Requests of this category pass although the rules deny them."""
         return self.tables[category].audit_only
 
     def atoms_of(self, address: Address) -> frozenset[Atom]:
@@ -309,7 +307,8 @@ class Policy:
         return decision if group is None else self._commanding(request, decision, group)
 
     def _commanding(self, request: Request, decision: Decision, group: AuthorityGroup) -> Decision:
-        """Deny what the rules grant to a host without a claim to the group, and calls of a host that does not hold it.
+        """Deny what the rules grant to a host without a claim to the group, and calls of a host that does not hold
+        it.
 
         The publication of a host with a claim stays registered, because a ROS 1 node never registers again. The relay
         carries its messages only while the host holds the group.
@@ -349,9 +348,8 @@ class Policy:
         return _by_rule(what, found, table.audit_only)
 
     def _asking(self, request: Request, rule: CompiledRule, audit_only: bool) -> Decision:
-        """Decide for a host that needs an approval.
-
-        A call of a service passes here in operation, because the relay holds each of its requests.
+        """Decide for a host that needs an approval. A service call passes here, because the relay holds each of its
+        requests.
         """
         if self._is_approved(request):
             reason = f"{_what(request, 'may')} by {rule.place}, while an approval lasts"
@@ -394,7 +392,7 @@ def _what(request: Request, may: str) -> str:
 
 
 def _by_rule(what: str, rule: CompiledRule, audit_only: bool) -> Decision:
-    """Return a denial by a rule. The reason lists the allowed hosts, unless it would be too long."""
+    """The reason lists the allowed hosts, unless it would be too long."""
     told = f"{what}, by {rule.place}"
     reason = f"{what}: {rule.shown}, by {rule.place}"
     decision = _decided(False, rule.rule, reason if len(reason) <= _LONGEST_REASON else told, audit_only)
@@ -407,6 +405,6 @@ def _shortened(text: str, limit: int = 60) -> str:
 
 
 def place_of(rule: Rule) -> str:
-    """Return the position of a rule as text, short enough for a sentence."""
+    """Short enough for a sentence."""
     file = rule.file.rpartition("/")[2]
     return f"[{rule.section}] {_shortened(rule.key, 50)} ({_shortened(file, 30)}:{rule.line})"

@@ -1,6 +1,6 @@
 """Compile a policy: read the text, check every word, compile the rules.
 
-All errors are reported at once. An invalid section or value is left out, and the rest of the text is still checked.
+All errors are reported at once: an invalid section or value is left out, and the rest is still checked.
 """
 
 from collections.abc import Collection, Mapping
@@ -27,11 +27,10 @@ def compile_policy(
     hosts: Mapping[str, Address] | None = None,
     robot: Collection[Address | Network] = (),
 ) -> Policy:
-    """Compile a text to a policy. Raises `PolicyError` with every error in the text.
+    """Raises `PolicyError` with every error in the text.
 
-    `file` is the name of the text in findings and rules. `hosts` maps the names of enrolled hosts (`host:NAME`) to
-    their addresses. A name without an address matches no host and causes a warning. `robot` lists the addresses of the
-    predefined group `robot`.
+    `file` is the name of the text in findings and rules. `hosts` has the addresses of enrolled hosts (`host:NAME`). A
+    name without an address matches no host and causes a warning. `robot` lists the addresses of the group `robot`.
     """
     findings = Findings(file)
     written = _by_name(read(text, findings), findings)

@@ -1,7 +1,6 @@
 """Collect errors and warnings about an operator's file, with their position: `file:line:column: error: text`.
 
-Errors reject the file; warnings (the lint) never do. All findings are reported together, so that a file can be fixed in
-one step.
+Errors reject the file; warnings never do. All are reported together, so that a file can be fixed in one step.
 """
 
 import enum
@@ -11,7 +10,7 @@ MAXIMUM_FINDINGS = 200
 
 
 class FindingSeverity(enum.StrEnum):
-    """The severity of a finding: an error rejects the file."""
+    """An error rejects the file."""
 
     ERROR = "error"
     WARNING = "warning"
@@ -19,7 +18,7 @@ class FindingSeverity(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True, order=True)
 class PolicyFinding:
-    """One mistake. `line` and `column` count from 1; `text` describes the mistake and the remedy."""
+    """`line` and `column` count from 1; `text` describes the mistake and the remedy."""
 
     file: str
     line: int
@@ -33,7 +32,7 @@ class PolicyFinding:
 
 
 class PolicyError(Exception):
-    """The whole text is rejected; `findings` has every error (and the warnings found so far)."""
+    """`findings` has every error, and the warnings found so far."""
 
     def __init__(self, findings: list[PolicyFinding]) -> None:
         self.findings = findings
@@ -41,7 +40,7 @@ class PolicyError(Exception):
 
 
 class Findings:
-    """The findings of one file. Beyond `MAXIMUM_FINDINGS`, further errors are only counted."""
+    """Beyond `MAXIMUM_FINDINGS`, errors of the file are only counted."""
 
     def __init__(self, file: str) -> None:
         self.file = file
@@ -61,11 +60,10 @@ class Findings:
 
     @property
     def full(self) -> bool:
-        """Whether the list is full, so that another error is only counted."""
         return len(self._errors) >= MAXIMUM_FINDINGS
 
     def raise_errors(self) -> None:
-        """If there is an error, raise `PolicyError` with all findings in the order of the file."""
+        """Raise `PolicyError` with all findings in the order of the file."""
         if not self._errors:
             return
         findings = sorted([*self._errors, *self.warnings])
@@ -77,7 +75,7 @@ class Findings:
 
 
 def quoted(text: str, limit: int = 60) -> str:
-    """Return untrusted text in a form that is safe to print: quoted, shortened, with control characters escaped."""
+    """Quote, shorten and escape untrusted text."""
     shown = text if len(text) <= limit else text[: limit - 1] + "…"
     return '"' + "".join(c if c.isprintable() and c != '"' else _escaped(c) for c in shown) + '"'
 

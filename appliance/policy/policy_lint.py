@@ -1,4 +1,4 @@
-"""Warn about valid rules that the author most likely did not intend. Warnings never reject a policy."""
+"""Warn about valid rules that the author most likely did not intend; warnings never reject a policy."""
 
 import bisect
 import ipaddress
@@ -43,7 +43,7 @@ def _shadowed_defaults(tables: Tables, findings: Findings) -> None:
 
 
 def _dead_rules(tables: Tables, table: HostSets, findings: Findings) -> None:
-    """Warn about rules that let a host publish, subscribe or offer although it may not use any node name."""
+    """Warn about hosts that may publish, subscribe or offer, but may not use any node name."""
     named = {atom for rule in tables[Category.NODE].rules for atom in rule.atoms}
     if EVERYONE in named:
         return
@@ -61,7 +61,7 @@ def _dead_rules(tables: Tables, table: HostSets, findings: Findings) -> None:
 
 
 def _nameless(named: set[Atom], table: HostSets) -> dict[Atom, Network]:
-    """For each atom, return a network in it that does not overlap the hosts of `[Nodes]`; omit atoms without one."""
+    """For each atom, return a network that does not overlap the hosts of `[Nodes]`, if there is one."""
     networks = table.networks()
     nodes = [network for network, atom in networks.items() if not named.isdisjoint(table.above([atom]))]
     overlap = _Overlap(nodes)
@@ -78,7 +78,7 @@ def _nameless(named: set[Atom], table: HostSets) -> dict[Atom, Network]:
 
 
 class _Overlap:
-    """A set of networks; `any` checks whether a network overlaps one of them."""
+    """Overlaps with a set of networks."""
 
     def __init__(self, networks: list[Network]) -> None:
         self._starts: dict[int, list[int]] = {}
@@ -99,7 +99,7 @@ class _Overlap:
 def _nodes_that_cannot_start(
     tables: Tables, present: set[Category], written: Mapping[str, SectionText], findings: Findings
 ) -> None:
-    """Warn about commands that every node needs but that are granted to no host."""
+    """Warn about commands that every node needs but that no host may use."""
     if Category.COMMAND not in present:
         return
     table = tables[Category.COMMAND]
@@ -119,7 +119,7 @@ def _unused_groups(groups: HostGroups, findings: Findings) -> None:
 
 
 def _missing_sections(present: set[Category], findings: Findings) -> None:
-    """Warn about missing sections whose requests are therefore denied for all hosts."""
+    """Requests of a missing section are denied for all hosts."""
     for decider in sections.DECIDERS:
         if not decider.extension and decider.categories[0] not in present:
             findings.warn(

@@ -1,4 +1,4 @@
-"""Read the sections that do not decide requests: `[Ports]`, `[Monitor]` and `[Options]`."""
+"""Read `[Ports]`, `[Monitor]` and `[Options]`, which do not decide requests."""
 
 import re
 from collections.abc import Collection, Iterator, Sequence
@@ -14,7 +14,7 @@ from roswire.names import is_global_name
 
 TAKEOVERS = ("same-host", "granted")
 AT_ONCE = "[Options] takeover = granted"
-"""The option that lets another host take over a node name. A denial that it would prevent names this option."""
+"""Lets another host take over a node name; a denial that it would prevent names this option."""
 _MASTER_PORT = 11311
 _RANGE = re.compile(r"([0-9]{1,5})-([0-9]{1,5})", re.ASCII)
 
@@ -30,7 +30,7 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class MonitorSection:
-    """`[Monitor]`: the topics and services that are relayed even without a specification."""
+    """Topics and services that are relayed even without a specification."""
 
     topics: frozenset[str] = frozenset()
     services: frozenset[str] = frozenset()
@@ -75,7 +75,7 @@ def read_monitor(section: SectionText | None, findings: Findings) -> MonitorSect
 
 
 def read_options(section: SectionText | None, findings: Findings) -> Options:
-    """Return the options; an option that the file does not set has its default."""
+    """An option that is not set has its default."""
     options = Options()
     for entry in _entries(section, ("takeover", "audit-only", "tell"), findings):
         match entry.key.text:
@@ -117,7 +117,7 @@ def _audit_only(entry: Entry, findings: Findings) -> frozenset[str]:
 
 
 def _entries(section: SectionText | None, keys: Collection[str], findings: Findings) -> Iterator[Entry]:
-    """Yield the entries of a section. Entries with an unknown or repeated key are left out and reported as errors."""
+    """Entries with an unknown or repeated key are errors."""
     first_lines: dict[str, int] = {}
     for entry in section.entries if section else ():
         word = entry.key

@@ -28,7 +28,7 @@ from appliance.policy.sections import DEFAULT, LIMITS
 
 
 class LimitScope(StrEnum):
-    """The scope of a limit, which counts the messages in its scope together."""
+    """A limit counts the messages in its scope together."""
 
     PUBLISHER = "publisher"
     SUBSCRIBER = "subscriber"
@@ -37,7 +37,7 @@ class LimitScope(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """Messages and bytes per second; 0 means unlimited."""
+    """Per second; 0 means unlimited."""
 
     messages: float = 0.0
     bytes: float = 0.0
@@ -69,7 +69,7 @@ _LINES = 1000
 
 @dataclass(frozen=True, slots=True)
 class Clause:
-    """One limit of a line. It applies to nodes on hosts with one of `atoms` (None: on all hosts)."""
+    """Applies to nodes on hosts with one of `atoms` (None: on all hosts)."""
 
     part: LimitScope
     atoms: frozenset[Atom] | None
@@ -78,14 +78,14 @@ class Clause:
 
 @dataclass(frozen=True, slots=True)
 class LimitRule:
-    """One line of `[Limits]`; `key` is None for `default`."""
+    """`key` is None for `default`."""
 
     rule: Rule
     key: Key | None
     clauses: tuple[Clause, ...]
 
     def rate(self, part: LimitScope, atoms: frozenset[Atom]) -> Rate:
-        """Return the strictest limit among the clauses for this scope that apply to a host with these atoms."""
+        """The strictest clause counts."""
         rate = NO_LIMIT
         for clause in self.clauses:
             if clause.part is part and (clause.atoms is None or not clause.atoms.isdisjoint(atoms)):
@@ -113,7 +113,7 @@ class LimitTable:
 
 
 def read_limits(section: SectionText | None, file: str, groups: HostGroups, findings: Findings) -> LimitTable:
-    """Return the lines of the section. Invalid parts are left out and reported in `findings`."""
+    """Invalid parts are left out and reported in `findings`."""
     table = LimitTable()
     first_lines: dict[str, int] = {}
     patterns: list[tuple[Key, int]] = []
@@ -138,7 +138,7 @@ def read_limits(section: SectionText | None, file: str, groups: HostGroups, find
 
 
 def _key(word: Word, patterns: list[tuple[Key, int]], findings: Findings) -> Key | None:
-    """Return the parsed key. Return None for `default`, and for an invalid key, which is reported as an error."""
+    """Return None for `default`, and for an invalid key."""
     if word.text == DEFAULT:
         return None
     try:
@@ -157,7 +157,7 @@ def _key(word: Word, patterns: list[tuple[Key, int]], findings: Findings) -> Key
 
 
 def _clauses(entry: Entry, groups: HostGroups, findings: Findings) -> Iterator[Clause]:
-    """Yield the clauses of a line; each begins with the word for its scope."""
+    """Each clause begins with the word for its scope."""
     parts: list[tuple[Word, list[Word]]] = []
     for word in entry.values:
         if word.text in _PARTS:
@@ -193,7 +193,7 @@ def _clause(part: Word, words: list[Word], groups: HostGroups, findings: Finding
 
 
 def _rate(part: Word, words: list[Word], findings: Findings) -> Rate | None:
-    """Parse numbers with units, such as `5Hz` or `5 Hz`. Report an error and return None if they are invalid."""
+    """`5Hz` or `5 Hz`. Report an error and return None if invalid."""
     found: dict[str, float] = {}
     words = list(words)
     while words:

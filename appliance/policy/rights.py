@@ -1,8 +1,8 @@
 """List the rights that a call needs. Only this module knows which rules must grant a call.
 
-RVMaster's gate, the revocation of live rights, `explain`, test cases, `diff` and `learn` all use this module, so they
-cannot contradict each other. `rights_of_call` returns the rights of a whole call. `rights_of` returns the rights of an
-action that a person names (`publish /cmd_vel`). `decide` makes one decision on several rights.
+RVMaster's gate, revocation, `explain`, test cases, `diff` and `learn` all use it, so they cannot contradict each
+other. `rights_of_call` returns the rights of a whole call. `rights_of` returns the rights of an action that a person
+names (`publish /cmd_vel`). `decide` makes one decision on several rights.
 
 A right is a question to one section of the policy. A call needs all of these rights:
 
@@ -26,13 +26,14 @@ from roswire.xmlrpc import Value
 
 _NODE_CATEGORIES = {call.category for call in CALLS.values() if call.node} - {Category.COMMAND}
 COMMAND_FOR = {Category.CALL: "lookupService", Category.READ: "getParam", Category.WRITE: "setParam"}
-"""The commands by which a node calls a service, reads a parameter and writes a parameter."""
+"""A node calls a service, reads and writes a parameter by these commands."""
 
 
 class Right(NamedTuple):
-    """One question to the policy.
+    """A question to the policy.
 
-    `namespace`: the parameter contains other parameters. `alone`: the question excludes everything below the parameter.
+    `namespace`: the parameter contains other parameters. `alone`: the question excludes everything below the
+    parameter.
     """
 
     request: Request
@@ -46,7 +47,7 @@ class Right(NamedTuple):
 
 
 def request_of(call: str, host: Address, caller_id: str, resource: str) -> Request:
-    """Return the policy request for a call: about its topic or service, or otherwise about the command."""
+    """The request is about the topic or service, or otherwise about the command."""
     category = policy_call(call).category
     return Request(host, caller_id, category, call if category is Category.COMMAND else resource)
 
@@ -54,10 +55,9 @@ def request_of(call: str, host: Address, caller_id: str, resource: str) -> Reque
 def rights_of_call(
     request: Request, call: str, key: str | None = None, *, value: Value = None, tree: Tree | None = None
 ) -> list[Right]:
-    """Return all rights that this call needs.
+    """`request` is the one that decides the call (`request_of`).
 
-    `request` is the request that decides the call (`request_of`). `key` and `value` are the key and the new value of
-    its parameter. `tree` is the present parameter tree.
+    `key` and `value` are those of its parameter, and `tree` is the present parameter tree.
     """
     row = policy_call(call)
     if key is None or row.touches is None:
@@ -71,7 +71,7 @@ def rights_of_call(
 
 
 def rights_to_keep(request: Request, call: str, resource: str, *, namespace: bool) -> list[Right]:
-    """Return all rights that a host needs to keep the live right that this call gave.
+    """Return the rights that a host needs to keep the live right of this call.
 
     `namespace`: the resource is a parameter that contains other parameters.
     """
@@ -80,7 +80,7 @@ def rights_to_keep(request: Request, call: str, resource: str, *, namespace: boo
 
 
 def rights_of(request: Request, touched: Iterable[Right] = ()) -> list[Right]:
-    """Return all rights that an action needs, including `touched`, the rights on its parameters."""
+    """`touched` are the rights on the action's parameters."""
     rights = [Right(request)]
     if (command := COMMAND_FOR.get(request.category)) is not None:
         rights.append(Right(_of(request, Category.COMMAND, command)))
@@ -95,7 +95,7 @@ def right_to_read(request: Request, value: Value) -> Right:
 
 
 def right_to_find(request: Request) -> Right:
-    """Return the right to learn that a parameter exists, without the right on anything below it."""
+    """The right to learn that a parameter exists does not include anything below it."""
     return Right(request, alone=True)
 
 
@@ -106,9 +106,9 @@ def needs_node(request: Request) -> bool:
 
 
 def decide(policy: Policy, rights: Iterable[Right]) -> Decision:
-    """Return one decision on all rights: the first of the lowest rank, so a denial before a missing approval.
+    """Return the first decision of the lowest rank, so a denial before a missing approval.
 
-    Each right that asks needs its own approval, so one that lacks it is decisive even if another has it.
+    Each right that asks needs its own approval.
     """
     first, *others = rights
     verdict = decide_right(policy, first)

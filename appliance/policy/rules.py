@@ -1,4 +1,4 @@
-"""Compile the lines of the deciding sections into rule tables, and report their mistakes."""
+"""Compile the deciding sections into rule tables, and report mistakes."""
 
 from appliance.base.validation_messages import meant
 from appliance.policy import commands
@@ -11,11 +11,11 @@ from appliance.policy.policy_findings import Findings, quoted
 from appliance.policy.sections import ASK, ASKING, DEFAULT, PARAMETERS, Decider
 
 MAXIMUM_INNER_STARS = 1000
-"""The most keys with a star before the end, in all sections together. Such keys make the search for a name branch."""
+"""In all sections together: keys with a star before the end make the search branch."""
 
 
 class RuleCompiler:
-    """The compiler that fills one `RuleTable` per category."""
+    """Fills one `RuleTable` per category."""
 
     def __init__(self, file: str, groups: HostGroups, findings: Findings) -> None:
         self.tables = {category: RuleTable() for category in Category}
@@ -61,7 +61,7 @@ class RuleCompiler:
             )
 
     def _asking(self, category: Category, entry: Entry) -> tuple[tuple[Word, ...], tuple[Word, ...]]:
-        """Return the words of a value before and after `ask`."""
+        """Return the words before and after `ask`."""
         places = [place for place, word in enumerate(entry.values) if word.text == ASK]
         if not places:
             return entry.values, ()

@@ -8,7 +8,7 @@ from appliance.policy.model import Category
 
 @dataclass(frozen=True, slots=True)
 class Decider:
-    """A section that decides requests. `phrases` maps its categories to the words before a resource in messages.
+    """A section that decides requests; `phrases` are the words before a resource in messages.
 
     The sections with `extension` are not in the thesis: if one is missing, its requests are allowed for all hosts. If
     another section is missing, its requests are denied.
@@ -42,13 +42,12 @@ BY_CATEGORY = {category: decider for decider in DECIDERS for category in decider
 PARAMETERS = frozenset({Category.READ, Category.WRITE})
 
 ASK = "ask"
-"""The word in a value after which the hosts need an operator's approval."""
+"""Hosts after this word need an operator's approval."""
 
 ASKING = frozenset({Category.PUBLISH, Category.CALL, Category.WRITE})
-"""The categories whose rules may have `ask`."""
 
 DEFAULT = "default"
-"""The key that applies to names without another matching key in the section."""
+"""Applies to names without another matching key in the section."""
 
 GROUPS, PORTS, MONITOR, LIMITS, OPTIONS = "Groups", "Ports", "Monitor", "Limits", "Options"
 AUTHORITY = "Authority"

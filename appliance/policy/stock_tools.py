@@ -1,7 +1,7 @@
 """List the rights that the stock tools of ROS need before they do what the user asked for. No I/O.
 
-A tool on a host without rights is denied one call after the other, and reports only the first one. The calls are those
-that the tools of Debian 12 made with all their verbs that only read.
+A tool on a host without rights is denied one call after the other, and reports only the first one. The calls are
+those that the tools of Debian 12 made with all their verbs that only read.
 """
 
 from dataclasses import dataclass
@@ -17,14 +17,14 @@ _LOG_LEVEL = ("get_loggers", "set_logger_level")
 
 @dataclass(frozen=True, slots=True)
 class StockTool:
-    """A tool: the calls that it makes under its own name, and whether it also starts an anonymous node."""
+    """The calls are made under the tool's own name; `node`: it also starts an anonymous node."""
 
     name: str
     calls: tuple[str, ...]
     node: bool = True
 
     def rights(self, host: Address) -> list[Right]:
-        """Return the rights that the tool needs on this host, without those on topics and services of its user."""
+        """Topics and services of the tool's user are not included."""
         name = f"/{self.name}_1_1000000000"
         asked = [(Category.COMMAND, call) for call in self.calls]
         if self.node:
@@ -50,7 +50,7 @@ _TOOLS = (
 
 
 def stock_tool(caller_id: str) -> StockTool | None:
-    """Return the tool that calls under this name: `/rostopic`, `/rostopic_4711_1700000000000`, `/rosparam-4711`."""
+    """A tool calls as `/rostopic`, `/rostopic_4711_1700000000000` or `/rosparam-4711`."""
     if len(caller_id) > _LONGEST:
         return None
     key = key_of(caller_id)

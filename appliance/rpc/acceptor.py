@@ -30,10 +30,10 @@ _log = structlog.get_logger()
 
 
 class Acceptor:
-    """Pass each new connection and its host to `accepted`, which then owns the socket. Charge the host for the time.
+    """`accepted` owns the socket; the host is charged for the time.
 
-    If `accepted` returns False (too many connections), further connections of this host in the same turn are closed at
-    once. With `paced`, accepting waits for the turn of unknown hosts.
+    If it returns False (too many connections), other connections of this host in the same turn are closed at once.
+    With `paced`, accepting waits for the turn of unknown hosts.
     """
 
     def __init__(

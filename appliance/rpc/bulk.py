@@ -30,7 +30,7 @@ def bulk_turns(quota_class: Callable[[Address], QuotaClass]) -> Turns[Address]:
 
 
 class Bulk:
-    """The bulk of one request: reserved on demand, and released when the request ends.
+    """Reserved on demand, and released when the request ends.
 
     `in_thread` charges the host for work in a thread, which is not part of the request's own steps.
     """
@@ -49,13 +49,13 @@ class Bulk:
         self.give_back()
 
     async def take(self) -> None:
-        """Wait for the reservation, unless the request already has it."""
+        """Do nothing if the request already has it."""
         if not self.taken:
             await self._turns.enter(self._host)
             self.taken = True
 
     async def in_thread(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function in a thread, and charge its processor time to the host."""
+        """Charge the processor time to the host."""
         used = 0.0
 
         def measured() -> T:
@@ -78,9 +78,9 @@ class Bulk:
 
 
 class LargeWrites:
-    """Limit the large values under way to the ROS master and to another appliance: one at a time for each host.
+    """Large values to the ROS master and to another appliance go one at a time for each host.
 
-    The ROS master is one Python process. Many threads that read large values would block its other threads. The
+    The ROS master is one Python process, whose threads would block each other while they read large values. The
     changes of all hosts reach the other appliance in one order. A call that has its turn waits only for these two;
     `stored` waits for the other appliance.
     """
@@ -97,7 +97,7 @@ class LargeWrites:
 
     @contextlib.asynccontextmanager
     async def turn(self, host: Address, values: list[Value]) -> AsyncIterator[bool]:
-        """Take a turn for a write of these values to the ROS master, if they are large. Yield whether they are."""
+        """Yield whether the values are large."""
         if weigh(values, self._enough) < self._enough:
             yield False
             return
@@ -111,7 +111,7 @@ class LargeWrites:
 
 
 def text_weight(text: str) -> int:
-    """Return the approximate bytes of a string on the wire, with `&`, `<` and `>` escaped."""
+    """Approximate bytes on the wire, with `&`, `<` and `>` escaped."""
     if text.isascii() and not ("&" in text or "<" in text or ">" in text):
         return len(text)
     size = len(text.encode("utf-8", "surrogatepass"))
@@ -119,7 +119,7 @@ def text_weight(text: str) -> int:
 
 
 def weigh(value: Value, enough: int) -> int:
-    """Return the approximate bytes of a value on the wire; stop counting at `enough`."""
+    """Approximate bytes on the wire; stop counting at `enough`."""
     total = 0
     waiting: list[Value] = [value]
     while waiting and total < enough:

@@ -32,30 +32,30 @@ class Stage(StrEnum):
     IDLE = "idle"
 
     UNFINISHED = "unfinished"
-    """The connection waits for the rest of a request, for its turn, or for the peer to read an answer."""
+    """Waits for the rest of a request, for its turn, or for the peer to read an answer."""
 
     SERVED = "served"
-    """A handler works on a request of the connection."""
+    """A handler works on a request."""
 
 
 class TrackedConnection(Protocol):
-    """The interface of a connection in the table; `deadline` is in monotonic seconds."""
+    """`deadline` is in monotonic seconds."""
 
     deadline: float
 
     @property
     def holding(self) -> int:
-        """Return the bytes that the connection holds, and releases when it ends."""
+        """Bytes that are released when the connection ends."""
 
     def expire(self) -> None:
-        """Handle a passed deadline."""
+        """The deadline has passed."""
 
     def abort(self) -> None:
-        """End the connection now, and `leave` the table."""
+        """End now, and `leave` the table."""
 
 
 Patience = Callable[[QuotaClass, Stage, bool], float]
-"""Return the seconds before a connection may be evicted. True: for a host of the same quota class."""
+"""Returns the seconds before a connection may be evicted. True: for a host of the same quota class."""
 
 
 def _of_ros(_quota_class: QuotaClass, stage: Stage, own: bool) -> float:
@@ -65,7 +65,7 @@ def _of_ros(_quota_class: QuotaClass, stage: Stage, own: bool) -> float:
 
 
 class ConnectionTable(Generic[Holder]):
-    """The connections of all listeners that share this table. `quota_class` returns the present class of a host.
+    """Listeners may share the table. `quota_class` returns the present class of a host.
 
     `connection_class` returns the class that counts for connections (None: `quota_class`).
     """
@@ -103,11 +103,11 @@ class ConnectionTable(Generic[Holder]):
 
     @property
     def connections(self) -> frozenset[TrackedConnection]:
-        """Return all connections, including those that wait for their refusal."""
+        """Include those that wait for their refusal."""
         return frozenset(self._of)
 
     def enter(self, connection: TrackedConnection, host: Holder) -> str:
-        """Add a connection; evict another connection if necessary. Return why there is no room, or an empty string."""
+        """Evict another connection if necessary. Return why there is no room."""
         why = self._take(self.connected, host, 1)
         if not why:
             self._of[connection] = host, self.connected
@@ -115,14 +115,14 @@ class ConnectionTable(Generic[Holder]):
         return why
 
     def turn_away(self, connection: TrackedConnection, host: Holder) -> bool:
-        """Count a connection that stays open for its refusal. Return False if too many stay already."""
+        """The connection stays open for its refusal. Return False if too many stay already."""
         if self.farewells.take(host):
             return False
         self._of[connection] = host, self.farewells
         return True
 
     def leave(self, connection: TrackedConnection) -> None:
-        """Remove a connection; ignore a connection that is not in the table."""
+        """Ignore a connection that is not in the table."""
         if connection in self._stages:
             self._queues[self._stages.pop(connection)].remove(connection)
         host, pool = self._of.pop(connection, (None, self.connected))
@@ -130,7 +130,7 @@ class ConnectionTable(Generic[Holder]):
             pool.give_back(host)
 
     def file(self, connection: TrackedConnection, stage: Stage) -> None:
-        """Set the stage of a connection, and restart its wait."""
+        """The wait restarts."""
         host, pool = self._of.get(connection, (None, self.farewells))
         if host is None or pool is not self.connected:
             return
@@ -141,14 +141,14 @@ class ConnectionTable(Generic[Holder]):
         self._queues[stage].put(connection, host, self._clock())
 
     def hold(self, host: Holder, size: int) -> str:
-        """Count bytes held for a host, and return an empty string. If they are too many, return only the reason."""
+        """Return the reason if the bytes are too many, which are then not counted."""
         return self._take(self.held, host, size)
 
     def release(self, host: Holder, size: int) -> None:
         self.held.give_back(host, size)
 
     async def sweep(self) -> None:
-        """Expire connections past their deadline, once a second, until cancelled."""
+        """Once a second, until cancelled."""
         while True:
             await asyncio.sleep(1.0)
             now = clock.now()
@@ -166,7 +166,7 @@ class ConnectionTable(Generic[Holder]):
         return why
 
     def _to_make_room(self, host: Holder) -> TrackedConnection | None:
-        """Return the connection to evict for a new connection of this host, or None."""
+        """Return the connection to evict for a new one of this host."""
         mine = self._connection_class(host)
         for quota_class in QuotaClass:
             if quota_class > mine:
@@ -179,7 +179,7 @@ class ConnectionTable(Generic[Holder]):
         return None
 
     def _to_free_bytes(self, host: Holder) -> TrackedConnection | None:
-        """Return the connection with the most bytes among those that may be evicted for this host, or None."""
+        """Return the connection with the most bytes that may be evicted for this host."""
         mine, most = self._quota_class(host), self.held.held(host)
         able = [
             connection

@@ -23,10 +23,8 @@ def itself(host: Hashable) -> Hashable:
 
 
 class Turns(Generic[Holder]):
-    """The slots for requests within the quotas of `bounds`; other requests wait for their turn.
-
-    While a slot is free, a request waits only because its host or its group has used up its quota. `alike(host)`
-    returns the group of a host. A host must pay for its audit records before it gets a slot: `pause(host)` returns the
+    """While a slot is free, a request waits only if its host or group has used up its quota. `alike(host)` returns
+    the group of a host. A host must pay for its audit records before it gets a slot: `pause(host)` returns the
     seconds until the next check, or 0 if everything is paid.
     """
 
@@ -51,7 +49,7 @@ class Turns(Generic[Holder]):
         self.waiting: OrderedDict[Hashable, OrderedDict[Holder, Queue]] = OrderedDict()
 
     async def enter(self, host: Holder) -> None:
-        """Wait until this host's audit records are paid, then take a slot or wait for a turn."""
+        """Audit records must be paid first."""
         while seconds := self.pause(str(host)):
             await asyncio.sleep(seconds)
         kind = self._alike(host)
@@ -69,7 +67,7 @@ class Turns(Generic[Holder]):
             raise
 
     def leave(self, host: Holder) -> None:
-        """Release a slot, and give free slots to the longest waiting hosts that may have them."""
+        """Free slots go to the longest waiting hosts that may have them."""
         self._give_back(host)
         while self.waiting and (following := self._next()) is not None:
             kind, host = following
@@ -86,7 +84,7 @@ class Turns(Generic[Holder]):
                 turn.set_result(None)
 
     def _next(self) -> tuple[Hashable, Holder] | None:
-        """Take a slot for the next host, and return the host with its group. Return None if no host may have a slot."""
+        """Return the next host with its group, or None if no host may have a slot."""
         for kind, hosts in self.waiting.items():
             if self._taken.get(kind, 0) < self._together or (self._own_slots and kind not in self._own):
                 for host in hosts:

@@ -28,7 +28,7 @@ _FIELD_FRAMING = len(": \r\n")
 
 @dataclass(frozen=True, slots=True)
 class HttpLimits:
-    """The limits of the HTTP layer, in bytes and seconds."""
+    """In bytes and seconds."""
 
     head_bytes: int = 64 << 10
     head_seconds: float = 10.0
@@ -39,7 +39,7 @@ class HttpLimits:
 
     @property
     def framing_bytes(self) -> int:
-        """Return the bytes that a request may have besides its body: head, chunk sizes, trailers."""
+        """Head, chunk sizes, trailers."""
         return self.head_bytes + self.body_bytes // 16
 
 
@@ -66,29 +66,29 @@ class Front(asyncio.BaseProtocol, ABC):
         self.allow(limits.head_seconds)
 
     def allow(self, seconds: float) -> None:
-        """Set the deadline: the connection must make progress within this time."""
+        """The connection must make progress within this time."""
         self.deadline = clock.now() + seconds
 
     @abstractmethod
     def reject(self, status: bytes, what: str) -> None:
-        """Answer with this status and close the connection. `what` describes the peer's action."""
+        """Close the connection after the answer. `what` describes the peer's action."""
 
     @property
     @abstractmethod
     def waiting(self) -> int:
-        """Return the number of requests that wait while another request is served."""
+        """Requests that wait while another one is served."""
 
     @property
     @abstractmethod
     def is_quiet(self) -> bool:
-        """Whether no answer is in progress. Only then does the next head have a deadline."""
+        """No answer is in progress: only then does the next head have a deadline."""
 
     @property
     def is_open(self) -> bool:
         return self._socket is None
 
     def open(self, transport: asyncio.Transport) -> bool:
-        """Begin to use a transport. Abort it and return False if the connection has ended already."""
+        """Return False, and abort the transport, if the connection has ended already."""
         self.transport, self._socket = transport, None
         if self.closing or not transport.get_extra_info("peername"):
             self.abort()
@@ -100,7 +100,7 @@ class Front(asyncio.BaseProtocol, ABC):
         return True
 
     def parse(self, data: bytes) -> None:
-        """Parse a piece of input, within the limits."""
+        """Within the limits."""
         if self.closing:
             return
         try:
@@ -119,7 +119,7 @@ class Front(asyncio.BaseProtocol, ABC):
                 self._reject_head()
 
     def _await_rest(self) -> None:
-        """Wait for the rest of a request. Most requests end in their first piece, and wait for nothing."""
+        """Most requests end in their first piece, and wait for nothing."""
         if self.is_quiet and (self.in_request or self.closing):
             self.connection_table.file(self, Stage.UNFINISHED)
             if not self.closing:
@@ -159,7 +159,7 @@ class Front(asyncio.BaseProtocol, ABC):
         return 0
 
     def leave(self) -> None:
-        """Leave the connection table; a second call has no effect."""
+        """A second call has no effect."""
         self.closing = True
         self.connection_table.leave(self)
 
@@ -176,7 +176,7 @@ class Front(asyncio.BaseProtocol, ABC):
 
 
 def plain_address(text: str) -> Address:
-    """Parse an address without its scope id; return an IPv4-mapped IPv6 address as IPv4."""
+    """The scope id is dropped, and an IPv4-mapped IPv6 address becomes IPv4."""
     address = address_of(text.partition("%")[0])
     if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
         return address_of(str(address.ipv4_mapped))

@@ -1,7 +1,7 @@
 """Run a coroutine in the turns of a host (`processor_time`), and without a delay if the host has its turn.
 
-asyncio starts a task in a later turn of the loop. Most requests wait for nothing, so they can be answered by the piece
-of work that reads them. A `HostTask` therefore runs its first step when it is made, like an eager task of Python 3.12.
+asyncio starts a task in a later turn of the loop. Most requests wait for nothing, so a `HostTask` runs its first step
+when it is made, like an eager task of Python 3.12.
 """
 
 import asyncio
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 class HostTask(asyncio.Future[T]):
-    """A task whose steps, from one `await` to the next, wait for the turn of a host and are charged to it.
+    """Its steps, from one `await` to the next, wait for the turn of a host and are charged to it.
 
     If a piece of the host's work makes the task, the first step is part of this piece.
     """
@@ -37,7 +37,7 @@ class HostTask(asyncio.Future[T]):
             _register_task(self)  # type: ignore[arg-type]  # it has the methods of a task
 
     def cancel(self, msg: Any | None = None) -> bool:
-        """Raise `CancelledError` in the coroutine where it waits. Return False if the task has ended."""
+        """Return False if the task has ended."""
         if self.done():
             return False
         self._cancels += 1
@@ -45,11 +45,11 @@ class HostTask(asyncio.Future[T]):
         return True
 
     def cancelling(self) -> int:
-        """Return the number of cancellations that `uncancel` has not undone."""
+        """Cancellations that `uncancel` has not undone."""
         return self._cancels
 
     def uncancel(self) -> int:
-        """Undo one cancellation, and return the number of the others."""
+        """Return the number of the others."""
         self._cancels = max(0, self._cancels - 1)
         return self._cancels
 
@@ -77,7 +77,7 @@ class HostTask(asyncio.Future[T]):
                 _enter_task(loop, outer)
 
     def _resume(self) -> asyncio.Future[Any] | None:
-        """Run the coroutine to its next `await`, and return what it awaits. Raises `StopIteration` at its end."""
+        """Run to the next `await`, and return what is awaited. Raises `StopIteration` at the end."""
         if self._cancel_soon:
             self._cancel_soon = False
             return self._work.throw(asyncio.CancelledError())  # type: ignore[no-any-return]  # a future, or None

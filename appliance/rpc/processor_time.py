@@ -1,7 +1,6 @@
 """Share the processor time of one event loop among hosts: start-time fair queueing.
 
-Work for a host (accept a connection, read a piece of a request, one step of a handler) is measured and charged.
-Invariants:
+Work for a host is measured and charged. Invariants:
 
 1. In one turn of the loop, work runs for `TURN_SECONDS`, and the last piece may finish later. Further work waits for
    later turns. Pieces are short: `await asyncio.sleep(0)` divides a long task.
@@ -36,9 +35,9 @@ Work = Callable[[], None]
 
 
 class Line(Generic[Key, Item]):
-    """Waiting items by key. The key with the least use, in seconds, is next.
+    """The key with the least use, in seconds, is next.
 
-    `start` is the use of the key that was served last. A key that comes back starts with this use.
+    A key that comes back starts with `start`, the use of the key that was served last.
     """
 
     def __init__(self) -> None:
@@ -52,7 +51,7 @@ class Line(Generic[Key, Item]):
         return sum(map(len, self.queues.values()))
 
     def used(self, key: Key) -> float:
-        """Return the use of a key, at least `start`."""
+        """At least `start`."""
         used, start = self._used.get(key, self.start), self.start
         return used if used > start else start
 
@@ -77,7 +76,7 @@ class Line(Generic[Key, Item]):
             queue.append(item)
 
     def pop(self) -> tuple[Key, Item]:
-        """Return the next key and item. Among keys with equal use, the longest waiting one is next."""
+        """Among keys with equal use, the longest waiting one is next."""
         order = self._order
         while True:
             stored, _, key = order[0]
@@ -97,7 +96,7 @@ class Line(Generic[Key, Item]):
 
 
 class ProcessorTime:
-    """Run the work of hosts. `kind(host)` returns the class of a host; `clock` returns processor seconds."""
+    """`kind(host)` returns the class of a host; `clock` returns processor seconds."""
 
     def __init__(
         self,
@@ -126,7 +125,7 @@ class ProcessorTime:
         return self._spent + running < TURN_SECONDS
 
     def run(self, host: Address, work: Work) -> bool:
-        """Run short work for a host now and return True, or queue it for the host's turn and return False.
+        """Return False if the work is queued for the host's turn.
 
         Exceptions of the work are reported to the event loop.
         """
@@ -137,20 +136,20 @@ class ProcessorTime:
         return False
 
     def charge(self, host: Address, seconds: float) -> None:
-        """Charge a host for time that was used in this turn of the loop."""
+        """The time was used in this turn of the loop."""
         self._spent += seconds
         self.charge_beside(host, seconds)
         self._end_turn_later()
 
     def charge_beside(self, host: Address, seconds: float) -> None:
-        """Charge a host for time that another thread used."""
+        """Another thread used the time."""
         kind = self._kind(host)
         self._classes.charge(kind, seconds)
         if (hosts := self._hosts.get(kind)) is not None:
             hosts.charge(host, seconds)
 
     def begin(self) -> bool:
-        """Begin a piece of work. Return False if another piece is running; its host is charged for both."""
+        """Return False if another piece is running; its host is charged for both."""
         if self._since is not None:
             return False
         self._since = self._clock()

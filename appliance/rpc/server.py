@@ -53,7 +53,7 @@ _BEGINNING_SECONDS = 1.0  # the longest wait for these bytes
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """The peer of a connection. `host` and `text` are its address; `local` is the address that it connected to.
+    """`local` is the address that the peer connected to. `here`: the peer is on this machine.
 
     `here` is true if the peer is on this machine.
     """
@@ -68,7 +68,7 @@ class Peer:
 
 
 class HttpRequest(NamedTuple):
-    """A complete POST request; `arrived` is the arrival time of its last byte (monotonic ns)."""
+    """`arrived` is when its last byte came (monotonic ns)."""
 
     peer: Peer
     path: str
@@ -79,10 +79,10 @@ class HttpRequest(NamedTuple):
 Handler = Callable[[HttpRequest], Awaitable[bytes]]
 
 AtOnce = Callable[[HttpRequest], bytes | None]
-"""Return the answer to a request that needs no waiting, or None to leave the request to the handler."""
+"""Answers a request that needs no waiting; None leaves it to the handler."""
 
 Refusal = Callable[[bytes], bytes]
-"""Return the answer to a refused request. The argument is the beginning of its body."""
+"""Answers a refused request, from the beginning of its body."""
 
 
 def not_at_once(_request: HttpRequest) -> bytes | None:
@@ -90,16 +90,16 @@ def not_at_once(_request: HttpRequest) -> bytes | None:
 
 
 class NoAnswerError(Exception):
-    """The handler wants the connection reset, as if the node were gone."""
+    """The connection is reset, as if the node were gone."""
 
 
 @dataclass(eq=False)
 class HttpServer:
-    """Serve one listening socket: `handler` returns the response body of a request.
+    """`handler` returns the response body of a request.
 
-    `refuse(peer)` is called after the head of a request. If it returns a `Refusal`, this function makes the answer from
-    the beginning of the body, as far as it arrives in time. Then the connection is closed. Without `keep`, every answer
-    closes the connection. `troubled(peer, reason)` is called for each exceeded limit, `malformed(peer,
+    `refuse(peer)` is called after the head of a request. If it returns a `Refusal`, this function makes the answer
+    from the beginning of the body, as far as it arrives in time. Then the connection is closed. Without `keep`, every
+    answer closes the connection. `troubled(peer, reason)` is called for each exceeded limit, `malformed(peer,
     reason)` for each request that is not one of HTTP's, or that is not served here. The program `first` sends some
     connections to a second socket; they are accepted in the turn of unknown hosts.
     """
@@ -119,7 +119,7 @@ class HttpServer:
     malformed: Callable[[Peer, str], None] = lambda peer, reason: None  # noqa: ARG005 - same
     connections: "set[_Connection]" = field(default_factory=set, init=False)
     buffer: bytearray = field(default_factory=lambda: bytearray(_READ_AT_ONCE), init=False)
-    """The buffer of all connections: the event loop fills it and calls `buffer_updated` in one step."""
+    """Shared by all connections: the event loop fills it and calls `buffer_updated` in one step."""
     _acceptors: list[Acceptor] = field(default_factory=list, init=False)
     _queues: SourceQueues | None = field(default=None, init=False)
     _opening: set[asyncio.Task[None]] = field(default_factory=set, init=False)
@@ -145,7 +145,7 @@ class HttpServer:
             connection.abort()
 
     def _accepted(self, sock: socket.socket, host: Address) -> bool:
-        """Queue the connection for its host's turn. If there are too many, close the connection and return False."""
+        """Close the connection and return False if there are too many."""
         if self._queues is not None:
             self._queues.update()
         too_many = self.connection_table.arriving.take(host)
@@ -160,7 +160,7 @@ class HttpServer:
         return False
 
     def _admit(self, sock: socket.socket, host: Address) -> None:
-        """Open the connection, unless it has ended already or exceeds a limit."""
+        """It may have ended already or exceed a limit."""
         self.connection_table.arriving.give_back(host)
         if self._closed or _has_ended(sock):
             sock.close()
@@ -191,7 +191,7 @@ class HttpServer:
 
 
 class _Connection(Front, asyncio.BufferedProtocol):
-    """Serve the requests of one connection, one after the other."""
+    """Serves one request after the other."""
 
     most_waiting = _MOST_PIPELINED
 
@@ -216,7 +216,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
     # --- asyncio.Protocol ---
 
     def enter(self) -> bool:
-        """Enter the connection table, at least for a refusal. If that is impossible too, return False."""
+        """Enter at least for a refusal; return False if that is impossible too."""
         self._too_many = self.connection_table.enter(self, self.peer.host)
         self._counted = not self._too_many
         if self._too_many and not self.connection_table.turn_away(self, self.peer.host):
@@ -253,7 +253,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
             self.transport.resume_reading()
 
     def parse(self, data: bytes) -> None:
-        """Parse a piece of input as `Front` does, and limit the body."""
+        """Limit the body too."""
         super().parse(data)
         if self.closing or not (self.in_request and self.head_done):
             return
@@ -367,7 +367,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
             self.transport.pause_reading()
 
     def _body_is_held(self) -> bool:
-        """Count the bytes of the body so far. If they are too many, refuse the request and return False."""
+        """Count its bytes so far. If they are too many, refuse the request and return False."""
         unheld = len(self._body) - self._held
         too_much = self.connection_table.hold(self.peer.host, unheld) if unheld else ""
         if too_much:
@@ -383,11 +383,11 @@ class _Connection(Front, asyncio.BufferedProtocol):
 
     @property
     def holding(self) -> int:
-        """Return the bytes to release when the connection ends: all held bytes except a request being served."""
+        """All held bytes except a request being served."""
         return self._held + self._unsent + sum(_held_by(request) for request, _ in self._pending)
 
     def leave(self) -> None:
-        """Leave the connection table, once. A request being served continues, but its answer is dropped."""
+        """A request being served continues, but its answer is dropped."""
         if self._patience is not None:
             self._patience.cancel()
         self.server.connections.discard(self)
@@ -413,7 +413,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
             self.transport.resume_reading()
 
     def _answered_at_once(self, request: HttpRequest, *, keep: bool) -> bool:
-        """Answer the request at once, without a task or a slot. Return False if that is not possible."""
+        """Answer without a task or a slot; return False if that is not possible."""
         answer = self.server.at_once(request)
         if answer is None:
             return False
@@ -488,10 +488,10 @@ class _Connection(Front, asyncio.BufferedProtocol):
         self.connection_table.release(self.peer.host, size)
 
     def _write(self, status: bytes, body: bytes, *, keep: bool, unread: bool = False) -> None:
-        """Send a response; without `keep`, close the connection.
+        """Without `keep`, close the connection.
 
-        `unread`: the request was not read to its end. Its rest is read and dropped for a while, because an immediate
-        close would reset the connection and the peer would lose the answer.
+        `unread`: the rest of the request is read and dropped for a while, because an immediate close would reset the
+        connection and the peer would lose the answer.
         """
         connection = b"keep-alive" if keep else b"close"
         head = b"HTTP/1.1 %b\r\nContent-Type: text/xml\r\nContent-Length: %d\r\nConnection: %b\r\n\r\n"
@@ -533,13 +533,13 @@ class _Connection(Front, asyncio.BufferedProtocol):
         self.abort()
 
     def _reset(self) -> None:
-        """Reset the connection, so that the peer sees an error and not an orderly end."""
+        """The peer sees an error and not an orderly end."""
         self.transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
         self.abort()
 
 
 def _has_ended(sock: socket.socket) -> bool:
-    """Whether the peer closed the connection without data. Opening the transport would take a hundred times as long."""
+    """The peer closed it without data. Opening the transport would take a hundred times as long."""
     try:
         return not sock.recv(1, socket.MSG_PEEK)
     except BlockingIOError:
@@ -553,7 +553,7 @@ def _held_by(request: HttpRequest) -> int:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Return a TCP socket that listens at `host:port` (port 0: any free port); `::` also accepts IPv4."""
+    """Port 0 is any free port; `::` also accepts IPv4."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     sock = socket.socket(family, socket.SOCK_STREAM)
     try:
@@ -569,5 +569,5 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def exceeds_limit(status: bytes) -> bool:
-    """Return whether a request with this answer exceeds a limit. Otherwise it is wrong, however small it is."""
+    """Otherwise the request is wrong, however small it is."""
     return status[:3] in (b"413", b"431", b"503")

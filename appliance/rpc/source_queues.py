@@ -20,7 +20,7 @@ from appliance.policy.policy import Policy
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 Program = Callable[[], bytes]
-"""Return the BPF program for the policy in force; the same object until the policy changes."""
+"""For the policy in force; the same object until the policy changes."""
 
 FIRST, SECOND = 0, 1  # the sockets of a port, as the kernel numbers them
 _MOST_INSTRUCTIONS = 1024  # the most instructions of a program; each listener has a copy
@@ -38,10 +38,7 @@ _log = structlog.get_logger()
 
 
 class NamedFirst:
-    """Make the program that sends connections of this machine, and of hosts that the policy names, to the first socket.
-
-    Blocked hosts are sent to the second socket. Call the object to get the program.
-    """
+    """This machine and hosts that the policy names are first, blocked hosts second."""
 
     def __init__(self, policy: Callable[[], Policy]) -> None:
         self._policy = policy
@@ -58,7 +55,7 @@ class NamedFirst:
 
 
 class SourceQueues:
-    """The second listening socket of a port, for the connections that `program` sends there.
+    """`program` sends connections to it.
 
     Raises `OSError` if the kernel does not support such programs.
     """
@@ -83,7 +80,6 @@ class SourceQueues:
             raise
 
     def update(self) -> None:
-        """Attach the program for the policy in force, unless it is attached already."""
         program = self._program()
         if program is self._attached:
             return
@@ -101,7 +97,7 @@ class SourceQueues:
 
 
 def first_for(networks: Iterable[Network], blocked: Iterable[Address] = ()) -> bytes:
-    """Return the program that sends these sources, except blocked addresses, to the first socket, others to the second.
+    """Return the program that sends these sources, except blocked ones, to the first socket.
 
     If there are too many addresses for a program, it ignores the blocks. If there are still too many, it sends all
     sources to the first socket.
@@ -118,7 +114,7 @@ def first_for(networks: Iterable[Network], blocked: Iterable[Address] = ()) -> b
 
 
 def _program(tests: Sequence[tuple[Network, int]]) -> list[bytes]:
-    """Return the program for these networks and their sockets; the first network that contains the source decides."""
+    """The first network that contains the source decides."""
     code = [_instruction(_LOAD, _PROTOCOL)]
     for version, ethertype in ((4, 0x0800), (6, 0x86DD)):
         own = _tests(version, [test for test in tests if test[0].version == version])
@@ -128,7 +124,7 @@ def _program(tests: Sequence[tuple[Network, int]]) -> list[bytes]:
 
 
 def _tests(version: int, networks: list[tuple[Network, int]]) -> list[bytes]:
-    """Return the instructions that compare the source address with each network, word by word."""
+    """Compare word by word."""
     words = 4 if version == 6 else 1
     code = []
     for word in range(words):

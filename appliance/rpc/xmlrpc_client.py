@@ -1,7 +1,7 @@
 """Make the appliance's XML-RPC calls. A client with a pool reuses its connections, any other opens one for each call.
 
-Each call has a time limit, and each response has a size limit. For a slow, silent or misbehaving peer, the caller gets
-a `CallFailedError`. Other callers are not affected.
+Each call has a time limit, and each response has a size limit. For a slow, silent or misbehaving peer, the caller
+gets a `CallFailedError`.
 """
 
 import asyncio
@@ -19,27 +19,27 @@ from roswire.xmlrpc import FaultReceived, Value, XmlRpcLimits, build_call, parse
 
 
 class CallFailedError(Exception):
-    """A call has no usable answer; the message gives the reason and the address."""
+    """No usable answer; the message gives the reason and the address."""
 
 
 class RefusedError(CallFailedError):
-    """The peer refuses connections or cannot be reached, so there is no server at the address."""
+    """There is no server at the address."""
 
 
 class UnreachedError(CallFailedError):
-    """The time limit passed before a connection was made: the machine is off, or packets are lost."""
+    """No connection in time: the machine is off, or packets are lost."""
 
 
 class UnansweredError(CallFailedError):
-    """The time limit passed between connection and answer: the peer hangs or is very slow."""
+    """No answer in time: the peer hangs or is very slow."""
 
 
 class BrokenOffError(CallFailedError):
-    """The connection broke before the answer. The peer may have carried out the call."""
+    """The connection broke; the peer may have carried out the call."""
 
 
 class XmlRpcClient:
-    """A client of the XML-RPC server at `uri`. It keeps up to `pool` connections (0: a new connection for each call).
+    """Keeps up to `pool` connections (0: a new one for each call).
 
     `timeout` is in seconds and applies to a whole call. `bare` leaves out the header fields that the ROS master does
     not need: each would cost it 10 µs. `disconnected` is called when the server closes a kept connection.
@@ -68,7 +68,7 @@ class XmlRpcClient:
         self._head = head.encode("ascii")
 
     async def call(self, method: str, *params: Value) -> Value:
-        """Call `method` and return its value. Raises `CallFailedError` (or `RefusedError`)."""
+        """Raises `CallFailedError` (or `RefusedError`)."""
         body = await self._written(method, params)
         request = self._head % len(body) + body
         seconds = self._timeout + len(request) // _READ_IN_A_SECOND
@@ -88,7 +88,7 @@ class XmlRpcClient:
             raise CallFailedError(f"{self._where} answered {method} with nonsense: {error}") from error
 
     async def refuses(self, seconds: float) -> bool:
-        """Return whether the server's address refuses connections. One that is silent for these seconds does not."""
+        """A server that is silent for these seconds does not refuse."""
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(seconds):
@@ -112,10 +112,8 @@ class XmlRpcClient:
         return node_uri(self.uri.host, self.uri.port, self.uri.path)
 
     async def _exchange(self, request: bytes, seconds: float) -> bytes:
-        """Return the response.
-
-        Raises `UnreachedError` if the time limit passes before a connection is made, `TimeoutError` if it passes later,
-        and another `OSError` if the connection fails.
+        """Raises `UnreachedError` if the time limit passes before a connection is made, `TimeoutError` if it passes
+        later, and another `OSError` if the connection fails.
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + seconds
@@ -153,7 +151,7 @@ class XmlRpcClient:
                 connection.close()
 
     def close(self) -> None:
-        """Close the idle connections, and keep no others: a call under way closes its connection at its end."""
+        """A call under way closes its connection at its end."""
         self._pool = 0
         while self._idle:
             self._idle.pop().close()
@@ -173,7 +171,7 @@ class _Connection(asyncio.Protocol):
         self.alive = True
 
     def request(self, data: bytes) -> "asyncio.Future[bytes]":
-        """Send one request, and return a future of the response's body."""
+        """The future gets the response's body."""
         self._answer = asyncio.get_running_loop().create_future()
         self._parser = httptools.HttpResponseParser(self)
         self._body = bytearray()

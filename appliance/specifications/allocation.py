@@ -28,7 +28,7 @@ Resource = tuple[str, str]
 
 @dataclass(frozen=True, slots=True)
 class FileGroup:
-    """Files that stay together, the number of specifications in each, and the topics and services that they use."""
+    """`files` has the number of specifications in each; `resources` are what they use."""
 
     files: Mapping[str, int]
     resources: frozenset[Resource]
@@ -40,7 +40,7 @@ class FileGroup:
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """A carried topic or service that moves to another relay."""
+    """A topic or service moves to another relay."""
 
     kind: str
     name: str
@@ -50,18 +50,18 @@ class Move:
 
 @dataclass(frozen=True, slots=True)
 class AllocationPlan:
-    """A possible allocation: the relays of files and resources, and the resources and files that move."""
+    """The relays of files and resources, and what moves."""
 
     files: Mapping[str, int] = field(default_factory=dict)
     resources: Mapping[Resource, int] = field(default_factory=dict)
     moves: tuple[Move, ...] = ()
     moved_files: frozenset[str] = frozenset()
     losing: frozenset[int] = frozenset()
-    """Relays that give up monitors, or topics and services that may have had monitors."""
+    """Relays that give up monitors, or topics and services that may have had some."""
 
 
 class Allocation:
-    """The allocation in force across this number of relays; `save(text)` stores it."""
+    """`save(text)` stores the allocation."""
 
     def __init__(self, relays: int, save: Callable[[str], None] = lambda _text: None) -> None:
         self.relays = relays
@@ -76,11 +76,11 @@ class Allocation:
 
     @property
     def resources(self) -> set[Resource]:
-        """Return the topics and services that are placed explicitly, not by their name."""
+        """Others are placed by their names."""
         return set(self._plan.resources)
 
     def restore(self, text: str) -> bool:
-        """Restore a stored allocation; return False if it is unreadable or has another number of relays."""
+        """Return False if the text is unreadable or has another number of relays."""
         try:
             kept = json.loads(text)
             plan = AllocationPlan(
@@ -95,7 +95,7 @@ class Allocation:
         return True
 
     def plan(self, checked: CheckedSpecifications, carried: Collection[Resource] = ()) -> AllocationPlan:
-        """Plan the allocation for these specifications, while these topics and services are carried."""
+        """`carried` are topics and services."""
         carried = set(carried)
         groups = groups_of(checked)
         homes = self._homes(groups, carried)
@@ -120,7 +120,7 @@ class Allocation:
     def _one_way(
         self, groups: Sequence[FileGroup], homes: Sequence[int], carried: Collection[Resource]
     ) -> list[int]:
-        """Return each group's relay: all groups that move are on one relay, so that no group has to leave it."""
+        """All groups that move are on one relay, so that no group has to leave it."""
         moving = [
             self._cost(group, home, carried) != (0, 0) for group, home in zip(groups, homes, strict=True)
         ]
@@ -160,7 +160,6 @@ class Allocation:
         return AllocationPlan(files, resources, moves, moved, frozenset(losing))
 
     def adopt(self, plan: AllocationPlan) -> None:
-        """Put a plan into force and store it."""
         self._plan = plan
         kept = {
             "relays": self.relays,
@@ -185,7 +184,7 @@ class Allocation:
 
 
 def groups_of(checked: CheckedSpecifications) -> list[FileGroup]:
-    """Return the groups, largest first; groups of equal size are in the order of their files' names."""
+    """Largest first; equal ones in the order of their files' names."""
     touched: dict[str, set[Resource]] = {file: set() for file in checked.monitors.values()}
     for name, file in checked.monitors.items():
         touched[file] |= {(TOPIC, topic) for topic in checked.topics[name]}
@@ -204,7 +203,7 @@ def groups_of(checked: CheckedSpecifications) -> list[FileGroup]:
 
 
 def _join(touched: Mapping[str, Iterable[Resource]], checked: CheckedSpecifications) -> list[set[str]]:
-    """Return the sets of files that topics, services or variables connect, directly or indirectly."""
+    """Topics, services or variables connect files, directly or indirectly."""
     group = {file: {file} for file in touched}
 
     def join(one: str, other: str) -> None:

@@ -1,4 +1,4 @@
-"""Compile whole sets of specifications; for control, this runs in the process `compiler`."""
+"""Compile whole sets of specifications; control has the process `compiler` for this."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
@@ -23,7 +23,7 @@ from roswire.errors import DefinitionError
 from roswire.standard import standard_definitions
 
 Topics = Mapping[str, Mapping[str, str]]
-"""Topics that replace those given in texts, by monitor and name."""
+"""By monitor and name."""
 
 NO_TOPICS: Topics = MappingProxyType({})
 
@@ -39,7 +39,7 @@ def contents(
     unbuilt: Mapping[str, str] = {},
     given_topics: Topics = NO_TOPICS,
 ) -> Contents:
-    """Compile these files with these definitions. Raises `SpecificationsRefusedError` with all errors.
+    """Raises `SpecificationsRefusedError` with all errors.
 
     With `load`, the module of the whole set is also built and loaded. The monitors of the files in `unbuilt` do
     nothing, for the reason given. `given_topics` replace topics given in the texts.
@@ -113,9 +113,9 @@ def _givens(monitors: MonitorSet, name: str) -> Iterator[GivenDeclared]:
 def contents_at_start(
     files: Mapping[str, str], texts: Mapping[str, str], given_topics: Topics = NO_TOPICS
 ) -> Contents:
-    """Compile these files; the monitors of files with errors do nothing (`Contents.unbuilt`, `Contents.left_out`).
+    """Monitors of files with errors do nothing (`Contents.unbuilt`, `Contents.left_out`).
 
-    Raises `SpecificationsRefusedError` if they exceed a limit.
+    Raises `SpecificationsRefusedError` if the files exceed a limit.
     """
     try:
         return contents(files, texts, load=True, given_topics=given_topics)
@@ -136,7 +136,7 @@ def contents_at_start(
 def check(
     sources: Sources, site_keys: Sequence[str], *, compiler: Callable[..., Contents] = contents
 ) -> CheckedSpecifications:
-    """Compile everything in the caller's process. Raises `SpecificationsRefusedError` with all errors.
+    """Compile in the caller's process. Raises `SpecificationsRefusedError` with all errors.
 
     With `site_keys`, each text must be signed with one of these keys.
     """
@@ -159,7 +159,7 @@ def _topics_known(text: str, file: str, texts: Mapping[str, str]) -> bool:
 def _good(
     files: Mapping[str, str], texts: Mapping[str, str], topics: Topics
 ) -> tuple[set[str], dict[str, str]]:
-    """Return the files that compile together, and the last error of each file that has had one."""
+    """Return files that compile together, and the last error of each file that has had one."""
     errors: dict[str, str] = {}
 
     def grown(good: set[str], more: Sequence[str]) -> set[str]:
@@ -181,7 +181,7 @@ def _good(
 
 
 def _places(monitors: MonitorSet) -> dict[str, str]:
-    """Return the position where each topic is first named, as text."""
+    """Where each topic is first named."""
     named = [
         (event.position, event.topic) for monitor in monitors.monitors for event in monitor.code.events
     ] + [(publication.position, publication.topic) for publication in monitors.compiled.publications]
@@ -193,7 +193,7 @@ def _places(monitors: MonitorSet) -> dict[str, str]:
 
 
 def parts(compiled: bytes, wanted: Sequence[PartNames]) -> list[bytes]:
-    """Return the parts of a set (`Contents.compiled`) for these relays. Raises `SpecificationsRefusedError`."""
+    """Raises `SpecificationsRefusedError`."""
     try:
         return [*map(_bounded, parts_of(compiled, [(names.monitors, names.shadows) for names in wanted]))]
     except SpecificationError as error:

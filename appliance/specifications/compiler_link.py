@@ -1,13 +1,13 @@
 """Control's link to the compiler process, which parses specifications for it.
 
-The process is started on demand and ends when it is idle. Specifications that exceed its limits are refused and end the
-process; the specifications in force stay in force.
+The process is started on demand and ends when it is idle. Specifications that exceed its limits are refused and end
+the process; the specifications in force stay in force.
 
 Orders take precedence over dry runs. A dry run begins only while no order is compiled and no other dry run is under
 way; a new order ends it.
 
-The last answer for a start is kept, and the last parts. So a standby that has checked whether it could start compiles
-nothing when it takes over: the robot would wait for that.
+The last answer for a start is kept, and the last parts. So a standby that has checked its start compiles nothing when
+it takes over, while the robot waits.
 """
 
 import asyncio
@@ -36,7 +36,7 @@ _TRIES = 2  # an idle compiler may end just when a question is sent
 
 
 class SpecificationCompiler:
-    """Control's end of the link; `wanted()` requests the start of the compiler process."""
+    """`wanted()` requests the start of the compiler process."""
 
     def __init__(self, wanted: Callable[[], None]) -> None:
         self._wanted = wanted
@@ -65,11 +65,11 @@ class SpecificationCompiler:
         self._there.set()
 
     async def check(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-        """Compile for an order. Raises `SpecificationsRefusedError`, also if the compiler does not answer."""
+        """For an order. Raises `SpecificationsRefusedError`, also if the compiler does not answer."""
         return await self._checked(sources, site_keys, at_start=False)
 
     async def check_at_start(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-        """Compile for a start: files with errors do not keep the others from coming into force (`Contents.unbuilt`).
+        """For a start: files with errors do not keep the others from coming into force (`Contents.unbuilt`).
 
         Raises the errors of `check`.
         """
@@ -90,7 +90,7 @@ class SpecificationCompiler:
         return checked(answer.contents, sources, site_keys)
 
     async def try_out(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-        """Compile for a dry run. Raises the errors of `check`, also if an order ended the dry run."""
+        """For a dry run. Raises the errors of `check`, also if an order ended the dry run."""
         if not sources.files:
             return CheckedSpecifications()
         require_bounded(sources)
@@ -109,13 +109,13 @@ class SpecificationCompiler:
         return checked(answer.contents, sources, site_keys)
 
     async def parts(self, compiled: bytes, wanted: list[messages.PartNames]) -> list[bytes]:
-        """Compile the relays' parts. Raises `SpecificationsRefusedError`, also if the compiler does not answer."""
+        """Raises `SpecificationsRefusedError`, also if the compiler does not answer."""
         answer = await self._asked_once(lambda number: messages.PartsWanted(number, compiled, wanted))
         parts: list[bytes] = answer.parts
         return parts
 
     async def _asked_once(self, question: Callable[[int], messages.Message]) -> Any:
-        """Return the answer for an order; to the same question as the last one, the same. Raises as `_asked` does."""
+        """The same question as the last one gets the same answer. Raises as `_asked` does."""
         wanted = question(0)
         last, answer = self._kept.get(type(wanted), (None, None))
         if last != wanted:
@@ -124,13 +124,13 @@ class SpecificationCompiler:
         return answer
 
     async def _ordered(self, question: Callable[[int], messages.Message]) -> Any:
-        """Return the answer for an order. Raises as `_asked` does."""
+        """Raises as `_asked` does."""
         with self._order():
             return await self._asked(question)
 
     @contextlib.contextmanager
     def _order(self) -> Iterator[None]:
-        """End a dry run in progress, and let no dry run begin while an order is compiled."""
+        """End a dry run in progress, and let none begin."""
         self._orders += 1
         self._no_order.clear()
         if self._dry_run:
@@ -145,7 +145,7 @@ class SpecificationCompiler:
     async def _asked(
         self, question: Callable[[int], messages.Message], *, goes_on: Callable[[], bool] = lambda: True
     ) -> Any:
-        """Return the answer; if the compiler has just ended, ask its successor.
+        """If the compiler has just ended, ask its successor.
 
         Raises `SpecificationsRefusedError`, also if `goes_on()` returns False.
         """
@@ -172,7 +172,7 @@ class SpecificationCompiler:
         raise SpecificationsRefusedError([_ENDED])
 
     async def _answer(self, question: Callable[[int], messages.Message]) -> Any:
-        """Ask, and end the compiler if the order is withdrawn before the answer. Raises the errors of `Link.ask`."""
+        """End the compiler if the order is withdrawn before the answer. Raises the errors of `Link.ask`."""
         asking = asyncio.ensure_future(self._link.ask(question, _WORK_SECONDS))
         try:
             while not (await asyncio.wait((asking,), timeout=_LOOK_SECONDS))[0]:

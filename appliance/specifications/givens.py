@@ -20,13 +20,13 @@ _TOPIC = "topic"
 
 
 class Givens:
-    """The values that operators gave (`said`), by monitor and name; those of topics belong to a revision's sources."""
+    """`said` has the values by monitor and name; those of topics belong to a revision's sources."""
 
     def __init__(self) -> None:
         self.said: dict[str, dict[str, GivenValue]] = {}
 
     def in_force(self, checked: CheckedSpecifications) -> dict[str, dict[str, GivenValue]]:
-        """Return the given values of constants that these specifications declare."""
+        """Only constants that these specifications declare."""
         found = {
             monitor: {
                 one.name: values[one.name] for one in declared if one.name in values and _holds(one, values)
@@ -37,7 +37,7 @@ class Givens:
         return {monitor: values for monitor, values in found.items() if values}
 
     def dropped(self, checked: CheckedSpecifications) -> list[str]:
-        """Return a text for each value of a monitor that these specifications do not allow."""
+        """A text for each value that these specifications do not allow."""
         kept = self.in_force(checked)
         return [
             f"{monitor}: {name}={_shown(value)} no longer applies, because the text does not allow it: the default of"
@@ -48,13 +48,13 @@ class Givens:
         ]
 
     def enforce(self, checked: CheckedSpecifications) -> list[str]:
-        """Keep only the values that these specifications allow; return the texts of those `dropped`."""
+        """Return the texts of `dropped` values."""
         dropped = self.dropped(checked)
         self.said = self.in_force(checked)
         return dropped
 
     def states(self, checked: CheckedSpecifications, monitor: str) -> list[GivenState]:
-        """Return everything that is given to a monitor, with its present value."""
+        """With present values."""
         said = self.said.get(monitor, {})
         return [
             GivenState(
@@ -67,7 +67,7 @@ class Givens:
 def parsed(
     declared: tuple[GivenDeclared, ...], monitor: str, values: Mapping[str, GivenValue]
 ) -> dict[str, GivenValue]:
-    """Return values of constants as their types hold them. Raises `SpecificationsRefusedError` with all errors."""
+    """Raises `SpecificationsRefusedError` with all errors."""
     known = {one.name: one for one in declared}
     found: dict[str, GivenValue] = {}
     findings = []
@@ -89,7 +89,7 @@ def parsed(
 
 
 def split(given: Given) -> tuple[dict[str, dict[str, str]], dict[str, dict[str, GivenValue]]]:
-    """Return the topics and the constants among the values of a load: a topic begins with `/`."""
+    """A topic begins with `/`."""
     topics: dict[str, dict[str, str]] = {}
     constants: dict[str, dict[str, GivenValue]] = {}
     for monitor, values in given.items():
@@ -114,7 +114,7 @@ def require_topics(topics: Mapping[str, Mapping[str, str]], checked: CheckedSpec
 
 
 def _value(declared: GivenDeclared, value: GivenValue) -> GivenValue | None:
-    """Return a value as its type holds it; None if it does not."""
+    """None if the type cannot hold the value."""
     if declared.kind == "bool":
         words = {"true": True, "false": False}
         found = words.get(value) if isinstance(value, str) else value
@@ -142,7 +142,7 @@ def _holds(declared: GivenDeclared, values: Mapping[str, GivenValue]) -> bool:
 
 
 def _allowed(declared: GivenDeclared) -> str:
-    """Return what a constant takes, as the end of an error."""
+    """The end of an error."""
     unit = f" {declared.unit}" if declared.unit else ""
     if declared.kind == "bool":
         return "is not true or false"

@@ -15,7 +15,7 @@ from appliance.specifications.specification_files import CheckedSpecifications
 
 
 class LiveType(NamedTuple):
-    """The type that a node registered, and the md5sum in its header (empty if no relay has seen the header).
+    """The type that a node registered, and the md5sum in its header (empty if no relay has seen it).
 
     `moving`: it has published in the last minute, as far as is known.
     """
@@ -31,7 +31,7 @@ _ANY = "*"
 
 
 class TopicFindings(NamedTuple):
-    """`conflicts` are topics that would be cut, `warnings` all others; both as `file:line:column: severity: text`."""
+    """`conflicts` would be cut; both are `file:line:column: severity: text`."""
 
     conflicts: list[str]
     warnings: list[str]
@@ -46,10 +46,10 @@ def judge_topics(
     forced: bool,
     promoted: Collection[str] = (),
 ) -> TopicFindings:
-    """Compare topics that specifications add, or give another type, with the topics that nodes publish.
+    """Compare topics that specifications add, or give another type, with those that nodes publish.
 
-    Monitors in `shadow` mode cut nothing: they just do not get messages that they cannot read. With `forced`, conflicts
-    are warnings. Monitors that are `promoted` from shadow mode are judged again.
+    Monitors in `shadow` mode cut nothing: they just do not get messages that they cannot read. With `forced`,
+    conflicts are warnings. Monitors that are `promoted` from shadow mode are judged again.
     """
     found = TopicFindings([], [])
     acting = [name for name in coming.monitors if name not in shadow]
@@ -115,7 +115,7 @@ _UNREAD = "monitors in shadow mode do not see its messages"
 
 
 def _difference(theirs: LiveType, ours: LiveType) -> str:
-    """Return how the types differ, or an empty string. As in ROS, `*` fits any type, and the md5sum decides."""
+    """As in ROS, `*` fits any type, and the md5sum decides."""
     if theirs.name not in (_ANY, ours.name):
         return f"{theirs.name}, not as {ours.name}"
     if {theirs.md5sum, ours.md5sum} & {"", _ANY} or theirs.md5sum == ours.md5sum:

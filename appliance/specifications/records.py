@@ -27,7 +27,7 @@ _LEVELS = {"WARN": Severity.WARNING, "ERROR": Severity.WARNING, "FATAL": Severit
 
 @dataclass(frozen=True, slots=True)
 class MonitorRecords:
-    """Makes audit records from reports; `fields(topic, data)` parses a message.
+    """`fields(topic, data)` parses a message.
 
     `counts` has the number of events by kind and monitor; a change by several monitors counts for each of them. `at`
     has the number of dropped or changed messages by topic. Actions that monitors in shadow mode would have taken are

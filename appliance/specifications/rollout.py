@@ -2,9 +2,9 @@
 
 First, relays that give nothing up get their new specifications. When all of these have taken them, moving topics are
 withdrawn from their old relay, and the allocation changes. The topics are then placed on the relay that has their
-monitors, so no message bypasses its monitors. Then the relays that gave something up get their specifications; the load
-is complete when they have answered (`all_taken`). A monitor whose file moves loses its state, which stays with the
-former relay. If the monitor's actions depend on its state, the monitor holds its topics.
+monitors, so no message bypasses its monitors. Then the relays that gave something up get their specifications; the
+load is complete when they have answered (`all_taken`). A monitor whose file moves loses its state, which stays with
+the former relay. If the monitor's actions depend on its state, the monitor holds its topics.
 """
 
 import asyncio
@@ -28,7 +28,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 
 SHADOW: Literal["shadow"] = "shadow"
 Switch = bool | Literal["shadow"]
-"""Whether the actions of a monitor take effect; in shadow mode they are only reported."""
+"""Do actions take effect? In shadow mode they are only reported."""
 
 _RELAY_SECONDS = 15.0
 _TRIES = 5  # attempts, because affected nodes may come and go during each
@@ -36,22 +36,22 @@ _SILENT = f"a relay does not answer within {_RELAY_SECONDS:g} s"
 
 
 class Relays(Protocol):
-    """The interface to the relays that the specifications need."""
+    """The interface to the relays."""
 
     def send(self, message: Message, relay: int) -> bool:
-        """Send a message to a relay; return False if the relay is not connected."""
+        """Return False if the relay is not connected."""
 
     async def carried_out(self) -> None:
-        """Wait until every relay has carried out its messages."""
+        """Every relay has carried out its messages."""
 
     def live_resources(self) -> set[Resource]:
-        """Return the topics and services of live nodes."""
+        """The resources of live nodes."""
 
     def withdraw(self, moves: Sequence[Move]) -> None:
-        """Stop carrying these topics and services; called before the new allocation is adopted."""
+        """Called before the new allocation is adopted."""
 
     def place(self, moves: Sequence[Move]) -> None:
-        """Carry these topics and services on their new relays; called after the allocation was adopted."""
+        """Called after the allocation was adopted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class Revision:
 
 @dataclass(frozen=True, slots=True)
 class InheritedState:
-    """After a takeover: the states that the other appliance's relays `left`.
+    """The states that the other appliance's relays `left`.
 
     `at`: the time of its monitors by then, if it is later than that in the states. `lost`: why other states are lost.
     """
@@ -77,15 +77,15 @@ class InheritedState:
 
 
 Parts = Callable[[bytes, list[messages.PartNames]], Awaitable[list[bytes]]]
-"""Returns the parts of a compiled set for the named monitors. Raises `SpecificationsRefusedError`."""
+"""Raises `SpecificationsRefusedError`."""
 
 
 @dataclass(slots=True)
 class Rollout:
-    """The specifications that the relays got, and their answers; `states(checked)` returns each monitor's switch.
+    """`states(checked)` returns each monitor's switch.
 
-    Each relay gets only its own part of the compiled set; `parts` makes the parts before the specifications are stated.
-    `rows` has the state and counters of monitors that their relays have reported.
+    Each relay gets only its own part, which `parts` makes before the specifications are stated. `rows` are the last
+    reports.
     """
 
     allocation: Allocation
@@ -129,11 +129,11 @@ class Rollout:
 
     @property
     def why_held(self) -> dict[str, str]:
-        """Return the monitors that hold their topics, each with the reason why its state was lost (empty: not lost)."""
+        """The reason is empty if no state was lost."""
         return {name: why for names in self._held.values() for name, why in names.items()}
 
     async def start(self, now: Revision, *, restarted: bool, kept: str) -> None:
-        """Begin with these specifications; after a crash of control (`restarted`), relays keep the ones that they have.
+        """After a crash of control (`restarted`), relays keep the specifications that they have.
 
         Raises `SpecificationsRefusedError`.
         """
@@ -146,7 +146,7 @@ class Rollout:
         await self._make(now, self.allocation.of_file)
 
     async def leave(self, seconds: float) -> list[bytes]:
-        """Make all relays drop all messages; return the states of their monitors.
+        """Make all relays drop all messages, and return the states of their monitors.
 
         Raises `ConnectionError` if a relay is away, and `TimeoutError` if one does not answer within `seconds`.
         """
@@ -154,7 +154,7 @@ class Rollout:
         return [answer.content or b"" for answer in await self._states(seconds, copy=False)]
 
     async def copies(self, seconds: float, *, full: bool) -> list[messages.StateLeft]:
-        """Return copies of the states of all relays' monitors, `full` or only if changed. Raises as `leave` does."""
+        """`full`, or only if changed. Raises as `leave` does."""
         return await self._states(seconds, copy=True, full=full)
 
     async def _states(self, seconds: float, *, copy: bool, full: bool = True) -> list[messages.StateLeft]:
@@ -173,16 +173,16 @@ class Rollout:
             self.relays.send(self.statement(relay), relay)
 
     def has_state(self) -> bool:
-        """Return whether monitors run whose state may be copied: no relay leaves it, and all have the inherited one."""
+        """The state may be copied: no relay leaves it, and all have the inherited one."""
         return bool(self._now.checked.monitors) and not self._leaving and not self._heirs
 
     def inherit(self, state: InheritedState, taken: Callable[[], None]) -> None:
-        """Give each relay the state of the other appliance's monitors; call `taken` once all relays have it."""
+        """Call `taken` once all relays have it."""
         self._inherited, self._heirs = state, set(range(self.allocation.relays))
         self._inheritance_taken = taken
 
     def statement(self, relay: int) -> messages.SpecificationsStated:
-        """Return a relay's first message; a restarted relay must hold topics as its monitors require."""
+        """A restarted relay must hold topics as its monitors require."""
         restarted = relay in self._known
         self._known.add(relay)
         (self._fresh.add if restarted else self._fresh.discard)(relay)
@@ -212,7 +212,7 @@ class Rollout:
         return [name for name in names if name in self._began]
 
     async def take(self, coming: Revision) -> list[str]:
-        """Roll out these specifications to every relay; return the monitors that began again because they moved.
+        """Return the monitors that began again because they moved.
 
         A disconnected relay gets them when it returns. If this raises `SpecificationsRefusedError`, nothing has
         changed.
@@ -230,11 +230,11 @@ class Rollout:
         raise SpecificationsRefusedError(["topics that must move changed during the rollout; try again"])
 
     def moved_files(self, coming: CheckedSpecifications) -> frozenset[str]:
-        """Return the files that would move to another relay, with the loss of their monitors' state."""
+        """Their monitors would lose their state."""
         return self.allocation.plan(coming, self.relays.live_resources()).moved_files
 
     async def all_taken(self) -> None:
-        """Wait until the relays that gave something up have taken or refused (`refused`) the new specifications."""
+        """Wait for relays that gave something up; refusals are in `refused`."""
         answers, self._answers = self._answers, {}
         if answers:
             await asyncio.wait(answers.values(), timeout=_RELAY_SECONDS)
@@ -286,7 +286,7 @@ class Rollout:
         return [finding for findings in said for finding in findings]
 
     def _settle(self, coming: Revision, plan: AllocationPlan) -> list[str]:
-        """Put the revision into force without an `await`, so that no message of a relay is processed in between.
+        """Do not `await`, so that no message of a relay is processed in between.
 
         Relays that already have the revision confirm it again.
         """
@@ -334,7 +334,7 @@ class Rollout:
             self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
 
     async def _make(self, revision: Revision, of_file: Callable[[str], int]) -> None:
-        """Let the compiler make the parts of these specifications that are still missing for the relays."""
+        """Make only missing parts."""
         compiled = revision.checked.compiled
         wanted = parts_wanted(revision, self.allocation.relays, of_file)
         missing = [names for names in wanted if (compiled, names) not in self.compiled_parts]
@@ -395,7 +395,7 @@ class Rollout:
                 self._merge_rows()
 
     def lost(self, relay: int) -> None:
-        """Refuse the specifications that a lost relay has not answered, because they may have killed it."""
+        """A lost relay may have been killed by specifications that it has not answered."""
         for at, statement in [entry for entry in self._waiting if entry[0] == relay]:
             self._answer(at, statement, ["a relay process exited during the load: try again"])
 
@@ -425,7 +425,7 @@ class Rollout:
         self._answer(relay, statement, [])
 
     def _say_held(self, relay: int, taken: messages.SpecificationsTaken) -> None:
-        """Record each monitor that holds its topics because its state is lost, with the command that resumes it."""
+        """The record has the command that resumes the monitor."""
         before = self._held.get(relay, {})
         for name, why in taken.because.items():
             if before.get(name) != why:
@@ -467,7 +467,7 @@ def _names(revision: Revision, relay: int, of_file: Callable[[str], int]) -> mes
 def parts_wanted(
     revision: Revision, relays: int, of_file: Callable[[str], int] | None = None
 ) -> list[messages.PartNames]:
-    """Return the parts that the relays run; without `of_file`, those of a start on another appliance."""
+    """Without `of_file`, return the parts of a start on another appliance."""
     if of_file is None:
         of_file = _of(Allocation(relays).plan(revision.checked))
     names = dict.fromkeys(_names(revision, relay, of_file) for relay in range(relays))

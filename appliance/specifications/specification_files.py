@@ -23,7 +23,7 @@ _LONGEST = (
 
 
 class SpecificationsRefusedError(Exception):
-    """The specifications are refused; `findings` has every reason, as `file:line:column: error: text`."""
+    """`findings` has every reason, as `file:line:column: error: text`."""
 
     def __init__(self, findings: list[str]) -> None:
         super().__init__("\n".join(findings))
@@ -31,10 +31,9 @@ class SpecificationsRefusedError(Exception):
 
 
 class Sources(msgspec.Struct, frozen=True):
-    """Texts of specifications by file name, and texts of message definitions by `package/Type.msg` (or `.srv`).
+    """By file name, and definitions by `package/Type.msg` (or `.srv`).
 
-    `signatures` are the signatures of the site, by the same names. `topics` replace topics given in the texts, by
-    monitor and name.
+    `signatures` of the site have the same names. `topics` replace topics given in the texts, by monitor and name.
     """
 
     files: dict[str, str] = {}
@@ -45,12 +44,11 @@ class Sources(msgspec.Struct, frozen=True):
     def with_topics(
         self, topics: Mapping[str, Mapping[str, str]], among: Collection[str] | None = None
     ) -> "Sources":
-        """Return the same texts with these topics (only those of the monitors `among` others)."""
         kept = {name: dict(given) for name, given in topics.items() if among is None or name in among}
         return msgspec.structs.replace(self, topics=kept)
 
     def with_files(self, new: "Sources") -> "Sources":
-        """Return the sources with files added or replaced by name, sorted."""
+        """Files are added or replaced by name, and sorted."""
         fresh = new.files.keys() | new.definitions.keys()
         signatures = {name: text for name, text in self.signatures.items() if name not in fresh}
         signatures |= {name: text for name, text in new.signatures.items() if text and name in fresh}
@@ -63,7 +61,7 @@ class Sources(msgspec.Struct, frozen=True):
         )
 
     def without(self, files: set[str]) -> "Sources":
-        """Return the sources without some files; definitions stay."""
+        """Definitions stay."""
         left, signatures = (
             {name: text for name, text in texts.items() if name not in files}
             for texts in (self.files, self.signatures)
@@ -71,7 +69,7 @@ class Sources(msgspec.Struct, frozen=True):
         return Sources(left, self.definitions, signatures, self.topics)
 
     def signers(self, site_keys: Sequence[str]) -> list[str]:
-        """Return the keys that signed the sources; empty without site keys.
+        """Empty without site keys.
 
         Raises `SpecificationsRefusedError` with every file and definition that no site key signed.
         """
@@ -81,7 +79,7 @@ class Sources(msgspec.Struct, frozen=True):
         return sorted(found)
 
     def signed(self, site_keys: Sequence[str]) -> tuple["Sources", dict[str, str]]:
-        """Return the sources that site keys signed, and the errors of the others by their names below the folder."""
+        """Return also the errors of the others by their names below the folder."""
         _, errors = self._signed(site_keys)
         files, definitions = (
             {name: text for name, text in texts.items() if folder + name not in errors}
@@ -101,7 +99,7 @@ class Sources(msgspec.Struct, frozen=True):
         return found, unsigned
 
     def difference(self, before: "Sources") -> tuple[list[str], list[str], list[str]]:
-        """Return the names of added, changed and removed files; the name of a definition is `msg/package/Type.msg`."""
+        """Added, changed and removed files; a definition is `msg/package/Type.msg`."""
         old, new = before.named(), self.named()
         return (
             [name for name in new if name not in old],
@@ -114,18 +112,18 @@ class Sources(msgspec.Struct, frozen=True):
 
 
 class CheckedSpecifications(messages.Contents, frozen=True):
-    """Specifications that may come into force; `signed_by` are the keys of the site that signed them."""
+    """May come into force; `signed_by` are keys of the site."""
 
     signed_by: list[str] = []  # noqa: RUF012  each struct gets one of its own
 
     def fields(self, topic: str, data: bytes) -> dict[str, Any] | None:
-        """Parse the first bytes of a message on a topic; return None if the topic's type is not known."""
+        """Only the first bytes are given. Return None if the type is not known."""
         name = self.types.get(topic)
         definitions = _definitions(name, self.texts.get(name, "")) if name is not None else None
         return read_fields(definitions, name, data) if name is not None and definitions is not None else None
 
     def md5sum(self, topic: str) -> str:
-        """Return the md5sum of a topic's type; empty if its definition is not known."""
+        """Empty if the definition is not known."""
         name = self.types.get(topic, "")
         definitions = _definitions(name, self.texts.get(name, ""))
         return "" if definitions is None else definitions.md5sum(name)
@@ -146,12 +144,12 @@ def _definitions(name: str, text: str) -> Definitions | None:
 
 
 def checked(contents: messages.Contents, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-    """Return the compiler's result with the keys that signed the texts. Raises `SpecificationsRefusedError`."""
+    """Raises `SpecificationsRefusedError`."""
     return CheckedSpecifications(**msgspec.structs.asdict(contents), signed_by=sources.signers(site_keys))
 
 
 def require_bounded(sources: Sources) -> None:
-    """Raise `SpecificationsRefusedError` if the sources are too many or too long."""
+    """Raise `SpecificationsRefusedError` for too many or too long sources."""
     if len(sources.files) > _MOST_FILES:
         raise SpecificationsRefusedError(
             [f"{len(sources.files)} specification files; the limit is {_MOST_FILES}"]
@@ -170,7 +168,7 @@ def _too_long(name: str) -> str:
 
 
 def read_folder(folder: Path) -> Sources:
-    """Read the `.rv` files of a folder and the definitions in its `msg/`, with their signatures.
+    """The definitions are in its `msg/`; signatures are read too.
 
     Raises `SpecificationsRefusedError`.
     """
@@ -181,9 +179,9 @@ def read_folder(folder: Path) -> Sources:
 
 
 def read_usable(folder: Path, site_keys: Sequence[str]) -> tuple[Sources, dict[str, str]]:
-    """Read the files of a folder that may come into force; return the errors of the others, by name.
+    """Return also the errors of files that may not come into force, by name.
 
-    The others cannot be opened, are not UTF-8 text, are too long, or have no signature of a site key. Raises
+    They cannot be opened, are not UTF-8 text, are too long, or have no signature of a site key. Raises
     `SpecificationsRefusedError` if the folder cannot be read.
     """
     found, errors = _read_folder(folder)
@@ -193,7 +191,7 @@ def read_usable(folder: Path, site_keys: Sequence[str]) -> tuple[Sources, dict[s
 
 
 def _read_folder(folder: Path) -> tuple[Sources, dict[str, str]]:
-    """Return the readable files of a folder, and the errors of the others by their names below the folder."""
+    """Return also the errors of unreadable files by their names below the folder."""
     try:
         if not _is(stat.S_ISDIR, folder):
             raise SpecificationsRefusedError([f"{folder}: the folder of specifications does not exist"])
@@ -220,7 +218,7 @@ def _read_folder(folder: Path) -> tuple[Sources, dict[str, str]]:
 
 
 def _definitions_in(own: Path) -> dict[str, Path]:
-    """Return the files of definitions by `package/Type.msg`. Raises `SpecificationsRefusedError`."""
+    """By `package/Type.msg`. Raises `SpecificationsRefusedError`."""
     found = {}
     try:
         for path in files_below(own) if _is(stat.S_ISDIR, own) else ():
@@ -241,7 +239,7 @@ def _unreadable(path: Path, error: OSError) -> SpecificationsRefusedError:
 
 
 def _is(kind: Callable[[int], bool], path: Path) -> bool:
-    """Return whether a path exists and is of this kind. Raises `OSError` if that is unknown."""
+    """Raises `OSError` if it is unknown whether the path exists."""
     try:
         return kind(stat_given(path).st_mode)
     except (FileNotFoundError, NotADirectoryError):
@@ -266,10 +264,10 @@ _Stamp = tuple[str, int, int, int, int]
 
 
 class SpecificationFolder:
-    """The content of a folder; empty without a folder.
+    """Empty without a folder.
 
-    Each status and list request compares the folder with the specifications in force. Therefore the files are read only
-    if one has changed.
+    Each status and list request compares the folder with the specifications in force. Therefore the files are read
+    only if one has changed.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -278,15 +276,15 @@ class SpecificationFolder:
         self._found: Sources | None = None
 
     def read(self) -> Sources:
-        """Read all files. Raises `SpecificationsRefusedError`."""
+        """Raises `SpecificationsRefusedError`."""
         return read_folder(self.path) if self.path is not None else Sources()
 
     def read_usable(self, site_keys: Sequence[str]) -> tuple[Sources, dict[str, str]]:
-        """Read the files that may come into force, like the function. Raises `SpecificationsRefusedError`."""
+        """Like the function. Raises `SpecificationsRefusedError`."""
         return read_usable(self.path, site_keys) if self.path is not None else (Sources(), {})
 
     def looked_at(self) -> Sources | None:
-        """Return the present content; None if it is not valid. Do not read unchanged files again."""
+        """None if the content is not valid. Unchanged files are not read again."""
         if self.path is None:
             return Sources()
         stamps = _stamps(self.path)
@@ -300,7 +298,7 @@ class SpecificationFolder:
 
 
 def _stamps(folder: Path) -> list[_Stamp] | None:
-    """Return stamps that change when a file changes; None if the folder cannot be read."""
+    """They change when a file changes; None if the folder cannot be read."""
     try:
         own = folder / "msg"
         found = [path for path, _is_folder in entries_of(folder) if path.match("*.rv*")]

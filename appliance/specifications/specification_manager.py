@@ -83,7 +83,7 @@ _WORDS: dict[Switch, str] = {True: "enabled", False: "disabled", SHADOW: "in sha
 
 
 class UnknownMonitorError(Exception):
-    """A monitor, file or revision does not exist; the text lists the valid ones."""
+    """The text lists the valid ones."""
 
 
 class DryRunUnderWayError(Exception):
@@ -91,7 +91,7 @@ class DryRunUnderWayError(Exception):
 
 
 class MonitorsChangedError(Exception):
-    """The monitors changed after a change to them was prepared; `tag` is the present tag."""
+    """The monitors changed after a change was prepared; `tag` is the present one."""
 
     def __init__(self, expected: str, tag: str) -> None:
         super().__init__(
@@ -102,22 +102,21 @@ class MonitorsChangedError(Exception):
 
 
 class _Consent(NamedTuple):
-    """Whether a change may cut topics whose publishers have another type (`force`), and `hold` topics with traffic."""
+    """`force`: topics may be cut whose publishers have another type. `hold`: topics with traffic may be held."""
 
     force: bool = False
     hold: bool = False
 
 
 _ALL = _Consent(force=True, hold=True)
-"""The consent for a rollback, which must never fail."""
+"""A rollback must never fail."""
 
 
 class SpecificationManager(Revisions[MonitorRevisionRow]):
-    """Manages specifications and switches, and answers operators' requests about them.
+    """Changes are made one at a time.
 
     `published()` is called when monitors may publish other topics. Each callback in `told` gets every event that a
-    relay reports. With `site_keys`, everything in force is signed with one of these keys. Changes are made one at a
-    time.
+    relay reports. With `site_keys`, everything in force is signed with one of these keys.
     """
 
     refusal = SpecificationsRefusedError
@@ -143,7 +142,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         parts: Parts,
         live: Callable[[], Published],
     ) -> None:
-        """`check` compiles for an order, `check_at_start` for a start, and `try_out` for a dry run.
+        """`check` is for an order, `check_at_start` for a start, and `try_out` for a dry run.
 
         `live()` returns the topics published now.
         """
@@ -173,7 +172,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     # --- start ---
 
     async def start(self, *, restarted: bool, taken_over: bool = False) -> None:
-        """Bring specifications into force at start. Raises `SpecificationsRefusedError`.
+        """Raises `SpecificationsRefusedError`.
 
         As with the policy, after a crash of control, use the specifications that were in force. At the start of the
         appliance, use the folder's, unless an operator's own revision was in force when the appliance stopped. One of
@@ -223,18 +222,18 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     @property
     def differs_from_folder(self) -> bool:
-        """Whether the specifications in force differ from the folder's; False without a folder."""
+        """False without a folder."""
         found = self._folder.looked_at()
         return self.folder is not None and (
             found is None or found.with_topics(self.sources.topics) != self.sources
         )
 
     def names(self) -> list[str]:
-        """Return the names of all monitors, in the order in which they get messages."""
+        """In the order in which they get messages."""
         return list(self.checked.monitors)
 
     def file_of(self, name: str) -> str:
-        """Return the file with this name, or the file of the monitor with this name. Raises `UnknownMonitorError`."""
+        """`name` is a file or a monitor. Raises `UnknownMonitorError`."""
         if name in self.sources.files:
             return name
         if name not in self.checked.monitors:
@@ -242,12 +241,12 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return self.checked.monitors[name]
 
     async def revisions(self, _request: admin.MonitorRevisions) -> answers.MonitorRevisionList:
-        """Return all kept revisions, the newest first."""
+        """The newest first."""
         rows = [self._described(row) for row in await self._kept()]
         return answers.MonitorRevisionList(msgspec.convert(rows, list[answers.MonitorRevision]))
 
     async def texts(self, request: admin.MonitorRevisionWanted) -> answers.RevisionTexts:
-        """Return a revision with its texts. Raises `UnknownMonitorError`."""
+        """Raises `UnknownMonitorError`."""
         row = await self._find(request.revision)
         if row is None:
             raise UnknownMonitorError(f"revision {request.revision} of the specifications does not exist")
@@ -260,10 +259,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     # --- changing ---
 
     async def load(self, request: admin.MonitorLoad, who: str) -> Replacement:
-        """Add these files, replacing files of the same names. Raises `SpecificationsRefusedError`.
+        """Files of the same names are replaced. Raises `SpecificationsRefusedError`.
 
-        With `confirm_within`, this change, like any other, is rolled back automatically after that many seconds unless
-        confirmed.
+        With `confirm_within`, this change, like any other, is rolled back automatically after that many seconds
+        unless confirmed.
         """
         async with self._changing(request.expected):
             topics, constants = split(request.given)
@@ -310,7 +309,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return answers.Tried(revision, tag, *files, [*checked.warnings, *warnings], [*checked.monitors])
 
     async def replace(self, request: admin.MonitorReplace, who: str) -> Replacement:
-        """Replace the file of a monitor by a text. Raises `UnknownMonitorError`, and the errors of `load`."""
+        """Raises `UnknownMonitorError`, and the errors of `load`."""
         file = self.file_of(request.name)
         load = admin.MonitorLoad(
             {file: request.text},
@@ -326,7 +325,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return await self.load(load, who)
 
     async def reload(self, request: admin.MonitorReload, who: str) -> Replacement:
-        """Load the folder's files; other files stay in force, unless `prune` is set.
+        """Other files stay in force, unless `prune` is set.
 
         Raises `SpecificationsRefusedError`, also without a folder.
         """
@@ -356,7 +355,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             return await self._change(sources, who, who, note, consent=_Consent(hold=True))
 
     async def held_by_bundle(self, sources: Sources) -> list[str]:
-        """Return why these sources would hold topics that carry messages. Raises `SpecificationsRefusedError`."""
+        """Return why these sources would hold topics with traffic. Raises `SpecificationsRefusedError`."""
         sources = sources.with_topics(self.sources.topics)
         if sources == self.sources:
             return []
@@ -364,7 +363,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return self._held(checked, self._in_shadow(checked), hold=False).conflicts
 
     async def remove(self, request: admin.MonitorRemove, who: str) -> Replacement:
-        """Remove files, given by their names or the names of their monitors.
+        """Files are given by their names or those of their monitors.
 
         Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` if other monitors use variables of these
         files, or if a file has further monitors that are not named.
@@ -391,7 +390,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             return await self._change(sources, keeper, who, note, request.confirm_within, consent=_Consent())
 
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
-        """Bring a kept revision into force again (None: the previous revision; 0: no specifications).
+        """None is the previous revision, 0 no specifications.
 
         A monitor that returns gets the switch that it had when it was removed. Raises `SpecificationsRefusedError`.
         """
@@ -403,7 +402,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             )
 
     async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.MonitorsConfirmed:
-        """Keep an unconfirmed change, if there is one."""
         async with self._changing(request.expected):
             promoted = self.returns.unconfirmed()
             waited = self.confirm_by is not None or bool(promoted)
@@ -422,7 +420,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             return answers.MonitorsConfirmed(waited, self.revision, self.tag)
 
     async def switch(self, request: admin.MonitorSwitch, who: str) -> Switched:
-        """Enable or disable monitors, for `for_seconds` or until further notice; return the monitors that changed.
+        """For `for_seconds` or until further notice; return the monitors that changed.
 
         Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` if a monitor to enable is in shadow mode, or
         shares variables with a monitor in shadow mode.
@@ -441,11 +439,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             return self._switched(names, until=self.returns.until(names[0]) if names else None)
 
     async def shadow(self, request: admin.MonitorShadow, who: str) -> Switched:
-        """Put monitors into shadow mode, or from shadow mode into force; return the monitors that changed.
+        """Return the monitors that changed.
 
         With `confirm_within`, monitors return to shadow mode after that many seconds unless confirmed. Raises the
-        errors of `switch`. Raises `SpecificationsRefusedError` also for a disabled monitor that should come
-        into force, and for a monitor that would cut a topic.
+        errors of `switch`. Raises `SpecificationsRefusedError` also for a disabled monitor that should come into
+        force, and for a monitor that would cut a topic.
         """
         async with self._changing(request.expected):
             self.judge_shadow(request)
@@ -457,7 +455,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             )
 
     def judge_shadow(self, request: admin.MonitorShadow) -> list[str]:
-        """Return warnings about topics; nothing changes. Raises the errors of `shadow`."""
+        """Return warnings; nothing changes. Raises the errors of `shadow`."""
         self._all_known(request.names)
         disabled = [name for name in request.names if self.switches.states[name] is False]
         if disabled and not request.shadow:
@@ -486,7 +484,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             raise SpecificationsRefusedError([text])
 
     async def _come_back(self, back: Mapping[str, Switch]) -> None:
-        """Switch monitors back when their time is over. Raises `SpecificationsRefusedError`."""
+        """Their time is over. Raises `SpecificationsRefusedError`."""
         async with self._one_change:
             for to in (True, SHADOW):
                 names = [name for name in self.switches.states if back.get(name) == to]
@@ -587,7 +585,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         )
 
     async def resume(self, request: admin.MonitorResume, who: str) -> Switched:
-        """Release the topics that these monitors hold; return the monitors that held their topics.
+        """Return the monitors that held their topics.
 
         Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` for monitors whose relay process is not
         running, because the next process will hold the topics again.
@@ -618,7 +616,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             return self._switched(held)
 
     async def give(self, request: admin.MonitorGive, who: str) -> answers.GivenSet:
-        """Set constants that are given to a monitor; return everything that is given to it.
+        """Return everything that is given to the monitor.
 
         Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` for a value outside of its range.
         """
@@ -690,7 +688,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             raise UnknownMonitorError(self._unknown(unknown))
 
     async def _count(self) -> None:
-        """Change the tag; store the new tag first, so that no crash restores an old one."""
+        """Store the new tag first, so that no crash restores an old one."""
         self.store.save_setting(_ACTS, str(self._acts + 1))
         await self.store.settled()
         self._acts += 1
@@ -714,7 +712,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         topics: Mapping[str, Mapping[str, str]] = MappingProxyType({}),
         constants: Given = NO_VALUES,
     ) -> Replacement:
-        """Compile sources and put them into force; `kept` are files that are not in the folder.
+        """`kept` are files that are not in the folder.
 
         `switches`, and the values `given`, are for monitors that are not in force yet; monitors in the files `shadow`
         start in shadow mode. `topics` and `constants` are new values of this change.
@@ -776,7 +774,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     def _check_given(
         self, topics: Mapping[str, Mapping[str, str]], constants: Given, checked: CheckedSpecifications
     ) -> dict[str, dict[str, messages.GivenValue]]:
-        """Return the constants as their types hold them. Raises `SpecificationsRefusedError`."""
+        """Raises `SpecificationsRefusedError`."""
         require_topics(topics, checked)
         if topics and self.site_keys:
             text = "the site signs the topics of a text, so a load cannot replace them: sign a text with another topic"
@@ -789,7 +787,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         }
 
     def _in_shadow(self, checked: CheckedSpecifications, files: Collection[str] = ()) -> set[str]:
-        """Return which of these monitors are, or would be, in shadow mode, including all monitors in `files`."""
+        """Include all monitors in `files`."""
         states = self.switches.states_of(checked)
         return {name for name, file in checked.monitors.items() if states[name] == SHADOW or file in files}
 
@@ -801,7 +799,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         *,
         promoted: Collection[str] = (),
     ) -> list[str]:
-        """Return warnings about topics. Raises `SpecificationsRefusedError` if a topic would be cut, or held."""
+        """Return warnings. Raises `SpecificationsRefusedError` if a topic would be cut, or held."""
         cut = judge_topics(
             coming, self.checked, self._live(), shadow=shadow, forced=consent.force, promoted=promoted
         )

@@ -1,4 +1,4 @@
-"""Stored revisions of the specifications: their form, the last switches of their monitors, and those of a start."""
+"""Keep revisions of the specifications, and choose those of a start."""
 
 import contextlib
 from collections.abc import Awaitable, Callable, Collection, Sequence
@@ -18,17 +18,14 @@ from appliance.specifications.specification_files import (
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 
 Check = Callable[[Sources, Sequence[str]], Awaitable[CheckedSpecifications]]
-"""Checks these sources with the keys of the site. Raises `SpecificationsRefusedError`."""
+"""Raises `SpecificationsRefusedError`."""
 
 NOTHING = MonitorRevisionRow(0, "{}", 0.0, DISK, "")
 """The revision before the first."""
 
 
 class StartingSpecifications(NamedTuple):
-    """The specifications that a start brings into force.
-
-    `refused` has the errors of the folder, if the revision that was in force before stays in force instead.
-    """
+    """`refused` has the errors of the folder, if the revision that was in force stays in force instead."""
 
     sources: Sources
     checked: CheckedSpecifications
@@ -36,8 +33,7 @@ class StartingSpecifications(NamedTuple):
 
 
 class StoredSpecifications(Sources, frozen=True):
-    """A stored revision; `switches` are the switches of its monitors, and `given` the values of their constants, at the
-    time when the revision was replaced."""
+    """`switches` and `given` are those of the time when the revision was replaced."""
 
     switches: dict[str, Switch] = {}  # noqa: RUF012  each struct gets one of its own
     given: dict[str, dict[str, GivenValue]] = {}  # noqa: RUF012  as above
@@ -64,9 +60,9 @@ async def specifications_at_start(
     named: Collection[str],
     kept: MonitorRevisionRow | None = None,
 ) -> StartingSpecifications:
-    """Return the specifications that a start brings into force: of the stored revision `last`, or the folder's (None).
+    """Use the stored revision `last`, or the folder.
 
-    If a reload would refuse the folder, they are those of `kept`, the revision that was in force before.
+    If a reload would refuse the folder, use `kept`, the revision that was in force.
 
     Raises `SpecificationsRefusedError`, also if they are not of an operator and lack a monitor that is `named` to be
     enabled, unless a file is left out.
@@ -113,7 +109,7 @@ async def _folder_or_kept(
 def _without_unusable(
     checked: CheckedSpecifications, sources: Sources, folder: SpecificationFolder, site_keys: Sequence[str]
 ) -> CheckedSpecifications:
-    """Add to the files that are left out those of the folder of which no usable text is in force."""
+    """Files of the folder without a usable text in force count as left out."""
     try:
         _, errors = folder.read_usable(site_keys)
     except SpecificationsRefusedError:
@@ -131,7 +127,7 @@ def unknown_monitors(names: Sequence[str], checked: CheckedSpecifications) -> st
 async def _check_kept(
     check: Check, row: MonitorRevisionRow, site_keys: Sequence[str]
 ) -> CheckedSpecifications:
-    """Compile a stored revision; if it is refused (by a newer version), the error has the command that discards it."""
+    """The error of a revision that a newer version refuses has the command that discards it."""
     try:
         return await check(sources_of(row), site_keys)
     except SpecificationsRefusedError as error:
@@ -143,7 +139,7 @@ async def _check_kept(
 
 
 def forget_revision(store: StateStore, now: float) -> int | None:
-    """Make the next start use the folder; return the discarded revision, or None if the folder's was in use.
+    """The next start uses the folder. Return the discarded revision, or None if the folder was in use.
 
     Call this only while the appliance is not running.
     """

@@ -16,7 +16,7 @@ SWITCHES = "monitor switches"
 
 
 class Switches:
-    """The switches that were made (`said`), and the states of all monitors in force; `enable` is the start option."""
+    """`said` has the switches that were made; `enable` is the start option."""
 
     def __init__(self, enable: str) -> None:
         self._all: Switch = SHADOW if enable == "shadow" else enable == "all"
@@ -32,18 +32,17 @@ class Switches:
         return self.states.get(name) is True
 
     def in_shadow(self, name: str) -> bool:
-        """Return whether a monitor is in shadow mode: it gets copies of messages, and its actions are only recorded."""
         return self.states.get(name) == SHADOW
 
     def shadowed(self) -> list[str]:
         return [name for name, state in self.states.items() if state == SHADOW]
 
     def switched_off(self) -> dict[str, Switch]:
-        """Return the monitors that an operator (not the configuration) disabled or put into shadow mode."""
+        """By an operator, not the configuration."""
         return {name: to for name, to in self.said.items() if to is not True and self.states.get(name) == to}
 
     def states_of(self, checked: CheckedSpecifications) -> dict[str, Switch]:
-        """Return the states of these monitors; shadow mode extends to monitors that share variables with one in it."""
+        """Shadow mode extends to monitors that share variables with one in it."""
         states = {name: self._own(name) for name in checked.monitors}
         if SHADOW in states.values():
             for group in checked.sharing:
@@ -58,7 +57,7 @@ class Switches:
         return self.said.get(name, self._all or name in self.named)
 
     def enforce(self, checked: CheckedSpecifications) -> list[str]:
-        """Put these specifications into force; return the monitors that are in shadow mode only because of others."""
+        """Return the monitors that are in shadow mode only because of others."""
         self.said = {name: to for name, to in self.said.items() if name in checked.monitors}
         self.states = self.states_of(checked)
         drawn_in = [name for name, to in self.states.items() if to == SHADOW and self._own(name) != SHADOW]

@@ -24,7 +24,7 @@ from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 
 LONGEST = 30 * 86_400.0
-"""The most seconds of a time limit."""
+"""In seconds."""
 
 _SETTING = "monitor returns"
 _AGAIN_SECONDS = 5.0
@@ -32,9 +32,7 @@ _log = structlog.get_logger()
 
 
 class _Return(msgspec.Struct, frozen=True):
-    """The time limit of the switch `of`: its end (`until`, seconds since the epoch), its length (`seconds`), and the
-    switch `back`.
-    """
+    """The switch `of` ends at `until` (seconds since the epoch), after `seconds`; then `back` applies."""
 
     until: float
     seconds: float
@@ -49,7 +47,7 @@ def returns_moved(store: StateStore, seconds: float) -> None:
 
 
 class TimedSwitches:
-    """The time limits of monitors; when one ends, `come_back(back)` is called, which calls `end` like every switch."""
+    """When a time limit ends, `come_back(back)` is called, which calls `end` like every switch."""
 
     def __init__(
         self, store: StateStore, come_back: Callable[[Mapping[str, Switch]], Awaitable[None]]
@@ -65,15 +63,15 @@ class TimedSwitches:
         return name in self._kept
 
     def until(self, name: str) -> float | None:
-        """Return when a disabled monitor is enabled again, in seconds since the epoch; None without a limit."""
+        """When a disabled monitor is enabled again, in seconds since the epoch."""
         return self._end_of(name, False)
 
     def confirm_by(self, name: str) -> float | None:
-        """Return when a monitor in force returns to shadow mode unless confirmed; None without a limit."""
+        """When a monitor in force returns to shadow mode unless confirmed, in seconds since the epoch."""
         return self._end_of(name, True)
 
     def unconfirmed(self) -> list[str]:
-        """Return the monitors that return to shadow mode unless confirmed."""
+        """They return to shadow mode unless confirmed."""
         return [name for name, one in self._kept.items() if one.of is True]
 
     def _end_of(self, name: str, of: Switch) -> float | None:
@@ -81,7 +79,7 @@ class TimedSwitches:
         return found.until if found is not None and found.of == of else None
 
     def start(self, states: Mapping[str, Switch]) -> None:
-        """Resume the time limits of monitors that still have the limited switch after a start."""
+        """Only of monitors that still have the limited switch."""
         text = self._store.settings().get(_SETTING, "{}")
         kept = msgspec.json.decode(text, type=dict[str, _Return])
         now = clock.wall()
@@ -93,7 +91,7 @@ class TimedSwitches:
         self._save()
 
     def begin(self, back: Mapping[str, Switch], seconds: float, of: Switch = False) -> None:
-        """Limit the time of the switch `of` of these monitors: after `seconds`, apply the switches in `back`.
+        """After `seconds`, apply the switches in `back`.
 
         A monitor that has a limit already goes back to the switch of that limit.
         """

@@ -32,7 +32,7 @@ _INCOMPLETE = "the installation is incomplete: install the package again, or run
 
 
 class LaunchPlan(msgspec.Struct, frozen=True):
-    """The plan to start a child: JSON in the child's arguments, without secrets."""
+    """JSON in the child's arguments, without secrets."""
 
     parent: int
     lifeline: int
@@ -57,12 +57,12 @@ class LaunchPlan(msgspec.Struct, frozen=True):
 
 
 def title_of(role: str, index: int | None) -> str:
-    """Return the title of a process: its role, with a number unless the process is the role's first."""
+    """A number follows the role unless the process is its first."""
     return role if not index else f"{role}-{index + 1}"
 
 
 class UnreachableError(Exception):
-    """Report a needed file that the role's user cannot reach."""
+    """The role's user cannot reach a needed file."""
 
 
 def main() -> None:
@@ -110,10 +110,10 @@ def _leave_network_if_allowed() -> None:
 
 
 def _enter_sandbox(plan: LaunchPlan) -> None:
-    """Enter the sandbox; report to the supervisor the limits that this kernel lacks.
+    """Report to the supervisor the limits that this kernel lacks.
 
-    The process runs without the lacking limits. Raises `SeccompError` only for a role without network: such a role must
-    not be able to make a socket.
+    The process runs without them. Raises `SeccompError` only for a role without network: such a role must not be able
+    to make a socket.
     """
     lacks = []
     abi = 0

@@ -4,4 +4,4 @@ from appliance.base.user_errors import UserError
 
 
 class StartError(UserError):
-    """Report that the appliance cannot start or go on; the message has the cause, the place and the remedy."""
+    """The message has the cause, the place and the remedy."""

@@ -1,8 +1,8 @@
 """Keep listening sockets open while control restarts.
 
-Control opens the ports that nodes use and sends each socket to the supervisor under a name. When control dies, the
-ports stay open and connections wait in the kernel's queue. The next control process gets all sockets back. This module
-accepts no connection and reads no data. Names are checked and counted, so a faulty control cannot fill the memory.
+Control sends each socket to the supervisor under a name. When control dies, connections wait in the kernel's queue,
+and the next control process gets all sockets back. This module accepts no connection and reads no data. Names are
+checked and counted, so a faulty control cannot fill the memory.
 """
 
 import os
@@ -14,11 +14,11 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:/\[\]-]{0,199}")
 
 
 class ListenerRejectedError(ValueError):
-    """Report a socket that is not kept; the message says why."""
+    """The message says why a socket is not kept."""
 
 
 class InheritedListeners:
-    """Listening sockets by name; this object owns their descriptors."""
+    """Owns the descriptors."""
 
     def __init__(self, *, limit: int = 10_000) -> None:
         self._limit = limit
@@ -31,7 +31,7 @@ class InheritedListeners:
         return iter(list(self._sockets.items()))
 
     def keep(self, name: str, descriptor: int) -> None:
-        """Keep `descriptor` under `name` and close the name's earlier socket; close `descriptor` if it is rejected.
+        """Close the name's earlier socket. Close `descriptor` if it is rejected.
 
         Raises `ListenerRejectedError` for an invalid name, a socket that does not listen, or too many sockets.
         """

@@ -4,7 +4,7 @@ The policy may be in a home of mode 0700, and an operator expects `rosrv up` to 
 does. The role gets open files, so no file is copied, and a reload reads the present text.
 
 1. Only a path that the role's row lists is opened: a file of it with its signature and test cases, or a folder with
-   everything below it. A role that was taken over gets nothing else.
+   everything below it. A compromised role gets nothing else.
 2. A thread answers, because a file system may block; it ends with the role.
 """
 
@@ -26,7 +26,7 @@ _ANSWER_SECONDS = 0.5  # RVMaster may wait for it
 
 
 class Borrower:
-    """A role's end of the link. A supervisor that hangs delays the role once, not at each request."""
+    """A supervisor that hangs delays the role once, not at each request."""
 
     def __init__(self, link: socket.socket) -> None:
         self._link = link
@@ -34,7 +34,7 @@ class Borrower:
         self._is_owed = False  # the answer to an earlier request
 
     def open(self, path: Path) -> int | None:
-        """Return a descriptor of a file or folder; None if it is not an input of the role.
+        """Return None if the path is not an input of the role.
 
         Raises `OSError`, which is `TimeoutError` while the supervisor does not answer.
         """
@@ -66,7 +66,7 @@ class Borrower:
 
 
 def lend_inputs(inputs: Collection[Path]) -> socket.socket | None:
-    """Return the role's end of a link over which it gets these files; None if it has the supervisor's rights anyway."""
+    """None if the role has the supervisor's rights anyway."""
     if not inputs or os.geteuid() != 0:
         return None
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -92,7 +92,7 @@ def _serve(link: socket.socket, inputs: tuple[Path, ...]) -> None:
 
 
 def open_input(path: Path, inputs: Collection[Path]) -> int | None:
-    """Open one of the inputs, a file beside it, or a file below it; return None for others. Raises `OSError`."""
+    """Open an input, a file beside it, or a file below it; return None for others. Raises `OSError`."""
     for given in inputs:
         if any(path == given.with_name(given.name + suffix) for suffix in _BESIDE):
             return open_as_owner(path)

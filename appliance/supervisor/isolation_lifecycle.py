@@ -59,7 +59,7 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True)
 class AppliancePorts:
-    """The ports that the firewall handles; `inner` and `own` are known only when control is ready."""
+    """`inner` and `own` are known only when control is ready."""
 
     master: int
     rosmaster: int
@@ -74,30 +74,26 @@ class AppliancePorts:
 
 
 class NoIsolation:
-    """No isolation: the processes share the supervisor's namespace, without a firewall."""
+    """The processes share the supervisor's namespace, without a firewall."""
 
     kind = "none"
     probes = False
 
     @contextlib.contextmanager
     def inside(self) -> Iterator[None]:
-        """Enter the namespace of the processes for a block that does not await."""
+        """For a block that does not await."""
         yield
 
     def build(self) -> None:
-        """Build the isolation. Raises `StartError` after removing everything that was built."""
+        """Raises `StartError` after removing everything that was built."""
 
-    def remove(self) -> None:
-        """Remove the isolation."""
+    def remove(self) -> None: ...
 
     def control_ready(self, inner_port: int, own_port: int) -> None:
-        """Close the ports of control's master-side endpoint and of the own node's master to other users.
-
-        Raises `NetworkError`.
-        """
+        """Close both ports to other users. Raises `NetworkError`."""
 
     def open_tunnels(self, pool: str, address: str) -> Esp:  # noqa: ARG002  the same everywhere
-        """Accept addresses of `pool` through IPsec only, and add `address`; return where ESP runs.
+        """Accept addresses of `pool` through IPsec only.
 
         Raises `NetworkError` if clear text cannot be blocked, or ESP cannot run.
         """
@@ -117,27 +113,26 @@ class NoIsolation:
         )
 
     def clear_tunnels(self) -> None:
-        """Remove the IPsec states and policies that an ended charon left. Raises `NetworkError`, `LeftoversError`."""
+        """An ended charon left IPsec states and policies. Raises `NetworkError`, `LeftoversError`."""
 
     def route_to(self, host: str) -> str | None:  # noqa: ARG002  the same everywhere
-        """Return the machine's address by which `host` reaches the appliance; None: the address that `host` used."""
+        """Return None if the address that `host` used is right."""
         return None
 
     def endpoint(self) -> PublicAddress:
-        """Return the address at which other networks' hosts reach the appliance. Raises `NetworkError` if unknown."""
+        """For hosts of other networks. Raises `NetworkError` if unknown."""
         raise NetworkError(f"isolation {self.kind} has no tunnels: use isolation netns or container")
 
     def report(self) -> FirewallState:
-        """Return the state of the firewall for `rosrv status`."""
         return FirewallState()
 
     def probe(self) -> str | None:
-        """Return why a hidden port may be reachable by other users, or None."""
+        """Return why a hidden port may be reachable by other users."""
         return None
 
 
 class ContainerIsolation(NoIsolation):
-    """The isolation in a container: the supervisor's own namespace, with the firewall."""
+    """The supervisor's own namespace, with the firewall."""
 
     kind = "container"
     probes = True
@@ -162,7 +157,7 @@ class ContainerIsolation(NoIsolation):
 
     @contextlib.contextmanager
     def _standing(self) -> Iterator[None]:
-        """Lock the rules. Raises `NetworkError` after they are removed."""
+        """Raises `NetworkError` after the rules are removed."""
         with self._changing:
             self._require_standing()
             yield
@@ -173,7 +168,7 @@ class ContainerIsolation(NoIsolation):
 
     @contextlib.contextmanager
     def _taking_away(self) -> Iterator[None]:
-        """Lock the rules for their removal; wait at most `_PATIENCE_SECONDS` for a call that hangs."""
+        """Wait at most `_PATIENCE_SECONDS` for a call that hangs."""
         self._ending = True
         held = self._changing.acquire(timeout=_PATIENCE_SECONDS)
         if not held:
@@ -185,7 +180,7 @@ class ContainerIsolation(NoIsolation):
                 self._changing.release()
 
     def build(self) -> None:
-        """Install the firewall. Raises `StartError`."""
+        """Raises `StartError`."""
         self._ending = False
         if self._namespace == Namespace.own():
             _require_own_network()
@@ -203,7 +198,6 @@ class ContainerIsolation(NoIsolation):
             )
 
     def remove(self) -> None:
-        """Remove every rule and the tunnels' address."""
         if self.firewall is None:
             return
         with self._taking_away():
@@ -217,7 +211,7 @@ class ContainerIsolation(NoIsolation):
                 log.error("firewall rules may remain", error=str(error))
 
     def _end_tunnels(self, own: str) -> None:
-        """Remove the tunnels' address, and the IPsec states and policies that a killed charon left in the kernel."""
+        """Remove also the IPsec states and policies that a killed charon left in the kernel."""
         try:
             self._namespace.run(lambda: clear_leftovers(own.partition("/")[0]))
             interfaces.delete_address(self._namespace, "lo", own)
@@ -225,7 +219,7 @@ class ContainerIsolation(NoIsolation):
             log.error("tunnel state may remain", error=str(error))
 
     def control_ready(self, inner_port: int, own_port: int) -> None:
-        """Close both ports to all users except the users of rosmaster and rosout."""
+        """The users of rosmaster and rosout still reach them."""
         with self._standing():
             if self.firewall is not None and (inner_port, own_port) != (self._ports.inner, self._ports.own):
                 self._ports = replace(self._ports, inner=inner_port, own=own_port)
@@ -234,7 +228,7 @@ class ContainerIsolation(NoIsolation):
                 self._owed = False
 
     def open_tunnels(self, pool: str, address: str) -> Esp:
-        """Close the pool to clear text before it becomes reachable."""
+        """The pool is closed to clear text before it becomes reachable."""
         with self._standing():
             if self.firewall is None:
                 raise NetworkError("the firewall is not in force")
@@ -256,7 +250,7 @@ class ContainerIsolation(NoIsolation):
             return esp
 
     def open_own_network(self, network: str, ports: list[int]) -> None:
-        """Close the network to other machines before its addresses become the appliance's."""
+        """The network is closed to other machines before its addresses become the appliance's."""
         # Control is not trusted: accept only a network that was not in use before, and ports without a privilege.
         wanted, opened = str(ipaddress.IPv4Network(network)), tuple(map(PortRange.one, sorted(set(ports))))
         if any(port.first < _FIRST_FREE_PORT for port in opened):
@@ -276,7 +270,7 @@ class ContainerIsolation(NoIsolation):
                 raise
 
     def _require_unused(self, network: ipaddress.IPv4Network) -> None:
-        """Raise `NetworkError` if an interface of the namespace has an address in the network."""
+        """Raise `NetworkError` if an interface has an address in the network."""
         for text in interfaces.addresses(self._namespace):
             held = ipaddress.ip_interface(text).network
             if held.version == 4 and held.overlaps(network):
@@ -285,14 +279,14 @@ class ContainerIsolation(NoIsolation):
                 )
 
     def clear_tunnels(self) -> None:
-        """Remove what an ended charon left; its addresses stay closed to clear text."""
+        """The addresses stay closed to clear text."""
         with self._standing():
             if self._own is not None:
                 address = self._own.partition("/")[0]
                 self._namespace.run(lambda: clear_leftovers(address))
 
     def endpoint(self) -> PublicAddress:
-        """Return the container's only address. Among several, it is unknown which address outside hosts reach."""
+        """Among several addresses, it is unknown which one outside hosts reach."""
         found = only_address(self._namespace, without=("lo", USER_SPACE_INTERFACE))
         if is_contained() and not lives_on_the_machines_network():
             reason = f"{found.reason}, in a container: outside the machine the address may differ"
@@ -300,7 +294,7 @@ class ContainerIsolation(NoIsolation):
         return found
 
     def report(self) -> FirewallState:
-        """Install missing rules; return the back end and the rules with their counters."""
+        """Install missing rules."""
         with self._standing():
             if self.firewall is None:
                 return FirewallState()
@@ -315,7 +309,7 @@ class ContainerIsolation(NoIsolation):
         return FirewallState(report.backend, list(report.not_used), list(report.rules))
 
     def probe(self) -> str | None:
-        """Try to reach the hidden ports as another local user."""
+        """Try as another local user."""
         ports = {
             "ROSMaster": self._ports.rosmaster,
             "the master-side proxy endpoint": self._ports.inner,
@@ -369,7 +363,7 @@ class ContainerIsolation(NoIsolation):
         return (*self._ports.api_networks, *([self._tunnels[0]] if self._tunnels else []))
 
     def _neighbours(self) -> tuple[str, ...]:
-        """Return the addresses that on the link to the appliance only the machine itself may use."""
+        """On the link to the appliance, only the machine itself may use these addresses."""
         return ()
 
     def _forwarders(self) -> tuple[ForwarderAccess, ...]:
@@ -386,7 +380,7 @@ class ContainerIsolation(NoIsolation):
 
 
 class NetnsIsolation(ContainerIsolation):
-    """The isolation on a bare host: a separate namespace with forwarded ports for RVMaster, nodes and REST."""
+    """A separate namespace on a bare host, with forwarded ports for RVMaster, nodes and REST."""
 
     kind = "netns"
 
@@ -417,14 +411,14 @@ class NetnsIsolation(ContainerIsolation):
             yield
 
     def open_tunnels(self, pool: str, address: str) -> Esp:
-        """Close the pool to clear text as in a container, then forward IKE and ESP to the namespace."""
+        """Then forward IKE and ESP to the namespace."""
         with self._standing():
             esp = super().open_tunnels(pool, address)
             self._isolation.forward_tunnels()
             return esp
 
     def open_own_network(self, network: str, ports: list[int]) -> None:
-        """Do the same as in a container, then forward the ports to the namespace."""
+        """Then forward the ports to the namespace."""
         with self._standing():
             self._isolation.require_free(ports)
             super().open_own_network(network, ports)
@@ -438,7 +432,6 @@ class NetnsIsolation(ContainerIsolation):
         super().build()
 
     def remove(self) -> None:
-        """Remove firewall and namespace, and restore the host's settings."""
         with self._taking_away():
             super().remove()
             try:
@@ -454,7 +447,7 @@ class NetnsIsolation(ContainerIsolation):
         return tuple(ends.host for ends in self._isolation.ends.values())
 
     def route_to(self, host: str) -> str | None:
-        """Return the host's address by which `host` reaches the appliance; None for a host in a tunnel."""
+        """Return None for a host in a tunnel."""
         # `host` comes from control, which is not trusted: accept only an address.
         address = ipaddress.ip_address(host)
         if self._tunnels is not None and address in ipaddress.ip_network(self._tunnels[0]):
@@ -462,11 +455,11 @@ class NetnsIsolation(ContainerIsolation):
         return self._isolation.host_address_for(host)
 
     def endpoint(self) -> PublicAddress:
-        """Return the machine's address towards its default route; without a default route, its only address."""
+        """Prefer the address towards the default route; without one, there must be only one address."""
         return self._isolation.endpoint()
 
     def report(self) -> FirewallState:
-        """Report as in a container, with the rules on the host; install missing host rules again."""
+        """Install missing rules on the host again."""
         with self._standing():
             rules = self._isolation.rules()
             gone = [rule.purpose for rule in rules if not rule.in_force]
@@ -478,7 +471,7 @@ class NetnsIsolation(ContainerIsolation):
             return msgspec.structs.replace(super().report(), forwarding=list(rules), **self._look_at_others())
 
     def _look_at_others(self) -> dict[str, list[str]]:
-        """Return other programs' rules (such as Docker's) for forwarded packets, and log changes of these rules."""
+        """Log changes of other programs' rules for forwarded packets, such as Docker's."""
         try:
             found = {
                 "translations": list(self._isolation.translations()),
@@ -501,14 +494,14 @@ class NetnsIsolation(ContainerIsolation):
 def isolation_for(
     isolation: str, ports: AppliancePorts, backend: Literal["auto", "iptables", "nft"]
 ) -> NoIsolation:
-    """Return the isolation of a configuration; nothing is built yet."""
+    """Nothing is built yet."""
     if isolation == "container":
         return ContainerIsolation(ports, backend)
     return NetnsIsolation(ports, backend) if isolation == "netns" else NoIsolation()
 
 
 def _require_own_network() -> None:
-    """Raise `StartError` in a container with the machine's network: the firewall would affect the whole machine."""
+    """In a container with the machine's network, the firewall would affect the whole machine."""
     shared = lives_on_the_machines_network()
     if is_contained() and (shared or bridges()):
         raise StartError(

@@ -30,7 +30,7 @@ log = structlog.get_logger()
 
 
 class IsolationWatchdog:
-    """The isolation as the supervisor uses it; `tell` sends a message to control."""
+    """`tell` sends a message to control."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class IsolationWatchdog:
         return [self._report] if self._probe is None else [self._report, self._probe]
 
     async def look(self) -> str | None:
-        """Probe, check the rules and report to control; return why a hidden port is open, or None."""
+        """Return why a hidden port is open."""
         async with self._one_at_a_time:
             reason = await self._find_fault()
         self._found(reason)
@@ -67,7 +67,7 @@ class IsolationWatchdog:
             self._tell(message)
 
     async def control_ready(self, inner_port: int, own_port: int) -> str | None:
-        """Close control's inner ports to other users, and verify that; return the reason of a failure, or None."""
+        """Close control's inner ports to other users, and verify that; return the reason of a failure."""
         try:
             async with self._one_at_a_time:
                 await in_thread(lambda: self.isolation.control_ready(inner_port, own_port))
@@ -78,7 +78,7 @@ class IsolationWatchdog:
         return await self.look()
 
     async def open_tunnels(self, pool: str, address: str) -> messages.TunnelsEnclosed:
-        """Block clear text for a pool of addresses; return where ESP runs, or why no tunnels are possible."""
+        """Block clear text for a pool; return where ESP runs, or why no tunnels are possible."""
         try:
             async with self._one_at_a_time:
                 esp = await in_thread(lambda: self.isolation.open_tunnels(pool, address))
@@ -91,7 +91,7 @@ class IsolationWatchdog:
         return messages.TunnelsEnclosed(esp)
 
     async def open_own_network(self, network: str, ports: list[int]) -> str:
-        """Add a network of the appliance's own and open ports; return why that is not possible, or an empty text."""
+        """Return why that is not possible, or an empty text."""
         try:
             async with self._one_at_a_time:
                 await in_thread(lambda: self.isolation.open_own_network(network, ports))
@@ -103,7 +103,7 @@ class IsolationWatchdog:
         return ""
 
     async def clear_tunnels(self, passive: Callable[[], bool]) -> None:
-        """Remove what an ended charon left in the kernel, while this appliance is passive and runs no other charon."""
+        """This appliance must be passive and run no other charon."""
         try:
             async with self._one_at_a_time:
                 if passive():
@@ -120,7 +120,6 @@ class IsolationWatchdog:
             return None
 
     async def endpoint(self) -> messages.EndpointFound:
-        """Return the address at which other networks' hosts reach the appliance, or why it is unknown."""
         try:
             found = await in_thread(self.isolation.endpoint)
         except Exception as error:  # noqa: BLE001  see the invariant

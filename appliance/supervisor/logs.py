@@ -20,7 +20,7 @@ _transform = structlog.tracebacks.ExceptionDictTransformer(show_locals=False)
 
 
 def configure_logs(process: str) -> None:
-    """Log to standard error; every line has the name of its process."""
+    """Every line has the name of the process."""
     human = sys.stderr.isatty()
     shared: list[structlog.typing.Processor] = [
         structlog.contextvars.merge_contextvars,

@@ -24,7 +24,7 @@ from appliance.channel.messages import StateGiven
 
 FOLDER = "monitors"
 SIZE = 32 << 20
-"""Bytes of each file."""
+"""In bytes, for each file."""
 
 _ENDED = "ended"
 _MOST_LIVES = 4  # folders kept while no run is complete
@@ -35,14 +35,14 @@ log = structlog.get_logger()
 
 
 class _Ended(msgspec.Struct):
-    """The last orderly end: the id of the boot, and the time (ns since the epoch)."""
+    """`at` is nanoseconds since the epoch."""
 
     boot: str
     at: int
 
 
 class MonitorMemory:
-    """The files of this run, one for each relay, and the files of earlier runs."""
+    """Files of this run, one for each relay, and of earlier runs."""
 
     def __init__(self, state: Path, relays: int) -> None:
         self._folder = state / FOLDER
@@ -106,7 +106,7 @@ class MonitorMemory:
         return ended
 
     def _lives(self) -> list[Path]:
-        """Remove folders that are no longer needed; return the remaining folders, the oldest first."""
+        """Remove folders that are no longer needed; return the others, the oldest first."""
         kept: list[Path] = []
         runs = [path for path in self._folder.iterdir() if path.is_dir() and path.name.isdecimal()]
         for life in sorted(runs, reverse=True):

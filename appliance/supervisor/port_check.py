@@ -18,7 +18,7 @@ def free_port() -> int:
 
 
 def first_free(ports: range) -> int:
-    """Return the first of these loopback ports that has neither a listener nor an old connection. Raises `OSError`."""
+    """Return the first loopback port with neither a listener nor an old connection. Raises `OSError`."""
     for port in ports:
         with socket.socket() as sock:
             try:
@@ -30,7 +30,7 @@ def first_free(ports: range) -> int:
 
 
 def spare_ports(count: int, taken: Sequence[range], within: range) -> range:
-    """Return the highest `count` adjacent ports `within` that do not overlap `taken`. Raises `StartError`."""
+    """Return the highest adjacent ports that do not overlap `taken`. Raises `StartError`."""
     stop = within.stop
     while stop - count >= within.start:
         wanted = range(stop - count, stop)
@@ -45,7 +45,7 @@ def spare_ports(count: int, taken: Sequence[range], within: range) -> range:
 
 
 def require_free(host: str, port: int) -> None:
-    """Raise `StartError` if the address cannot be listened on; its text names the process on the port, if known."""
+    """Raise `StartError`; its text names the process on the port, if known."""
     if port == 0:
         return
     try:

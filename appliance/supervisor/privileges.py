@@ -36,7 +36,7 @@ _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 
 
 def die_with_parent(parent: int) -> None:
-    """Make the kernel kill this process when its parent `parent` dies; exit if the parent is already dead.
+    """Make the kernel kill this process when `parent` dies; exit if it is already dead.
 
     Call this after the change of user: a change clears the setting.
     """
@@ -46,7 +46,7 @@ def die_with_parent(parent: int) -> None:
 
 
 def raise_file_limit(wanted: int) -> int:
-    """Raise the limit on open files to `wanted`, or as close as permitted; return the new limit."""
+    """Raise the limit as close to `wanted` as permitted."""
     _soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if hard == resource.RLIM_INFINITY or hard >= wanted:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
@@ -60,7 +60,7 @@ def raise_file_limit(wanted: int) -> int:
 
 
 def raise_oom_score(score: int) -> None:
-    """Raise `oom_score_adj`, so the kernel kills this process earlier if memory is short; never lower it.
+    """The kernel kills this process earlier if memory is short. The score is never lowered.
 
     Call this before the change of user: the role's user may not write the file. With a read-only /proc, nothing
     changes.
@@ -71,7 +71,7 @@ def raise_oom_score(score: int) -> None:
 
 
 def raise_priority(by: int) -> int:
-    """Lower the niceness of this process by `by`; return `by`, or 0 if this is not permitted."""
+    """Return `by`, or 0 if this is not permitted."""
     try:
         os.setpriority(os.PRIO_PROCESS, 0, os.getpriority(os.PRIO_PROCESS, 0) - by)
     except PermissionError:
@@ -80,7 +80,7 @@ def raise_priority(by: int) -> int:
 
 
 def add_niceness(by: int) -> None:
-    """Add to the niceness of this process; do nothing that is not permitted.
+    """Do nothing that is not permitted.
 
     Where the kernel shares the processor among sessions (autogroups), the niceness of a process has an effect only
     inside its session. So a session with a process of higher priority gets its niceness: call this in a session of
@@ -111,7 +111,7 @@ def shorten_slice(nanoseconds: int) -> None:
 
 
 def leave_network() -> None:
-    """Move this process into an empty network namespace. Raises `OSError`."""
+    """The process moves into an empty network namespace. Raises `OSError`."""
     libc_call("unshare(CLONE_NEWNET)", _CLONE_NEWNET)
 
 
@@ -135,7 +135,7 @@ SUPERVISOR_CAPABILITIES = {
 
 
 def drop_unused_capabilities() -> None:
-    """Drop every capability that is not in `SUPERVISOR_CAPABILITIES`."""
+    """Keep `SUPERVISOR_CAPABILITIES`."""
     if os.geteuid() != 0:
         return
     kept = sum(1 << number for number in SUPERVISOR_CAPABILITIES.values())
@@ -149,7 +149,7 @@ def drop_unused_capabilities() -> None:
 
 
 def drop_privileges(account: Account, *, parent: int, capabilities: Sequence[str] = ()) -> None:
-    """Become `account` for good and keep only `capabilities` (of `SUPERVISOR_CAPABILITIES`). Raises `OSError`."""
+    """Become `account` for good; `capabilities` are of `SUPERVISOR_CAPABILITIES`. Raises `OSError`."""
     os.umask(0o077)
     if os.geteuid() == 0:
         kept = sum(1 << SUPERVISOR_CAPABILITIES[name] for name in capabilities)
@@ -179,7 +179,7 @@ def _empty_bounding_set(*, but: int = 0) -> None:
 
 
 def _reduce_capabilities(kept: int) -> None:
-    """Keep exactly the capabilities of this bit set; executed programs inherit them."""
+    """Executed programs inherit the capabilities of this bit set."""
     prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
     low, high = kept & 0xFFFFFFFF, kept >> 32
@@ -190,12 +190,12 @@ def _reduce_capabilities(kept: int) -> None:
 
 
 def prctl(option: int, first: int, second: int = 0) -> None:
-    """Call `prctl(2)`. Raises `OSError`."""
+    """`prctl(2)`. Raises `OSError`."""
     libc_call(f"prctl({option})", ctypes.c_int(option), *map(ctypes.c_ulong, (first, second, 0, 0)))
 
 
 def libc_call(what: str, *arguments: Any) -> None:
-    """Call the function of the C library with which `what` begins. Raises `OSError`."""
+    """`what` begins with the function's name. Raises `OSError`."""
     function = ctypes.CDLL(None, use_errno=True)[what.partition("(")[0]]
     if function(*arguments) != 0:
         number = ctypes.get_errno()

@@ -32,7 +32,7 @@ _log = structlog.get_logger()
 
 
 class ProgramOutput:
-    """The reader of a program's output, until the program and all that it started have ended."""
+    """Reads until the program and all that it started have ended."""
 
     def __init__(self, role: str, output: IO[bytes], loop: asyncio.AbstractEventLoop) -> None:
         self._role = role
@@ -69,7 +69,7 @@ _PROGRAM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
 @dataclass(frozen=True)
 class ProcessCallbacks:
-    """Callbacks of the supervisor for the events of a process."""
+    """Called for the events of a process."""
 
     received: Callable[["ProcessHandle", Any, tuple[int, ...]], None]
     violated: Callable[["ProcessHandle", str], None]
@@ -77,7 +77,7 @@ class ProcessCallbacks:
 
 
 def is_hanging(silent: float, *, starting: bool, still: float) -> bool:
-    """Return whether a process hangs after `silent` seconds without an answer and `still` seconds without progress.
+    """Return whether a process hangs: `silent` seconds without an answer, `still` seconds without progress.
 
     During a start, `silent` counts from the start; a start that progresses may take long.
     """
@@ -92,7 +92,7 @@ class ProcessHandle:
     def __init__(
         self, role: str, index: int, plan: LaunchPlan, lifeline: socket.socket, reports: ProcessCallbacks
     ) -> None:
-        """Start the process; `lifeline` is the supervisor's open end, and `plan.lifeline` is the child's."""
+        """`lifeline` is the supervisor's open end, and `plan.lifeline` is the child's."""
         self.role = role
         self.index = index
         self.ready = False
@@ -144,7 +144,7 @@ class ProcessHandle:
 
     @property
     def alive(self) -> bool:
-        """Whether the process's death is not known yet."""
+        """The process's death is not known yet."""
         return self._pidfd >= 0
 
     @property
@@ -158,7 +158,7 @@ class ProcessHandle:
         ]
 
     def send(self, message: Message, descriptors: tuple[int, ...] = ()) -> None:
-        """Send a message, unless the process is dead (its death is reported separately)."""
+        """Do nothing if the process is dead, because its death is reported separately."""
         if self._channel is None:
             return
         try:
@@ -176,7 +176,7 @@ class ProcessHandle:
         self.answered = clock.now()
 
     def discount_pause(self, seconds: float) -> None:
-        """Add `seconds` to the deadline of the answer: the supervisor did not run (a suspended machine)."""
+        """The supervisor did not run (a suspended machine), so the answer may come this much later."""
         self.started += seconds
         if self.answered is not None:
             self.answered += seconds
@@ -248,7 +248,7 @@ def _environment(home: str) -> dict[str, str]:
 
 
 def program_environment(home: str, extra: dict[str, str]) -> dict[str, str]:
-    """Return the environment of an external program; it inherits only language and time zone."""
+    """Only language and time zone are inherited."""
     environment = _environment(home)
     del environment["PYTHONPATH"], environment["PYDANTIC_DISABLE_PLUGINS"]
     return {**environment, **extra}

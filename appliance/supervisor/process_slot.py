@@ -21,7 +21,7 @@ STABLE_SECONDS = 10.0
 
 @dataclass
 class ProcessSlot:
-    """The place of one process of a role: the running process, or its next start."""
+    """The running process of a role, or its next start."""
 
     role: Role
     index: int
@@ -41,19 +41,19 @@ class ProcessSlot:
 
     @property
     def is_starting(self) -> bool:
-        """Whether the appliance does not serve yet because this process is not ready."""
+        """The appliance does not serve yet because this process is not ready."""
         if self.role.on_demand or self.role.dispensable:
             return False
         return self.process is None or not (self.process.ready or self.process.is_program)
 
     @property
     def is_failing(self) -> bool:
-        """Whether the last runs were all short, so that operators must be notified."""
+        """The last runs were all short, so operators must be notified."""
         return self.short_runs >= FAILING_AFTER
 
     @property
     def is_late(self) -> bool:
-        """Whether nodes cannot connect because this process is not ready."""
+        """Nodes cannot connect because this process is not ready."""
         role = self.role
         waited_for = (
             role.program is None and role.after is None and not role.on_demand and not role.dispensable
@@ -61,7 +61,7 @@ class ProcessSlot:
         return waited_for and (self.process is None or not self.process.ready)
 
     def record_death(self, process: ProcessHandle) -> float:
-        """Note the end of the process; return its run time in seconds."""
+        """Return the run time in seconds."""
         self.process = None
         self.since = process.since
         lived = clock.now() - process.started
@@ -69,7 +69,7 @@ class ProcessSlot:
         return lived
 
     def recovers(self) -> bool:
-        """Reset the failures if the process has run long enough; return whether this call reset them."""
+        """Reset the failures if the process has run long enough; return whether this call did so."""
         lasts = self.process is not None and clock.now() - self.process.started >= STABLE_SECONDS
         if not (lasts and self.is_failing):
             return False
@@ -77,13 +77,13 @@ class ProcessSlot:
         return True
 
     def delay(self) -> float:
-        """Return the seconds until the next start: 0 after a long run, more after each short run."""
+        """In seconds: 0 after a long run, more after each short run."""
         if self.is_failing and self.role.dispensable:
             return min(2.0 ** (self.short_runs - FAILING_AFTER + 1), _LONGEST_DELAY)
         return _BACKOFF[min(max(self.short_runs - 1, 0), len(_BACKOFF) - 1)]
 
     def plan(self, facts: Facts, lifeline: int, lender: int | None) -> LaunchPlan:
-        """Return the plan of the next start; `lifeline` and `lender` are the child's ends."""
+        """`lifeline` and `lender` are the child's ends."""
         role = self.role
         home = str(facts.part(role.part))
         plan = LaunchPlan(

@@ -9,8 +9,6 @@ from appliance.relay.relay_limits import RelayLimits
 
 
 class _Section(msgspec.Struct):
-    """The part of the supervisor's settings that a relay needs."""
-
     relay: RelayLimits
 
 
@@ -19,5 +17,5 @@ def main(lifeline_fd: int, index: int, config: Path) -> None:
 
 
 def limits_of(config: Path) -> RelayLimits:
-    """Return the limits in the configuration's section `relay`. Raises `OSError`, `msgspec.ValidationError`."""
+    """Raises `OSError`, `msgspec.ValidationError`."""
     return msgspec.json.decode(config.read_bytes(), type=_Section).relay

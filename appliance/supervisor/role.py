@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Facts:
-    """The paths and ports that the rows of the table need; control reports some of them when it is ready."""
+    """Control reports some of these when it is ready."""
 
     state: Path
     config: Path
@@ -32,12 +32,12 @@ class Facts:
         return self.state / name
 
     def run(self, name: str) -> Path:
-        """Return a file that the supervisor writes for the other processes."""
+        """The supervisor writes this file for the other processes."""
         return self.config.with_name(name)
 
 
 class RemoteReceiver(NamedTuple):
-    """A receiver on another machine, and the name of its client in the firewall's rules."""
+    """`client` is a name in the firewall's rules."""
 
     client: str
     protocol: str  # udp, or a protocol over TCP
@@ -46,18 +46,17 @@ class RemoteReceiver(NamedTuple):
 
 
 class SharedMemory(Protocol):
-    """Memory that the supervisor makes at the start and gives to processes; it survives them."""
+    """Made at the start and given to processes; it survives them."""
 
     def messages_for(self, role: str, index: int) -> "Iterator[tuple[MemoryGiven, int]]":
-        """Yield the messages and descriptors that a process gets at its start."""
+        """Yield messages and descriptors for the start of a process."""
 
-    def close(self) -> None:
-        """Close all descriptors."""
+    def close(self) -> None: ...
 
 
 @dataclass(frozen=True)
 class ExternalProgram:
-    """The command of an external program, and its environment besides HOME and PATH."""
+    """The environment does not include HOME and PATH."""
 
     argv: tuple[str, ...]
     environment: Mapping[str, str] = field(default_factory=dict)
@@ -128,5 +127,5 @@ class Role:
 
     @property
     def serves_robot(self) -> bool:
-        """Whether the role may run only while this appliance is active; a pause stops it."""
+        """The role may run only while this appliance is active; a pause stops it."""
         return not (self.outlives_takeover or self.stands_by)

@@ -1,7 +1,7 @@
 """The table of processes, with the user, the permissions and the start of each process.
 
-To add a process, add its row to `ROLES`. A role is either a part of the appliance (`entry`: a function that gets the
-lifeline) or an external program (`program`: the command and its environment).
+To add a process, add its row. A role is either a part of the appliance (`entry`: a function that gets the lifeline)
+or an external program (`program`: the command and its environment).
 """
 
 import shutil
@@ -28,7 +28,7 @@ ROS_PROGRAMS = {ROSMASTER: "python3-rosmaster", ROSOUT: "rosout"}
 
 
 def _of_ros(facts: Facts, part: str, master: str) -> dict[str, str]:
-    """Return the environment of a ROS program; its ROS_IP makes rosmaster listen on loopback only."""
+    """ROS_IP makes rosmaster listen on loopback only."""
     return {
         "ROS_IP": "127.0.0.1",
         "ROS_MASTER_URI": master,
@@ -40,7 +40,7 @@ def _of_ros(facts: Facts, part: str, master: str) -> dict[str, str]:
 
 
 def _messages_at(ports: range | None) -> tuple[str, ...]:
-    """Return the argument that makes roscpp serve messages at the first free port of the range.
+    """Return the argument that makes roscpp serve messages at the first free port.
 
     Connections of an earlier run may occupy a port for a minute.
     """
@@ -120,7 +120,7 @@ ROLES = (
     ),
     *(role for role in _OF_FEATURES if role.after is not None or role.on_demand),
 )  # fmt: skip
-"""The roles in the order of their start."""
+"""In the order of their start."""
 
 
 def roles_of(
@@ -129,7 +129,7 @@ def roles_of(
     api: bool = True,
     paired: bool = False,
 ) -> tuple[Role, ...]:
-    """Return the roles of an appliance with these parts. Raises `StartError` if a ROS program is missing."""
+    """Raises `StartError` if a ROS program is missing."""
     require_programs(ROS_PROGRAMS)
     wanted = {"api": api}
     return tuple(
@@ -140,7 +140,7 @@ def roles_of(
 
 
 def require_programs(packages: Mapping[Path, str]) -> None:
-    """Raise `StartError`, with the package to install, if a program is missing."""
+    """Raise `StartError`, with the package to install."""
     for program, package in packages.items():
         if shutil.which(program) is None:
             raise StartError(f"{program} is missing: install it with `apt install {package}`")

@@ -21,7 +21,7 @@ _REQUEST = (
 
 
 async def answers(port: int, account: Account, inside: AbstractContextManager[None], seconds: float) -> bool:
-    """Return whether `rosmaster` on this loopback port answers a call within `seconds`.
+    """`rosmaster` listens on this loopback port.
 
     `inside` enters rosmaster's network namespace while the socket is made.
     """

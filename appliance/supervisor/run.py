@@ -51,11 +51,11 @@ def run_appliance(
     pairing: Pairing | None = None,
     waits: Callable[[], None] = lambda: None,
 ) -> None:
-    """Run the appliance until it is stopped. Raises `StartError` if it cannot start or go on.
+    """Raises `StartError` if the appliance cannot start or go on.
 
     `ready` is called once, when nodes may connect; it gets control's message and the settings with all ports chosen.
-    With `pairing` the appliance is one of two, and `waits` is called once when it could serve.
-    `node_ports` is the policy's `[Ports] range`: the firewall limits connections to it, and `netns` forwards it.
+    With `pairing` the appliance is one of two, and `waits` is called once when it could serve. `node_ports` is the
+    policy's `[Ports] range`: the firewall limits connections to it, and `netns` forwards it.
     """
     if settings.isolation == "none":
         log.warning(
@@ -83,7 +83,7 @@ def run_appliance(
 
 
 def _weigh(pairing: Pairing) -> int:
-    """Give the supervisor of one of two appliances a priority, so that no load delays its gate."""
+    """No load may delay the gate of one of two appliances."""
     raised = raise_priority(-pairing.nice)
     if not raised:
         log.warning(
@@ -150,7 +150,7 @@ def _run(
 
 
 def _ports_of_rosout(settings: Settings, node_ports: range) -> range:
-    """Return the ports for rosout's messages; the kernel's local port range has none of them."""
+    """The kernel's local port range has none of these ports."""
     chosen = local_port_range()
     taken = [settings.listen_address[1], settings.rosmaster_port]
     taken += [settings.api_address[1]] if settings.api_address else []
@@ -162,7 +162,7 @@ def _ports_of_rosout(settings: Settings, node_ports: range) -> range:
 
 
 def _with_ports(settings: Settings) -> Settings:
-    """Return the settings, with every port chosen that must be known before the first process starts."""
+    """Choose every port that must be known before the first process starts."""
     host, port = settings.listen_address
     if port == 0 and settings.isolation != "none":
         port = free_port()
@@ -173,7 +173,7 @@ def _with_ports(settings: Settings) -> Settings:
 
 
 def _api_with_port(settings: Settings) -> str:
-    """Return the address of REST. If the default port is in use, warn and choose a free one."""
+    """If the default port is in use, warn and choose a free one."""
     if settings.api_address is None:
         return settings.api
     host, port = settings.api_address

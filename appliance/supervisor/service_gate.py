@@ -1,4 +1,4 @@
-"""Decide whether the appliance may serve. A feature can bring another decision for one of two appliances."""
+"""Decide whether the appliance may serve; a feature can decide for one of two appliances."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -7,10 +7,9 @@ from typing import Any
 
 @dataclass(frozen=True)
 class RoleChanges:
-    """The orders at a change of the role.
+    """`activate(epoch)` and `passivate()` begin and end the service.
 
-    `activate(epoch)` and `passivate()` begin and end the service. `suspend()` stops it, with all state kept; it returns
-    False if that is not possible now. `resume()` goes on.
+    `suspend()` stops it, with all state kept, until `resume()`; it returns False if that is not possible now.
     """
 
     activate: Callable[[int], None]
@@ -20,10 +19,10 @@ class RoleChanges:
 
 
 class ServiceGate:
-    """The gate of a single appliance, which always may serve, in epoch 0.
+    """A single appliance may always serve, in epoch 0.
 
-    `accepts` has the messages of roles that the gate decides by. Operators get `paused` as the answer while the service
-    is suspended, and `ended` while this appliance stops serving.
+    `accepts` has the messages of roles that the gate decides by. Operators get `paused` as the answer while the
+    service is suspended, and `ended` while this appliance stops serving.
     """
 
     accepts: Mapping[str, tuple[type, ...]] = {}
@@ -39,11 +38,9 @@ class ServiceGate:
     def active(self) -> bool:
         return self.epoch is not None and not self.suspended
 
-    def heard(self, message: Any) -> None:
-        """Take a message of `accepts`."""
+    def heard(self, message: Any) -> None: ...
 
-    def died(self, role: str, *, serves_robot: bool) -> None:
-        """Note the death of a process."""
+    def died(self, role: str, *, serves_robot: bool) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -51,8 +48,8 @@ class Pairing:
     """One of two appliances, before it starts.
 
     `robot` is an address of the robot. Only `other` may send to `port`. `files` are written for the processes: names,
-    users, contents. The supervisor gets the priority `nice`. `fixed_authority` is why the authority of hosts cannot be
-    replaced. `event` and `text` are printed when this appliance could serve, and `ready` is its state for systemd.
+    users, contents. The supervisor gets the priority `nice`. `fixed_authority` is why the authority of hosts cannot
+    be replaced. `event` and `text` are printed when this appliance could serve, and `ready` is its state for systemd.
     """
 
     robot: str

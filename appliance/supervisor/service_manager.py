@@ -17,7 +17,7 @@ _MORE = "EXTEND_TIMEOUT_USEC=120000000\n"
 
 
 class ServiceManager:
-    """Notifies systemd over its socket, and pings its watchdog; does nothing without a socket."""
+    """Does nothing without systemd's socket."""
 
     def __init__(self, address: str | None, watchdog_seconds: float | None) -> None:
         self._address = None if address is None else address.replace("@", "\0", 1)
@@ -33,7 +33,7 @@ class ServiceManager:
         return cls(said["NOTIFY_SOCKET"], _seconds(said))
 
     def starting(self, status: str) -> None:
-        """Report progress of the start, and request more time; `status` is the present step."""
+        """Request more time; `status` is the present step."""
         self._say(f"{_MORE}STATUS={status}")
 
     def ready(self, status: str) -> None:
@@ -45,7 +45,7 @@ class ServiceManager:
 
     @asynccontextmanager
     async def watched(self) -> AsyncIterator[None]:
-        """During the block, notify the watchdog twice per interval."""
+        """Notify the watchdog twice per interval."""
         task = asyncio.create_task(self._live())
         try:
             yield
@@ -69,7 +69,7 @@ class ServiceManager:
 
 
 def _seconds(said: Mapping[str, str | None]) -> float | None:
-    """Return the watchdog interval; None if it is for another process or not a number."""
+    """None if the watchdog is for another process or not a number."""
     text, pid = said["WATCHDOG_USEC"], said["WATCHDOG_PID"]
     if text is None or not text.isdigit() or int(text) == 0 or (pid is not None and pid != str(os.getpid())):
         return None

@@ -14,7 +14,7 @@ _ENDING = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGHUP})
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Hold the signals back until the end of the block, except within `heard`, then ignore them. Main thread only."""
+    """Except within `heard`, then ignore the signals. Main thread only."""
     before = block()
     try:
         yield
@@ -35,5 +35,5 @@ def heard() -> Iterator[None]:
 
 
 def block() -> set[int]:
-    """Block the signals in the calling thread and its children; return the previously blocked signals."""
+    """The thread's children block them too; return the previously blocked signals."""
     return {int(number) for number in signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)}

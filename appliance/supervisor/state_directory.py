@@ -34,7 +34,7 @@ _SHOWN = 3
 
 
 def foreign(path: Path) -> str | None:
-    """Return why the directory at `path` is not an appliance's state; None if it is one, is empty, or is missing.
+    """Return why a directory is not an appliance's state; an empty or missing one may become one.
 
     Raises `OSError`.
     """
@@ -49,7 +49,7 @@ def foreign(path: Path) -> str | None:
 
 
 def _has_lock(path: Path) -> bool:
-    """Whether the folder has a lock file of the folder's owner: in a shared folder, any user may create such a file."""
+    """In a shared folder, any user may create a lock file, so its owner must be the folder's."""
     try:
         lock = (path / _LOCK).lstat()
     except FileNotFoundError:
@@ -58,10 +58,10 @@ def _has_lock(path: Path) -> bool:
 
 
 class StateDirectory:
-    """The state directory of a running appliance; holds the lock until `close`."""
+    """Holds the lock until `close`."""
 
     def __init__(self, path: Path) -> None:
-        """Create the directory if needed, and lock it. Raises `StartError`."""
+        """Create the directory if needed. Raises `StartError`."""
         self.path = path.absolute()
         self._written: list[str] = []  # for the children, beside the configuration
         try:
@@ -82,7 +82,7 @@ class StateDirectory:
         return self.path / "run" / "config.json"
 
     def prepare(self, roles: Collection[Role]) -> None:
-        """Give each role its part, and remove unfinished files of killed writers.
+        """Remove unfinished files of killed writers.
 
         Raises `StartError` if a part belongs to another user, or its owner cannot be changed.
         """
@@ -117,7 +117,7 @@ class StateDirectory:
         write_whole(self.config, text.encode(), 0o644)
 
     def write_files(self, files: Iterable[tuple[str, str, bytes]]) -> None:
-        """Write further files (name, user, contents) for the children, each readable by its user only.
+        """Each file (name, user, contents) is readable by its user only.
 
         Remove those of an earlier start, which may have been killed.
         """
@@ -131,7 +131,7 @@ class StateDirectory:
             self._written.append(name)
 
     def open_admin_socket(self) -> socket.socket:
-        """Return the listening socket for the other verbs; replace an old one."""
+        """Replace an old one."""
         path = self.path / ADMIN_SOCKET
         path.unlink(missing_ok=True)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -188,7 +188,7 @@ class StateDirectory:
 
 
 def _hand_over(path: Path, uid: int, gid: int, mode: int) -> None:
-    """Change owner, group and mode of a folder, as its owner; otherwise the kernel drops the set-group-id bit."""
+    """Act as the folder's owner; otherwise the kernel drops the set-group-id bit."""
     os.chown(path, os.geteuid(), os.getegid())
     path.chmod(mode)
     os.chown(path, uid, gid)

@@ -86,7 +86,7 @@ log = structlog.get_logger()
 
 
 class ControlReady(msgspec.Struct, frozen=True):
-    """Control's message when nodes may connect (`Ready.detail`)."""
+    """`Ready.detail` of control."""
 
     master: str
     revision: int
@@ -115,12 +115,10 @@ class Supervisor:
         stands_by: Callable[[], None] = lambda: None,
         gate: Callable[[RoleChanges], ServiceGate] = ServiceGate,
     ) -> None:
-        """Prepare the slots. `ready` is called once when nodes may connect; it may raise `StartError`.
+        """`ready` is called once when nodes may connect; it may raise `StartError`.
 
-        `gate` decides whether the appliance may serve. `stands_by` is called once when it only waits for that.
-        Control gets `admin`. `listeners` are the sockets of roles that listen; they stay open while a process restarts,
-        so connections wait. `memories` are those of features. `memory` keeps the state of monitors; None: the state
-        is lost when relays die.
+        `stands_by` is called once when the appliance only waits for its `gate`. `listeners` stay open while a process
+        restarts, so connections wait. Without `memory`, the state of monitors is lost when relays die.
         """
         self._facts = facts
         self.slots = [
@@ -153,7 +151,7 @@ class Supervisor:
         self._since = clock.utc_now().isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
     async def run(self) -> None:
-        """Start all processes, keep them running, and end them on SIGTERM or SIGINT; SIGHUP reloads the policy.
+        """Run until SIGTERM or SIGINT; SIGHUP reloads the policy.
 
         Raises `StartError` if the appliance cannot start or go on; all processes are then stopped.
         """
@@ -184,7 +182,7 @@ class Supervisor:
                 self._memory.close()
 
     def stop(self, failure: str | None = None) -> None:
-        """End the appliance; `failure` is the reason why it cannot go on, None for an orderly end."""
+        """Without `failure`, this is an orderly end."""
         if not self.stopping.is_set():
             self.failure = failure
             self.stopping.set()
@@ -203,7 +201,7 @@ class Supervisor:
         self._spawn(self.until_ready())
 
     async def until_answering(self, slot: ProcessSlot) -> None:
-        """Wait until the process of this slot answers over HTTP; keep waiting if the process restarts."""
+        """Keep waiting if the process restarts."""
         began = clock.now()
         while self._gets_on(began, [slot]) and not self.stopping.is_set():
             process = slot.process
@@ -216,7 +214,7 @@ class Supervisor:
         self.stop(f"rosmaster does not answer on 127.0.0.1:{self._facts.rosmaster_port}; check the log")
 
     async def until_ready(self) -> None:
-        """Wait until all processes are ready; log the pending ones, and give up when they make no progress."""
+        """Give up when processes make no progress."""
         began = clock.now()
         while not self.is_ready and not self.stopping.is_set():
             with suppress(TimeoutError):
@@ -235,7 +233,7 @@ class Supervisor:
                 log.info("still starting", waits_for=words, seconds=waited)
 
     def _gets_on(self, began: float, slots: list[ProcessSlot]) -> bool:
-        """Whether a start may continue: for some minutes always, then up to a limit while processes make progress."""
+        """A start may continue for some minutes, then up to a limit while processes make progress."""
         waited = clock.now() - began
         if waited < _START_SECONDS:
             return True
@@ -243,7 +241,7 @@ class Supervisor:
         return waited < LONGEST_START_SECONDS and still < FIRST_ANSWER_SECONDS
 
     def start(self, slot: ProcessSlot) -> None:
-        """Start the process of a slot; after a failure try again with growing delays."""
+        """After a failure try again with growing delays."""
         slot.due = None
         if self._gate.suspended and slot.role.serves_robot:
             slot.due = asyncio.get_running_loop().call_later(_SUSPENDED_SECONDS, self.start, slot)
@@ -327,7 +325,7 @@ class Supervisor:
                 self.control_said(process, message, descriptors)
 
     def _sandboxed(self, process: ProcessHandle, sandbox: messages.Walled) -> None:
-        """Store a process's sandbox report, which is accepted only as its first message."""
+        """The report is accepted only as the process's first message."""
         if process.sandbox is not None:
             self._violated(process, "reported its sandbox twice")
             return
@@ -339,9 +337,9 @@ class Supervisor:
         self._tell_processes()
 
     def _cannot_serve(self, process: ProcessHandle, reason: str, output: Sequence[str]) -> None:
-        """End the appliance with this reason if it is still starting; otherwise only kill the process.
+        """End the appliance if it is still starting; otherwise only kill the process, whose next start may succeed.
 
-        The process starts again, and its next start may succeed. A dispensable process never ends the appliance.
+        A dispensable process never ends the appliance.
         """
         slot = next(slot for slot in self.slots if slot.process is process)
         process.reason = reason
@@ -426,7 +424,7 @@ class Supervisor:
     # --- one of two appliances ----------------------------------------------------------------------------
 
     def _note_parked(self) -> None:
-        """Start what a waiting appliance has, and announce once that it could serve."""
+        """Announce once that a waiting appliance could serve."""
         self._leave_answers()
         for slot in self.slots:
             if slot.role.stands_by and slot.is_free:
@@ -455,9 +453,10 @@ class Supervisor:
                 slot.process.kill()
 
     def _suspend(self) -> bool:
-        """Stop everything that serves the robot; return False if a process is only starting.
+        """Return False if a process is only starting.
 
-        A control that stood by is not, so a lapse soon after the activation does not end the appliance either.
+        A control that stood by does not count as starting, so a lapse soon after the activation does not end the
+        appliance.
         """
         serving = [(slot, slot.process) for slot in self.slots if slot.role.serves_robot]
         if any(slot.is_starting for slot, process in serving if process is not None):
@@ -493,7 +492,7 @@ class Supervisor:
     # --- readiness ----------------------------------------------------------------------------------------
 
     async def control_ready(self, process: ProcessHandle, said: ControlReady) -> None:
-        """Close control's inner ports to other users, and announce that the appliance serves."""
+        """Close control's inner ports to other users, then announce that the appliance serves."""
         reason = await self._watchdog.control_ready(said.inner_port, said.own_port)
         while self._gate.suspended and process.alive:
             await asyncio.sleep(_SUSPENDED_SECONDS)
@@ -514,7 +513,7 @@ class Supervisor:
             process.send(messages.Announced())
 
     def _answer(self, process: ProcessHandle, work: Coroutine[Any, Any, None]) -> None:
-        """Start a task that ends with an answer to control. Too many requests at once count as a violation."""
+        """Too many requests at once count as a violation."""
         if self._unanswered >= _MOST_UNANSWERED:
             work.close()
             self._violated(process, f"sent more than {_MOST_UNANSWERED} requests at once")
@@ -612,7 +611,6 @@ class Supervisor:
             process.note_answer()
 
     async def answers(self, seconds: float) -> bool:
-        """Return whether `rosmaster` answers within `seconds`."""
         inside = self._watchdog.isolation.inside()
         return await rosmaster_probe.answers(self._facts.rosmaster_port, account_of("rosrv"), inside, seconds)
 
@@ -649,7 +647,7 @@ class Supervisor:
         self._start_later(slot)
 
     def _ended(self, slot: ProcessSlot) -> None:
-        """Handle the normal end of a role on demand, which does not count as a restart."""
+        """The end of a role on demand does not count as a restart."""
         log.info("process ended", role=slot.role.name)
         slot.starts -= 1
         slot.short_runs = 0

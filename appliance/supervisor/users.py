@@ -30,7 +30,7 @@ NUMERIC_IDS = {
 
 @dataclass(frozen=True)
 class Account:
-    """A user with its numeric user and group ids."""
+    """A user with its numeric ids."""
 
     name: str
     uid: int
@@ -38,7 +38,7 @@ class Account:
 
 
 def account_of(user: str, group: str | None = None) -> Account:
-    """Return the account of a role's user; its group is the group of the user `group`, if given.
+    """`group` names the user whose group replaces the role's own.
 
     Raises `KeyError` for a user without a role.
     """

@@ -64,10 +64,7 @@ class _File(NamedTuple):
 
 
 def routes(settings: Settings) -> APIRouter:
-    """Return the routes, which are not part of the contract.
-
-    Raise `ModuleError` if the console's modules cannot be joined.
-    """
+    """The routes are not part of the contract. Raise `ModuleError` if the modules cannot be joined."""
     router = APIRouter(include_in_schema=False)
     served = _collect((files(__package__) / name for name in _SERVED), "")
     for feature in FEATURES:
@@ -84,7 +81,7 @@ def routes(settings: Settings) -> APIRouter:
     }
 
     def named(found: re.Match[str]) -> str:
-        """Return the lasting address of a file that a text names."""
+        """Return the lasting address of a file."""
         name = found[1]
         if name not in served:
             raise ModuleError(f"the console names {_PREFIX}{name}, which does not exist")
@@ -131,7 +128,7 @@ def routes(settings: Settings) -> APIRouter:
 
 
 def views() -> tuple[str, ...]:
-    """Return the names of all views, as in their addresses."""
+    """The names are those in their addresses."""
     parts = (part for feature in FEATURES for part in feature.console if part.place == "view")
     return (*_VIEWS, *(part.title.lower() for part in parts))
 

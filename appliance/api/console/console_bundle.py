@@ -46,7 +46,7 @@ _STYLE_COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 
 
 class ModuleError(Exception):
-    """The console's sources cannot be joined; the text names the file and, where known, the line."""
+    """The text names the file and, where known, the line."""
 
 
 class _Token(NamedTuple):
@@ -57,17 +57,14 @@ class _Token(NamedTuple):
 
 
 def join_modules(sources: Mapping[str, str], entry: str) -> str:
-    """Return one module with the entry and all that it imports.
-
-    The sources are keyed by their paths, such as `js/main.js`. Raise `ModuleError` for whatever cannot be joined.
-    """
+    """The sources are keyed by their paths, such as `js/main.js`. Raise `ModuleError`."""
     joining = _Joining(sources)
     joining.include(entry)
     return joining.script()
 
 
 def join_late_modules(sources: Mapping[str, str], entry: str) -> str:
-    """Return one module with the entry and all that it imports from its folder, with the exports of the entry.
+    """Return the entry and all that it imports from its folder, with the exports of the entry.
 
     A page loads it by `import()` at its address. Modules of other folders are in the page's script, with their state,
     so the entry gets them as arguments. Raise `ModuleError`.
@@ -79,7 +76,7 @@ def join_late_modules(sources: Mapping[str, str], entry: str) -> str:
 
 
 def join_styles(sources: Mapping[str, str], entry: str, within: tuple[str, ...] = ()) -> str:
-    """Return one style sheet: the entry with the files that it imports, without comments and indentation.
+    """Comments and indentation are removed.
 
     `within` are the files whose imports led to the entry. Raise `ModuleError` for a missing file, a cycle, and an
     import of another form.
@@ -186,7 +183,7 @@ class _Joining:
 
 
 def _tightened(pieces: list[_Token]) -> str:
-    """Return the text of the tokens, without the spaces that separate nothing."""
+    """Remove spaces that separate nothing."""
     kept: list[_Token] = []
     gap = ""
     for piece in pieces:
@@ -202,7 +199,7 @@ def _tightened(pieces: list[_Token]) -> str:
 
 
 def _apart(before: str, after: str) -> bool:
-    """Return whether two tokens of one line stay two tokens without a space between them."""
+    """The tokens of one line stay two tokens without a space between them."""
     return before in _SEPARATING or after in _SEPARATING
 
 
@@ -230,7 +227,7 @@ def _path(of: str, address: str) -> str:
 
 
 def _tokens(path: str, text: str) -> Iterator[_Token]:
-    """Yield the tokens of a module; comments and spaces become one space or line break."""
+    """Comments and spaces become one space or line break."""
     brackets: list[str] = []
     at, line, before = 0, 1, _Token("mark", ";", 1, outermost=True)
     while at < len(text):

@@ -38,9 +38,9 @@ _MOST_KNOWN = 1024
 
 @dataclass(frozen=True, slots=True)
 class Bearer:
-    """The holder of a token; `expires` is seconds since the epoch.
+    """`expires` is seconds since the epoch.
 
-    `shown` is the token (or its reading key) that the request carries. `asked` is the request, unless it is a GET.
+    `shown` is the token (or its reading key) that the request carries. `asked` is the request, unless it is a GET;
     `gone` is set when the client disconnects.
     """
 
@@ -54,7 +54,7 @@ class Bearer:
 
 
 class TokenAuthenticator:
-    """Checks tokens; of each peer, at most `failures_per_minute` wrong tokens are checked.
+    """At most `failures_per_minute` wrong tokens of each peer are checked.
 
     `used(id)` is called when a token was presented.
     """
@@ -75,7 +75,7 @@ class TokenAuthenticator:
         self._shown: OrderedDict[str, float] = OrderedDict()  # by peer: the time of its last valid token
 
     def quota_class(self, peer: str) -> QuotaClass:
-        """Return a peer's class: registered for this machine, or after a recent valid token; else unknown."""
+        """Registered for this machine, or after a recent valid token; else unknown."""
         shown = self._shown.get(peer)
         lately = shown is not None and clock.now() - shown < _KNOWN_SECONDS
         return QuotaClass.REGISTERED if lately or is_loopback(peer) else QuotaClass.UNKNOWN
@@ -97,7 +97,7 @@ class TokenAuthenticator:
         return kept is not None and not self._ends.passed(kept.id, kept.expires)
 
     async def recognise(self, authorization: str | None, host: str) -> Bearer:
-        """Return the holder of an `Authorization` header. Raises `ProblemError` (401, 429, 503)."""
+        """Raises `ProblemError` (401, 429, 503)."""
         if authorization is None:
             raise self._refusal("no token: send it as `Authorization: Bearer TOKEN`")
         if not self._stated:

@@ -35,10 +35,9 @@ _CONTAINER_ID = re.compile("[0-9a-f]{12}")
 
 
 def tls_context(home: Path, names: Iterable[str], now: datetime.datetime) -> ssl.SSLContext:
-    """Return the server's TLS context with the stored certificate.
+    """A new certificate is made if none is stored, or if the stored one ends soon or lacks one of `names`.
 
-    Make a new certificate if none is stored, or if the stored one ends soon or lacks one of `names`. Raises `OSError`,
-    `ValueError` and `ssl.SSLError` if the stored files cannot be used.
+    Raises `OSError`, `ValueError` and `ssl.SSLError` if the stored files cannot be used.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
@@ -49,7 +48,7 @@ def tls_context(home: Path, names: Iterable[str], now: datetime.datetime) -> ssl
 
 
 def renew(context: ssl.SSLContext, home: Path, names: Iterable[str], now: datetime.datetime) -> bool:
-    """Replace a certificate that ends soon or was made with a wrong clock; return whether it was replaced.
+    """A certificate that ends soon or was made with a wrong clock is replaced; return whether it was.
 
     Raises the same errors as `tls_context`.
     """
@@ -110,7 +109,7 @@ def _make(certificate_path: Path, key_path: Path, names: Iterable[str], now: dat
 
 
 def pin_of(home: Path) -> str:
-    """Return the pin of the server's key, in the format of curl's `--pinnedpubkey`."""
+    """In the format of curl's `--pinnedpubkey`."""
     certificate = x509.load_pem_x509_certificate((home / CERTIFICATE).read_bytes())
     public = certificate.public_key().public_bytes(
         serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo
@@ -119,7 +118,7 @@ def pin_of(home: Path) -> str:
 
 
 def fingerprint_of(home: Path) -> str:
-    """Return the SHA-256 of the certificate, hexadecimal."""
+    """Hexadecimal SHA-256."""
     certificate = x509.load_pem_x509_certificate((home / CERTIFICATE).read_bytes())
     return certificate.fingerprint(hashes.SHA256()).hex()
 

@@ -1,11 +1,11 @@
-"""Send the api's requests to control and await the answers; send notices of REST calls without an answer.
+"""Send the api's requests to control, and notices of REST calls without an answer.
 
 Invariants:
 
 1. At most `_MOST_OPEN` requests are open; a further request is rejected here and costs control nothing.
 2. A request ends with its answer, with the end of the link, or after a time limit.
-3. A notice (`tell`) never waits. While the control process is away, the last `_MOST_KEPT` notices are kept for the next
-   control process; lost notices are counted and logged.
+3. A notice (`tell`) never waits. While the control process is away, the last `_MOST_KEPT` notices are kept for the
+   next control process; lost notices are counted and logged.
 """
 
 import asyncio
@@ -48,7 +48,7 @@ _UNKNOWN = (
 
 
 class ControlAwayError(Exception):
-    """Report that control does not answer now; the text gives the client the reason.
+    """The text gives the client the reason.
 
     `active`: the address of the active appliance, if control only answers that this one is the standby.
     """
@@ -67,9 +67,8 @@ def _made(
 
 
 class ControlLink:
-    """The link to the control process.
-
-    `tokens_stated(tokens)` is called with the tokens that are valid from now on, `lost()` when control disconnects.
+    """`tokens_stated(tokens)` gets the tokens that are valid from now on; `lost()` is called when control
+    disconnects.
     """
 
     def __init__(self, tokens_stated: Callable[[list[TokenKept]], None], lost: Callable[[], None]) -> None:
@@ -103,7 +102,7 @@ class ControlLink:
     async def ask(
         self, request: AdminRequest[A], bearer: Bearer | None, seconds: float | None = None
     ) -> AdminAnswer[A]:
-        """Return control's answer to a request of the bearer. Raises `ControlAwayError`.
+        """Raises `ControlAwayError`.
 
         A request is withdrawn if the client disconnects, or if it has not taken effect after `seconds` (None: the
         operation's own limit).
@@ -136,7 +135,7 @@ class ControlLink:
     async def _asked(
         self, request: AdminRequest[Any], bearer: Bearer | None, until: float, longest: float
     ) -> bytes:
-        """Send a request, and withdraw it when its client disconnects. Raises as `Link.ask`."""
+        """The request is withdrawn when its client disconnects. Raises as `Link.ask`."""
         number = 0
 
         def question(given: int) -> RequestMade:
@@ -160,7 +159,7 @@ class ControlLink:
         return answer
 
     async def hand_over(self, door: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
-        """Pass a WebSocket on; return the status and why it is refused, or an empty text. Raises `ControlAwayError`."""
+        """Return the status and why the WebSocket is refused, or an empty text. Raises `ControlAwayError`."""
         if self.paused:
             raise ControlAwayError(self.paused)
         try:
@@ -172,7 +171,7 @@ class ControlLink:
         return answer.status, answer.reason
 
     def token_used(self, token: str) -> None:
-        """Report the use of a token to control; without control, a later use is reported."""
+        """Without control, a later use is reported."""
         with contextlib.suppress(ChannelFullError):
             self._link.send(TokenUsed(token))
 

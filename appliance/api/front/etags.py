@@ -13,7 +13,7 @@ def etag(tag: int | str) -> str:
 
 
 class ConditionalGet:
-    """ASGI middleware: a JSON answer to GET that has no ETag gets the hash of its body as its ETag.
+    """A JSON answer to GET that has no ETag gets the hash of its body.
 
     A client that sends the hash in `If-None-Match` gets 304, without the body. An answer with its own ETag is always
     sent completely: such an ETag names a revision, for `If-Match` of a change, and does not cover the whole body.
@@ -29,7 +29,7 @@ class ConditionalGet:
 
 
 class _Answer:
-    """One answer; its start is delayed until the first part of the body is known."""
+    """The start is delayed until the first part of the body is known."""
 
     def __init__(self, known: str, send: Send) -> None:
         self._known = {tag.strip().removeprefix("W/") for tag in known.split(",")}

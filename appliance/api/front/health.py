@@ -1,7 +1,7 @@
 """Answer `/healthz` (whether REST answers) and `/readyz` (whether nodes are served).
 
-The probes do not query control. They use the last sampled state, at most `history.IDLE_SECONDS` old. If that state is
-bad, it is sampled again, at a limited rate.
+The probes do not query control. They use the last sampled state, at most `history.IDLE_SECONDS` old; a bad state is
+sampled again, at a limited rate.
 """
 
 from typing import Literal

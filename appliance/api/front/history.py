@@ -55,7 +55,7 @@ class LastSample(NamedTuple):
 
 
 class SampleHistory:
-    """The samples of the last hour; `measures()` returns control's answer to `MetricsWanted`."""
+    """`measures()` returns control's answer to `MetricsWanted`."""
 
     def __init__(self, measures: Callable[[], Awaitable[Measures]]) -> None:
         self._measures = measures
@@ -66,7 +66,7 @@ class SampleHistory:
         self.seen = LastSample(0, None, None, _AWAY)
 
     def samples(self, most: int) -> list[Sample]:
-        """Return at most `most` evenly spaced samples of the last hour, the newest last."""
+        """Evenly spaced, the newest last."""
         kept = list(self._samples)
         step = -(-len(kept) // most)
         return kept[::-1][::step][::-1] if step > 1 else kept
@@ -81,13 +81,13 @@ class SampleHistory:
             self._followers -= 1
 
     async def after(self, number: int) -> LastSample:
-        """Wait for a sample newer than this number, and return it."""
+        """Wait for a sample newer than this number."""
         async with self._news:
             await self._news.wait_for(lambda: self.seen.number > number)
             return self.seen
 
     async def again(self, seconds: float) -> LastSample:
-        """Sample early and return the result; if sampling takes longer than `seconds`, return the last sample.
+        """If sampling takes longer than `seconds`, return the last sample.
 
         Control is queried at most once in `LEAST_SECONDS`.
         """
@@ -109,7 +109,6 @@ class SampleHistory:
                     await self._sooner.wait()
 
     async def look(self) -> None:
-        """Ask control for the present state, and keep it as the newest sample."""
         status, sample, away, active = None, None, None, ""
         try:
             body = await self._measures()
@@ -131,7 +130,7 @@ class SampleHistory:
 
 
 async def measures_of(control: ControlLink) -> Measures:
-    """Return control's answer to `MetricsWanted`. Raises `ControlAwayError`."""
+    """`MetricsWanted`. Raises `ControlAwayError`."""
     answer = await control.ask(MetricsWanted(), None)
     if not answer.ok:
         raise ControlAwayError(answer.error, answer.active)

@@ -1,8 +1,8 @@
 """Report all REST calls to control, which records them; equal reads and rejections are folded.
 
 The first call of a kind is reported at once; repetitions within `FOLD_SECONDS` are counted and reported as one call.
-Calls beyond `kinds` kinds are counted by status only. Changes are never folded: a change is any call with a valid token
-except GET and HEAD.
+Calls beyond `kinds` kinds are counted by status only. Changes (any call with a valid token except GET and HEAD) are
+never folded.
 """
 
 from collections import Counter
@@ -17,7 +17,7 @@ _Kind = tuple[str, str, str, str, int, str]
 
 
 class Journal:
-    """Reports answers to control; call `flush` every `FOLD_SECONDS`."""
+    """Call `flush` every `FOLD_SECONDS`."""
 
     def __init__(self, tell: Callable[[RestCalled], None], *, kinds: int = 512) -> None:
         self._tell = tell

@@ -45,7 +45,7 @@ _CONNECTION = "rosrv.connection"  # the key of the connection in a request's sta
 
 
 class _Connection(Front, asyncio.Protocol):
-    """One connection; bytes that the front accepts go to uvicorn's protocol."""
+    """Bytes that the front accepts go to uvicorn's protocol."""
 
     most_waiting = 16
     _uvicorn = asyncio.Protocol()  # does nothing until uvicorn's protocol replaces it
@@ -136,7 +136,7 @@ class _Connection(Front, asyncio.Protocol):
         self.connection_table.file(self, Stage.UNFINISHED if begun else Stage.IDLE)
 
     def reject(self, _status: bytes, what: str) -> None:
-        """Answer with the error and stop reading. Closing at once with unread bytes would lose the answer."""
+        """Closing at once with unread bytes would lose the answer."""
         self.closing = True
         self.transport.pause_reading()
         said = f"The peer {what}.\n".encode()
@@ -150,7 +150,7 @@ class _Connection(Front, asyncio.Protocol):
 
 
 def _class_of(quota_class: Callable[[str], QuotaClass], host: Address) -> str:
-    """Return the key under which a peer's processor time counts; all unknown peers share one key."""
+    """All unknown peers share one key for processor time."""
     peer = peer_key(str(host))
     return "" if quota_class(peer) is QuotaClass.UNKNOWN else peer
 
@@ -162,7 +162,7 @@ def _patience(quota_class: QuotaClass, stage: Stage, _own: bool) -> float:
 
 
 class Listener:
-    """The server of `app` on a listening socket; `quota_class(peer)` distinguishes known from unknown peers."""
+    """`quota_class(peer)` distinguishes known from unknown peers."""
 
     def __init__(
         self,
@@ -206,12 +206,12 @@ class Listener:
             self._begin(self._websockets.pass_on(passage, head))
 
     def protocol_of(self, connection: _Connection) -> asyncio.Protocol:
-        """Make this connection's protocol for HTTP and ASGI, as uvicorn's server does."""
+        """As uvicorn's server does."""
         make = cast(Callable[..., asyncio.Protocol], self._config.http_protocol_class)
         return make(config=self._config, server_state=self._state, app_state={_CONNECTION: connection})
 
     async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve a request; when the answer is sent, notify its connection."""
+        """Notify the connection when the answer is sent."""
         connection: _Connection = scope["state"].pop(_CONNECTION)
 
         async def sending(message: Message) -> None:
@@ -231,7 +231,7 @@ class Listener:
         self._begin(self.connection_table.sweep())
 
     async def stop(self) -> None:
-        """Stop accepting, let open requests finish for a second, and close all connections."""
+        """Open requests may finish for a second."""
         if self._acceptor is not None:
             self._acceptor.close()
         tasks = list(self._tasks)

@@ -20,7 +20,7 @@ _OF_A_SECOND = 1_000_000  # a float has no more digits
 
 
 def in_full(value: Any) -> Any:
-    """Return a value that msgspec can encode, with the RFC 3339 text of each time added."""
+    """Return a value that msgspec can encode, with the RFC 3339 text of each time."""
     if isinstance(value, msgspec.Struct):
         units = _units(type(value))
         if units is None:
@@ -39,7 +39,7 @@ def in_full(value: Any) -> Any:
 
 
 def describe(schema: dict[str, Any]) -> None:
-    """Add the RFC 3339 fields to the schema of a struct, each after its time."""
+    """Each RFC 3339 field follows its time."""
     fields: dict[str, Any] = {}
     for name, field in schema.get("properties", {}).items():
         fields[name] = field
@@ -53,7 +53,7 @@ def describe(schema: dict[str, Any]) -> None:
 
 
 def given(text: str) -> int:
-    """Parse a time; return nanoseconds since the epoch. Raises `ProblemError` (422)."""
+    """Return nanoseconds since the epoch. Raises `ProblemError` (422)."""
     try:
         return parse_timestamp(text, clock.wall_ns())
     except (OverflowError, ValueError) as error:
@@ -66,7 +66,7 @@ def _text(moment: float, unit: str) -> str:
 
 @functools.cache
 def _units(kind: type[msgspec.Struct]) -> dict[str, str] | None:
-    """Return the units of a struct's times; None if neither the struct nor a struct within it has a time."""
+    """Return None if neither the struct nor a struct within it has a time."""
     _, kinds = msgspec.json.schema_components([kind])
     found = {
         name: {field: unit for field, of in schema.get("properties", {}).items() if (unit := _unit(of))}

@@ -46,7 +46,7 @@ class Problem(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class ProblemError(Exception):
-    """Answers the request with a problem. `kind` is the end of the problem's type; `retry_after` is in seconds."""
+    """`kind` is the end of the problem's type; `retry_after` is in seconds."""
 
     def __init__(
         self,
@@ -91,16 +91,16 @@ class ProblemError(Exception):
 
 
 def too_many(kind: str, detail: str, seconds: float) -> ProblemError:
-    """Return the problem for too many requests (429), with the seconds to wait."""
+    """Status 429."""
     return ProblemError(429, kind, detail, retry_after=int(seconds) + 1)
 
 
 def bad_input(wrong: list[BadInput], *, besides: str = "") -> ProblemError:
-    """Return the problem for a request with these invalid parts (422); `besides` is added to the end of its detail."""
+    """Status 422; `besides` is added to the detail."""
     detail = "; ".join(f"{problem.where}: {problem.text}" for problem in wrong[:5])
     return ProblemError(422, "bad-input", detail + besides, errors=wrong)
 
 
 def defect(error: Exception) -> ProblemError:
-    """Return the problem for a defect of the appliance; it has the kind, and nothing about the cause."""
+    """The problem has the kind, and nothing about the cause."""
     return ProblemError(500, "defect", f"a defect of rosrv, please report it: {type(error).__name__}")

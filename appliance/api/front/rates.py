@@ -14,7 +14,6 @@ _V6_PREFIX = 64
 
 
 def peer_key(host: str) -> str:
-    """Return the key of the peer that an address belongs to."""
     try:
         address = ipaddress.ip_address(host)
     except ValueError:
@@ -27,7 +26,7 @@ def peer_key(host: str) -> str:
 
 
 class Buckets:
-    """One bucket for each peer: `burst` at once, `per_second` on average."""
+    """`burst` at once, `per_second` on average."""
 
     def __init__(self, per_second: float, burst: float, *, peers: int = 4096) -> None:
         self._per_second = per_second
@@ -36,7 +35,7 @@ class Buckets:
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def take(self, host: str, now: float) -> float:
-        """Take one token and return 0; if the bucket is empty, return the seconds until the next token."""
+        """Return 0, or the seconds until the next token."""
         left = self._left(host, now)
         if left < 1:
             self._keep(host, left, now)
@@ -45,7 +44,7 @@ class Buckets:
         return 0.0
 
     def wait(self, host: str, now: float) -> float:
-        """Return the seconds that `take` would return, without taking a token."""
+        """Like `take`, without taking a token."""
         left = self._left(host, now)
         return 0.0 if left >= 1 else (1 - left) / self._per_second
 

@@ -11,11 +11,11 @@ OneId = Annotated[
 
 
 class _RecordingId(StringConvertor):
-    """A converter that matches a recording's id in a path, but not the word `memory`."""
+    """Matches a recording's id, but not the word `memory`."""
 
     regex = "[0-9a-f]{20}"
 
 
 register_url_convertor("recording", _RecordingId())
 CONVERTORS = {"{recording_id}": "{recording_id:recording}"}
-"""The parameter of a path in the contract, and as Starlette matches it."""
+"""In the contract, and as Starlette matches it."""

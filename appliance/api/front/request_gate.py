@@ -1,12 +1,12 @@
-"""Check every request before it reaches a route (limits, origin, token), and report its answer.
+"""Check every request before it reaches a route, and report its answer.
 
 Order: rate → Host → Origin → size of the body → token. Invariants:
 
 1. A request that fails a check costs no more than reading its headers: no route, body parser or control handles it.
-2. Only `PUBLIC` paths and the console's own files are served without a token. Without a token, an unknown path gets the
-   same answer as a known path.
-3. A page of another site cannot misuse the browser of a person who can reach the appliance: a foreign name as Host (DNS
-   rebinding) and a foreign Origin are rejected, and no CORS header is ever sent.
+2. Only `PUBLIC` paths and the console's own files are served without a token. Without a token, an unknown path gets
+   the same answer as a known path.
+3. A page of another site cannot misuse the browser of a person who can reach the appliance: a foreign name as Host
+   (DNS rebinding) and a foreign Origin are rejected, and no CORS header is ever sent.
 4. Every answer is reported, with equal reads folded (see `Journal`), except answers of the health probes and the
    console's own files.
 5. A client that does not read its answer is disconnected.
@@ -66,7 +66,7 @@ def is_console(path: str) -> bool:
 
 
 class RequestGate:
-    """ASGI middleware around the application; `names` are REST's host names, besides addresses."""
+    """`names` are REST's host names, besides addresses."""
 
     def __init__(
         self,
@@ -79,7 +79,7 @@ class RequestGate:
         tunnels: ipaddress.IPv4Network | None = None,
         networks: Iterable[Network] = (),
     ) -> None:
-        """Make the gate. Hosts in `tunnels` that are in none of `networks` may only renew their certificates."""
+        """Hosts in `tunnels` that are in none of `networks` may only renew their certificates."""
         self._app = app
         self._tunnels = tunnels
         self._networks = tuple(networks)
@@ -118,7 +118,7 @@ class RequestGate:
                 gone.cancel()
 
     def admit_websocket(self, host: str, path: str) -> None:
-        """Check the rate and the network of a client that opens a WebSocket. Raises `ProblemError`."""
+        """Check rate and network. Raises `ProblemError`."""
         wait = self._rate.take(host, clock.now())
         if wait:
             raise too_many("too-many-requests", "too many requests from this host", wait)
@@ -171,7 +171,7 @@ class RequestGate:
 
 
 def asked_of(scope: Scope, headers: Headers, body: bytes) -> ClientRequest:
-    """Return the request in the form in which control verifies its signature."""
+    """The request in the form in which control verifies its signature."""
     query = scope["query_string"].decode("latin-1")
     return ClientRequest(
         host=scope["client"][0],
@@ -185,7 +185,7 @@ def asked_of(scope: Scope, headers: Headers, body: bytes) -> ClientRequest:
 
 
 class _Answer:
-    """One outgoing answer; it gets hardening headers and a time limit, and is reported when its status is known."""
+    """Gets hardening headers and a time limit, and is reported when its status is known."""
 
     def __init__(self, scope: Scope, send: Send, journal: Journal) -> None:
         self._scope = scope

@@ -16,7 +16,7 @@ _SCHEME = HTTPBearer(auto_error=False, description="A token made by `rosrv token
 
 
 class _Requires:
-    """A dependency that returns the bearer and requires at least the role `least`.
+    """Return the bearer, who must have at least the role `least`.
 
     It is asynchronous, like each dependency here: FastAPI would call any other in a thread, for every request.
     """
@@ -37,7 +37,7 @@ def requires(least: TokenRole) -> Any:
 
 
 VIEWER = requires("viewer")
-"""Use it in `dependencies=` of a route that requires the role and does not use the bearer."""
+"""For `dependencies=` of a route that does not use the bearer."""
 
 OPERATOR = requires("operator")
 Viewer = Annotated[Bearer, VIEWER]
@@ -58,7 +58,7 @@ async def _no_viewer(bearer: Viewer) -> Bearer:
 
 
 Reader = Annotated[Bearer, Depends(_no_viewer)]
-"""The roles that may read messages in records: investigators, operators and admins."""
+"""They may read messages in records: investigators, operators and admins."""
 
 _PROBLEMS = {
     "request": (422, "bad-input"),
@@ -73,12 +73,12 @@ _STANDBY_SECONDS = 2  # until a client may ask a standby again
 
 
 async def ask(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A:
-    """Return control's answer. Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
+    """Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
     return answered(await control.ask(request, bearer))
 
 
 async def ask_optional(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A | None:
-    """Return control's answer; None for a rejection, such as a standby's, or without an answer."""
+    """None for a rejection, such as a standby's, or without an answer."""
     try:
         return await ask(control, request, bearer)
     except (ControlAwayError, ProblemError):
@@ -86,7 +86,7 @@ async def ask_optional(control: ControlLink, request: AdminRequest[A], bearer: B
 
 
 def answered(answer: AdminAnswer[A]) -> A:
-    """Return the body of an answer. Raises `ProblemError` for a rejection."""
+    """Raises `ProblemError` for a rejection."""
     if answer.ok:
         return answer.given()
     if answer.trouble == "standby":

@@ -1,7 +1,7 @@
 """Make routes whose handlers take and return structs (msgspec): parse, encode, and add schemas to the contract.
 
-A handler returns a struct, or `Tagged` with a struct and its ETag; the struct's schema is in the contract. The handler
-declares a body as `Annotated[Kind, body(Kind)]`. If its answer is not a struct, it returns a `Response`.
+A handler returns a struct, or `Tagged` with a struct and its ETag, whose schema is in the contract; for another
+answer it returns a `Response`. The handler declares a body as `Annotated[Kind, body(Kind)]`.
 """
 
 import enum
@@ -27,7 +27,7 @@ _MOST_ERRORS = 50
 
 
 class Tagged(NamedTuple, Generic[A]):
-    """An answer with the revision or tag that becomes its ETag."""
+    """The tag is a revision or tag that becomes the ETag."""
 
     body: A
     tag: int | str
@@ -61,7 +61,7 @@ CONTRACT = Contract()
 
 
 def content(kind: Any) -> dict[str, Any]:
-    """Describe an answer of this kind, for `responses=` of a route."""
+    """For `responses=` of a route."""
     return {_JSON: {"schema": CONTRACT.reference(kind)}}
 
 
@@ -71,14 +71,14 @@ def file(media_type: str, description: str, *, binary: bool = False) -> Response
 
 
 class _Body:
-    """A dependency that reads a body of one kind; if text/plain is also accepted, `text` describes the field `text`."""
+    """`text` is the field of a body sent as text/plain."""
 
     def __init__(self, kind: Any, text: str | None) -> None:
         self.kind = kind
         self.text = text
 
     async def __call__(self, request: Request) -> Any:
-        """Return the body. Raises `ProblemError` (415, 422)."""
+        """Raises `ProblemError` (415, 422)."""
         content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         if content_type == "text/plain" and self.text is not None:
             return self._of_text(_text(await request.body()))
@@ -127,7 +127,7 @@ def _text(data: bytes) -> str:
 
 
 def _all_wrong(given: Any, kind: Any) -> list[BadInput]:
-    """Return the errors of all fields of a body; msgspec stops at the first."""
+    """msgspec stops at the first error; return all."""
     if not isinstance(given, dict):
         return []
     known = {field.encode_name: field for field in msgspec.structs.fields(kind)}
@@ -156,7 +156,7 @@ def _bad(error: msgspec.ValidationError, where: str = "body", kind: Any = None) 
 
 
 def _choices(kind: Any) -> tuple[str, ...]:
-    """Return the permitted strings of a kind with a fixed set of values; empty for any other kind."""
+    """Return the permitted strings of a kind with a fixed set of values."""
     parts = typing.get_args(kind)
     if isinstance(kind, type) and issubclass(kind, enum.StrEnum):
         return tuple(kind)
@@ -166,7 +166,7 @@ def _choices(kind: Any) -> tuple[str, ...]:
 
 
 def _not_json(text: str, error: Exception) -> ProblemError:
-    """Return the problem of invalid JSON, with the place and the message of Python's parser."""
+    """Include the place and the message of Python's parser."""
     try:
         json.loads(text)
     except json.JSONDecodeError as found:
@@ -182,10 +182,10 @@ def body(kind: type, *, text: str | None = None) -> Any:
 
 
 class Routes(APIRouter):
-    """FastAPI's router, for handlers that take and return structs."""
+    """Handlers take and return structs."""
 
     def add_api_route(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
-        """Add a handler, and add its name, answer, ETag and body to the contract."""
+        """Add name, answer, ETag and body to the contract."""
         options["operation_id"] = options.get("operation_id") or options.get("name") or endpoint.__name__
         hints = typing.get_type_hints(endpoint, include_extras=True)
         for hint in hints.values():

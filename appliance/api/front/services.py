@@ -17,7 +17,7 @@ _SEARCHES = 4
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """The parts that the routes share; `stopping` is set when the process must end.
+    """`stopping` is set when the process must end.
 
     `judging` shares the compiling of texts for queries and dry runs among tokens. `ordering` limits the same for
     orders, so that orders never wait for queries. `searches` and `exports` limit those of the audit log.

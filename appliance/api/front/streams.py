@@ -1,8 +1,8 @@
 """Limit long answers, which are streams and exports, by quotas.
 
 A long answer counts for its token and for its peer, and each has a quota. So neither a viewer's token with many
-connections nor a machine with many tokens can take the places of others, in particular of operators and admins. When
-the response ends, for any reason, its place is free again. `Work` does the same for answers that need much time.
+connections nor a machine with many tokens can take the places of others. When the response ends, for any reason, its
+place is free again. `Work` does the same for answers that need much time.
 """
 
 import asyncio
@@ -30,7 +30,7 @@ def peer_of(request: Request) -> str:
 
 
 class Streams:
-    """The places for long answers of one kind: `whole` places, with quotas for `tokens` and `peers`."""
+    """There are `whole` places, with quotas for `tokens` and `peers`."""
 
     def __init__(self, tokens: QuotaRow, peers: QuotaRow, whole: int) -> None:
         self.roles: dict[str, TokenRole] = {}
@@ -45,7 +45,7 @@ class Streams:
         )
 
     def take(self, bearer: Bearer, peer: str, what: str) -> Callable[[], None]:
-        """Take a place; return the function that releases it. Raises `ProblemError` (503)."""
+        """Return the function that releases the place. Raises `ProblemError` (503)."""
         self.roles[bearer.id] = bearer.role
         busy = self._tokens.refusal(bearer.id) or self._peers.refusal(peer)
         if busy:
@@ -72,7 +72,7 @@ class Streams:
 
 
 class Work:
-    """Slow answers of one kind, `whole` at once, in turns of tokens. `what` names them in the refusal."""
+    """Slow answers, `whole` at once, in turns of tokens. `what` names them in the refusal."""
 
     def __init__(self, what: str, whole: int) -> None:
         self._what = what
@@ -82,7 +82,7 @@ class Work:
 
     @contextlib.asynccontextmanager
     async def turn(self, bearer: Bearer) -> AsyncIterator[None]:
-        """Wait briefly for the token's turn, and keep it during the block. Raises `ProblemError` (503)."""
+        """Wait briefly, and keep the turn during the block. Raises `ProblemError` (503)."""
         token = bearer.id, bearer.role
         try:
             async with asyncio.timeout(_PATIENCE_SECONDS):
@@ -102,14 +102,14 @@ def _class_of(token: tuple[str, TokenRole]) -> QuotaClass:
 
 
 async def in_thread(pieces: Iterator[A]) -> AsyncIterator[A]:
-    """Read a slow iterator in a thread; yield its pieces, except empty ones."""
+    """Skip empty pieces."""
     while (piece := await asyncio.to_thread(next, pieces, None)) is not None:
         if piece:
             yield piece
 
 
 class StreamResponse(Response):
-    """A long response that releases its place when it ends."""
+    """Releases its place when it ends."""
 
     def __init__(self, response: Response, give_back: Callable[[], None]) -> None:
         self._response = response

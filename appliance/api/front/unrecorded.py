@@ -6,11 +6,11 @@ from appliance.base.validation_messages import meant
 from appliance.policy.model import Category
 
 CATEGORIES = (*Category, "monitor", "parameter", "publication", "rest", "service", "subscription", "topic")
-"""The categories of records, whether the policy decides them or not."""
+"""The policy does not decide all of them."""
 
 
 def unrecorded(wanted: Filter) -> list[str]:
-    """Return a sentence for each name that no record can have, with the nearest known name; globs are not checked."""
+    """Return a sentence with the nearest known name; globs are not checked."""
     return [
         f"this version records no {what} {name!r}{meant(name, known)}"
         for what, name, known in (("event", wanted.event, EVENTS), ("category", wanted.category, CATEGORIES))

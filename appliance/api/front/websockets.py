@@ -1,4 +1,4 @@
-"""Pass the WebSocket of a viewer on to the process of a door, after TLS.
+"""Pass the WebSocket of a viewer on to a door, after TLS.
 
 A viewer shows a ticket in the URL. Control checks it, and gives the door's process one end of a socket pair; this
 process copies bytes between the pair and the client. Invariants:
@@ -27,7 +27,7 @@ _LONGEST = 200  # characters of a name or a ticket
 
 
 class WebSocketPassage(asyncio.Protocol):
-    """The way of one WebSocket between its client and its door; this protocol has the door's end."""
+    """This protocol has the door's end."""
 
     def __init__(self, client: asyncio.Transport, target: bytes) -> None:
         self.client = client
@@ -52,12 +52,12 @@ class WebSocketPassage(asyncio.Protocol):
                 self.note()
 
     def client_left(self) -> None:
-        """End the door's end, after what the client sent."""
+        """The door first gets what the client sent."""
         if self._door is not None:
             self._door.close()
 
     def hold_door(self, *, held: bool) -> None:
-        """Stop or continue reading from the door, because the client does not read, or reads again."""
+        """The client does not read, or reads again."""
         if self._door is not None and not self._door.is_closing():
             (self._door.pause_reading if held else self._door.resume_reading)()
 
@@ -75,7 +75,7 @@ class WebSocketPassage(asyncio.Protocol):
             self._door.close()
 
     def begin(self, head: bytes) -> None:
-        """Send the door the head of the request, and what came since."""
+        """Include what came since the head of the request."""
         if self._door is None:
             return
         self._door.write(head)
@@ -109,7 +109,7 @@ class WebSocketHandover:
         self._gate = gate
 
     async def pass_on(self, passage: WebSocketPassage, head: bytes) -> None:
-        """Pass one on, or refuse its handshake with the reason."""
+        """A refusal has the reason."""
         host = passage.peer
         try:
             self._gate.admit_websocket(host, PREFIX.decode())
@@ -140,7 +140,7 @@ class WebSocketHandover:
 
 
 def _entry_of(target: bytes) -> tuple[str, str]:
-    """Return the door and the ticket of a request target. Raises `ProblemError`."""
+    """Raises `ProblemError`."""
     try:
         parts = urlsplit(target.decode("ascii"))
         ticket = parse_qs(parts.query).get("ticket", [""])[0]

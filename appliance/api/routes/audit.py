@@ -140,7 +140,7 @@ OneRecord = Annotated[
 
 
 class LogReader:
-    """Reads the log in threads; the number of threads is limited."""
+    """The number of threads is limited."""
 
     def __init__(self, services: Services) -> None:
         self.path = services.audit_log
@@ -148,7 +148,7 @@ class LogReader:
         self._searches = services.searches
 
     async def read(self, bearer: Bearer, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
-        """Wait for a turn and call a function of `appliance.audit` in a thread. Raises `ProblemError`."""
+        """Wait for a turn. Raises `ProblemError`."""
         async with self._searches.turn(bearer):
             return await self.in_thread(function, *arguments, **named)
 
@@ -159,7 +159,7 @@ class LogReader:
         return await self.in_thread(with_networks, wanted, await ask(self._control, PolicyWanted(), bearer))
 
     async def record(self, bearer: Bearer, record_id: str, neighbours: int) -> RecordInContext:
-        """Return a record with its neighbours. Raises `ProblemError`."""
+        """Raises `ProblemError`."""
         shown = await self.read(bearer, show, self.path, record_id, neighbours)
         if shown is None:
             raise ProblemError(404, "unknown", f"there is no record {record_id}")
@@ -329,7 +329,7 @@ def _exported(path: pathlib.Path, wanted: Filter, bearer: Bearer, robot: str) ->
 
 
 def _begun(entries: Iterator[_T]) -> Iterator[_T]:
-    """Read the first entry now and return all entries, so that an invalid search fails before the answer begins."""
+    """An invalid search fails before the answer begins."""
     first = next(entries, None)
     return iter(()) if first is None else itertools.chain((first,), entries)
 

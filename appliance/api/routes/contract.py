@@ -69,7 +69,7 @@ def _made(app: FastAPI) -> dict[str, Any]:
 
 
 def _plain(schema: Any) -> Any:
-    """Return the schema in a form that client generators understand: only `maxItems` gives a tuple's length."""
+    """Client generators understand only `maxItems` for a tuple's length."""
     if isinstance(schema, list):
         return [_plain(part) for part in schema]
     if not isinstance(schema, dict):
@@ -78,7 +78,7 @@ def _plain(schema: Any) -> Any:
 
 
 def _described(kind: str, schema: dict[str, Any]) -> None:
-    """Describe the fields that lack a description. A field that refers to a kind uses the kind's description."""
+    """A field without a description uses that of the kind that it refers to."""
     for name, field in schema.get("properties", {}).items():
         words = WORDS.get(f"{kind}.{name}", WORDS.get(name))
         if words is not None and "$ref" not in field and not is_described(field):
@@ -90,7 +90,7 @@ def is_described(field: dict[str, Any]) -> bool:
 
 
 def _tagged(responses: dict[str, Any]) -> None:
-    """Describe the ETags of `ConditionalGet`."""
+    """`ConditionalGet` adds these ETags."""
     good = responses["200"]
     if "application/json" in good.get("content", {}) and "ETag" not in good.get("headers", {}):
         good.setdefault("headers", {})["ETag"] = _HASH

@@ -1,6 +1,6 @@
 """The contract as a page for people: each call with its parameters, bodies, answers and examples. Pure.
 
-The page is one HTML file without scripts. All its texts come from the program, and are escaped.
+It is one HTML file without scripts; all texts come from the program, and are escaped.
 """
 
 import json
@@ -12,7 +12,7 @@ PATH = "/v1/openapi.html"
 _STYLE = "/console/static/css/contract.css"
 _ROLES = "docs/reference/rest.md"
 _GENERAL = frozenset({"400", "401", "403", "408", "413", "421", "429", "503"})
-"""Answers that each call may give: the page lists them once."""
+"""The page lists once what each call may answer."""
 
 _Json = Mapping[str, Any]
 

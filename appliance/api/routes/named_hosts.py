@@ -37,12 +37,12 @@ def labels_of(known: PolicyInForce) -> HostLabels:
 
 
 def host_in_words(known: PolicyInForce | None) -> HostInWords:
-    """Return the function that shows a host as text for people; it shows addresses if no policy is known."""
+    """Addresses are shown if no policy is known."""
     return str if known is None else partial(in_words, labels=names_of(known).labels())
 
 
 def has_name(wanted: Filter) -> bool:
-    """Return whether a search names its host, or gives a network: addresses and globs need no policy."""
+    """Addresses and globs need no policy."""
     if wanted.host is None or not _GLOB.isdisjoint(wanted.host):
         return False
     try:
@@ -56,7 +56,7 @@ def has_name(wanted: Filter) -> bool:
 
 
 def with_networks(wanted: Filter, known: PolicyInForce) -> Filter:
-    """Replace the name of a search's host by its networks. Raises `FilterError` for an unknown name."""
+    """Raises `FilterError` for an unknown name."""
     try:
         networks = names_of(known).networks(wanted.host or "")
     except UnknownHostNameError as error:

@@ -1,8 +1,7 @@
 """Derive routes from the table of operations (`channel/admin.py`): parameters, role, ETag, answer, contract.
 
-A route reads its order with the function that control also uses (`channel/rest_meaning.py`), so that both
-understand a request in the same way. The answer is control's, unless the operation's module has an `Answer`
-for the request.
+A route reads its order with the function that control also uses (`channel/rest_meaning.py`). The answer is control's,
+unless the operation's module has an `Answer` for the request.
 """
 
 import inspect
@@ -63,7 +62,7 @@ async def _nothing() -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class OperationCall(Generic[Q]):
-    """An operation that a bearer requests; `body` is the body as sent."""
+    """`body` is the body as sent."""
 
     services: Services
     operation: Operation
@@ -73,7 +72,7 @@ class OperationCall(Generic[Q]):
     dry_run: bool
 
     async def ask(self, request: AdminRequest[A]) -> A:
-        """Return control's answer. Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
+        """Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
         control = self.services.control
         return self._answered(await control.ask(request, self.bearer))
 
@@ -87,7 +86,7 @@ class OperationCall(Generic[Q]):
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer that replaces control's; the contract has the return type of `function`.
+    """Replaces control's answer; the contract has the return type of `function`.
 
     If the answer is not a struct, `success` describes it in the contract.
     """
@@ -97,7 +96,7 @@ class Answer:
 
 
 def routes(services: Services, answers: Mapping[str, Answer]) -> Routes:
-    """Return the routes of all operations with a name; `answers` has our own answers by operation name."""
+    """`answers` has our own answers by operation name."""
     router = Routes()
     assert answers.keys() <= {one.name for one in OPERATIONS}  # noqa: S101  no name is misspelt
     for operation in sorted(OPERATIONS, key=lambda one: "{" in one.path):  # literal paths before parameters
@@ -167,7 +166,7 @@ def _check(
 
 
 def _order(asked: ClientRequest, *, dry_run: bool) -> AdminRequest[Any]:
-    """Return the order of a request as control understands it. Raises `ProblemError`."""
+    """Raises `ProblemError`."""
     try:
         return meant(asked, dry_run=dry_run)
     except BadTagError as error:
@@ -186,7 +185,7 @@ def _answer_type(operation: Operation, own: Answer | None) -> Any:
 
 
 def _of_path(operation: Operation) -> Any:
-    """Return the dependency for the field in the path, if it has one; a list has one element there."""
+    """A list has one element in the path."""
     in_path = [(name, field) for name, field in operation.fields().items() if f"{{{name}}}" in operation.path]
     if not in_path:
         return Depends(_nothing)
@@ -201,7 +200,7 @@ def _of_path(operation: Operation) -> Any:
 
 
 def _of_query(operation: Operation) -> Any:
-    """Return the dependency for the query of all operations with this method and path."""
+    """For all operations with this method and path."""
     same = [one for one in OPERATIONS if (one.method, one.path) == (operation.method, operation.path)]
     fields: dict[str, Any] = {
         name: (_in_query(field.type), ... if field.required else field.default)

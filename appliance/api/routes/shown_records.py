@@ -64,7 +64,7 @@ def page_of(
     newest_first: bool,
     equality: bool = False,
 ) -> dict[str, Any]:
-    """Return a page of records that the bearer may read; the cursor reveals nothing about hidden records."""
+    """The cursor reveals nothing about hidden records."""
     found: list[LogEntry] = []
     more: str | None = cursor
     count = limit + 1
@@ -82,12 +82,12 @@ def page_of(
 
 
 def streamed(entry: LogEntry, *, equality: bool) -> dict[str, Any]:
-    """Return a record of a stream, on request with what makes equal ones one row."""
+    """With `equality`, include what makes equal records one row."""
     return as_object(entry) | ({"equality": equality_of(entry.record)} if equality else {})
 
 
 def readable(entries: Iterable[LogEntry], bearer: Bearer, text: str | None = None) -> list[LogEntry]:
-    """Return what the bearer may read, without records that match `text` only in their hidden parts."""
+    """Leave out records that match `text` only in their hidden parts."""
     found = []
     for entry in entries:
         shown = readable_by(entry, bearer)
@@ -97,5 +97,4 @@ def readable(entries: Iterable[LogEntry], bearer: Bearer, text: str | None = Non
 
 
 def readable_by(entry: LogEntry, bearer: Bearer) -> LogEntry:
-    """Return the record without the parts that the bearer may not read."""
     return entry if reads_contents(bearer) else without_contents(entry)

@@ -25,10 +25,10 @@ class ClientRequest(msgspec.Struct, frozen=True):
 
 
 class RequestMade(Message):
-    """The api passes on a client's request. The answer has the same `number`.
+    """`number` is that of the answer.
 
-    `shown` is the token or reading key of the request, empty if none is needed. A change also has `asked`. A request
-    that has not taken effect by `until` (seconds of the monotonic clock, which all processes share) is withdrawn.
+    `shown` is the token or reading key, empty if none is needed. A change also has `asked`. A request without effect
+    by `until` (seconds of the monotonic clock, which all processes share) is withdrawn.
     """
 
     number: int
@@ -39,22 +39,22 @@ class RequestMade(Message):
 
 
 class RequestWithdrawn(Message):
-    """The client of the request with this number is gone. Its order is withdrawn if it has not taken effect."""
+    """The client is gone: its order is withdrawn if it has not taken effect."""
 
     number: int
 
 
 class RequestAnswered(Message):
-    """Control answers the `RequestMade` with the same number. The admin socket would send the same document."""
+    """The document is the one that the admin socket would send."""
 
     number: int
     answer: bytes
 
 
 class ConnectionPassed(Message):
-    """The api passes on a WebSocket for a door, after TLS. It has read the head of the request, and sends it again.
+    """A WebSocket for a door, after TLS. The api has read the head of the request, and sends it again.
 
-    `peer` is the client's address, and `ticket` what it showed.
+    `ticket` is what the client showed.
     """
 
     descriptors: ClassVar[int] = 1
@@ -65,7 +65,7 @@ class ConnectionPassed(Message):
 
 
 class ConnectionAnswered(Message):
-    """Control answers the `ConnectionPassed` with the same number: empty, or an HTTP status and why it is refused."""
+    """Empty, or an HTTP status and why the connection is refused."""
 
     number: int
     status: int
@@ -88,19 +88,19 @@ class TokenKept(msgspec.Struct, frozen=True):
 
 
 class TokensStated(Message):
-    """Control sends the api all usable tokens, at the start of a link and after every change."""
+    """All usable tokens, at the start of a link and after every change."""
 
     tokens: list[TokenKept]
 
 
 class TokenUsed(Message):
-    """The api reports that a token was presented, at most once a minute for each token."""
+    """A token was presented; reported at most once a minute for each."""
 
     token: str
 
 
 class RestCalled(Message):
-    """The api reports REST calls for the audit log. `who` is the token's name, empty for an invalid token.
+    """REST calls for the audit log. `who` is the token's name, empty for an invalid token.
 
     `count` equal calls, collected for at least a second, are one message. `duration_us` is the duration of the first.
     `dry`: the call was a dry run.

@@ -6,9 +6,9 @@ from appliance.channel.messages.message import Message
 
 
 class StateOwner(msgspec.Struct, frozen=True):
-    """A monitor, by the digest that its state has, and whether it holds its topics if the state is lost.
+    """A monitor, by the digest that its state has. `holds`: it holds its topics if the state is lost.
 
-    `position` is where the file declares it, as text.
+    `position` is where the file declares it.
     """
 
     identity: str
@@ -17,7 +17,7 @@ class StateOwner(msgspec.Struct, frozen=True):
 
 
 GivenValue = bool | int | float | str
-"""A value that is given to a monitor; that of a topic is a string."""
+"""A string if the parameter is a topic."""
 
 
 class GivenDeclared(msgspec.Struct, frozen=True):
@@ -36,17 +36,17 @@ class GivenDeclared(msgspec.Struct, frozen=True):
 
 
 class Contents(msgspec.Struct, frozen=True):
-    """The contents of valid specifications: the monitors (name to file), and the topics that they use.
+    """The contents of valid specifications: monitors (name to file), and what they use.
 
     `sharing` has the groups of monitors that share variables, directly or indirectly. `published_by` maps a file to
     the topics that it publishes. `types` maps a topic to its message type, and `texts` maps such a type to its full
     definition. `certificates` has each property of a monitor, and whether its automaton was proved equal to its
-    formula. `places` maps a topic to its first position in the files (`file:line:column`). Each relay runs its part of
-    `compiled` (`PartsWanted`).
+    formula. `places` maps a topic to its first position in the files (`file:line:column`). Each relay runs its part
+    of `compiled` (`PartsWanted`).
 
     `unbuilt` has the monitors of files with errors, each with its first error. They do nothing; the relay holds their
-    topics. `left_out` has the files whose topics are not known, because they cannot be parsed or a type is not defined,
-    each with its first error; nothing holds their topics.
+    topics. `left_out` has the files whose topics are not known, because they cannot be parsed or a type is not
+    defined, each with its first error; nothing holds their topics.
 
     `givens` has the constants and topics that are given to each monitor.
     """
@@ -70,11 +70,11 @@ class Contents(msgspec.Struct, frozen=True):
 
 
 class ContentsWanted(Message):
-    """Control asks for the contents of specifications (name to text), given these message definitions.
+    """Control asks for the contents of specifications (name to text) with these message definitions.
 
-    A `dry_run` gets less processor time than an order, and builds the module too. `at_start`: files with errors do not
-    keep the others from being compiled (`Contents.unbuilt`). `topics` replace topics given in the texts, by monitor and
-    name.
+    A `dry_run` gets less processor time than an order, and builds the module too. `at_start`: files with errors do
+    not keep the others from being compiled (`Contents.unbuilt`). `topics` replace topics given in the texts, by
+    monitor and name.
     """
 
     number: int
@@ -86,28 +86,28 @@ class ContentsWanted(Message):
 
 
 class ContentsFound(Message):
-    """The contents of specifications without errors."""
+    """The specifications have no errors."""
 
     number: int
     contents: Contents
 
 
 class CompilationRefused(Message):
-    """The compiler rejects an order. `findings` has all errors (`file:line:column: error: text`), or the reason."""
+    """`findings` has all errors (`file:line:column: error: text`), or the reason."""
 
     number: int
     findings: list[str]
 
 
 class PartNames(msgspec.Struct, frozen=True, array_like=True):
-    """The monitors of one relay in order, and the subset in shadow mode."""
+    """The monitors of one relay in order; `shadows` are in shadow mode."""
 
     monitors: tuple[str, ...] = ()
     shadows: tuple[str, ...] = ()
 
 
 class PartsWanted(Message):
-    """Control asks for the parts of compiled specifications (`Contents.compiled`) that several relays run."""
+    """Control asks for the parts of `Contents.compiled` that several relays run."""
 
     number: int
     compiled: bytes
@@ -115,7 +115,7 @@ class PartsWanted(Message):
 
 
 class PartsMade(Message):
-    """The compiler returns the parts (`rosmop/fast/serialization.py`) in the order of `PartsWanted`."""
+    """The parts (`rosmop/fast/serialization.py`) are in the order of `PartsWanted`."""
 
     number: int
     parts: list[bytes]

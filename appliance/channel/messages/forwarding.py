@@ -4,9 +4,9 @@ from appliance.channel.messages.message import Message
 
 
 class ForwardingReported(Message):
-    """The forwarder reports its progress after a change, at most once a second.
+    """Progress after a change, at most once a second.
 
-    The process has sent `sent` messages since its start, up to record `sequence` and checkpoint `checkpoint`. `behind`
+    `sent` counts since the start of the process, up to record `sequence` and checkpoint `checkpoint`. `behind`
     records wait, the oldest for `seconds`. `missed` records were removed before they could be sent. `trouble` is the
     reason if forwarding is interrupted.
     """

@@ -1,4 +1,4 @@
-"""The lifeline: the link between the supervisor and each child process."""
+"""The lifeline: the link between the supervisor and each child."""
 
 from typing import Any, ClassVar
 
@@ -11,23 +11,23 @@ from appliance.channel.messages.tunnels import TunnelsEnclosed, TunnelsWanted
 
 
 class Ping(Message):
-    """The supervisor asks a child whether it is alive. Without an answer in 5 s, the child is killed and restarted."""
+    """Without an answer in 5 s, the child is killed and restarted."""
 
     number: int
 
 
 class Pong(Message):
-    """A child answers `Ping` from its main loop."""
+    """Sent from the child's main loop."""
 
     number: int
 
 
 class Stop(Message):
-    """The supervisor asks a child to end within 3 s."""
+    """The child must end within 3 s."""
 
 
 class Ready(Message):
-    """A child is in service. If the child is control, nodes may connect. `detail` is for the status: addresses, ports.
+    """A child is in service; for control, nodes may connect. `detail` is for the status: addresses, ports.
 
     Control's `detail` has these keys:
 
@@ -42,7 +42,7 @@ class Ready(Message):
 
 
 class Failed(Message):
-    """A child cannot serve. The supervisor shows the reason, and stops the appliance or restarts the child.
+    """A child cannot serve: the supervisor stops the appliance or restarts the child.
 
     `output` has the last lines of output of the program that the child ran.
     """
@@ -52,11 +52,11 @@ class Failed(Message):
 
 
 class Walled(Message):
-    """The first message of a child describes its sandbox (docs/dev/architecture.md) and missing kernel features.
+    """The first message of a child: its sandbox (docs/dev/architecture.md).
 
     `calls` is the limit on its system calls: "listed" (only calls on a list are allowed), "usual" (calls that no
-    process of the appliance makes are forbidden) or empty. `landlock` is the ABI version of the kernel's Landlock that
-    limits its files and ports; 0 means none.
+    process of the appliance makes are forbidden) or empty. `landlock` is the ABI version of the kernel's Landlock
+    that limits its files and ports; 0 means none.
     """
 
     calls: str
@@ -65,7 +65,7 @@ class Walled(Message):
 
 
 class LinkOpened(Message):
-    """The supervisor gives a child its end of a new link to another process. It replaces an earlier link."""
+    """A child's end of a new link, which replaces an earlier one."""
 
     descriptors: ClassVar[int] = 1
     role: str
@@ -73,27 +73,27 @@ class LinkOpened(Message):
 
 
 class SocketKept(Message):
-    """Control gives the supervisor a listening socket with a unique name. The supervisor keeps it if control dies."""
+    """A listening socket with a unique name. The supervisor keeps it if control dies."""
 
     descriptors: ClassVar[int] = 1
     name: str
 
 
 class SocketDropped(Message):
-    """Control no longer needs the kept socket with this name."""
+    """Control no longer needs this socket."""
 
     name: str
 
 
 class SocketRestored(Message):
-    """The supervisor returns a kept socket to a restarted control, or gives the api its listening socket (`api`)."""
+    """For a restarted control, or the api (`api`)."""
 
     descriptors: ClassVar[int] = 1
     name: str
 
 
 class SocketsRestored(Message):
-    """The supervisor has returned all kept sockets. It sends this at every start of control, even if there are none.
+    """All kept sockets are returned; sent at every start of control, even if there are none.
 
     `announced`: the caller that started the appliance has received the `Ready` of an earlier control process.
     """
@@ -107,87 +107,87 @@ class Announced(Message):
 
 
 class ProcessesChanged(Message):
-    """The supervisor lists the running processes for control: at the start, and after each start or death of one."""
+    """Sent at the start, and after each start or death of a process."""
 
     processes: list[ProcessInfo]
 
 
 class ClockRead(Message):
-    """The supervisor reports whether a time service synchronises the machine's clock: at the start, and on changes."""
+    """Whether a time service synchronises the machine's clock; sent at the start, and on changes."""
 
     synchronised: bool | None
 
 
 class FirewallReported(Message):
-    """The supervisor reports the state of isolation and firewall, for `rosrv status`."""
+    """The state of isolation and firewall, for `rosrv status`."""
 
     isolation: str
     report: FirewallState
 
 
 class ServicePaused(Message):
-    """The supervisor tells the api that a lapse of the lease has stopped control; without `reason`, control goes on."""
+    """For the api: a lapse of the lease has stopped control, or without `reason`, control goes on."""
 
     reason: str
 
 
 class ProbeFailed(Message):
-    """Another user could reach the port of the ROS master. Control stops serving nodes and reports the reason."""
+    """Another user could reach the port of the ROS master, so control stops serving nodes."""
 
     reason: str
 
 
 class ProbePassed(Message):
-    """The probe found that the port of the ROS master is hidden."""
+    """The port of the ROS master is hidden."""
 
 
 class PolicyReloadRequested(Message):
-    """The supervisor received SIGHUP. Control reads the policy file again, as for `rosrv policy reload`."""
+    """After SIGHUP, control reads the policy file as for `rosrv policy reload`."""
 
 
 class RouteWanted(Message):
-    """Control asks for the machine's address that a host uses to reach the appliance (isolation by a namespace)."""
+    """Control asks for the machine's address by which a host reaches the appliance (isolation by a namespace)."""
 
     host: str
 
 
 class RouteFound(Message):
-    """The supervisor answers `RouteWanted`. `address` is None if the address that the peer used is correct."""
+    """`address` is None if the one that the peer used is correct."""
 
     host: str
     address: str | None
 
 
 class EndpointWanted(Message):
-    """Control asks for the address at which hosts of other networks reach the appliance, for their kits."""
+    """For kits: the address at which hosts of other networks reach the appliance."""
 
 
 class EndpointFound(Message):
-    """The supervisor answers `EndpointWanted` with the address, or None, and the reason."""
+    """The address, or None and the reason."""
 
     address: str | None
     reason: str
 
 
 class LogHeld(Message):
-    """Control cannot write the audit log, because these processes hold its locks."""
+    """These processes hold locks of the audit log, so control cannot write it."""
 
     processes: list[int]
 
 
 class CompilerWanted(Message):
-    """Control has specifications to compile. The supervisor starts the compiler if it is not running."""
+    """Control has specifications to compile: start the compiler if it is not running."""
 
 
 class ProcessWanted(Message):
-    """Control asks the supervisor to start a process of a role on demand, if it is not running."""
+    """Start a process of a role on demand, if it is not running."""
 
     role: str
     index: int
 
 
 class OwnNetworkWanted(Message):
-    """Control asks for a network whose addresses only the appliance itself may use, and for open TCP ports.
+    """Control asks for a network that only the appliance itself may use, and for open TCP ports.
 
     Each request replaces the earlier ports. The network cannot change while the appliance runs.
     """
@@ -197,19 +197,19 @@ class OwnNetworkWanted(Message):
 
 
 class OwnNetworkOpened(Message):
-    """The supervisor answers `OwnNetworkWanted`: empty, or the reason of the failure."""
+    """Empty, or the reason of the failure."""
 
     reason: str = ""
 
 
 class ApplianceStopRequested(Message):
-    """Control asks the supervisor to end the appliance, after a granted `shutdown` call of the Master API."""
+    """Sent after a granted `shutdown` call of the Master API."""
 
     reason: str
 
 
 class MemoryGiven(Message):
-    """The supervisor gives a process shared memory of a feature, and the feature's `terms` for it.
+    """Shared memory of a feature, with the feature's `terms`.
 
     `used_by` is the feature's function that a relay calls with them (`module:function`); other processes need none.
     """
@@ -220,12 +220,12 @@ class MemoryGiven(Message):
 
 
 class StateGiven(Message):
-    """The supervisor gives a relay shared memory with the state of monitors.
+    """Shared memory with the state of monitors, for a relay.
 
-    It sends the memory of earlier lives of the appliance first, which the relay only reads, and then the relay's `own`.
-    `boot` identifies the present boot of the machine. The monitors' time (ns) is the machine's monotonic clock plus
-    `offset`. `ended_boot` identifies the boot in which the appliance last ended in order, at `ended_at` (ns since the
-    epoch).
+    It sends the memory of earlier lives of the appliance first, which the relay only reads, and then the relay's
+    `own`. `boot` identifies the present boot of the machine. The monitors' time (ns) is the machine's monotonic clock
+    plus `offset`. `ended_boot` identifies the boot in which the appliance last ended in order, at `ended_at` (ns
+    since the epoch).
     """
 
     descriptors: ClassVar[int] = 1
@@ -237,7 +237,7 @@ class StateGiven(Message):
 
 
 class LeaseHeld(Message):
-    """The lease reports that this appliance is active until `until` (seconds of CLOCK_BOOTTIME), in this epoch.
+    """This appliance is active until `until` (seconds of CLOCK_BOOTTIME), in this epoch.
 
     If no later time follows, the supervisor stops all processes that serve the robot.
     """
@@ -247,7 +247,7 @@ class LeaseHeld(Message):
 
 
 class LeaseEnded(Message):
-    """The lease reports that this appliance is not active any more.
+    """This appliance is not active any more.
 
     `renewable`: no other appliance can have had a grant so far, so a renewal in the same epoch may follow.
     """
@@ -256,7 +256,7 @@ class LeaseEnded(Message):
 
 
 class Activated(Message):
-    """The supervisor tells control of one of two appliances that it is active, in this epoch of the lease."""
+    """This appliance is active, in this epoch of the lease."""
 
     epoch: int
 

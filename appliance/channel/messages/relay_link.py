@@ -12,30 +12,30 @@ from appliance.channel.messages.message import Message
 
 
 class StateBegan(Message):
-    """Control begins to send its whole state. Facts that it does not send again before `StateEnded` are withdrawn."""
+    """Facts that control does not send again before `StateEnded` are withdrawn."""
 
     epoch: int
 
 
 class StateEnded(Message):
-    """Control has sent its whole state since the `StateBegan` with the same epoch."""
+    """The whole state has been sent since the `StateBegan` of this epoch."""
 
     epoch: int
 
 
 class OrdersAsked(Message):
-    """Control asks the relay to send `OrdersCarriedOut` once all earlier orders are carried out."""
+    """Sent to learn when all earlier orders are carried out."""
 
 
 class OrdersCarriedOut(Message):
-    """The relay answers `OrdersAsked`. Several are answered in order."""
+    """Several `OrdersAsked` are answered in order."""
 
 
 class NodePlaced(Message):
-    """Control places an incarnation, with the listening socket that replaces its TCPROS port.
+    """An incarnation, with the listening socket that replaces its TCPROS port.
 
-    `host` is the address for calls to the node; `name` is the node's name (its `callerid`). `monitors`: the incarnation
-    is the appliance's own publisher, whose port sends the messages that monitors publish.
+    `host` is the address for calls to the node; `name` is the node's name (its `callerid`). `monitors`: the
+    incarnation is the appliance's own publisher, whose port sends the messages that monitors publish.
     """
 
     descriptors: ClassVar[int] = 1
@@ -46,13 +46,13 @@ class NodePlaced(Message):
 
 
 class NodeWithdrawn(Message):
-    """An incarnation is gone. The relay closes its port and cuts its connections."""
+    """The relay closes its port and cuts its connections."""
 
     key: str
 
 
 class FlowLimit(msgspec.Struct, frozen=True, array_like=True):
-    """The messages and bytes that may pass in a second; 0 means unlimited."""
+    """Per second; 0 means unlimited."""
 
     messages: float = 0.0
     bytes: float = 0.0
@@ -62,12 +62,12 @@ UNLIMITED = FlowLimit()
 
 
 class PublicationPlaced(Message):
-    """The incarnation publishes this topic. The type is as registered, `*` if unknown.
+    """The type is as registered, `*` if unknown.
 
-    `limit` applies to all publications of the topic on this host. `together` applies to all publications of the topic;
-    hosts, by `counted_as`, share it equally. Sending this message again changes the limits. `named`: the policy names
-    the node's host, not only all hosts (`*`). `silent`: the relay takes no message from the node, because its host does
-    not hold the topic's group (`[Authority]`).
+    `limit` applies to all publications of the topic on this host. `together` applies to all publications of the
+    topic; hosts, by `counted_as`, share it equally. Sending this message again changes the limits. `named`: the
+    policy names the node's host, not only all hosts (`*`). `silent`: the relay takes no message from the node,
+    because its host does not hold the topic's group (`[Authority]`).
     """
 
     key: str
@@ -81,14 +81,14 @@ class PublicationPlaced(Message):
 
 
 class PublicationWithdrawn(Message):
-    """The incarnation no longer publishes this topic. The relay cuts its connections."""
+    """The relay cuts its connections."""
 
     key: str
     topic: str
 
 
 class ServicePlaced(Message):
-    """The incarnation offers this service at `host:port` (TCPROS)."""
+    """A TCPROS service at `host:port`."""
 
     key: str
     service: str
@@ -97,14 +97,14 @@ class ServicePlaced(Message):
 
 
 class ServiceWithdrawn(Message):
-    """The incarnation no longer offers this service. The relay cuts its connections."""
+    """The relay cuts its connections."""
 
     key: str
     service: str
 
 
 class GrantInstalled(Message):
-    """A subscriber (host, caller_id) may subscribe to this topic of the incarnation, up to a limit.
+    """Host and caller id may subscribe, up to a limit.
 
     Sending this message again changes the limit. `named`: the policy names the host, not only all hosts (`*`).
     """
@@ -118,7 +118,7 @@ class GrantInstalled(Message):
 
 
 class GrantRevoked(Message):
-    """The grant is gone. The relay cuts a connection that uses it."""
+    """The relay cuts a connection that uses the grant."""
 
     key: str
     topic: str
@@ -127,7 +127,7 @@ class GrantRevoked(Message):
 
 
 class ClientGranted(Message):
-    """A client (host, caller_id) may call this service of the incarnation.
+    """Host and caller id may call the service.
 
     `named`: the policy names the host, not only all hosts (`*`). `asks`: control approves each request
     (`ApprovalWanted`). Sending this message again changes both.
@@ -142,7 +142,7 @@ class ClientGranted(Message):
 
 
 class ClientRevoked(Message):
-    """The client may no longer call the service. The relay cuts the client's connections to it."""
+    """The relay cuts the client's connections to it."""
 
     key: str
     service: str
@@ -189,14 +189,14 @@ def withdrawal(fact: RelayFact) -> Message:
 
 
 class UpstreamWanted(Message):
-    """The relay needs the publisher's TCPROS address for a topic. Control calls `requestTopic` of the publisher."""
+    """For the publisher's TCPROS address, control calls its `requestTopic`."""
 
     key: str
     topic: str
 
 
 class UpstreamFound(Message):
-    """Control answers `UpstreamWanted`: the relay may connect to this address."""
+    """The relay may connect to this address."""
 
     key: str
     topic: str
@@ -205,7 +205,7 @@ class UpstreamFound(Message):
 
 
 class UpstreamRefused(Message):
-    """Control answers `UpstreamWanted`: the publisher did not answer, or refused. The relay asks again later."""
+    """The publisher did not answer, or refused. The relay asks again later."""
 
     key: str
     topic: str
@@ -216,9 +216,10 @@ Violation = Literal["", "limit exceeded", "malformed", "connection refused"]
 
 
 class UpstreamLost(Message):
-    """A connection to a publisher broke or could not be made. Control checks the node at once.
+    """A connection to a publisher broke or could not be made, so control checks the node at once.
 
-    `violation` is the event to record if the relay cut the connection because of the publisher's data; otherwise empty.
+    `violation` is the event to record if the relay cut the connection because of the publisher's data; otherwise
+    empty.
     """
 
     key: str
@@ -228,7 +229,7 @@ class UpstreamLost(Message):
 
 
 class LatchRefused(Message):
-    """A publisher's latched message was passed on but not kept, because its host's memory for them is used up."""
+    """A latched message was passed on but not kept, because its host's memory for them is used up."""
 
     key: str
     topic: str
@@ -236,11 +237,11 @@ class LatchRefused(Message):
 
 
 NO_GRANT = "no grant for"
-"""The beginning of the reason of each `ConnectionRefused` for lack of a grant. No other reason begins like this."""
+"""Begins the reason of each `ConnectionRefused` for lack of a grant, and no other."""
 
 
 class ConnectionOpened(Message):
-    """A subscriber (`topic` set) or a client (`service` set) is connected through the relay."""
+    """A subscriber or client is connected."""
 
     number: int
     key: str
@@ -251,16 +252,15 @@ class ConnectionOpened(Message):
 
 
 class ConnectionClosed(Message):
-    """A connection that was reported open is closed; `reason` is empty for an orderly end."""
+    """`reason` is empty for an orderly end."""
 
     number: int
     reason: str
 
 
 class ConnectionRefused(Message):
-    """A connection to a relay port was refused. `resource` is the topic or service in its header.
-
-    `kind` is "topic" or "service". Both fields are empty if the header names neither.
+    """`resource` is the topic or service in the header, and `kind` is "topic" or "service"; both are empty if it
+    names neither.
     """
 
     key: str
@@ -273,15 +273,15 @@ class ConnectionRefused(Message):
 
 
 DELAY_BOUNDS = (0.00005, 0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.1)
-"""The upper bounds (seconds) of the histogram of delays in `TopicTraffic`."""
+"""Upper bounds in seconds of the histogram in `TopicTraffic`."""
 
 
 class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
-    """The traffic of one relayed topic since the last report.
+    """Since the last report.
 
-    `delays` counts messages by the time from their receipt to the write to the subscribers' sockets. It has a count for
-    each of `DELAY_BOUNDS` and one for longer delays, or is empty if no message was delivered. `delay_seconds` is the
-    sum of all delays. `md5sum` is from the publisher's header; it is empty while unknown, and for services.
+    `delays` counts messages by the time from their receipt to the write to the subscribers' sockets. It has a count
+    for each of `DELAY_BOUNDS` and one for longer delays, or is empty if no message was delivered. `delay_seconds` is
+    the sum of all delays. `md5sum` is from the publisher's header; it is empty while unknown, and for services.
     """
 
     key: str
@@ -296,7 +296,7 @@ class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
 
 
 class LimitedRow(msgspec.Struct, frozen=True, array_like=True):
-    """Messages of a publication that a limit dropped since the last report.
+    """Messages that a limit dropped since the last report.
 
     `part` is the scope of the limit. `host` and `caller_id` identify the publisher, or, for a subscriber's limit, the
     subscriber.
@@ -312,13 +312,13 @@ class LimitedRow(msgspec.Struct, frozen=True, array_like=True):
 
 
 class MessagesLimited(Message):
-    """The relay reports the messages that limits of the policy dropped, at most once a second."""
+    """Sent at most once a second."""
 
     rows: list[LimitedRow]
 
 
 class TrafficReported(Message):
-    """The relay reports the changed counters of topics and services, at most once a second.
+    """Changed counters of topics and services, at most once a second.
 
     The counters cover `over` seconds. `unrecorded` counts connections that began and ended while there was no control
     process; they are not reported one by one. `memory` has the bytes that all hosts hold now, by kind.
@@ -331,21 +331,21 @@ class TrafficReported(Message):
 
 
 class SpecificationsStated(Message):
-    """Control sends the specifications in force: before it places any topic, and at every change.
+    """The specifications in force, sent before any topic is placed, and at every change.
 
     `part` is this relay's part of the compiled specifications (`rosmop/fast/serialization.py`; empty if it has none).
     `enabled` maps each monitor of this relay to whether its events happen. `restarted`: this relay replaces one that
     died, so its monitors with the modifier `hold` block their topics. The monitors in `moved` come from another relay
     and start here; with `hold`, they also block their topics.
 
-    `statement` is the number of this message. The answer repeats it, because the same revision may be sent again.
-    `ahead`: the relay carries out later messages only after these specifications are in force or rejected, so no topic
-    is placed before its monitors. The monitors in `shadows` are in shadow mode: they get copies of messages. `slices`
-    is the largest number of slices of a parametric specification.
+    The answer repeats `statement`, because the same revision may be sent again. `ahead`: the relay carries out later
+    messages only after these specifications are in force or rejected, so no topic is placed before its monitors. The
+    monitors in `shadows` are in shadow mode: they get copies of messages. `slices` is the largest number of slices of
+    a parametric specification.
 
-    After a takeover, `left` has the states that the relays of the other appliance left (`StateLeft`), and `left_at` the
-    time of its monitors by then (0: that in the states). `lost` is the reason why other states are lost. In both cases
-    the relay does not use its own memory.
+    After a takeover, `left` has the states that the relays of the other appliance left (`StateLeft`), and `left_at`
+    the time of its monitors by then (0: that in the states). `lost` is the reason why other states are lost. In both
+    cases the relay does not use its own memory.
 
     `unbuilt` has the monitors that do nothing because their files have errors, with the errors. Unless they are
     declared `begin`, they hold their topics. `given` has the values of given constants that differ from the text, by
@@ -394,27 +394,27 @@ class StateLeft(Message):
 
 
 class MonitorSwitched(Message):
-    """Control enables or disables the events of a monitor from now on."""
+    """Applies from now on."""
 
     name: str
     enabled: bool
 
 
 class MonitorGiven(Message):
-    """Control sets the given constants of a monitor; those that `values` lacks get the default of the text."""
+    """Constants that `values` lacks get the default of the text."""
 
     name: str
     values: dict[str, GivenValue]
 
 
 class MonitorResumed(Message):
-    """Control lets the topics continue that a monitor holds."""
+    """The topics that the monitor holds go on."""
 
     name: str
 
 
 class StopWanted(Message):
-    """Control has the monitors of a topic send their safe messages until a message comes on it.
+    """The monitors of a topic send their safe messages until a message comes on it.
 
     Without `begin`, control only asks which monitors have one.
     """
@@ -425,17 +425,17 @@ class StopWanted(Message):
 
 
 class StopBegun(Message):
-    """The answer to the `StopWanted` with this number: the names of the monitors that have a safe message."""
+    """The monitors that have a safe message."""
 
     number: int
     monitors: list[str]
 
 
 class SpecificationsTaken(Message):
-    """The relay has brought the specifications into force.
+    """The specifications are in force.
 
-    `began` lists the monitors that started in their initial state. `held` lists the monitors that hold their topics.
-    `because` gives the reason for each monitor that holds its topics because its state was lost.
+    `began` lists the monitors that started in their initial state, and `held` those that hold their topics. `because`
+    gives the reason for each monitor that holds its topics because its state was lost.
     """
 
     revision: int
@@ -446,7 +446,7 @@ class SpecificationsTaken(Message):
 
 
 class SpecificationsRefused(Message):
-    """The relay rejects the specifications and keeps its present ones. If it has none, it blocks everything."""
+    """The relay keeps its present specifications; if it has none, it blocks everything."""
 
     revision: int
     findings: list[str]
@@ -454,7 +454,7 @@ class SpecificationsRefused(Message):
 
 
 class OwnHeaderStated(Message):
-    """Control sends the connection header, without names, of a topic on which control publishes (`OwnPublished`)."""
+    """The connection header, without names, of a topic of `OwnPublished`."""
 
     topic: str
     type: str
@@ -463,14 +463,14 @@ class OwnHeaderStated(Message):
 
 
 class OwnPublished(Message):
-    """Control publishes a message as the appliance's own publisher. `data` does not include the length field."""
+    """A message of the appliance's own publisher, without the length field."""
 
     topic: str
     data: bytes
 
 
 class OwnServiceCalled(Message):
-    """A client called the appliance's own service, and waits for `OwnServiceAnswered`."""
+    """The client waits for `OwnServiceAnswered`."""
 
     number: int
     service: str
@@ -479,7 +479,7 @@ class OwnServiceCalled(Message):
 
 
 class OwnServiceAnswered(Message):
-    """Control answers a call of the appliance's own service, with a text.
+    """A text for the client of the appliance's own service.
 
     `repeats`: calls of the same host in the next second get this answer too.
     """
@@ -491,7 +491,7 @@ class OwnServiceAnswered(Message):
 
 
 class ApprovalWanted(Message):
-    """A client's request to a service needs an approval, and waits for `ApprovalAnswered`.
+    """The request waits for `ApprovalAnswered`.
 
     `digest` is the SHA-256 of the request, and `shown` its first bytes. `type` is the service's type.
     """
@@ -506,24 +506,21 @@ class ApprovalWanted(Message):
 
 
 class ApprovalAnswered(Message):
-    """Control has decided a request that needs an approval: `refused` has the reason, or is empty."""
+    """`refused` has the reason, or is empty."""
 
     number: int
     refused: str
 
 
 class MonitorCallWanted(Message):
-    """A monitor wants to call a service, and waits for `MonitorCallAnswered`."""
+    """The monitor waits for `MonitorCallAnswered`."""
 
     number: int
     service: str
 
 
 class MonitorCallAnswered(Message):
-    """Control has decided a call of a monitor.
-
-    The node `caller_id` may call the service at `host:port`, a port of its relay; or `refused` has the reason.
-    """
+    """The node `caller_id` may call the service at `host:port`, a port of its relay; or `refused` has the reason."""
 
     number: int
     host: str
@@ -533,7 +530,7 @@ class MonitorCallAnswered(Message):
 
 
 class PublicationRefused(Message):
-    """The relay does not carry a publisher or service, because its definition differs from the specifications'."""
+    """The definition of a publisher or service differs from the specifications', so the relay does not carry it."""
 
     key: str
     resource: str
@@ -570,7 +567,7 @@ class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
 
 
 class MonitorsReported(Message):
-    """The relay reports events of monitors in batches, at most a few times a second.
+    """Sent in batches, at most a few times a second.
 
     `lost` is the number of events that were lost while there was no control process.
     """
@@ -580,11 +577,11 @@ class MonitorsReported(Message):
 
 
 class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
-    """The state and counters of a running monitor. It counts since it was loaded, or since the relay started.
+    """Counters since the monitor was loaded, or the relay started.
 
     A monitor in shadow mode (`shadow`) counts the drops and changes that it would have made. `missed` counts the
-    messages that it would have received if it were in force. A parametric specification has `slices` slices now, and at
-    most `slice_limit`. `withholds`: it withholds a topic from hosts now.
+    messages that it would have received if it were in force. A parametric specification has `slices` slices now, and
+    at most `slice_limit`. `withholds`: it withholds a topic from hosts now.
     """
 
     name: str
@@ -605,13 +602,13 @@ class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
 
 
 class MonitorsCounted(Message):
-    """The relay reports the counters of all monitors after a change, at most once a second."""
+    """Sent after a change, at most once a second."""
 
     rows: list[MonitorRow]
 
 
 class LookWanted(Message):
-    """Control asks for at most `messages` next messages of a topic. `latched`: the latched message comes first."""
+    """Control asks for the next messages of a topic. `latched`: the latched message comes first."""
 
     number: int
     topic: str
@@ -620,13 +617,13 @@ class LookWanted(Message):
 
 
 class LookEnded(Message):
-    """The tap with this number is over."""
+    """The tap is over."""
 
     number: int
 
 
 class MessageSeen(Message):
-    """A message of a tap, as subscribers get it. `time` is in nanoseconds since the epoch, the size in bytes.
+    """`time` is in nanoseconds since the epoch, the size in bytes.
 
     Long `fields` are shortened. If there are only the first bytes, `why` is the reason.
     """

@@ -8,14 +8,14 @@ from appliance.channel.messages.message import Message
 
 
 class SignatureWanted(Message):
-    """Control asks the signer to sign an audit checkpoint."""
+    """`text` is an audit checkpoint."""
 
     number: int
     text: bytes
 
 
 class SignatureMade(Message):
-    """The signer returns its Ed25519 signature of `SignatureWanted.text` (64 bytes), and its public key (32 bytes)."""
+    """An Ed25519 signature (64 bytes), and the public key (32 bytes)."""
 
     number: int
     signature: bytes
@@ -23,16 +23,16 @@ class SignatureMade(Message):
 
 
 class SignatureRefused(Message):
-    """The signer refuses to sign a checkpoint that does not follow the last signed checkpoint, for this reason."""
+    """The checkpoint does not follow the last signed one."""
 
     number: int
     reason: str
 
 
 class RemovalWanted(Message):
-    """Control asks the signer to approve the removal of all records up to checkpoint `number`.
+    """Control asks to remove all records up to a checkpoint.
 
-    `checkpoint` is the text of this checkpoint, `newest` the text of the last signed checkpoint.
+    `checkpoint` is its text, `newest` that of the last signed one.
     """
 
     number: int
@@ -41,7 +41,7 @@ class RemovalWanted(Message):
 
 
 class RemovalApproved(Message):
-    """The settings require the removal. The signer returns the removal's text, and its signature over the text."""
+    """The settings require the removal; the signature is over `text`."""
 
     number: int
     text: bytes
@@ -50,7 +50,7 @@ class RemovalApproved(Message):
 
 
 class RemovalRefused(Message):
-    """The settings do not permit the removal, for this reason. `early`: they will permit it later."""
+    """`early`: the settings will permit the removal later."""
 
     number: int
     reason: str
@@ -58,13 +58,13 @@ class RemovalRefused(Message):
 
 
 class AuthorityRequest(Message):
-    """Control asks for the certificate of the appliance's authority. An answer has the `number` of its request."""
+    """Control asks for the certificate of the appliance's authority."""
 
     number: int
 
 
 class AuthorityStated(Message):
-    """The signer returns the certificate (PEM) of the authority whose key it has.
+    """The certificate (PEM) of the authority whose key the signer has.
 
     `trouble` says why it cannot use the sealed key of the other appliance's authority; empty if it can, or has none.
     """
@@ -75,10 +75,10 @@ class AuthorityStated(Message):
 
 
 class CertificateWanted(Message):
-    """Control asks for a certificate in this name, for the key in a signing request (PKCS #10, PEM).
+    """A request is PKCS #10, in PEM.
 
-    `proof`, if given, must be a signature over the bytes of `request` by the key of the certificate `former` (PEM). The
-    authority must have issued `former` for the same name.
+    `proof`, if given, must be a signature over the bytes of `request` by the key of the certificate `former` (PEM).
+    The authority must have issued `former` for the same name.
     """
 
     number: int
@@ -90,7 +90,7 @@ class CertificateWanted(Message):
 
 
 class CertificateMade(Message):
-    """The signer returns the certificate (PEM), its serial number (hexadecimal) and its end (s since the epoch)."""
+    """The certificate is PEM, the serial number hexadecimal, and the end in seconds since the epoch."""
 
     number: int
     certificate: bytes
@@ -99,28 +99,28 @@ class CertificateMade(Message):
 
 
 class CertificateRefused(Message):
-    """The signer refuses to make a certificate for this request, for this reason."""
+    """The signer makes no certificate, for this reason."""
 
     number: int
     reason: str
 
 
 class RevokedCertificate(msgspec.Struct, frozen=True):
-    """A serial number in hexadecimal, at most 160 bits, and the time of the revocation (seconds since the epoch)."""
+    """At most 160 bits, and the time of the revocation (seconds since the epoch)."""
 
     serial: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{1,40}$")]
     moment: Annotated[float, msgspec.Meta(ge=0, le=4_000_000_000)]
 
 
 class RevocationsRequest(Message):
-    """Control asks for a signed list of exactly these revoked certificates."""
+    """The list has exactly these certificates."""
 
     number: int
     revoked: list[RevokedCertificate]
 
 
 class RevocationsMade(Message):
-    """The signer returns the signed list of revoked certificates (CRL, PEM)."""
+    """A CRL in PEM."""
 
     number: int
     revocations: bytes

@@ -8,13 +8,13 @@ from appliance.channel.messages.message import Message
 
 Esp = Literal["kernel", "user space"]
 Fingerprint = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]
-"""SHA-256 of a public key (SubjectPublicKeyInfo in DER), in hexadecimal."""
+"""SHA-256 of a SubjectPublicKeyInfo in DER, in hexadecimal."""
 
 APPLIANCE_NAME = "rosrv-appliance"  # the name in the appliance's own certificate; no host may have this name
 
 
 class TunnelsWanted(Message):
-    """Control asks the supervisor for tunnels.
+    """Control asks for tunnels.
 
     From now on, addresses of `pool` are accepted only through IPsec, the appliance has `address` (in `pool`), and the
     process that runs charon is started.
@@ -25,31 +25,28 @@ class TunnelsWanted(Message):
 
 
 class TunnelsEnclosed(Message):
-    """The supervisor answers `TunnelsWanted`: the firewall is in force, and where ESP runs. Otherwise, see `reason`."""
+    """The firewall is in force, and ESP runs there; otherwise, see `reason`."""
 
     esp: Esp | None
     reason: str = ""
 
 
 class CertificateNeeded(Message):
-    """The charon process asks for a certificate for the appliance's own key, with a signing request (PEM).
-
-    `key` is the fingerprint of the key.
-    """
+    """A signing request (PEM) for the appliance's own key."""
 
     request: bytes
     key: Fingerprint
 
 
 class CharonStarted(Message):
-    """charon is running with this version. `key_exchange` lists the methods that it may offer, best first."""
+    """`key_exchange` lists the methods that charon may offer, best first."""
 
     version: str
     key_exchange: list[str]
 
 
 class TunnelHost(msgspec.Struct, frozen=True):
-    """A host that may open a tunnel: its name, its virtual address, and the serial number of its certificate."""
+    """A host that may open a tunnel; `address` is its virtual one."""
 
     name: str
     address: str
@@ -57,7 +54,7 @@ class TunnelHost(msgspec.Struct, frozen=True):
 
 
 class TunnelsStated(Message):
-    """Control sends the data that charon needs: certificates, the revocation list (PEM), and the permitted hosts."""
+    """All that charon needs; certificates and the revocation list are PEM."""
 
     number: int
     esp: Esp
@@ -69,7 +66,7 @@ class TunnelsStated(Message):
 
 
 class TunnelChanged(Message):
-    """The tunnel between a host at this real address and the appliance went up or down."""
+    """`remote` is the real address of the host."""
 
     name: str
     up: bool
@@ -77,7 +74,7 @@ class TunnelChanged(Message):
 
 
 class TunnelRefused(Message):
-    """The host at this real address was refused: its request for a tunnel, or, if not 0, this number of `packets`.
+    """A request for a tunnel was refused, or, if not 0, this number of `packets`.
 
     The source address of a tunnel's packet is not verified.
     """
@@ -88,7 +85,7 @@ class TunnelRefused(Message):
 
 
 class TunnelSeen(msgspec.Struct, frozen=True):
-    """An established tunnel, its age in seconds, and its traffic in bytes as counted by the appliance."""
+    """An established tunnel; bytes are counted by the appliance."""
 
     name: str
     remote: str
@@ -98,7 +95,7 @@ class TunnelSeen(msgspec.Struct, frozen=True):
 
 
 class TunnelsReported(Message):
-    """The charon process lists all present tunnels. It has carried out the `TunnelsStated` with the number `taken`."""
+    """All present tunnels, once the `TunnelsStated` with the number `taken` is carried out."""
 
     taken: int
     rows: list[TunnelSeen]

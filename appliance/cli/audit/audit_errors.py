@@ -19,7 +19,7 @@ CANNOT_READ = 2
 
 
 class Errors(ContextDecorator):
-    """A context manager, or a decorator, that prints an error of the audit log and exits with its status."""
+    """Prints an error of the audit log and exits with its status."""
 
     def __enter__(self) -> None:
         pass

@@ -188,7 +188,7 @@ def _verified(source: FileLog | RestLog, key: Path | None, checkpoints: Path | N
 
 
 def _print_result(result: Any, printed: Callable[[Any], None], *, as_json_lines: bool) -> None:
-    """Print the result of a verification; exit with status 1 if it has findings."""
+    """Exit with status 1 if there are findings."""
     if as_json_lines:
         write(json.dumps(msgspec.to_builtins(result)))
     else:
@@ -251,7 +251,7 @@ def export(
 
 
 def _filter_of(appliance: Appliance) -> Filter:
-    """Return the filter that the options choose, with the networks of a host's name. Raises `FilterError`."""
+    """The name of a host becomes its networks. Raises `FilterError`."""
     wanted = FILTER.value(appliance.params)
     for warning in unrecorded(wanted):
         note(printable(warning))
@@ -261,7 +261,7 @@ def _filter_of(appliance: Appliance) -> Filter:
 
 
 def _known(appliance: Appliance, wanted: Filter) -> PolicyKnown:
-    """Return the policy in force, which has the names of hosts. Raises `FilterError` if no appliance answers."""
+    """The policy has the names of hosts. Raises `FilterError` if no appliance answers."""
     try:
         answer = appliance.ask(PolicyWanted())
     except NotRunningError:

@@ -29,9 +29,9 @@ _GAP = 2
 
 
 def print_entries(entries: list[LogEntry], host_in_words: HostInWords, *, each: bool = False) -> None:
-    """Print records in the order given: on a terminal equal ones as one row unless `each`, else each in a line.
+    """On a terminal, equal records are one row unless `each`.
 
-    The rows are a table. If the terminal is too narrow for its names, the reason of each row is below it.
+    If the terminal is too narrow, the reason of each row is below it.
     """
     if sys.stdout.isatty():
         rows = [row for entry in entries for row in grouped([entry])] if each else grouped(entries)
@@ -63,7 +63,6 @@ def line(entry: LogEntry, host_in_words: HostInWords) -> str:
 
 
 def print_shown(shown: RecordInContext, host_in_words: HostInWords) -> None:
-    """Print a record in full, then the records before and after it."""
     record = shown.entry.record
     fields = {
         "id": record.id,
@@ -131,7 +130,7 @@ def _elsewhere(found: Elsewhere) -> Iterator[str]:
 
 
 def write(text: str) -> None:
-    """Write a line to standard output; escape characters that its encoding lacks."""
+    """Escape characters that the encoding of standard output lacks."""
     encoding = sys.stdout.encoding or "ascii"
     sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")
 
@@ -154,7 +153,7 @@ def _table(rows: list[tuple[Text, ...]]) -> Table:
 
 
 def _below(rows: list[tuple[Text, ...]]) -> Table:
-    """Return the rows for a narrow terminal: record and event, then the reason, all beside the number."""
+    """For a narrow terminal: record and event, then the reason, all beside the number."""
     grid = Table.grid(padding=(0, _GAP, 0, 0))
     grid.add_column(no_wrap=True, justify="right", style="bold")
     grid.add_column(overflow="fold")
@@ -196,7 +195,7 @@ def _monitor(record: AuditRecord) -> str | None:
 
 
 def _by(record: AuditRecord) -> str | None:
-    """Return the holder of a token, or `operator`, who gave an order or made a REST call."""
+    """The holder of a token, or `operator`."""
     who = record.detail.get("who")
     unknown = (
         who == "None" and record.event in FOLDED
@@ -214,7 +213,7 @@ def _joined(*parts: str | None) -> str:
 
 
 def _why(record: AuditRecord) -> str:
-    """Return the reason, with the rule (unless the reason already names it) and the count of a folded record."""
+    """Include the rule, unless the reason already names it, and the count of a folded record."""
     rule = record.rule
     named = rule is None or f"{Path(rule.file).name}:{rule.line}" in record.reason
     why = record.reason if named else f"{record.reason} ({rule_text(record.rule)})"

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 ADMIN_SOCKET = "admin.sock"
 SECONDS = 60.0
-"""Time limit in seconds; longer than control's slowest answers (enrolment through charon, compiling specifications)."""
+"""In seconds; longer than control's slowest answers (enrolment through charon, compiling specifications)."""
 QUICK_SECONDS = 2.0
-"""Time limit in seconds for names: an appliance that hangs must not keep an operator from reading the log."""
+"""In seconds: an appliance that hangs must not keep an operator from reading the log."""
 _GRACE_SECONDS = 10.0
 UNKNOWN = (
     "the change may have taken effect; if it has not by now, it never will. List recent changes:"
@@ -24,15 +24,15 @@ UNKNOWN = (
 
 
 class NotRunningError(Exception):
-    """Report that no appliance answers, or that it rejects this user or token; the text has the remedy."""
+    """No appliance answers, or it rejects this user or token; the text has the remedy."""
 
 
 class AccessDeniedError(NotRunningError):
-    """Report that this user or token may not use the appliance, which waiting does not change."""
+    """Waiting does not change this."""
 
 
 class AdminSocket:
-    """A client of the appliance that runs with a state directory; each answer may take `seconds`.
+    """Each answer may take `seconds`.
 
     After that time the request is withdrawn, and its outcome may take `grace` seconds.
     """
@@ -43,13 +43,13 @@ class AdminSocket:
         self._grace = grace
 
     def audit(self) -> "FileLog":
-        """Return the audit log, read from its file even while the appliance is stopped."""
+        """The appliance may be stopped."""
         from appliance.cli.connection.audit_file import FileLog  # noqa: PLC0415  only for the verbs that read it
 
         return FileLog(self.state, self.robot_name)
 
     def robot_name(self) -> str:
-        """Return the name of the robot; empty if it has none, or no appliance is in service."""
+        """Empty if it has none, or no appliance is in service."""
         try:
             answer = AdminSocket(self.state, QUICK_SECONDS, 0.1).ask(StatusWanted())
         except NotRunningError:
@@ -57,7 +57,7 @@ class AdminSocket:
         return answer.given().name if answer.ok else ""
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
-        """Send one request to the running appliance. Raises `NotRunningError`."""
+        """Raises `NotRunningError`."""
         line = encoded(request)
         path = self.state / ADMIN_SOCKET
         if not self.state.is_dir():
@@ -91,7 +91,7 @@ class AdminSocket:
             raise NotRunningError(f"{path}: an appliance of another version answers: {error}") from None
 
     def _read(self, sock: socket.socket) -> bytes:
-        """Read the answer. At the time limit, withdraw the request and wait for its outcome."""
+        """At the time limit, withdraw the request and wait for its outcome."""
         line = bytearray()
         try:
             _read_line(sock, line)
@@ -103,7 +103,7 @@ class AdminSocket:
 
 
 def encoded(request: AdminRequest[Any]) -> bytes:
-    """Encode a request. Raises `NotRunningError` for text that is not valid UTF-8."""
+    """Raises `NotRunningError` for text that is not valid UTF-8."""
     try:
         return msgspec.json.encode(request)
     except UnicodeEncodeError as error:

@@ -28,7 +28,7 @@ Progress = Callable[[int], None]
 
 
 class FileLog:
-    """The log in the state directory of a running or stopped appliance, or in a copy of the directory.
+    """The appliance may be stopped, or this is a copy of its state directory.
 
     All methods raise `LogUnreadableError`. `robot` returns the name of the robot, empty if it is not known.
     """
@@ -46,14 +46,13 @@ class FileLog:
         return self._state / "control" / "audit.db"
 
     def search(self, wanted: Filter, cursor: str | None, limit: int, *, newest_first: bool) -> SearchPage:
-        """Return at most `limit` records from `cursor` on."""
         return search(self.path, wanted, cursor, limit, newest_first=newest_first)
 
     def denials(self, wanted: Filter, limit: int) -> DenialSummary:
         return summary_of_log(self.path, wanted, limit)
 
     def show(self, record_id: str, neighbours: int) -> RecordInContext | None:
-        """Return one record with its neighbours; None if the log has no such record."""
+        """None if the log has no such record."""
         return show(self.path, record_id, neighbours)
 
     def export(self, wanted: Filter) -> Iterator[LogEntry]:
@@ -64,7 +63,7 @@ class FileLog:
         return ((entry.sequence, evidence_line(entry, chain, robot)) for entry, chain in found)
 
     def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[LogEntry]]:
-        """Yield the last matching records, oldest first; then, if `on`, yield new records without end."""
+        """Yield the last records, oldest first; then, if `on`, new ones without end."""
         path = self.path
         follower = Follower(path, wanted)
         if lines:
@@ -77,7 +76,7 @@ class FileLog:
     def verify(
         self, key: bytes | None, copies: Sequence[SignedCheckpoint] | None, progress: Progress
     ) -> Verification:
-        """Verify the log; if the signer's own records are readable, compare the log with them.
+        """If the signer's own records are readable, compare the log with them.
 
         `progress` is called with the sequence of the last verified record.
         """
@@ -87,7 +86,7 @@ class FileLog:
         return verify(path, key, signer if may else None, copies, progress)
 
     def checkpoints(self, after: int) -> list[SignedCheckpoint]:
-        """Return some of the signed checkpoints after a number, in order; empty at the end."""
+        """Empty at the end."""
         return signed_checkpoints(self.path, after)
 
     def last(self) -> int:

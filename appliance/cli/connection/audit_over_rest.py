@@ -29,7 +29,7 @@ _MOST_FAILURES = 5
 
 
 class RestLog:
-    """The audit log over REST. It has the same methods as `FileLog`, but they raise `NotRunningError`."""
+    """Like `FileLog`, but the methods raise `NotRunningError`."""
 
     def __init__(self, client: RestClient) -> None:
         self._client = client
@@ -78,7 +78,7 @@ class RestLog:
                     yield int(json.loads(line)["sequence"]), line
 
     def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[LogEntry]]:
-        """Yield the last matching records, then new records; reconnect when the connection breaks."""
+        """Reconnect when the connection breaks."""
         position = self.last()
         if lines:
             yield self.search(wanted, str(position + 1), lines, newest_first=True).entries[::-1]
@@ -127,7 +127,7 @@ class RestLog:
 
     @contextmanager
     def _lines(self, path: str, params: dict[str, Any], seconds: float) -> Iterator[Iterator[str]]:
-        """Stream the lines of an answer; translate errors, including errors raised inside the block."""
+        """Translate errors, including those raised inside the block."""
         with (
             self._refusals(),
             self._client.streamed("GET", _PATH + path, params=params, seconds=seconds) as answer,
@@ -136,7 +136,7 @@ class RestLog:
 
     @contextmanager
     def _refusals(self) -> Iterator[None]:
-        """Translate REST's problems and malformed answers into errors for the caller."""
+        """Translate REST's problems and malformed answers."""
         try:
             yield
         except RestProblemError as problem:
@@ -165,11 +165,11 @@ class RestLog:
 
 
 class _NothingThereError(Exception):
-    """Report a record that the log does not have."""
+    pass
 
 
 class _EndedError(NotRunningError):
-    """Report that the appliance ended the stream."""
+    """The appliance ended the stream."""
 
 
 def _parameters(wanted: Filter) -> dict[str, Any]:

@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 
 class RestWay:
-    """The appliance at a URL; it takes the same requests and gives the same answers as over the admin socket."""
+    """Takes the same requests and gives the same answers as `AdminSocket`."""
 
     def __init__(self, url: str, token: str | None, authority: Path | None) -> None:
-        """Make the client. Raises `ValueError` if a token must not be sent to this URL."""
+        """Raises `ValueError` if a token must not be sent to this URL."""
         self.client = RestClient(url, token, authority)
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
-        """Send one request to the running appliance. Raises `NotRunningError`."""
+        """Raises `NotRunningError`."""
         encoded(request)  # rejects text that the socket would also reject
         try:
             return AdminAnswer(True, _carry_out(self.client, request))
@@ -41,7 +41,7 @@ class RestWay:
 
 
 def _carry_out(rest: RestClient, request: AdminRequest[A]) -> A:
-    """Send a request over REST. Raises `NotRunningError` for a request that REST does not offer."""
+    """Raises `NotRunningError` for a request that REST does not offer."""
     asked: Any = request  # its kind is checked below
     if isinstance(asked, admin.RegistrationsWanted):
         return cast(A, _registrations(_carry_out(rest, admin.GraphWanted())))

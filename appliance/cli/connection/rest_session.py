@@ -31,12 +31,12 @@ _MAKE = "make one on its machine: rosrv token add NAME"
 
 
 class RestProblemError(Exception):
-    """Report a request that REST denied or rejected; `lines` is the text, and its first line is a summary."""
+    """REST denied or rejected a request; the first of `lines` is a summary."""
 
     def __init__(
         self, status: int, kind: str, lines: list[str], findings: list[dict[str, Any]] | None = None
     ) -> None:
-        """Store the problem; `findings` are the errors in the sent text, with their places."""
+        """`findings` are the errors in the sent text."""
         super().__init__(lines[0])
         self.findings = findings
         self.status = status
@@ -45,10 +45,10 @@ class RestProblemError(Exception):
 
 
 class RestClient:
-    """A REST client for the holder of a token; its methods raise `NotRunningError` and `RestProblemError`."""
+    """The methods raise `NotRunningError` and `RestProblemError`."""
 
     def __init__(self, url: str, token: str | None, authority: Path | None) -> None:
-        """Prepare the connection. Raises `ValueError` if a token must not be sent to this URL."""
+        """Raises `ValueError` if a token must not be sent to this URL."""
         self.url, secure = _place_of(url)
         self._token = _checked_token(token)
         if authority is not None and not secure:
@@ -76,7 +76,7 @@ class RestClient:
         match: bool = False,
         order: bool = True,
     ) -> dict[str, Any]:
-        """Return the answer's body. `match`: accept any present revision (`If-Match: *`).
+        """`match`: accept any present revision (`If-Match: *`).
 
         An `order` is signed unless it is a GET; a dry run is not an order.
         """
@@ -194,7 +194,7 @@ def _stated(request: httpx.Request, challenge: str) -> bytes:
 
 
 def _place_of(url: str) -> tuple[str, bool]:
-    """Return a URL's scheme, host and port, and whether it is encrypted. Raises `ValueError`."""
+    """Scheme, host and port, and whether it is encrypted. Raises `ValueError`."""
     try:
         parts = urlsplit(url)
         host, _port = parts.hostname, parts.port

@@ -82,7 +82,7 @@ class _Target:
 
 
 class Appliance(typer.Context):
-    """The call of a verb, with the appliance that its options choose.
+    """A call of a verb, with the appliance that its options choose.
 
     `said`: whether the command line or the environment names the appliance. `place`: the URL of REST; None over the
     socket. `as_json`: whether to print answers as JSON.
@@ -94,7 +94,7 @@ class Appliance(typer.Context):
 
     @property
     def way(self) -> "AdminSocket | RestWay":
-        """Return the connection. Exits with status 2 for options that exclude each other."""
+        """Exits with status 2 for options that exclude each other."""
         return self._target.way
 
     @property
@@ -115,28 +115,28 @@ class Appliance(typer.Context):
         return self.way.client
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
-        """Send one request to the running appliance. Raises `NotRunningError`."""
+        """Raises `NotRunningError`."""
         return self.way.ask(request)
 
     def audit(self) -> "FileLog | RestLog":
-        """Return the appliance's audit log; with a state directory, the appliance may be stopped."""
+        """With a state directory, the appliance may be stopped."""
         return self.way.audit()
 
     @cached_property
     def host_in_words(self) -> "HostInWords":
-        """Return the function that names hosts by the policy in force; it returns addresses if no appliance answers."""
+        """Addresses are shown if no appliance answers."""
 
         return named_by(self.way)
 
     def ask_or_exit(self, request: AdminRequest[A]) -> A:
-        """Return the answer's body. Exits with status 1 for a rejected request, and 2 if no appliance answers."""
+        """Exits with status 1 for a rejected request, and 2 if no appliance answers."""
         try:
             return self.body_or_exit(self.way.ask(request))
         except NotRunningError as error:
             raise usage_error(str(error)) from None
 
     def answer_or_exit(self, request: AdminRequest[A]) -> A:
-        """Return the answer's body, as `ask_or_exit` does; with --json, print the body and exit instead."""
+        """Like `ask_or_exit`; with --json, print the body and exit instead."""
         body = self.ask_or_exit(request)
         if self.as_json:
             say_json(body)  # type: ignore[arg-type]  # each answer is a struct
@@ -144,7 +144,7 @@ class Appliance(typer.Context):
         return body
 
     def body_or_exit(self, answer: AdminAnswer[A]) -> A:
-        """Return the answer's body; print a rejection with its findings and exit with status 1."""
+        """Print a rejection with its findings and exit with status 1."""
         if answer.ok:
             return answer.given()
         if self.as_json:
@@ -157,8 +157,6 @@ class Appliance(typer.Context):
 
 
 class _ApplianceCommand(GroupedCommand):
-    """A verb with --json and the options that choose an appliance."""
-
     context_class = Appliance
 
     def __init__(
@@ -182,14 +180,14 @@ def speaks(verb: Callable[Concatenate[Appliance, _P], None]) -> GroupedVerb:
 
 
 def speaks_here(verb: Callable[Concatenate[Appliance, _P], None]) -> GroupedVerb:
-    """Like `speaks`, for a verb that REST does not offer: its help has no --api, whose use gets the reason."""
+    """For a verb that REST does not offer: its help has no --api, whose use gets the reason."""
     return GroupedVerb(verb, partial(_ApplianceCommand, over_rest=False))
 
 
 def speaks_with(
     json_help: str, group: OptionGroup[Any] | None = None
 ) -> Callable[[Callable[Concatenate[Appliance, _P], None]], GroupedVerb]:
-    """Like `speaks`, with this help of --json, and the options of `group` before the verb's own."""
+    """`group` has options before the verb's own."""
 
     def command(*args: Any, **settings: Any) -> GroupedCommand:
         before = () if group is None else group.options
@@ -222,7 +220,7 @@ def _choose(
         ),
     ] = None,
 ) -> _Target:
-    """Return the appliance that the options choose. Exits with status 2 for options that exclude each other."""
+    """Exits with status 2 for options that exclude each other."""
     sources = {name: context.get_parameter_source(name) for name in ("state", "api", "api_ca")}
     said = {name: "" if source is None else source.name for name, source in sources.items()}
     typed = {name for name, source in said.items() if source == "COMMANDLINE"}

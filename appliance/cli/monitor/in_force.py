@@ -286,7 +286,7 @@ def _assigned(text: str, form: str) -> tuple[str, str]:
 
 
 def _given_to_monitors(given: list[str]) -> dict[str, dict[str, GivenValue]]:
-    """Return the values of `--set`, by monitor and name."""
+    """By monitor and name."""
     found: dict[str, dict[str, GivenValue]] = {}
     for text in given:
         path, value = _assigned(text, "--set MONITOR.NAME=VALUE")
@@ -323,7 +323,7 @@ def _switch(appliance: Appliance, order: admin.AdminRequest[Switched], word: str
 
 
 def say_shadow_deadline(confirm_by: float | None) -> None:
-    """Print when monitors return to shadow mode unless confirmed; print nothing if they stay in force."""
+    """Print nothing if the monitors stay in force."""
     if confirm_by is not None:
         say(f"back to shadow mode at {moment(confirm_by)} unless you run: rosrv monitor confirm", "yellow")
 

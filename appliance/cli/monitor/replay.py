@@ -104,7 +104,7 @@ def replay_monitor(
 
 
 def _specifications(appliance: Appliance, what: str, folders: Sequence[Path]) -> Specifications:
-    """Return the specifications of a file, or those of the appliance with a chosen monitor."""
+    """`what` is a path, or the name of a monitor of the appliance."""
     path = Path(what)
     if path.suffix == ".rv" or path.is_file():
         return read_for_recordings(MONITOR, [path], folders)
@@ -124,7 +124,7 @@ def _specifications(appliance: Appliance, what: str, folders: Sequence[Path]) ->
 
 
 def _topics(specifications: Specifications, patterns: Sequence[str]) -> dict[str, str]:
-    """Return the selected topics and their types, for the chosen monitor; if None, for all monitors in the texts."""
+    """Types by topic, of the chosen monitor or of all."""
     return {
         topic: kind
         for topic, kind in topics_of(specifications).items()

@@ -8,11 +8,11 @@ from appliance.network.namespaces import NetworkError
 
 
 class FirewallError(NetworkError):
-    """Report that the kernel or its tools reject the rules, or do not enforce them."""
+    """The kernel or its tools reject the rules, or do not enforce them."""
 
 
 class BackendMissingError(FirewallError):
-    """Report that a program, a library or a part of the kernel is missing for the back end."""
+    """The back end lacks a program, a library or a part of the kernel."""
 
 
 @dataclass(frozen=True)
@@ -31,20 +31,19 @@ class Backend(Protocol):
 
     @property
     def name(self) -> str:
-        """Return `nft` or `iptables`."""
+        """`nft` or `iptables`."""
 
     @property
     def families(self) -> tuple[Family, ...]:
-        """Return the address families of the rules: those that the kernel supports."""
+        """The families that the kernel supports."""
 
     def install(self, rules: tuple[PacketRule, ...]) -> None:
-        """Replace all rules of the appliance; rules of other programs stay.
+        """Rules of other programs stay.
 
         Raises `BackendMissingError`, `FirewallError`; the old rules are then still in force.
         """
 
-    def remove(self) -> None:
-        """Remove every rule and chain of the appliance, if there are any."""
+    def remove(self) -> None: ...
 
     def counters(self) -> tuple[RuleCounter, ...]:
-        """Return the appliance's rules that are in force and hooked in."""
+        """Only rules that are in force and hooked in."""

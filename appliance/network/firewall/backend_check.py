@@ -1,8 +1,8 @@
 """Test on a loopback port of our own that a back end works on this machine.
 
-A kernel may accept rules that it never applies (a match extension is a stub, or a container engine filters the calls).
-So a back end is used only after three tests on IPv4 and IPv6. The port must be reached without a rule, refused with a
-rule for another user, and reached with a rule for this user.
+A kernel may accept rules that it never applies (a match extension is a stub, or a container engine filters the
+calls). So a back end is used only after three tests on IPv4 and IPv6: the port must be reached without a rule,
+refused with a rule for another user, and reached with a rule for this user.
 """
 
 import errno
@@ -18,7 +18,7 @@ _LOOPBACK = ((socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1"))
 
 
 def prove(backend: Backend, namespace: Namespace) -> None:
-    """Install rules for a port of our own, try them, and remove them. Raises `FirewallError`."""
+    """Raises `FirewallError`."""
     own, other = os.geteuid(), os.geteuid() + 1
     try:
         for family, address in _LOOPBACK:
@@ -47,7 +47,7 @@ def _listen(family: socket.AddressFamily, address: str) -> socket.socket | None:
 
 
 def _expect(namespace: Namespace, server: socket.socket, when: str, *, reached: bool) -> None:
-    """Connect to `server` from the namespace. Raises `FirewallError` unless the outcome is as `reached` demands."""
+    """Raises `FirewallError` unless the outcome is as `reached` demands."""
     address = server.getsockname()[:2]
 
     def connect() -> str | None:

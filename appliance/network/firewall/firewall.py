@@ -32,7 +32,7 @@ class FirewallReport:
 
 
 class Firewall:
-    """The rules of one namespace, with the given back end or the first one that works (nft, then iptables)."""
+    """Without a given back end, the first one that works (nft, then iptables)."""
 
     def __init__(self, namespace: Namespace, backend: BackendChoice = "auto") -> None:
         self._namespace = namespace
@@ -42,7 +42,7 @@ class Firewall:
         self._not_used: list[str] = []
 
     def install(self, settings: FirewallSettings) -> str:
-        """Choose a back end, remove old rules, install the rules; return the back end's name.
+        """Remove old rules first; return the back end's name.
 
         Raises `PrivilegeError`, or `FirewallError` with the reason of each back end.
         """
@@ -55,7 +55,7 @@ class Firewall:
         return self._backend.name
 
     def update(self, settings: FirewallSettings) -> None:
-        """Replace the rules according to new settings. Raises `FirewallError`; the old rules then stay in force."""
+        """Raises `FirewallError`; the old rules then stay in force."""
         if self._backend is None:
             raise FirewallError("the firewall is not installed yet: call install first")
         rules = appliance_rules(settings)
@@ -63,7 +63,7 @@ class Firewall:
         self._rules = rules
 
     def remove(self) -> None:
-        """Remove all rules of the appliance, with both back ends."""
+        """Both back ends are cleared."""
         for backend in self._all():
             if self._backend is not None and backend.name == self._backend.name:
                 backend.remove()
@@ -82,7 +82,7 @@ class Firewall:
         return (NftBackend(self._namespace), IptablesBackend(self._namespace))
 
     def _choose(self, rules: tuple[PacketRule, ...]) -> Backend:
-        """Install the rules with the first back end that works and accepts all of them; return the back end."""
+        """Return the first back end that works and accepts all rules."""
         backends = self._all()
         for backend in backends:
             self._clear(backend)  # an old rule of any back end would disturb the test
@@ -103,7 +103,7 @@ class Firewall:
         )
 
     def _clear(self, backend: Backend) -> None:
-        """Remove old rules of a back end. A back end that this machine lacks has no rules."""
+        """A back end that this machine lacks has no rules."""
         try:
             backend.remove()
         except FirewallError as error:
@@ -115,7 +115,7 @@ class Firewall:
 def statuses(
     rules: tuple[PacketRule, ...], counters: tuple[RuleCounter, ...], families: tuple[Family, ...] = (4, 6)
 ) -> tuple[FirewallRule, ...]:
-    """Join the rules with their counters in the kernel; a rule's counters are summed over both address families.
+    """Counters are summed over both address families.
 
     A rule is in force if the kernel has it once for each of its families, or once for both. Only `families` count.
     """

@@ -19,7 +19,7 @@ MAX_PORT = 65535
 
 
 class Chain(StrEnum):
-    """The chains of the appliance; `HOOKS` has their hooks in the kernel."""
+    """`HOOKS` has their hooks in the kernel."""
 
     IN = "ROSRV-IN"
     OUT = "ROSRV-OUT"
@@ -32,7 +32,7 @@ class Chain(StrEnum):
 
 
 class Hook(NamedTuple):
-    """The hook of a chain in the kernel; chains of one hook run by priority, smallest first."""
+    """Chains of one hook run by priority, smallest first."""
 
     place: str
     kind: Literal["filter", "nat"] = "filter"
@@ -71,7 +71,7 @@ class PacketVerdict(StrEnum):
 
 @dataclass(frozen=True)
 class PortRange:
-    """Ports `first` to `last`, both included."""
+    """Both ends are included."""
 
     first: int
     last: int
@@ -95,7 +95,7 @@ class PortRange:
 
 @dataclass(frozen=True)
 class Interface:
-    """A network interface; `other` means every interface except this one."""
+    """`other` means every interface except this one."""
 
     name: str
     other: bool = False
@@ -106,7 +106,7 @@ class Interface:
 
 @dataclass(frozen=True)
 class RateLimit:
-    """A limit per host; it matches new connections above `per_second`, after a burst of `burst`."""
+    """Per host: matches new connections above `per_second`, after `burst`."""
 
     per_second: int
     burst: int
@@ -118,7 +118,7 @@ class RateLimit:
 
 @dataclass(frozen=True)
 class PacketRule:
-    """A rule; it matches if all given conditions match."""
+    """All given conditions must match."""
 
     purpose: str  # shown by `rosrv status` and kept as the rule's comment; at most 100 characters
     verdict: PacketVerdict
@@ -169,14 +169,14 @@ class PacketRule:
         return self.tcp_ports is not None or self.from_ports is not None or self.opening or self.accepting
 
     def families(self) -> tuple[Family, ...]:
-        """Return the families of the rule: its own family, else the family of its addresses, else both."""
+        """The own family, else that of the addresses, else both."""
         given = self.source or self.destination or self.to
         if given is not None:
             return (family_of(given),)
         return (4, 6) if self.family is None else (self.family,)
 
     def describe(self) -> str:
-        """Return the matches and the verdict in netfilter's terms."""
+        """In netfilter's terms."""
         matches = {
             "in": self.arrives_on,
             "out": self.leaves_on,
@@ -209,7 +209,7 @@ class PacketRule:
 
 @dataclass(frozen=True)
 class ForwarderAccess:
-    """A local user that sends to one receiver, such as the audit log's forwarder, and may reach nothing else."""
+    """The user may reach only this receiver, such as that of the audit log."""
 
     uid: int
     address: str
@@ -226,7 +226,7 @@ class ForwarderAccess:
 
 @dataclass(frozen=True)
 class PeerAccess:
-    """The other one of two appliances, and the port of both (TCP and UDP)."""
+    """`port` is that of both appliances (TCP and UDP)."""
 
     other: str
     port: int
@@ -315,7 +315,7 @@ _sending = partial(PacketRule, chain=Chain.OUT)
 
 
 def appliance_rules(settings: FirewallSettings) -> tuple[PacketRule, ...]:
-    """Return the rules of the appliance's namespace in order."""
+    """In order."""
     return (
         *(
             _arriving(
@@ -345,7 +345,7 @@ def appliance_rules(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def family_of(address: str) -> Family:
-    """Return the family of an address or network. Raises `ValueError`."""
+    """Raises `ValueError`."""
     try:
         return 6 if ipaddress.ip_network(address).version == 6 else 4
     except ValueError as error:
@@ -354,7 +354,7 @@ def family_of(address: str) -> Family:
 
 
 def inner_port(name: str, port: int | None, user: str, uid: int) -> tuple[PacketRule, ...]:
-    """Return the rules of a port that only one local user may connect to, over loopback; no rules without a port."""
+    """Only one local user may connect, over loopback; no rules without a port."""
     return () if port is None else _inner_ports(name, PortRange.one(port), user, uid)
 
 
@@ -367,7 +367,7 @@ def _inner_ports(name: str, ports: PortRange, user: str, uid: int) -> tuple[Pack
 
 
 def _rosmaster(settings: FirewallSettings) -> tuple[PacketRule, ...]:
-    """Let `rosmaster` connect only to the master-side endpoint, once the endpoint exists."""
+    """Only to the master-side endpoint, once it exists."""
     if settings.inner_port is None:
         return ()
     uid = settings.rosmaster_uid
@@ -378,7 +378,7 @@ def _rosmaster(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def _own_node(settings: FirewallSettings) -> tuple[PacketRule, ...]:
-    """Let only control call the own node, and let the node reach only its master, proxy endpoints and relays."""
+    """Only control may call the node, which reaches only its master, proxy endpoints and relays."""
     node = settings.own_node
     if node is None:
         return ()
@@ -398,7 +398,7 @@ def _own_node(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def _ports_of_others(uid: int, settings: FirewallSettings) -> Iterator[PacketRule]:
-    """Block the own node from RVMaster's port, REST, low ports, and the kernel's local port range.
+    """Block RVMaster's port, REST, low ports, and the kernel's local port range.
 
     The rules list blocked instead of permitted ports, because a new policy may change the permitted ones.
     """
@@ -421,7 +421,7 @@ def _sends_nothing_out(name: str, uid: int) -> PacketRule:
 
 
 def _tunnel_only(network: str, interface: str | None) -> tuple[PacketRule, ...]:
-    """Accept packets from a network, and send packets to it, only through its tunnel."""
+    """Only the tunnel carries packets of the network."""
     outside = Interface(interface, other=True) if interface else None
     refused = partial(PacketRule, verdict=PacketVerdict.DROP, clear_text=interface is None)
     return (
@@ -431,7 +431,7 @@ def _tunnel_only(network: str, interface: str | None) -> tuple[PacketRule, ...]:
 
 
 def _own_network(network: str | None) -> tuple[PacketRule, ...]:
-    """Drop packets from other machines that have an address of the appliance's own network."""
+    """Packets from other machines must not have such an address."""
     if network is None:
         return ()
     outside = partial(PacketRule, verdict=PacketVerdict.DROP, chain=Chain.IN, arrives_on=OUTSIDE)
@@ -442,7 +442,6 @@ def _own_network(network: str | None) -> tuple[PacketRule, ...]:
 
 
 def _forwarding(forwarder: ForwarderAccess) -> tuple[PacketRule, ...]:
-    """Let a forwarder's user send to its receiver only."""
     sending = partial(_sending, uid=forwarder.uid)
     ports = PortRange.one(forwarder.port)
     return (
@@ -458,7 +457,6 @@ def _forwarding(forwarder: ForwarderAccess) -> tuple[PacketRule, ...]:
 
 
 def _peer(access: PeerAccess | None) -> tuple[PacketRule, ...]:
-    """Let only the other appliance send to the port of both (TCP and UDP)."""
     if access is None:
         return ()
     port = PortRange.one(access.port)
@@ -497,7 +495,7 @@ def _rate_limits(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def _chosen_by_the_kernel(settings: FirewallSettings) -> Iterator[PacketRule]:
-    """Close the local port range, where the own node listens, to other machines, except for configured ports."""
+    """Close the local port range to other machines, except for configured ports, because the own node listens there."""
     if settings.client_ports is None:
         return
     chosen = {
@@ -515,11 +513,11 @@ def _chosen_by_the_kernel(settings: FirewallSettings) -> Iterator[PacketRule]:
 
 
 def _rate_limit(limit: RateLimit | None, name: str, ports: PortRange) -> tuple[PacketRule, ...]:
-    """Limit the connections of each host; packets above the limit are dropped, and the host's kernel sends them again.
+    """Packets above the limit are dropped, and the host's kernel sends them again.
 
-    The first packet after the handshake counts: its sender received our SYN-ACK, so its address is not forged. Against
-    forged first packets, the kernel limits half-open connections; above that limit it answers with SYN cookies, which
-    need no memory.
+    The first packet after the handshake counts: its sender received our SYN-ACK, so its address is not forged.
+    Against forged first packets, the kernel limits half-open connections; above that limit it answers with SYN
+    cookies, which need no memory.
     """
     if limit is None:
         return ()

@@ -76,7 +76,7 @@ class IptablesBackend:
         return self._namespace.run(_families)
 
     def install(self, rules: tuple[PacketRule, ...]) -> None:
-        """Replace the appliance's chains, first of IPv4, then of IPv6."""
+        """IPv4 first, then IPv6."""
         elsewhere = [rule.purpose for rule in rules if rule.chain not in _CHAINS]
         if elsewhere:
             raise BackendMissingError(f"address translation needs nft, not iptables: {'; '.join(elsewhere)}")
@@ -84,7 +84,7 @@ class IptablesBackend:
         self._in_tables(lambda table: table.replace(rendered))
 
     def remove(self) -> None:
-        """Unhook and delete the appliance's chains, without creating unused tables."""
+        """No unused tables are created."""
         _in_used_tables(self._namespace, "filter", lambda table: table.replace([]))
 
     def counters(self) -> tuple[RuleCounter, ...]:
@@ -103,7 +103,7 @@ class IptablesBackend:
 
 
 def load_modules() -> None:
-    """Load the kernel modules of legacy xtables, because the kernel does not load them automatically.
+    """The kernel does not load the modules of legacy xtables automatically.
 
     Call this while the process may still load modules. A failure appears only later, as an error of `install`.
     """
@@ -113,24 +113,24 @@ def load_modules() -> None:
 
 
 def foreign_translations(namespace: Namespace) -> tuple[str, ...]:
-    """Return the chains of legacy xtables that translate the source of connections."""
+    """Chains of legacy xtables."""
     return _foreign(namespace, "nat", lambda table: table.translating())
 
 
 def foreign_forward_drops(namespace: Namespace) -> tuple[str, ...]:
-    """Return the chains of legacy xtables that drop forwarded packets by default."""
+    """Chains of legacy xtables."""
     return _foreign(namespace, "filter", lambda table: table.dropping("FORWARD"))
 
 
 def _foreign(namespace: Namespace, name: str, look: "Callable[[_Table], list[str]]") -> tuple[str, ...]:
-    """Return the results of `look` for the table `name` of each family, if the table is in use."""
+    """Only for families that use the table."""
     found: list[str] = []
     _in_used_tables(namespace, name, lambda table: found.extend(look(table)))
     return tuple(found)
 
 
 def _in_used_tables(namespace: Namespace, name: str, work: "Callable[[_Table], None]") -> None:
-    """Run `work` with the table `name` of each family that uses it; the library is loaded only if one does."""
+    """The library is loaded only if a family uses the table."""
 
     def inside() -> None:
         used = [family for family in _families() if name in _tables_in_use(family)]
@@ -144,7 +144,7 @@ def _in_used_tables(namespace: Namespace, name: str, work: "Callable[[_Table], N
 
 
 def _tables_in_use(family: Family) -> list[str]:
-    """Return the names of the tables in use. Opening an unused table would create it."""
+    """Opening an unused table would create it."""
     names = "ip6_tables_names" if family == 6 else "ip_tables_names"
     try:
         return Path("/proc/thread-self/net", names).read_text(encoding="ascii").split()
@@ -218,7 +218,7 @@ def _tracked(rule: PacketRule) -> list[Extension]:
 
 
 def _hashlimit(per_second: int, burst: int) -> tuple[tuple[str, str], ...]:
-    """Return a limit with one bucket per source address, shared by rules with the same limit."""
+    """One bucket per source address, shared by rules with the same limit."""
     return (
         ("hashlimit-above", f"{per_second}/sec"),
         ("hashlimit-burst", str(burst)),
@@ -246,7 +246,7 @@ _CHAINS = (Chain.IN, Chain.OUT, Chain.FORWARD)
 
 
 class _Table:
-    """An open table of one family in the namespace of the thread."""
+    """Open in the namespace of the thread."""
 
     def __init__(self, library: Any, table: Any, family: Family) -> None:
         self._library = library
@@ -311,7 +311,7 @@ class _Table:
                 self._table.delete_entry(hook.place, jump.rule, jump.mask)
 
     def _hooks(self, chain: Chain, hook: str) -> int:
-        """Count the jumps to a chain; only the targets of foreign rules are read."""
+        """Only the targets of foreign rules are read."""
         count, entry = 0, self._table.first_rule(hook)
         while entry:
             count += self._table.get_target(entry) == chain.value.encode()
@@ -348,7 +348,7 @@ class _Table:
 
 
 def _comment(rule: Any) -> str:
-    """Return a rule's comment, read from its match. The library's own function would redirect our standard output."""
+    """The library's own function would redirect our standard output."""
     for match in rule.matches:
         if match.name == "comment":
             content = bytes(match.match_buf)[_MATCH_HEADER:]
@@ -396,7 +396,7 @@ def _library() -> Any:
 
 
 def _families() -> tuple[Family, ...]:
-    """Return the families that the kernel has: without IPv6 if it is disabled."""
+    """Without IPv6 if it is disabled."""
     return (4, 6) if Path("/proc/sys/net/ipv6").exists() else (4,)
 
 

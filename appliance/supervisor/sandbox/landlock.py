@@ -26,15 +26,15 @@ _READ = _READ_FILE | _READ_DIR
 _PR_SET_NO_NEW_PRIVS = 38
 
 FILES, PORTS, SIGNALS = 1, 4, 6
-"""The first ABI version with each limit."""
+"""ABI versions."""
 
 
 class LandlockError(Exception):
-    """Report that the kernel's Landlock rejects a rule."""
+    """The kernel's Landlock rejects a rule."""
 
 
 def version() -> int:
-    """Return the ABI of the kernel's Landlock; 0 without it, or if it is disabled."""
+    """Return 0 without Landlock, or if it is disabled."""
     return max(system_call(_CREATE_RULESET, None, 0, _ASK_VERSION)[0], 0)
 
 
@@ -46,7 +46,7 @@ def lacking(abi: int) -> list[str]:
 
 
 def restrict(sandbox: SandboxPlan) -> int:
-    """Limit this process and its children to the files and ports of `sandbox`; return the ABI, 0 for none.
+    """Limit this process and its children; return the ABI, 0 for none.
 
     Raises `LandlockError`.
     """

@@ -44,12 +44,12 @@ _REMEDY = (
 
 
 class ViewError(Exception):
-    """Report that a process cannot be shown what it needs; the message has the cause and the remedy."""
+    """The message has the cause and the remedy."""
 
 
 @dataclass(frozen=True)
 class PrivateView:
-    """The folders that are covered, and those that are shown: folders of the program, and the state directory.
+    """Covered folders, and folders of the program and the state directory that are shown.
 
     `owned` are the folders of the program with files that only their owner may read.
     """
@@ -61,16 +61,16 @@ class PrivateView:
 
 
 def program_folders() -> tuple[Path, ...]:
-    """Return the folders of the program: the Python environment, and the packages unless they are in it."""
+    """The Python environment, and the packages unless they are in it."""
     top, environment = Path(appliance.__file__).resolve().parent.parent, Path(sys.prefix).resolve()
     packages = () if top.is_relative_to(environment) else tuple(top / name for name in _PACKAGES)
     return (environment, *packages)
 
 
 def view_of(program: Sequence[Path], state: Path) -> PrivateView | None:
-    """Return the view that other users need to run the program with this state.
+    """Return the view that other users need.
 
-    None if they can reach both, or if the processes have this user (not root).
+    None if they reach everything, or if the processes have this user (not root).
     """
     if os.geteuid() != 0:
         return None
@@ -89,7 +89,7 @@ def view_of(program: Sequence[Path], state: Path) -> PrivateView | None:
 
 
 def require_view(view: PrivateView | None, *, may_mount: bool) -> PrivateView | None:
-    """Return the view if this process may mount it. Raises `StartError` if it may not and the program needs it."""
+    """Raises `StartError` if this process may not mount the view and the program needs it."""
     if view is None or may_mount:
         return view
     if view.program:
@@ -101,7 +101,7 @@ def require_view(view: PrivateView | None, *, may_mount: bool) -> PrivateView | 
 
 
 def enter(view: PrivateView, account: Account) -> None:
-    """Move this process, which has one thread, into the view, before it becomes `account`. Raises `ViewError`."""
+    """This process must have one thread, and not be `account` yet. Raises `ViewError`."""
     try:
         _enter(view, account)
     except OSError as error:
@@ -134,7 +134,7 @@ def _closed_above(path: Path) -> Path | None:
 
 
 def _is_open(folder: Path) -> bool:
-    """Return whether other users may read a folder; of our packages, also every file: a pull may have another umask."""
+    """In our packages, other users must be able to read every file: a pull may have another umask."""
     if folder.name not in _PACKAGES:
         return _permits(folder, _ENTER | _READ)
     return all(
@@ -152,7 +152,7 @@ def _permits(path: Path, wanted: int) -> bool:
 
 
 def _tree(folder: str, account: Account | None) -> int:
-    """Return a read-only tree of mounts of a folder of the program; `account`: the user that appears as its owner."""
+    """Return a read-only tree of mounts; the user `account` appears as its owner."""
     tree = _clone(folder)
     if account is None:
         _set_attributes(tree, _ATTR_READ_ONLY, 0, folder)
@@ -175,7 +175,7 @@ def _set_attributes(tree: int, attributes: int, namespace: int, folder: str) -> 
 
 @contextlib.contextmanager
 def _user_namespace(owner: os.stat_result, account: Account) -> Iterator[int]:
-    """Provide a user namespace that maps the owner to the account; only mounts use it. Raises `OSError`."""
+    """Map the owner to the account; only mounts use the namespace. Raises `OSError`."""
     here, there = socket.socketpair()
     child = os.fork()
     if child == 0:

@@ -1,4 +1,4 @@
-"""The permissions of a process's sandbox. `seccomp` and `landlock` enforce them."""
+"""`seccomp` and `landlock` enforce the permissions of a sandbox."""
 
 import socket
 from dataclasses import dataclass

@@ -71,7 +71,7 @@ Comparison = tuple[int, int, int, int]  # argument, operator, value, second valu
 
 
 class SeccompError(Exception):
-    """Report that no filter is in force; the text gives the reason."""
+    """No filter is in force."""
 
 
 class _Comparison(ctypes.Structure):
@@ -84,8 +84,6 @@ class _Comparison(ctypes.Structure):
 
 
 class _Filter:
-    """A filter while it is built."""
-
     def __init__(self, otherwise: int) -> None:
         try:
             self._library = ctypes.CDLL(LIBRARY, use_errno=True)
@@ -99,11 +97,11 @@ class _Filter:
         self._otherwise = otherwise
 
     def set(self, attribute: int, value: int) -> None:
-        """Set an attribute. An attribute that libseccomp or the kernel lacks is skipped; the same calls are denied."""
+        """Skip an attribute that libseccomp or the kernel lacks; the same calls are denied."""
         self._library.seccomp_attr_set(self._context, ctypes.c_int(attribute), ctypes.c_uint32(value))
 
     def add(self, action: int, names: Iterable[str], *comparisons: Comparison) -> None:
-        """Add a rule that applies to these calls if all comparisons hold. Calls this architecture lacks are skipped."""
+        """The rule applies if all comparisons hold. Calls that this architecture lacks are skipped."""
         if action == self._otherwise:
             return
         compared = (_Comparison * len(comparisons))(*(_Comparison(*comparison) for comparison in comparisons))
@@ -125,7 +123,7 @@ class _Filter:
 
 
 def load_filter(sandbox: SandboxPlan) -> None:
-    """Filter the system calls of this process and its children; needs `no_new_privs`. Raises `SeccompError`."""
+    """The filter includes children, and needs `no_new_privs`. Raises `SeccompError`."""
     made = _Filter(_FAIL_ENOSYS if sandbox.allowlist else _ACT_ALLOW)
     made.set(_ATTR_ACT_BADARCH, _ACT_KILL_PROCESS)
     made.set(_ATTR_CTL_SSB, 1)

@@ -1,10 +1,10 @@
-"""Make system calls that the C library of Debian 12 has no function for; their numbers are the same everywhere."""
+"""Make system calls for which Debian 12's C library has no function; their numbers are the same everywhere."""
 
 import ctypes
 
 
 def system_call(number: int, *arguments: int | bytes | None) -> tuple[int, int]:
-    """Return the result of a system call, negative for a failure, and the error number."""
+    """Return the result, negative for a failure, and the error number."""
     libc = ctypes.CDLL(None, use_errno=True)
     given = [ctypes.c_long(argument) if isinstance(argument, int) else argument for argument in arguments]
     result: int = libc.syscall(ctypes.c_long(number), *given)
