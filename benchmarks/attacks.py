@@ -97,7 +97,7 @@ def header(**fields: str) -> bytes:
 
 
 def receive(sock: socket.socket, size: int) -> bytes:
-    """Return exactly this number of bytes. Raises `ConnectionError` at the end of the stream."""
+    """Raises `ConnectionError` at the end of the stream."""
     data = bytearray()
     while len(data) < size:
         piece = sock.recv(size - len(data))
@@ -108,7 +108,6 @@ def receive(sock: socket.socket, size: int) -> bytes:
 
 
 def read_header(sock: socket.socket) -> dict[str, str]:
-    """Return the peer's connection header."""
     rest, fields = receive(sock, struct.unpack("<I", receive(sock, 4))[0]), {}
     while rest:
         size = struct.unpack_from("<I", rest)[0]
@@ -126,7 +125,7 @@ def text(value: bytes) -> bytes:
 
 
 class _NodeApi(socketserver.StreamRequestHandler):
-    """The API of a node: it answers `requestTopic` with the TCPROS port, and all other calls with success."""
+    """Answers `requestTopic` with the TCPROS port, and all other calls with success."""
 
     def handle(self) -> None:
         size = 0
@@ -147,8 +146,6 @@ class _NodeServer(socketserver.ThreadingTCPServer):
 
 
 class Nodes:
-    """Nodes that publish and serve at any number of addresses in the calling thread's namespace."""
-
     def __init__(self) -> None:
         self._api = _NodeServer(("", 0), _NodeApi)
         self._listener = socket.create_server(("", 0), backlog=1024)
@@ -166,14 +163,14 @@ class Nodes:
         assert answer[0] == 1, answer
 
     def serve(self, address: str, node: str, service: str) -> None:
-        """Register a service; its requests are answered with an empty success."""
+        """Requests are answered with an empty success."""
         answer = call(
             address, "registerService", node, service, f"rosrpc://{address}:{self.port}", self.uri(address)
         )
         assert answer[0] == 1, answer
 
     def peers(self, topic: str, count: int) -> list[socket.socket]:
-        """Return the connections of the relay for a topic, once there are `count` of them."""
+        """Waits until there are `count` connections of the relay."""
         with self._changed:
 
             def found() -> list[socket.socket]:
@@ -243,7 +240,7 @@ DEFINITIONS = {
 
 
 def call(address: str, method: str, *params: Any, uri: str = MASTER) -> Any:
-    """Make one call of the Master API from an address, on a new connection; try again if an attack interferes."""
+    """Each call has a new connection, and is repeated if an attack interferes."""
     place = uri.removeprefix("http://").rstrip("/")
     host, _, port = place.rpartition(":")
     tries = 0
@@ -263,7 +260,7 @@ def call(address: str, method: str, *params: Any, uri: str = MASTER) -> Any:
 
 
 def subscribe(nodes: Nodes, address: str, node: str, topic: str) -> list[socket.socket]:
-    """Subscribe as a node does: a connection for each publisher, after its header."""
+    """Returns a connection for each publisher, after its header."""
     type_name, connections = TYPES[topic], []
     code, reason, publishers = call(address, "registerSubscriber", node, topic, type_name, nodes.uri(address))
     assert code == 1, reason
@@ -283,7 +280,7 @@ def subscribe(nodes: Nodes, address: str, node: str, topic: str) -> list[socket.
 
 
 def probe_messages(seconds: float, robot: Host, operator: Host, answers: Connection, begin: Event) -> None:
-    """Send 100 messages a second from the robot to its operator, for `seconds` after each time that `begin` is set."""
+    """Each time that `begin` is set, it sends for `seconds`."""
     realtime()
     with robot.entered():
         nodes = Nodes()
@@ -338,7 +335,7 @@ def probe_messages(seconds: float, robot: Host, operator: Host, answers: Connect
 
 
 def probe_calls(seconds: float, robot: Host, keep: bool, answers: Connection, begin: Event) -> None:
-    """Make 20 calls a second from the robot, on one connection if `keep` is set, otherwise each on a new one.
+    """20 calls a second, on one connection if `keep` is set, otherwise each on a new one.
 
     Each round has the same number of calls, so that rows can be compared; it is cut off at three times its length.
     """
@@ -379,7 +376,7 @@ def probe_calls(seconds: float, robot: Host, keep: bool, answers: Connection, be
 
 
 def realtime() -> None:
-    """Give this process a priority above everything that it measures."""
+    """Above everything that it measures."""
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
 
 
@@ -387,7 +384,7 @@ def realtime() -> None:
 
 
 class Pipes:
-    """Many connections that send a message repeatedly, as fast as the receiver reads or at a total rate."""
+    """Sends as fast as the receiver reads, or at a total rate."""
 
     def __init__(self, socks: Sequence[socket.socket]) -> None:
         self._rest: dict[socket.socket, memoryview] = {}
@@ -397,7 +394,6 @@ class Pipes:
         self.sent = 0
 
     def send(self, data: bytes) -> None:
-        """Send the data on each connection, after the rest of the previous data."""
         for sock in list(self.socks):
             view = self._rest.pop(sock, None) or memoryview(data)
             try:
@@ -412,7 +408,7 @@ class Pipes:
             self.sent += count
 
     def at(self, rate: float, data: bytes) -> None:
-        """Send `rate` times a second, forever."""
+        """Forever."""
         for turn in itertools.count():
             if turn == 0:
                 start = time.monotonic()
@@ -421,7 +417,7 @@ class Pipes:
 
 
 def published(nodes: Nodes, addresses: Sequence[str], topic: str, *, listen: bool = False) -> Pipes:
-    """Register a publisher at each address and, with `listen`, a subscriber; return the connections."""
+    """With `listen`, each address also subscribes."""
     for number, address in enumerate(addresses):
         nodes.publish(address, f"/guest/n{number}_{topic.rpartition('/')[2]}", topic, TYPES[topic])
     if listen:
@@ -438,14 +434,14 @@ def _drain(sock: socket.socket) -> None:
 
 
 def loop(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """Make a monitor of the guest's own topic loop over a string, at 0.8 MB/s."""
+    """0.8 MB/s on the guest's own topic, whose monitor loops over a string."""
     pipes = published(Nodes(), addresses, "/guest/loop")
     go()
     pipes.at(8 / len(addresses), frame(text(b"y" * 100_000)))
 
 
 def scans(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """Send scans of 200,000 ranges to the shipped obstacle monitor, two a second."""
+    """200,000 ranges for the shipped obstacle monitor, two a second."""
     pipes = published(Nodes(), addresses, "/landshark/scan")
     head = struct.pack("<III", 1, 0, 0) + text(b"") + struct.pack("<7f", 0, 0, 0, 0, 0, 0, 0)
     go()
@@ -456,7 +452,7 @@ def scans(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def joints(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """Send messages with a field behind a million empty strings, 4 MB each, two a second."""
+    """A field behind a million empty strings, 4 MB, two a second."""
     pipes = published(Nodes(), addresses, "/guest/joints")
     body = struct.pack("<III", 1, 0, 0) + text(b"") + struct.pack("<I", 1_000_000) + bytes(4_000_000)
     go()
@@ -464,7 +460,7 @@ def joints(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def six_joints(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """Send the messages of `joints` from six publishers at once, as fast as they are read."""
+    """The messages of `joints` from six publishers at once, as fast as they are read."""
     nodes = Nodes()
     for number in range(6):
         for index, address in enumerate(addresses[: max(1, len(addresses) // 6)]):
@@ -476,7 +472,7 @@ def six_joints(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def slices(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """Make 20,000 slices, and then send empty messages that concern all slices."""
+    """20,000 slices, then empty messages that concern all of them."""
     nodes = Nodes()
     make = published(nodes, addresses, "/guest/make")
     touch = published(nodes, addresses, "/guest/touch")
@@ -490,7 +486,7 @@ def slices(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def flood(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """Send 8-byte messages on a topic without a monitor, as fast as they are taken."""
+    """8 bytes, without a monitor, as fast as they are taken."""
     pipes = published(Nodes(), addresses, "/guest/flood", listen=True)
     go()
     while True:
@@ -499,7 +495,7 @@ def flood(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def kept(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """Keep 500 connections to RVMaster, each with one small call after the other."""
+    """500 connections, each with one small call after the other."""
     body = xmlrpc.client.dumps(("/guest/looker", "/rosdistro"), "getParam").encode()
     request = b"POST /RPC2 HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body)
     selector = selectors.DefaultSelector()
@@ -526,7 +522,7 @@ def kept(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def multicalls(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """Send multicalls of 9,000 reads on 16 connections, and open 60 connections a second from an unknown host."""
+    """Multicalls of 9,000 reads on 16 connections; 60 connections a second from an unknown host."""
     part = {"methodName": "getParam", "params": ["/guest/looker", "/rosdistro"]}
     body = xmlrpc.client.dumps(([part] * 9000,), "system.multicall").encode()
 
@@ -552,7 +548,7 @@ def multicalls(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def service(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """Send requests of 100 kB to a service whose monitor loops over them, ten a second."""
+    """100 kB for a monitor that loops over them, ten a second."""
     place = call(addresses[0], "lookupService", "/guest/asker", "/guest/service")[2].removeprefix("rosrpc://")
     host, _, port = place.rstrip("/").rpartition(":")
     socks = []
@@ -568,7 +564,7 @@ def service(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def connections(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """Open and close connections to RVMaster and to a port of the relay, as fast as possible."""
+    """To RVMaster and to a port of the relay, as fast as possible."""
     code, _, uri = call(addresses[0], "lookupNode", "/guest/looker", "/probe_source")
     assert code == 1, uri
     place = (APPLIANCE, int(uri.rstrip("/").rpartition(":")[2]))
@@ -599,7 +595,7 @@ ATTACKS: dict[str, tuple[Callable[..., None], ...]] = {
 
 
 def attack(crowd: Host, function: Callable[..., None], addresses: Sequence[str]) -> tuple[Any, Event]:
-    """Start an attack in a process; return it, and an event that is set when the attack has begun."""
+    """The event is set when the attack has begun."""
     under_way = CONTEXT.Event()
 
     def run() -> None:
@@ -612,14 +608,11 @@ def attack(crowd: Host, function: Callable[..., None], addresses: Sequence[str])
 
 
 def burn() -> None:
-    """Compute without end."""
     while True:
         sum(range(100_000))
 
 
 class Rig:
-    """The appliance, the robot's probes and the crowd."""
-
     def __init__(self, lab: Lab, home: Path, seconds: float, relays: int) -> None:
         self.seconds = seconds
         middle = lab.host("appliance", f"{APPLIANCE}/16")
@@ -637,7 +630,6 @@ class Rig:
 
     @contextlib.contextmanager
     def running(self) -> Iterator[None]:
-        """Start everything, and stop it at the end."""
         with self.appliance, contextlib.ExitStack() as stack:
             self._probes = []
             with self.robot.entered():
@@ -660,7 +652,7 @@ class Rig:
             yield
 
     def measure(self) -> list[tuple[list[float], Counter[str]]]:
-        """Run one round of all probes; return delays in seconds, and the number of failures by kind."""
+        """Delays in seconds, and failures by kind."""
         for _, begin in self._probes:
             begin.set()
         return [ours.recv() for ours, _ in self._probes]
@@ -687,7 +679,7 @@ class Rig:
 
 
 def figures(delays: Sequence[float]) -> dict[str, float]:
-    """Return median, 99th percentile and maximum in milliseconds."""
+    """Median, 99th percentile and maximum in milliseconds."""
     if len(delays) < 2:
         return {"p50": float("nan"), "p99": float("nan"), "max": float("nan")}
     p99 = statistics.quantiles(delays, n=100, method="inclusive")[98]
@@ -726,7 +718,6 @@ def main() -> None:
 
 
 def show(rows: Sequence[tuple[str, str, dict[str, Any]]]) -> None:
-    """Print the table, and the figures as JSON."""
     table = Table("attack", "by")
     for name in PROBES:
         table.add_column(f"{name}: p50 p99 max ms", justify="right")

@@ -1,9 +1,10 @@
 """The cost of the audit log to a caller of RVMaster: python -m benchmarks.audit_latency [--seconds 2] [--rounds 3]
 
-Appliances that differ in one thing run at once and take turns, so that whatever else the machine does falls on all of
-them: `batched` (the default), `strict` (on disk before the answer), and `batched` with forwarding to a syslog receiver
-that takes everything. Each caller makes one call after the other (`hasParam`) on a connection of its own. Cells are
-medians of the rounds, in microseconds; CPU is of control, a call.
+Appliances take turns: `batched` (the default), `strict` (on disk before the answer), and `batched` with forwarding to
+a syslog receiver that takes everything. Each caller makes one call after the other (`hasParam`) on its own
+connection.
+
+Cells are medians of the rounds, in microseconds; CPU is of control, a call.
 """
 
 import argparse
@@ -30,8 +31,6 @@ _TICKS = os.sysconf("SC_CLK_TCK")
 
 
 class Running:
-    """One appliance."""
-
     def __init__(self, folder: Path, name: str, audit: dict[str, object]) -> None:
         self.name = name
         home = folder / name
@@ -56,7 +55,7 @@ class Running:
         self._control = next(one["pid"] for one in processes if one["role"] == "control")
 
     def cpu(self) -> float:
-        """Return the seconds of CPU that control has used."""
+        """In seconds, of control."""
         fields = Path(f"/proc/{self._control}/stat").read_text().rsplit(")", 1)[1].split()
         return (int(fields[11]) + int(fields[12])) / _TICKS
 
@@ -66,7 +65,7 @@ class Running:
 
 
 def calls(port: int, seconds: float, taken: list[float]) -> None:
-    """Make calls as one caller; append the time of each to `taken`."""
+    """`taken` gets the time of each call."""
     data = request("hasParam", "/bench", "/run_id", keep=True)
     with socket.create_connection(("127.0.0.1", port)) as connection:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -87,10 +86,7 @@ def _length(answer: bytes) -> int:
 
 
 def measure(one: Running, clients: int, seconds: float) -> tuple[float, float, float, float]:
-    """Return the median and 99th percentile, calls a second, and CPU of control per call.
-
-    Times are in microseconds.
-    """
+    """Returns the median and 99th percentile, calls a second, and CPU of control per call; times in microseconds."""
     taken: list[list[float]] = [[] for _ in range(clients)]
     threads = [threading.Thread(target=calls, args=(one.port, seconds, mine)) for mine in taken]
     before = one.cpu()

@@ -36,7 +36,7 @@ def row(name: str, value: str) -> None:
 
 
 def record(log: AuditLog, number: int) -> AuditRecord:
-    """Return a decision; one in ten thousand is special, so that selective searches find something."""
+    """One in ten thousand is special, so that selective searches find something."""
     special = number % 10_000 == 9_999
     return AuditRecord(
         id=log.ids.next(),
@@ -57,7 +57,7 @@ def record(log: AuditLog, number: int) -> AuditRecord:
 
 
 def open_log(directory: Path, name: str, durability: str) -> AuditLog:
-    """Open a log without folding, because writing is measured."""
+    """Without folding, because writing is measured."""
     return AuditLog(
         directory / name / "audit.db",
         durability="strict" if durability == "strict" else "batched",
@@ -67,7 +67,7 @@ def open_log(directory: Path, name: str, durability: str) -> AuditLog:
 
 
 def measure_burst(directory: Path, count: int) -> None:
-    """Measure a burst without pauses: the cost of a record to its caller, and the writer's rate."""
+    """The cost of a record to its caller, and the writer's rate."""
     log = open_log(directory, "burst", "batched")
     records = [record(log, number) for number in range(count)]
     start = time.perf_counter()
@@ -97,7 +97,7 @@ async def _clients(log: AuditLog, clients: int, each: int) -> float:
 
 
 def measure_strict(directory: Path) -> None:
-    """Measure clients that each wait for their record before they send the next one."""
+    """Each client waits for its record before it sends the next one."""
     for clients in (1, 10, 100, 1000):
         log = open_log(directory, f"strict{clients}", "strict")
         rate = asyncio.run(_clients(log, clients, max(20, 10_000 // clients)))
@@ -106,7 +106,7 @@ def measure_strict(directory: Path) -> None:
 
 
 async def _paced(log: AuditLog, rate: int, seconds: float) -> tuple[float, float]:
-    """Write `rate` records a second from a loop; return the delay of its other work (median, 99.9 %) in ms."""
+    """Returns the delay of the loop's other work (median, 99.9 %) in ms."""
     late: list[float] = []
 
     async def other_work() -> None:
@@ -131,7 +131,7 @@ async def _paced(log: AuditLog, rate: int, seconds: float) -> tuple[float, float
 
 
 def measure_loop(directory: Path) -> None:
-    """Measure the delay of an event loop that makes 10,000 records a second, and whether the writer keeps pace."""
+    """10,000 records a second; also whether the writer keeps pace."""
     log = open_log(directory, "paced", "batched")
     median, worst = asyncio.run(_paced(log, 10_000, 5.0))
     row("10,000 records/s from an event loop: its other work waits, median", f"{median:.3f} ms")
@@ -141,7 +141,7 @@ def measure_loop(directory: Path) -> None:
 
 
 def measure_busy(directory: Path) -> None:
-    """Measure the writer beside a thread that never releases the interpreter lock voluntarily."""
+    """The thread never releases the interpreter lock voluntarily."""
     log = open_log(directory, "busy", "batched")
     records = [record(log, number) for number in range(50_000)]
     stop = threading.Event()
@@ -166,7 +166,7 @@ def measure_busy(directory: Path) -> None:
 
 
 def measure_forwarding(directory: Path, count: int) -> None:
-    """Measure reading committed records, formatting them as messages, and sending them to a willing receiver."""
+    """Committed records are read, formatted as messages, and sent."""
     log = open_log(directory, "forward", "batched")
     for number in range(count):
         log.record(record(log, number))
@@ -189,7 +189,7 @@ def measure_forwarding(directory: Path, count: int) -> None:
 
 
 def timed(name: str, action: Callable[[], object]) -> None:
-    """Print a line with the best of three runs."""
+    """The best of three runs."""
     best = float("inf")
     for _ in range(3):
         start = time.perf_counter()
@@ -199,7 +199,6 @@ def timed(name: str, action: Callable[[], object]) -> None:
 
 
 def measure_search(directory: Path, count: int) -> None:
-    """Measure searches over many records, and their verification."""
     log = open_log(directory, "search", "batched")
     path = directory / "search" / "audit.db"
     start = time.perf_counter()

@@ -1,15 +1,17 @@
 """The cost of a message as users pay it: `python -m benchmarks.cold [--busy]` (under two minutes).
 
-On a robot most messages come alone, 20 to 1,000 times a second, and find the caches cold. Here the relay is the one of
-an appliance that `rosrv up` has started: as its own user, with a policy that grants the load's nodes, once without a
-monitor and once with one (it reads two fields, writes one and steps one FSM). Beside it: nothing, `copying_relay.c`
-with epoll, and five lines of Python. They take turns in every round. Cells are medians of the rounds; in parentheses
-are the median, the least and the greatest ratio to the C relay of the same round.
+On a robot most messages come alone, 20 to 1,000 times a second, and find the caches cold. The relay is that of an
+appliance started by `rosrv up`, once without a monitor and once with one (it reads two fields, writes one and steps
+one FSM). Beside it, in turns: nothing, `copying_relay.c` with epoll, and five lines of Python.
 
-*paced100*, *paced1000* (or any other number): messages a second. The load then has real-time priority if permitted, so
-that the delay is that of the process in the middle. *window*: 64 messages on their way. `--busy` adds other programs
-that use half of each core and walk through their memory. Processor time is that of the process in the middle, all
-threads. Needs g++, rosmaster and chrt.
+Cells are medians of the rounds; in parentheses are the median, the least and the greatest ratio to the C relay of the
+same round.
+
+*paced100*, *paced1000* (or any other number): messages a second, with real-time priority of the load if permitted.
+*window*: 64 messages on their way. `--busy` adds programs that use half of each core and walk through their memory.
+Processor time is that of the process in the middle, all threads.
+
+Needs g++, rosmaster and chrt.
 """
 
 import argparse
@@ -56,11 +58,11 @@ while True:
         at = (at + part) % len(memory)
     pause.wait(max(0, began + 0.005 - time.monotonic()))
 """
-"""A robot's other program: every 5 ms it walks through its memory for 2.5 ms."""
+"""Every 5 ms it walks through its memory for 2.5 ms."""
 
 
 class DeployedRelay:
-    """The relay of a running appliance, at which the load's nodes register for each run."""
+    """The load's nodes register again for each run."""
 
     def __init__(self, name: str, *specifications: str) -> None:
         self.name = name
@@ -79,7 +81,7 @@ class DeployedRelay:
             raise
 
     def target(self, publisher: int) -> tuple[int, str]:
-        """Register this run's nodes in place of those of the last run; return port and topic for the subscriber."""
+        """Returns port and topic for the subscriber."""
         self._call("unregisterSubscriber", "/load_listener", "/load", self._api.uri)
         self._call("unregisterPublisher", "/load", "/load", self._api.uri)
         self._api.publisher = publisher
@@ -91,7 +93,6 @@ class DeployedRelay:
         return port, "/load"
 
     def close(self) -> None:
-        """Stop the appliance."""
         self._appliance.close()
         self._api.close()
 
@@ -125,13 +126,13 @@ def other_programs(number: int) -> Iterator[None]:
 
 
 def realtime() -> tuple[str, ...]:
-    """Return the prefix of a command that has real-time priority, or nothing if that is not permitted."""
+    """Empty if real-time priority is not permitted."""
     permitted = subprocess.run([*REALTIME, "true"], check=False, stderr=subprocess.DEVNULL).returncode == 0
     return REALTIME if permitted else ()
 
 
 def cell(runs: list[Result], base: list[Result], value: Callable[[Result], float]) -> str:
-    """Return the median, and the median, least and greatest ratio to the base of the same round."""
+    """The median, and the median, least and greatest ratio to the base of the same round."""
     middle = statistics.median(map(value, runs))
     if not middle:
         return "-"

@@ -20,7 +20,7 @@ READY = "Nodes may connect"
 
 
 def start(compose: Compose) -> tuple[float, float]:
-    """Return the seconds from `up` until nodes may connect, and until the container counts as healthy."""
+    """Returns the seconds until nodes may connect, and until the container counts as healthy."""
     moment = compose.engine.docker("info", "--format", "{{.SystemTime}}").stdout.strip()
     begun = time.perf_counter()
     compose("up", "--detach", "--no-build")
@@ -31,7 +31,6 @@ def start(compose: Compose) -> tuple[float, float]:
 
 
 def stop(compose: Compose) -> float:
-    """Return the seconds that `stop` takes."""
     begun = time.perf_counter()
     compose("stop")
     return time.perf_counter() - begun

@@ -1,11 +1,8 @@
 """RVMaster beside plain `rosmaster`: `python -m benchmarks.control_plane [--seconds 2] [--rounds 3] [--only CALL]`.
 
-Both run at once, the appliance as `rosrv up` runs it for users: each process as its own user, with policy, audit log
-and metrics. In every round they take turns at every load, so that whatever else the machine does falls on both. Cells
-are medians of the rounds; the ratio is the median of the rounds' ratios, `added` the difference of the medians
-of the delay of one call, and processor time is that of the plain master, and of RVMaster with the one it hides. The
-load is one process with one loop: it sends requests that were built before and reads answers by their length, so it
-costs little beside what it measures.
+Both run at once and take turns at every load, the appliance as `rosrv up` runs it. Cells are medians of the rounds;
+the ratio is the median of the rounds' ratios, `added` the difference of the medians of the delay of one call.
+Processor time is that of the plain master, and of RVMaster with the one it hides.
 """
 
 import argparse
@@ -78,7 +75,7 @@ def requests(operation: str, client: int, keep: bool) -> list[bytes]:
 
 
 def furnish(port: int) -> None:
-    """Register nodes, topics and parameters like those of a small robot."""
+    """As those of a small robot."""
     with xmlrpc.client.ServerProxy(f"http://127.0.0.1:{port}/") as master:
         for node in range(NODES):
             for topic in range(TOPICS):
@@ -95,7 +92,7 @@ def furnish(port: int) -> None:
 
 
 class Client:
-    """One connection with one request at a time; `delays` are seconds per call, `answer` is the last body."""
+    """One request at a time; `delays` are seconds per call, `answer` is the last body."""
 
     def __init__(self, port: int, wanted: list[bytes], keep: bool, host: str = "127.0.0.1") -> None:
         self.delays: list[float] = []
@@ -106,7 +103,7 @@ class Client:
         self.sock: socket.socket | None = None
 
     def send(self) -> socket.socket:
-        """Send the next request, on a new connection if there is none."""
+        """Opens a connection if there is none."""
         self._began = time.perf_counter()
         if self.sock is None:
             self.sock = socket.create_connection(("127.0.0.1", self._port), source_address=(self._host, 0))
@@ -117,7 +114,10 @@ class Client:
         return self.sock
 
     def receive(self) -> bool:
-        """Read the available data; return whether the answer is complete. Raises `ConnectionError` for a refusal."""
+        """Returns whether the answer is complete.
+
+        Raises `ConnectionError` for a refusal.
+        """
         assert self.sock is not None
         piece = self.sock.recv(1 << 20)
         self._buffer += piece
@@ -140,7 +140,7 @@ class Client:
 
 
 def load(port: int, operation: str, clients: int, keep: bool, seconds: float) -> tuple[float, float]:
-    """Return calls per second and the median delay of a call in microseconds."""
+    """Returns calls per second and the median delay of a call in microseconds."""
     # Each client is a separate host: a long load of one host would exceed its quota of the audit log and be delayed.
     group = [
         Client(port, requests(operation, one, keep), keep, f"127.0.0.{one + 1}") for one in range(clients)
@@ -179,7 +179,7 @@ def free_port() -> int:
 
 
 def await_port(port: int) -> None:
-    """Wait until a program listens on the port, at most 30 seconds."""
+    """At most 30 seconds."""
     deadline = time.monotonic() + 30
     while time.monotonic() < deadline:
         with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1):
@@ -189,7 +189,6 @@ def await_port(port: int) -> None:
 
 
 def processor_seconds(pids: list[int]) -> float:
-    """Return the processor time that these processes have used."""
     ticks = 0
     for pid in pids:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
@@ -198,7 +197,7 @@ def processor_seconds(pids: list[int]) -> float:
 
 
 def await_rest(pids: list[int]) -> None:
-    """Wait until these processes have started and are idle, at most 30 seconds."""
+    """Waits until the processes are idle, at most 30 seconds."""
     deadline, before = time.monotonic() + 30, -1.0
     while time.monotonic() < deadline and (used := processor_seconds(pids)) != before:
         before = used
@@ -206,7 +205,7 @@ def await_rest(pids: list[int]) -> None:
 
 
 def descendants(pid: int) -> list[int]:
-    """Return the ids of a process and of all its descendants."""
+    """The process itself is included."""
     found = [pid]
     for task in Path(f"/proc/{pid}/task").iterdir():
         for child in (task / "children").read_text(encoding="utf-8").split():
@@ -215,13 +214,11 @@ def descendants(pid: int) -> list[int]:
 
 
 class Master(NamedTuple):
-    """One of the two masters: the port where it listens, and its processes."""
-
     port: int
     pids: list[int]
 
     def under(self, operation: str, clients: int, keep: bool, seconds: float) -> tuple[float, float, float]:
-        """Return calls per second, and median delay and processor time of a call in microseconds."""
+        """Returns calls per second, and median delay and processor time of a call in microseconds."""
         before = processor_seconds(self.pids)
         began = time.perf_counter()
         rate, delay = load(self.port, operation, clients, keep, seconds)
@@ -230,7 +227,6 @@ class Master(NamedTuple):
 
 
 def measure(plain: Master, ours: Master, seconds: float, rounds: int, only: str) -> Table:
-    """Return the table of all operations under all loads."""
     columns = ("call", "clients", "connections", "rosmaster calls/s", "RVMaster calls/s", "ratio", "added µs")
     table = Table(*columns, "processor µs")
     for operation in OPERATIONS:
@@ -263,7 +259,6 @@ def measure(plain: Master, ours: Master, seconds: float, rounds: int, only: str)
 
 @contextmanager
 def masters() -> Iterator[tuple[Master, Master]]:
-    """Run a plain rosmaster, and an appliance as `rosrv up` runs it for users."""
     port = free_port()
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o755)
@@ -296,7 +291,6 @@ def masters() -> Iterator[tuple[Master, Master]]:
 
 
 def main() -> None:
-    """Run both masters and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--rounds", type=int, default=3)

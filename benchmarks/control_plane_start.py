@@ -1,14 +1,13 @@
 """A robot that starts, beside plain `rosmaster`: `python -m benchmarks.control_plane_start [--rounds 5]`.
 
-Both masters are new in each round, the appliance as `rosrv up` runs it for users, and take turns. Measured is
+Both masters are new in each round and take turns.
 
-- `parameters`: roslaunch clears a namespace and sets 4,000 parameters below it, in one multicall;
-- `nodes`: 100 nodes at once publish ten topics each and subscribe to ten of the next one, over a kept connection each
-  as roscpp does. It is over when every call is answered and every subscriber knows its publishers: from the answer, or
-  from the `publisherUpdate` that follows. Each node answers at a port of its own.
+- `parameters`: roslaunch clears a namespace and sets 4,000 parameters below it, in one multicall; - `nodes`: 100
+nodes at once publish ten topics each and subscribe to ten of the next one, each over a kept connection as with
+roscpp. It is over when every call is answered and every subscriber knows its publishers.
 
-Figures are seconds until it is over and seconds of processor time (of RVMaster with the master that it hides), medians
-of the rounds; the ratios are medians of the rounds' ratios, above 1 where RVMaster is slower.
+Figures are medians of the rounds: seconds until it is over, and seconds of processor time (of RVMaster with the
+master that it hides). A ratio above 1: RVMaster is slower.
 """
 
 import argparse
@@ -37,7 +36,6 @@ PATIENCE = 120.0  # seconds without any progress
 
 
 def parameters(port: int) -> float:
-    """Return the seconds until roslaunch's multicall is answered."""
     names = [f"/start/part_{one // 50}/value_{one % 50}" for one in range(PARAMETERS)]
     calls: list[tuple[str, list[str | int]]] = [("deleteParam", ["/roslaunch", "/start"])]
     calls += [("setParam", ["/roslaunch", name, place]) for place, name in enumerate(names)]
@@ -57,7 +55,7 @@ def parameters(port: int) -> float:
 
 
 class Node:
-    """One node: its calls to the master, one after the other, and its port, which receives lists of publishers."""
+    """Makes one call after the other; its port receives lists of publishers."""
 
     def __init__(self, master: int, number: int) -> None:
         self.listening = socket.create_server(("127.0.0.1", 0), backlog=64)
@@ -75,26 +73,23 @@ class Node:
         self.client = Client(master, self.calls, keep=True)
 
     def answered(self, answer: bytes) -> None:
-        """Handle the answer to the node's last call."""
         place = len(self.client.delays) - 1 - TOPICS
         if 0 <= place < TOPICS and b"http://" in answer:
             self.known.add(self._wanted[place])
 
     def told(self, body: bytes) -> None:
-        """Handle a call of the master: a list of publishers, or a query whether the node is alive."""
+        """A list of publishers, or a query whether the node is alive."""
         call = parse_call(body, XmlRpcLimits())
         if call.method == "publisherUpdate" and call.params[2]:
             self.known.add(str(call.params[1]))
 
     @property
     def done(self) -> bool:
-        """Whether all calls of the node are answered, and it knows a publisher of each topic."""
+        """All calls are answered, and a publisher of each topic is known."""
         return len(self.client.delays) >= len(self.calls) and len(self.known) == TOPICS
 
 
 class Told:
-    """A connection of a master to a node."""
-
     def __init__(self, node: Node) -> None:
         self._node = node
         self.sock, _ = node.listening.accept()
@@ -102,7 +97,7 @@ class Told:
         self._buffer = b""
 
     def receive(self) -> bool:
-        """Read the available data and acknowledge complete calls; return whether the connection stays open."""
+        """Acknowledges complete calls; returns whether the connection stays open."""
         piece = self.sock.recv(1 << 16)
         self._buffer += piece
         head, mark, body = self._buffer.partition(b"\r\n\r\n")
@@ -115,7 +110,7 @@ class Told:
 
 
 def nodes(port: int) -> float:
-    """Return the seconds until all nodes have registered and know their publishers."""
+    """Until all nodes know their publishers."""
     group = [Node(port, number) for number in range(NODES)]
     poll = select.epoll()
     listening = {node.listening.fileno(): node for node in group}
@@ -168,13 +163,12 @@ def nodes(port: int) -> float:
 
 
 def timed(start: Callable[[int], float], master: Master) -> tuple[float, float]:
-    """Return the seconds and the processor seconds that a start takes."""
+    """Returns the seconds and the processor seconds."""
     before = processor_seconds(master.pids)
     return start(master.port), processor_seconds(master.pids) - before
 
 
 def main() -> None:
-    """Run both masters and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=5)
     given = parser.parse_args()

@@ -29,7 +29,7 @@ _FIELDS = ("key", "value")
 
 
 def specification(name: str, events: Mapping[str, Sequence[str]], over: Sequence[str], formula: str) -> str:
-    """Return a parametric `ptltl` property; `events` has the names of each event's values, `over` the parameters."""
+    """`events` has the names of each event's values, `over` the parameters."""
     lines = [
         f"event {event}({', '.join(f'std::string {one}' for one in values if one in over)}) /{event} "
         f"diagnostic_msgs/KeyValue "
@@ -42,7 +42,7 @@ def specification(name: str, events: Mapping[str, Sequence[str]], over: Sequence
 
 
 def of(events: Mapping[str, Sequence[str]], *properties: tuple[Sequence[str], str]) -> tuple[str, ...]:
-    """Return one specification for each property, given by parameters and formula."""
+    """A property is given by parameters and formula."""
     return tuple(
         specification(f"s{number}", events, over, formula)
         for number, (over, formula) in enumerate(properties)
@@ -51,7 +51,7 @@ def of(events: Mapping[str, Sequence[str]], *properties: tuple[Sequence[str], st
 
 @dataclass(frozen=True)
 class Case:
-    """A trace, the specifications, and the events at which DejaVu reports their failure, counted from 1."""
+    """`fails` has the events at which DejaVu reports a failure, counted from 1."""
 
     trace: str
     specifications: tuple[str, ...]
@@ -101,7 +101,7 @@ CASES = (
 
 
 def messages(trace: Path) -> list[tuple[str, bytes]]:
-    """Return the topics, each with a `diagnostic_msgs/KeyValue` of the first two values; no property uses a third."""
+    """A `diagnostic_msgs/KeyValue` has the first two values; no property uses a third."""
     found = []
     with trace.open(newline="") as rows:
         for name, *values in (row for row in csv.reader(rows) if row):
@@ -111,7 +111,7 @@ def messages(trace: Path) -> list[tuple[str, bytes]]:
 
 
 def failing(specifications: Sequence[str], trace: Sequence[tuple[str, bytes]]) -> tuple[list[int], float]:
-    """Return the events at which a specification is violated, counted from 1, and the microseconds of an event."""
+    """Returns the violated events, counted from 1, and the microseconds of an event."""
     sources = {f"{number}.rv": text for number, text in enumerate(specifications)}
     monitors = MonitorSet.of(compiled_from(sources, standard_definitions()), slices=SLICES)
     monitors.start(0)
@@ -127,7 +127,7 @@ def failing(specifications: Sequence[str], trace: Sequence[tuple[str, bytes]]) -
 
 
 def main(checkout: Path) -> int:
-    """Print the results; return 0 if all are equal to DejaVu's, else 1."""
+    """Returns 0 if all results are equal to DejaVu's, else 1."""
     wrong = 0
     for case in CASES:
         path = checkout / TESTS / case.trace

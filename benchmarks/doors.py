@@ -51,7 +51,7 @@ _CLIENTS = 20
 
 
 class Viewer:
-    """A WebSocket client that only finds the frames; a library would be slower than some of the servers."""
+    """It only finds the frames; a library would be slower than some of the servers."""
 
     def __init__(self, address: str, port: int, subprotocol: str = "") -> None:
         self.socket = socket.create_connection((address, port), timeout=20)
@@ -75,7 +75,7 @@ class Viewer:
         self.socket.sendall(frame_of(json.dumps(message).encode()))
 
     def frames(self, head_bytes: int = _HEAD_BYTES) -> Iterator[tuple[int, bytes]]:
-        """Yield the opcode and the first bytes of each frame."""
+        """The opcode and the first bytes of each frame."""
         data = self._data
         while True:
             length, head = (data[1] & 0x7F, 2) if len(data) >= 2 else (0, len(data) + 1)
@@ -97,7 +97,7 @@ class Viewer:
 
 
 def frame_of(data: bytes) -> bytes:
-    """Return the text frame of a client; its mask is zero."""
+    """The mask is zero."""
     length = bytes([0x80 | len(data)]) if len(data) < 126 else struct.pack(">BH", 0x80 | 126, len(data))
     return b"\x81" + length + b"\0\0\0\0" + data
 
@@ -115,8 +115,6 @@ def subscribe_foxglove(viewer: Viewer, _compression: str) -> None:
 
 
 class Way(NamedTuple):
-    """A way from the topic to the client."""
-
     name: str
     system: "System"
     compression: str = "none"
@@ -130,7 +128,7 @@ class Way(NamedTuple):
 
 @dataclass
 class System:
-    """A server for WebSocket clients, and the session of the robot's nodes behind it."""
+    """`session` is that of the robot's nodes behind the server."""
 
     session: RosSession
     address: str
@@ -138,11 +136,11 @@ class System:
     pids: Callable[[], Sequence[int]]
     """The processes on the path of a message; the last one serves the clients."""
     stop: Callable[[], object] = lambda: None
-    """Ends a peer, which may not end on SIGINT."""
+    """A peer may not end on SIGINT."""
 
 
 class Heard(NamedTuple):
-    """The frames of a client: how many a second, the median and the 99th percentile of the delay, processor time."""
+    """Frames a second, the median and 99th percentile of the delay, and processor time."""
 
     rate: float
     p50_us: float
@@ -151,7 +149,7 @@ class Heard(NamedTuple):
 
 
 def heard(way: Way, operator: Host, size: int, hertz: int, seconds: float) -> Heard:
-    """Let the publisher run with this rate, and count what the client receives."""
+    """Counts what the client receives at this rate of the publisher."""
     talker = way.system.session.start([str(_LOAD), str(size), str(hertz)], label="talker")
     try:
         talker.wait_for(event="ready")
@@ -188,19 +186,19 @@ def _count(way: Way, seconds: float) -> Heard:
 
 
 def processor_seconds(pid: int) -> float:
-    """Return the processor time of a process so far; `/proc/PID/stat` would have it in steps of 10 ms."""
+    """`/proc/PID/stat` would have it in steps of 10 ms."""
     tasks = Path(f"/proc/{pid}/task").iterdir()
     return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) / 1e9
 
 
 def private_kb(pid: int) -> int:
-    """Return the memory that only this process has, in kB."""
+    """In kB; shared memory does not count."""
     text = Path(f"/proc/{pid}/smaps_rollup").read_text()
     return sum(int(one) for one in re.findall(r"Private_(?:Clean|Dirty): +(\d+)", text))
 
 
 def memory(way: Way, operator: Host) -> tuple[float, float]:
-    """Return the memory of the server in MB, and what each of some idle subscribers adds, in kB."""
+    """Returns the server's memory in MB, and what each of some idle subscribers adds, in kB."""
     pid = way.system.pids()[-1]
     first = operator.run(way.open)
     threading.Event().wait(1)
@@ -214,7 +212,7 @@ def memory(way: Way, operator: Host) -> tuple[float, float]:
 
 
 def robot_p50(way: Way, folder: Path, seconds: float) -> float:
-    """Return the median delay in microseconds between two nodes of the robot."""
+    """In microseconds, between two nodes of the robot."""
     talker = way.system.session.start([str(_ROBOT), "talk", "1", "200", "100"], label="robot talker")
     talker.wait_for(event="ready")
     listener = way.system.session.start([str(_ROBOT), "listen", "1", str(folder / "heard")], label="robot")
@@ -228,7 +226,7 @@ def robot_p50(way: Way, folder: Path, seconds: float) -> float:
 
 @contextmanager
 def flood(way: Way, operator: Host) -> Iterator[list[int]]:
-    """Send messages to a server during a block, with the least priority; yields their number at the end."""
+    """The flood has the least priority; yields the number of messages at the end."""
     over, sent = threading.Event(), [0]
 
     def work() -> None:
@@ -249,7 +247,6 @@ def flood(way: Way, operator: Host) -> Iterator[list[int]]:
 
 
 def peer(command: str, master: PlainMaster, home: Path, robot: Host, port: int) -> System:
-    """Start a peer at the plain master."""
     session = RosSession(master.master_uri, home, robot)
     process = session.start([command, f"_port:={port}"], label=Path(command).name)
 
@@ -271,7 +268,6 @@ def peer(command: str, master: PlainMaster, home: Path, robot: Host, port: int) 
 
 
 def door(appliance: Appliance, home: Path, robot: Host) -> System:
-    """Add the door of an agent."""
     appliance.rosrv("door", "add", "viewer", "--port", "9091")
     eventually(lambda: not appliance.row("door", "list")["trouble"], appliance.story)
     address = appliance.host.address
@@ -280,7 +276,6 @@ def door(appliance: Appliance, home: Path, robot: Host) -> System:
 
 
 def main() -> None:
-    """Measure and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=2.0)
@@ -320,7 +315,6 @@ def main() -> None:
 
 
 def show_speed(ways: Sequence[Way], operator: Host, size: int, rounds: int, seconds: float) -> None:
-    """Print the medians of the rounds."""
     hertz, rates = _SIZES[size]
     paced: dict[str, list[Heard]] = {way.name: [] for way in ways}
     most: dict[str, list[Heard]] = {way.name: [] for way in ways}
@@ -342,7 +336,6 @@ def show_speed(ways: Sequence[Way], operator: Host, size: int, rounds: int, seco
 
 
 def show_memory(ways: Sequence[Way], operator: Host) -> None:
-    """Print the memory of each server."""
     table = Table("", "private MB", f"kB for each of {_CLIENTS} idle clients")
     for way in ways:
         talker = way.system.session.start([str(_LOAD), "200", "1"], label="talker")
@@ -354,7 +347,6 @@ def show_memory(ways: Sequence[Way], operator: Host) -> None:
 
 
 def show_flood(way: Way, operator: Host, home: Path, rounds: int, seconds: float) -> None:
-    """Print the delay of the robot's messages beside a flooded door."""
     calm, flooded, frames = [], [], 0
     for _ in range(rounds):
         calm.append(robot_p50(way, home, 2 * seconds))

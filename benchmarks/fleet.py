@@ -46,7 +46,6 @@ _SERVER = {"shared_buffers": "512MB", "fsync": "on"}
 
 
 def main() -> None:
-    """Run all parts, and print the figures of each."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -73,8 +72,6 @@ def main() -> None:
 
 
 class _Measurement:
-    """The parts of the measurement, on a site that does not run yet."""
-
     def __init__(self, site: FleetSite, cluster: PostgresCluster, given: argparse.Namespace) -> None:
         self._site, self._cluster, self._given = site, cluster, given
         keys = KeyFolder(site.folder / "keys", lambda _key: PASSPHRASE)
@@ -110,7 +107,7 @@ class _Measurement:
             self._site.kill()
 
     def _timed(self, name: str, part: Callable[[], object], searching: "_Searches") -> None:
-        """Run a part while an operator searches; print the searches and the processor time."""
+        """An operator searches while the part runs."""
         begun, spent, program = time.monotonic(), self._processor_seconds(), self._site.pid
         searching.take()
         part()
@@ -237,7 +234,7 @@ class _Measurement:
         raise SystemExit(f"not within {_LONGEST_SECONDS:g} s: {what}")
 
     def _processor_seconds(self) -> dict[str, float]:
-        """Return the processor time so far of each program that runs."""
+        """The time so far of each program that runs."""
         return {
             "collector": _ticks(_family(self._site.pid)),
             "PostgreSQL": _ticks(_family(self._cluster.pid)),
@@ -250,7 +247,7 @@ class _Measurement:
 
 
 class _Searches:
-    """An operator who searches in a thread; `take` returns the times since the last call, by kind and `all`."""
+    """`take` returns the times since the last call, by kind and `all`."""
 
     def __init__(self, site: FleetSite) -> None:
         self._site = site
@@ -262,7 +259,7 @@ class _Searches:
         self._thread.start()
 
     def take(self) -> tuple[dict[str, list[float]], int]:
-        """Return the seconds of each search since the last call, and the number of failed ones."""
+        """Seconds of each search, and the number of failed ones."""
         with self._lock:
             found, self._times = self._times, defaultdict(list)
             failed, self._failed = self._failed, 0
@@ -307,7 +304,6 @@ def _family(pid: int) -> list[int]:
 
 
 def _ticks(pids: Iterable[int]) -> float:
-    """Return the processor seconds of processes."""
     ticks = 0
     for pid in pids:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()

@@ -37,7 +37,7 @@ _FORK = multiprocessing.get_context("fork")  # a process gets the site as it is
 
 @dataclass(frozen=True)
 class SimulatedLoad:
-    """The load of all appliances together: each records `records` decisions every `seconds`, and seals them."""
+    """Each appliance records `records` decisions every `seconds`, and seals them."""
 
     records: int
     seconds: float
@@ -45,7 +45,7 @@ class SimulatedLoad:
 
 
 def enrol(site: FleetSite, names: Sequence[str]) -> None:
-    """Enrol appliances whose files exist."""
+    """Their files exist."""
     assert site.data is not None
     robots = Robots(site.data / "robots")
     for name in names:
@@ -55,7 +55,7 @@ def enrol(site: FleetSite, names: Sequence[str]) -> None:
 
 
 class SimulatedRobots:
-    """Appliances in several processes. `begin` lets all of them push at the same time; `end` returns their lags."""
+    """Appliances in several processes: `begin` lets all of them push at the same time; `end` returns their lags."""
 
     def __init__(self, site: FleetSite, names: Sequence[str], processes: int, load: SimulatedLoad) -> None:
         self._begin, self._end = _FORK.Event(), _FORK.Event()
@@ -67,7 +67,7 @@ class SimulatedRobots:
         ]
 
     def start(self) -> None:
-        """Start the processes; return when every appliance has sealed its first records and waits."""
+        """Returns when every appliance has sealed its first records and waits."""
         for process in self._processes:
             process.start()
         for _process in self._processes:
@@ -77,7 +77,7 @@ class SimulatedRobots:
         self._begin.set()
 
     def end(self) -> list[float]:
-        """Push what is sealed, and end; return the seconds from each record to its receipt."""
+        """Pushes what is sealed; returns the seconds from each record to its receipt."""
         self._end.set()
         lags = [lag for _process in self._processes for lag in self._results.get()]
         for process in self._processes:
@@ -110,7 +110,7 @@ class SimulatedRobots:
 
 
 class _Appliance:
-    """One appliance: it records and pushes in `work`, and polls for bundles in two threads of its own."""
+    """It records and pushes in `work`, and polls for bundles in two threads."""
 
     def __init__(self, robot: FleetRobot, load: SimulatedLoad) -> None:
         self.robot = robot
@@ -121,7 +121,7 @@ class _Appliance:
         self._bundles = self._poll_loop(robot.site, f"https://127.0.0.1:{robot.site.port}")
 
     def work(self, ended: Callable[[], bool]) -> None:
-        """Record and push at the load's rate until `ended`; then push the rest."""
+        """After `ended`, the rest is pushed."""
         self._bundles.start()
         pusher, pause = self.robot.pusher(), threading.Event()
         sealed = time.monotonic()

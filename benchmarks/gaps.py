@@ -26,7 +26,7 @@ _SETTLED = 11.0  # seconds: a process that dies within ten seconds of its start 
 
 
 def longest_gap(listener: Process, fault: Callable[[], object]) -> float:
-    """Cause a fault; return the longest gap from then until `_SETTLED` seconds after messages arrive again."""
+    """Ends `_SETTLED` seconds after messages arrive again."""
     seen, began = len(listener.events), time.monotonic()
     fault()
     listener.wait_for(lambda event: event["ended"] > began, since=seen, event="gap", timeout=_LIMIT)
@@ -35,7 +35,6 @@ def longest_gap(listener: Process, fault: Callable[[], object]) -> float:
 
 
 def main() -> None:
-    """Print the median and the longest gap of both faults."""
     arguments = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     arguments.add_argument("--deaths", type=int, default=20)
     arguments.add_argument("--restarts", type=int, default=5)

@@ -22,7 +22,7 @@ ALLOWED = 20.0
 
 
 def lateness(trials: int, silent: float) -> list[float | None]:
-    """Return for each cut the milliseconds by which the stop was late; None without a stop."""
+    """In milliseconds, for each cut; None without a stop."""
     text = text_of(Guard("deadman", PRESETS["deadman"], values={"silent": f"{silent:g}"}))
     with (
         Appliance(monitors={"deadman": text}) as appliance,

@@ -31,8 +31,6 @@ VALUES: dict[str, Callable[[], Any]] = {
 
 
 class Caller:
-    """A kept connection from an address."""
-
     def __init__(self, port: int, address: str) -> None:
         self._connection = http.client.HTTPConnection("127.0.0.1", port, 120, source_address=(address, 0))
 
@@ -45,10 +43,7 @@ class Caller:
 
 
 def delays(port: int, seconds: float, large: bytes | None) -> tuple[list[float], int]:
-    """Return the robot's delays in milliseconds while the guest repeatedly sends `large`.
-
-    The second result is the number of the guest's calls.
-    """
+    """In milliseconds, while the guest repeatedly sends `large`; also the number of the guest's calls."""
     stop, sent = threading.Event(), [0]
 
     def flood() -> None:

@@ -54,13 +54,13 @@ TOOLS = (("rostopic", "list"), ("rosnode", "info", "/node_0"), ("rosparam", "dum
 
 @dataclass
 class Start:
-    """The measured figures of one start, in seconds."""
+    """In seconds."""
 
     figures: dict[str, float] = field(default_factory=dict)
 
 
 class Reports:
-    """Receive the nodes' reports that they are up."""
+    """A report says that a node is up."""
 
     def __init__(self) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -68,7 +68,10 @@ class Reports:
         self.port = int(self._socket.getsockname()[1])
 
     def wait(self, numbers: set[int]) -> float:
-        """Return the time (monotonic) at which the last of these nodes is up. Raises `TimeoutError`."""
+        """Returns the time (monotonic) at which the last of these nodes is up.
+
+        Raises `TimeoutError`.
+        """
         last, deadline = 0.0, time.monotonic() + LIMIT
         while numbers:
             self._socket.settimeout(max(0.001, deadline - time.monotonic()))
@@ -85,7 +88,7 @@ class Reports:
 
 
 class OtherClient:
-    """Make calls from another node during the start, each over a new connection."""
+    """Each call has a new connection."""
 
     def __init__(self, uri: str) -> None:
         self.delays: dict[str, list[float]] = {"getParam": [], "registerPublisher": []}
@@ -130,7 +133,7 @@ class _Node:
 
 
 def package(folder: Path, nodes: int, port: int, *, rospy: bool) -> Path:
-    """Write a ROS package with the node and a launch file; return the launch file."""
+    """Returns the launch file."""
     made = folder / "launched"
     made.mkdir()
     (made / "package.xml").write_text(
@@ -159,7 +162,7 @@ def package(folder: Path, nodes: int, port: int, *, rospy: bool) -> Path:
 
 
 def start(session: RosSession, masters: list[int], nodes: int, *, rospy: bool) -> Start:
-    """Launch the robot at a master whose processes are `masters` and their descendants, and measure."""
+    """`masters` are the processes of the master; their descendants count too."""
     reports, measured = Reports(), Start()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -191,7 +194,7 @@ def _used(masters: list[int]) -> dict[int, float]:
 
 
 def killed(session: RosSession, folder: Path, reports: Reports, nodes: int, path: dict[str, str]) -> float:
-    """Kill the first node and start it again; return the seconds until it is up."""
+    """Returns the seconds until the first node is up again."""
     [found] = [
         int(entry.name)
         for entry in Path("/proc").iterdir()
@@ -215,7 +218,7 @@ def _is_first(entry: Path, folder: str) -> bool:
 
 @contextlib.contextmanager
 def plain() -> Iterator[tuple[RosSession, list[int]]]:
-    """Run rosmaster with rosout; yield a session and both processes."""
+    """The processes are rosmaster and rosout."""
     with (
         tempfile.TemporaryDirectory() as home,
         PlainMaster(Path(home)) as master,
@@ -226,7 +229,7 @@ def plain() -> Iterator[tuple[RosSession, list[int]]]:
 
 @contextlib.contextmanager
 def deployed() -> Iterator[tuple[RosSession, list[int]]]:
-    """Run the appliance as `rosrv up` does; yield a session and its supervisor."""
+    """The process is the supervisor."""
     options = ("--api", "off", "--listen", f"127.0.0.1:{free_port()}")
     with Appliance(options=options) as appliance, tempfile.TemporaryDirectory() as home:
         assert appliance.process is not None

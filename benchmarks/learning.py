@@ -44,7 +44,7 @@ Row = tuple[str, int, bytes]
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive in the form in which the learner reads a recording."""
+    """In the form in which the learner reads a recording."""
 
     name: str
     rows: tuple[Row, ...]
@@ -66,7 +66,7 @@ class Drive:
 
 
 def mission(chance: random.Random) -> list[Part]:
-    """Return a mission of half a minute to a minute and a half of driving, turning, aiming and shooting."""
+    """Half a minute to a minute and a half of driving, turning, aiming and shooting."""
     parts = [Part(1.0, tilt=chance.uniform(-0.4, 0.5))]
     for _ in range(chance.randint(8, 16)):
         kind = chance.choice(("ahead", "ahead", "turn", "turn", "back", "aim", "stand"))
@@ -87,7 +87,7 @@ def mission(chance: random.Random) -> list[Part]:
 
 
 def drive(number: int, seed: int) -> Drive:
-    """Return a drive, received with jitter and measured with noise."""
+    """Received with jitter and measured with noise."""
     chance = random.Random(f"{seed} {number}")
     offset = number * 1000  # seconds: the offset differs from drive to drive
     rows: list[Row] = []
@@ -108,7 +108,6 @@ def drive(number: int, seed: int) -> Drive:
 
 
 def altered(topic: str, data: bytes, change: Callable[[Any], None]) -> bytes:
-    """Return a message after a change of its fields."""
     fields = MESSAGES.decode(TYPES[topic], data)
     for name in ("ranges", "position"):
         if isinstance(getattr(fields, name, None), np.ndarray):
@@ -118,7 +117,7 @@ def altered(topic: str, data: bytes, change: Callable[[Any], None]) -> bytes:
 
 
 def get(fields: Any, path: str) -> Any:
-    """Return a field; for `a#1` the element, for `a#` the whole array."""
+    """For `a#1` the element, for `a#` the whole array."""
     path, _, element = path.partition("#")
     for step in path.split("."):
         fields = getattr(fields, step)
@@ -126,7 +125,7 @@ def get(fields: Any, path: str) -> Any:
 
 
 def put(fields: Any, path: str, value: Any) -> None:
-    """Set a field; paths are those of `get`."""
+    """Paths are those of `get`."""
     path, _, element = path.partition("#")
     *above, last = path.split(".")
     for step in above:
@@ -160,7 +159,7 @@ ENUMERATIONS: Mapping[str, tuple[tuple[str, object], ...]] = {
 
 @dataclass
 class Seeding:
-    """A fault being put into a drive: from `time` on, in some topic and field."""
+    """`time` is the fault's beginning."""
 
     drive: Drive
     time: int
@@ -174,7 +173,7 @@ class Seeding:
         return topic, found
 
     def after(self, topic: str, seconds: float = 1000.0) -> list[int]:
-        """Return the indexes of the topic's messages in this number of seconds from the fault's beginning."""
+        """Indexes of the topic's messages in this number of seconds from the fault's beginning."""
         return [
             place
             for place, row in enumerate(self.drive.rows)
@@ -186,7 +185,7 @@ class Seeding:
         return get(MESSAGES.decode(TYPES[topic], data), path)
 
     def span(self, topic: str, path: str) -> float:
-        """Return the range of the field's values in this drive; 1 for a constant."""
+        """1 for a constant."""
         values = [
             float(self.value(place, path)) for place, row in enumerate(self.drive.rows) if row[0] == topic
         ]
@@ -277,7 +276,7 @@ KINDS: Mapping[str, Callable[[Seeding], list[Row]]] = {
 
 
 def seeded(kind: str, drives: Sequence[Drive], chance: random.Random) -> tuple[Drive, int, list[Row], str]:
-    """Return a drive, its fault's time, its messages with the fault, and the fault's description.
+    """Returns a drive, its fault's time, its messages with the fault, and the fault's description.
 
     A fault that changes nothing is replaced by another one.
     """
@@ -294,7 +293,7 @@ def seeded(kind: str, drives: Sequence[Drive], chance: random.Random) -> tuple[D
 
 
 def alarms(learnt: LearningResult, rows: Sequence[Row]) -> list[tuple[int, str, str]]:
-    """Return time, specification and text of every warning."""
+    """Time, specification and text of every warning."""
     monitors = MonitorSet.of(compiled_from({"learnt.rv": learnt.text}, KNOWN))
     monitors.start(rows[0][1], frozenset(TYPES))
     found = []
@@ -307,8 +306,6 @@ def alarms(learnt: LearningResult, rows: Sequence[Row]) -> list[tuple[int, str, 
 
 @dataclass(frozen=True)
 class Judged:
-    """The scores of the learnt specifications."""
-
     learnt: LearningResult
     hours: float
     false_alarms: list[tuple[int, str, str]]
@@ -338,7 +335,6 @@ def judge(count: int, faults: int, seed: int) -> Judged:
 
 
 def main() -> None:
-    """Print the scores as JSON."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--drives", type=int, default=240)
     parser.add_argument("--faults", type=int, default=100)

@@ -2,10 +2,11 @@
 
     python -m benchmarks.logic_steps [--long EVENTS] [--beside]
 
-The cost must not grow with the trace or with a time bound. The loop around the step is measured alone and subtracted.
-For monitors that are tables the cost of a loop that looks the tables up inline is shown as well. `--beside`
-measures formulas of `mtl` about the past beside reelay and rtamt: one event for each unit of time, the same verdicts,
-in this process, the call of a step included.
+The cost must not grow with the trace or with a time bound. The loop around the step is subtracted. For tables, the
+cost of looking them up inline is shown as well.
+
+`--beside` measures formulas of `mtl` about the past beside reelay and rtamt, in this process: one event for each unit
+of time.
 """
 
 import argparse
@@ -56,11 +57,11 @@ BESIDE = (
     ("historically[0,50ns] (c => once[0,100ns] a)", "(historically[0:50] ({c} -> once[0:100] {a}))",
      "(historically[0:50] ((c >= 0) implies (once[0:100] (a >= 0))))"),
 )  # fmt: skip
-"""A formula here, in reelay, and in rtamt."""
+"""The same formula in reelay and in rtamt follows."""
 
 
 def trace(kind: str, length: int) -> list[int]:
-    """Return event indexes: random, balanced pairs of depth up to two, or all openings before all closings."""
+    """Random, balanced pairs of depth up to two, or all openings before all closings."""
     if kind == "pairs":
         return [0, 0, 1, 1, 0, 1] * (length // 6)
     if kind == "nested":
@@ -69,7 +70,7 @@ def trace(kind: str, length: int) -> list[int]:
 
 
 def per_step(run: Run, events: Sequence[int]) -> float:
-    """Return nanoseconds per step; events are one millisecond apart."""
+    """Nanoseconds; events are one millisecond apart."""
     step = run.step
     times = range(0, len(events) * MS, MS)
     gc.collect()
@@ -84,7 +85,7 @@ def per_step(run: Run, events: Sequence[int]) -> float:
 
 
 def inline_step(compiled: CompiledProperty, events: Sequence[int]) -> float | None:
-    """Return nanoseconds per step of code that looks up the tables inline."""
+    """Nanoseconds of code that looks up the tables inline."""
     if not isinstance(compiled, FiniteProperty):
         return None
     table, verdicts, state = compiled.automaton.table, compiled.automaton.verdicts, compiled.automaton.initial
@@ -102,7 +103,7 @@ def inline_step(compiled: CompiledProperty, events: Sequence[int]) -> float | No
 
 
 def others(for_reelay: str, for_rtamt: str, events: Sequence[int]) -> tuple[Callable[[int], bool], ...]:
-    """Return a step of reelay and a step of rtamt; each returns whether the formula holds at an event."""
+    """Each step returns whether the formula holds at an event."""
     other: Any = reelay.discrete_timed_monitor(pattern=for_reelay, semantics="boolean", condense=False)
     third = rtamt.StlDiscreteTimeSpecification()
     for name in (*EVENTS, "out"):
@@ -118,7 +119,7 @@ def others(for_reelay: str, for_rtamt: str, events: Sequence[int]) -> tuple[Call
 
 
 def beside(events: Sequence[int]) -> None:
-    """Print the cost of a step here, in reelay and in rtamt. Raises `SystemExit` if a verdict differs."""
+    """Raises `SystemExit` if a verdict differs."""
     print(f"{'here':>8} {'reelay':>8} {'rtamt':>8}  ns/step, {len(events)} events")
     for formula, for_reelay, for_rtamt in BESIDE:
         compiled = compile_property("mtl", formula, EVENTS, Position("benchmark", 1, 1))

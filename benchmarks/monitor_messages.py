@@ -67,7 +67,7 @@ OTHERS = "".join(
 
 
 def command(frame: bytes = b"base_link") -> bytes:
-    """Return a `geometry_msgs/TwistStamped` of 80 bytes and its frame's name."""
+    """`geometry_msgs/TwistStamped`, 80 bytes and the frame's name."""
     return struct.pack(f"<IIII{len(frame)}s6d", 1, 2, 3, len(frame), frame, 2.0, 0, 0, 0, 0, 0.5)
 
 
@@ -101,7 +101,7 @@ def with_module(text: str) -> MonitorSet:
 
 
 def batched(messages: int, body: bytes, text: str = REFERENCE, topic: str = "/cmd") -> float:
-    """Return the time of a message in a batch of `messages`, after a first round that allocates the buffers."""
+    """The first round, which allocates the buffers, does not count."""
     loaded = with_module(text)
     loaded.process(topic, bytearray(body), 1)
     lane, area = loaded.lane(topic), loaded.area

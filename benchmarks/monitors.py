@@ -68,7 +68,7 @@ Results = dict[tuple[str, int, str], list[Result]]
 
 
 class MinimalRelay:
-    """A program with one connection in and one out, a new process for each run."""
+    """Each run has a new process."""
 
     def __init__(self, name: str, *command: str) -> None:
         """`command` is called with the publisher's port, and prints the port for the subscriber."""
@@ -93,7 +93,7 @@ class MinimalRelay:
 
 
 class CopyingRelay(MinimalRelay):
-    """The relay in C; with `epoll` it waits for data like a relay with many connections."""
+    """With `epoll` it waits for data like a relay with many connections."""
 
     def __init__(self, *, epoll: bool = False) -> None:
         source = HERE / "copying_relay.c"
@@ -108,7 +108,7 @@ def specification(name: str, topic: str) -> str:
 
 
 def monitored(others: int) -> Relay:
-    """Return the relay with the monitor on the load's topic, and this number of others elsewhere."""
+    """`others` monitors are on other topics."""
     name = f"+ {others} elsewhere" if others else "one monitor"
     relay = Relay(name)
     files = [("load.rv", specification("load", "/load"))]
@@ -136,9 +136,9 @@ def of_kind(name: str) -> Relay:
 
 
 def topics_at_once(number: int, seconds: float) -> tuple[float, float, float]:
-    """Run this number of topics at 1,000 messages of 200 bytes a second, with a monitor on each.
+    """1,000 messages of 200 bytes a second on each topic, which has a monitor.
 
-    Return the median and the largest of the topics' p50 (microseconds), and the part of a core that the relay uses.
+    Returns the median and the largest of the topics' p50 (microseconds), and the part of a core that the relay uses.
     """
     relay = Relay("topics")
     names = [f"/load{one}" for one in range(number)]
@@ -168,7 +168,6 @@ def topics_at_once(number: int, seconds: float) -> tuple[float, float, float]:
 
 
 def show_topics(numbers: tuple[int, ...], rounds: int, seconds: float) -> None:
-    """Print how the delay grows with the number of topics."""
     print("\n1,000 messages of 200 bytes a second on each topic, a monitor on each: p50 in microseconds")
     first = 0.0
     for number in numbers:
@@ -183,13 +182,13 @@ def show_topics(numbers: tuple[int, ...], rounds: int, seconds: float) -> None:
 
 
 def resident(pid: int | None) -> float:
-    """Return the MiB of memory of a process."""
+    """In MiB."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def show_memory(minutes: float) -> None:
-    """Print the relay's memory at twelve times while messages arrive at full speed."""
+    """Printed twelve times while messages arrive at full speed."""
     relay = monitored(0)
     print(f"\nas fast as it goes for {minutes:g} minutes, one monitor: MiB that the relay holds", flush=True)
     try:
@@ -205,7 +204,7 @@ def show_memory(minutes: float) -> None:
 
 
 def show(results: Results, mode: str, sizes: tuple[int, ...], names: list[str]) -> None:
-    """Print one mode: medians, ratios to the C relay, losses, CPU time."""
+    """Medians, ratios to the C relay, losses, CPU time."""
     what = {
         "window": "64 messages on their way: messages a second",
         "flat": "as fast as it goes: messages a second",
@@ -236,7 +235,6 @@ def cell(results: Results, mode: str, size: int, name: str) -> str:
 
 
 def begin(systems: list[System], *, peers: bool, kinds: bool) -> None:
-    """Start the systems that are compared, which take turns."""
     systems += [Direct(), CopyingRelay(), CopyingRelay(epoll=True), Relay("relay alone")]
     if kinds:
         systems += map(of_kind, KINDS)

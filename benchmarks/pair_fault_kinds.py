@@ -22,7 +22,7 @@ _ROLES = ("control", "relay", "rosmaster", "signer", "lease", "api", "recorder",
 _STANDBY_ROLES = ("control", "lease", "signer", "relay", "supervisor")
 _PROMOTE_SECONDS = 30.0
 Said = list[str]
-"""The answers to orders of operators during a fault."""
+"""Answers to orders of operators during a fault."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ def _promoted(
     on: str,
     during: Callable[..., contextlib.AbstractContextManager[object]] | None = None,
 ) -> Iterator[None]:
-    """Give the order on the `active`, the `standby` or `both`, half a second after `during` has begun."""
+    """The order comes half a second after `during` has begun; `on` is `active`, `standby` or `both`."""
     names = {"active": [active], "standby": [passive], "both": [active, passive]}[on]
     with during(site, active, passive, said) if during is not None else contextlib.nullcontext():
         _NEVER.wait(0.5 if during is not None else 0)
@@ -219,7 +219,7 @@ KINDS = tuple(_kinds())
 
 
 def drawn(number: int, seed: int) -> list[tuple[Fault, float]]:
-    """Return a list of faults with their seconds: every kind once, in random order, then every kind again."""
+    """Every kind once, in random order, then every kind again; with seconds."""
     chance, found = random.Random(seed), list[tuple[Fault, float]]()
     while len(found) < number:
         found += [(one, chance.uniform(one.least, one.most)) for one in chance.sample(KINDS, len(KINDS))]

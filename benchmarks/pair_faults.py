@@ -56,8 +56,6 @@ _NEVER = threading.Event()
 
 @dataclass
 class Noticed:
-    """One fault, and what was noticed."""
-
     number: int
     fault: str
     seconds: float
@@ -76,7 +74,7 @@ class Noticed:
 
 
 class Statuses:
-    """The answers of both appliances about the pair; a thread asks each."""
+    """A thread asks each appliance."""
 
     def __init__(self, site: StandbySite) -> None:
         self.said: dict[str, str] = {}
@@ -107,7 +105,7 @@ def _judgement(state: StandbyState) -> str:
 
 
 def answered_by_two(events: list[dict[str, object]], grants: int) -> int:
-    """Return the number of changes of the answering appliance that `grants` of the lease do not explain."""
+    """Changes of the answering appliance that `grants` of the lease do not explain."""
     by = [event["by"] for event in events if event.get("event") == "answered"]
     changes = sum(here != there for here, there in itertools.pairwise(by))
     return max(0, changes - grants)
@@ -116,7 +114,7 @@ def answered_by_two(events: list[dict[str, object]], grants: int) -> int:
 def suffer(
     site: StandbySite, robot: StandbyRobot, probe: Process, row: Noticed, fault: Fault
 ) -> list[Process]:
-    """Let a fault happen; return the listeners whose subscriptions are lost."""
+    """Returns the listeners whose subscriptions are lost."""
     active, passive = site.pair()
     epoch, mark = site.lease.read().epoch, probe.mark()
     with Watch(robot) as watch:
@@ -142,7 +140,6 @@ def suffer(
 
 
 def judge(row: Noticed, fault: Fault, limit: float) -> None:
-    """Add the broken promises to a row."""
     allowed = limit * (_WAIT_SHARE if fault.goes_on else 1.0)
     allowed += row.seconds if fault.interrupts or fault.cut_off else 0.0
     for what, seconds in (("Master API", row.api), ("topics", row.topics), ("services", row.services)):
@@ -172,7 +169,7 @@ def _start_again(robot: StandbyRobot, lost: list[Process]) -> None:
 
 @contextlib.contextmanager
 def running_site() -> Iterator[tuple[StandbySite, Process]]:
-    """Run both appliances and the witness, with their states on small disks; and the outsider's probe."""
+    """States are on small disks; yields the outsider's probe too."""
     with contextlib.ExitStack() as stack:
         home = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         disk = stack.enter_context(small_disk(home / "robot", "1m"))
@@ -196,7 +193,7 @@ def running_site() -> Iterator[tuple[StandbySite, Process]]:
 
 
 def until_whole(site: StandbySite, robot: StandbyRobot) -> None:
-    """Wait until nothing is lost, the robot admits the holder alone, and both appliances report no trouble."""
+    """Nothing is lost, the robot admits the holder alone, and both appliances report no trouble."""
     robot.lost_nothing()
     eventually(lambda: robot.admitted() == {ADDRESSES[site.holder()]}, site.story)
     wanted = standby_requests.StandbyWanted()
@@ -207,7 +204,7 @@ def until_whole(site: StandbySite, robot: StandbyRobot) -> None:
 def one(
     site: StandbySite, robot: StandbyRobot, probe: Process, row: Noticed, fault: Fault, *, limit: float
 ) -> None:
-    """Let a fault happen, and judge it; a row with a broken promise has the output of all programs as its `story`."""
+    """A row with a broken promise has the output of all programs as its `story`."""
     try:
         _start_again(robot, suffer(site, robot, probe, row, fault))
         judge(row, fault, limit)
@@ -220,7 +217,7 @@ def one(
 
 
 def run(faults: Sequence[tuple[Fault, float]], *, done: int, load: int, limit: float) -> Iterator[Noticed]:
-    """Yield a row for each fault after the first `done`; a site that did not recover is made again."""
+    """Skips the first `done` faults; a site that did not recover is made again."""
     while done < len(faults):
         with running_site() as (site, probe), StandbyRobot(site, rate=_RATE) as robot, busy(load):
             for fault, seconds in faults[done:]:
@@ -233,14 +230,14 @@ def run(faults: Sequence[tuple[Fault, float]], *, done: int, load: int, limit: f
 
 
 def read(results: Path | None) -> list[Noticed]:
-    """Return the rows of earlier runs."""
+    """Rows of earlier runs."""
     if results is None or not results.exists():
         return []
     return [Noticed(**json.loads(line)) for line in results.read_text().splitlines()]
 
 
 def keep(row: Noticed, results: Path | None) -> None:
-    """Print a row, and add it to the results; the output of all programs gets a file of its own."""
+    """The output of all programs gets its own file."""
     line = json.dumps({name: value for name, value in asdict(row).items() if name != "story"})
     print(line, flush=True)
     if results is None:
@@ -280,7 +277,6 @@ def shown(rows: list[Noticed]) -> Table:
 
 
 def main() -> None:
-    """Run the faults, and print the table."""
     arguments = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     arguments.add_argument("--faults", type=int, default=150)
     arguments.add_argument("--seed", type=int, default=1)

@@ -37,7 +37,7 @@ NEAR = message("sensor_msgs/LaserScan", ranges=[0.1] * 40)
 
 
 def alone(stops: int) -> dict[str, list[float]]:
-    """Return the milliseconds of stops without sockets."""
+    """In milliseconds, without sockets."""
     sent: list[int] = []
     monitors = QuietMonitors(lambda _topic, _data: sent.append(time.perf_counter_ns()))
     monitors.load(STOP)
@@ -53,7 +53,7 @@ def alone(stops: int) -> dict[str, list[float]]:
 
 
 def deployed(stops: int) -> dict[str, list[float]]:
-    """Return the milliseconds of changed commands and of stops at a running appliance."""
+    """In milliseconds, of changed commands and of stops."""
     monitors = {"stop": SILENT_STOP, "cap": CAP}
     with (
         Appliance(monitors=monitors, options=("--api", "127.0.0.1:0")) as appliance,
@@ -67,7 +67,7 @@ def deployed(stops: int) -> dict[str, list[float]]:
 
 @contextlib.contextmanager
 def busy_programs(number: int) -> Iterator[None]:
-    """Run this number of programs that always want a core."""
+    """Each always wants a core."""
     command = [sys.executable, "-c", "while True: pass"]
     programs = [subprocess.Popen(command, start_new_session=True) for _ in range(number)]
     try:

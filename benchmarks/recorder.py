@@ -52,8 +52,6 @@ audit: {{reserve_bytes: 1MiB}}
 
 
 class Bag(NamedTuple):
-    """The load's messages in a bag."""
-
     messages: int
     lost: int
     closed: float
@@ -62,7 +60,7 @@ class Bag(NamedTuple):
 
 @dataclass
 class Result:
-    """The result of one run; `cpu` is percent of a core by process name."""
+    """`cpu` is percent of a core by process name."""
 
     p50: float
     bag: Bag | None = None
@@ -70,7 +68,7 @@ class Result:
 
 
 class Load:
-    """The two nodes at a master, already connected. The listener writes its received messages to a file in `folder`."""
+    """Two connected nodes; the listener writes its received messages to a file in `folder`."""
 
     def __init__(self, session: RosSession, folder: Path, topics: int, size: int, hertz: int) -> None:
         self._heard = folder / "heard"
@@ -85,7 +83,6 @@ class Load:
         self.last(_WARM_SECONDS)
 
     def last(self, seconds: float) -> None:
-        """Let the load run for this number of seconds."""
         try:
             self._listener.popen.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -93,14 +90,14 @@ class Load:
         raise SystemExit(f"the listener ended: {self._listener.story()}")
 
     def end(self) -> float:
-        """Return the median delay that the listener measured, in microseconds."""
+        """The median delay in microseconds."""
         self._listener.interrupt()
         heard = self._listener.wait_for(event="heard")
         self._talker.stop()
         return float(heard["p50_us"])
 
     def heard(self, began: int, ended: int) -> dict[str, set[int]]:
-        """Return the numbers of the messages that the listener received from `began` to `ended` (ns), by topic.
+        """By topic, from `began` to `ended` (ns).
 
         The first second is left out, because its messages may have been published before.
         """
@@ -113,16 +110,15 @@ class Load:
 
 @contextmanager
 def measured(pids: Mapping[str, int], seconds: float, into: dict[str, float]) -> Iterator[None]:
-    """Store the processor time of these processes inside the block, in percent of a core over `seconds`."""
+    """In percent of a core over `seconds`."""
     before = {name: cpu_seconds(pid) for name, pid in pids.items()}
     yield
     into |= {name: 100 * (cpu_seconds(pid) - before[name]) / seconds for name, pid in pids.items()}
 
 
 def counted(path: Path, closed: float, heard: dict[str, set[int]] | None = None) -> Bag:
-    """Count the load's messages in a bag, and those missing between the first and the last of a topic.
-
-    With `heard`, every message in `heard` that the bag lacks counts as missing.
+    """Counts messages, and those missing between the first and the last of a topic; with `heard`, also each of these
+    that the bag lacks.
     """
     numbers: dict[str, set[int]] = {}
     with Reader(path) as reader:
@@ -137,7 +133,7 @@ def counted(path: Path, closed: float, heard: dict[str, set[int]] | None = None)
 
 
 def snapshot_program() -> Path | None:
-    """Return the node of rosbag_snapshot if it is installed."""
+    """None if rosbag_snapshot is not installed."""
     installed = Path("/").glob("opt/ros/*/lib/rosbag_snapshot/snapshot")
     found = shutil.which("snapshot")
     return next(installed, None) if found is None else Path(found)
@@ -146,7 +142,7 @@ def snapshot_program() -> Path | None:
 def at_plain_master(
     folder: Path, load: tuple[int, int, int], seconds: float, recorder: str, snapshot: Path | None
 ) -> Result:
-    """Run the load without a recorder (""), with `rosbag`, or with `snapshot`, the node of rosbag_snapshot."""
+    """`recorder` is "" (none), `rosbag`, or `snapshot`, the node of rosbag_snapshot."""
     with PlainMaster(folder) as master, RosSession(master.master_uri, folder) as session:
         running = Load(session, folder, *load)
         if not recorder:
@@ -176,7 +172,7 @@ def at_plain_master(
 def at_appliance(
     folder: Path, load: tuple[int, int, int], seconds: float, *, recorder: bool, kills: bool = False
 ) -> Result:
-    """Run the load without or with the recorder; with `kills`, kill its processes during the load.
+    """With `kills`, the appliance's processes are killed during the load.
 
     The recorder records the seconds before the request, and some after it.
     """

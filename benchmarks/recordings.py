@@ -43,7 +43,7 @@ app()
 
 
 def make(path: Path, seed: int, seconds: int, payload: int) -> None:
-    """Write a recording of 50 commands and 50 strings of a length each second."""
+    """50 commands and 50 strings each second."""
     known, chance = standard_definitions(), random.Random(seed)
     with Writer(path) as writer:
         rows = [
@@ -59,13 +59,13 @@ def make(path: Path, seed: int, seconds: int, payload: int) -> None:
 
 
 def processor_time() -> float:
-    """Return the seconds of all processes that have ended."""
+    """The seconds of all processes that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
 def run(folder: Path, recordings: str, workers: int) -> tuple[float, int]:
-    """Return the seconds of a run, and the largest memory of its first process in bytes."""
+    """Returns seconds, and the largest memory of the first process in bytes."""
     command = [
         sys.executable,
         "-c",

@@ -46,7 +46,7 @@ TYPE = "relay_load/Sample"
 
 @dataclass
 class Result:
-    """One run: messages a second, lost fraction and number, delays in microseconds, the relay's CPU time a message."""
+    """Messages a second, lost fraction and number, delays in microseconds, the relay's CPU time a message."""
 
     rate: float
     loss: float
@@ -57,7 +57,7 @@ class Result:
 
 
 def compiled() -> Path:
-    """Return the load generator; compile it if its source is newer."""
+    """Compiles the load generator if its source is newer."""
     source = HERE / "relay_load.cpp"
     if not PROGRAM.exists() or PROGRAM.stat().st_mtime < source.stat().st_mtime:
         PROGRAM.parent.mkdir(parents=True, exist_ok=True)
@@ -67,7 +67,7 @@ def compiled() -> Path:
 
 
 def cpu_seconds(pid: int | None) -> float:
-    """Return the user and system time of a process so far."""
+    """User and system time so far."""
     if pid is None:
         return 0.0
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -77,10 +77,9 @@ def cpu_seconds(pid: int | None) -> float:
 def run(
     mode: str, size: int, seconds: float, system: "System", *md5sum: str, prefix: Sequence[str] = ()
 ) -> Result:
-    """Run the load once through a system, with this prefix of its command.
+    """`prefix` begins the load's command; `md5sum` replaces the md5sum of the message type.
 
-    `md5sum` replaces the md5sum of the message type. Sessions share the cores equally (`sched_autogroup_enabled`), so
-    the load has its own, like a node of roslaunch.
+    Sessions share the cores equally (`sched_autogroup_enabled`), so the load has its own, like a node of roslaunch.
     """
     with subprocess.Popen(
         [*prefix, str(compiled()), str(size), str(seconds), mode, *md5sum],
@@ -107,33 +106,29 @@ def run(
 
 
 class System(Protocol):
-    """A system between the publisher and the subscriber."""
+    """Between the publisher and the subscriber."""
 
     name: str
     pid: int | None
 
     def target(self, publisher: int) -> tuple[int, str]:
-        """Return port and topic for the subscriber, given the publisher's port."""
+        """Returns port and topic for the subscriber."""
 
-    def close(self) -> None:
-        """End the system."""
+    def close(self) -> None: ...
 
 
 class Direct:
-    """A system without a relay."""
-
     name = "direct"
     pid: int | None = None
 
     def target(self, publisher: int) -> tuple[int, str]:
         return publisher, "-"
 
-    def close(self) -> None:
-        """Do nothing: there is no process to end."""
+    def close(self) -> None: ...
 
 
 class Relay:
-    """This project's relay process, with a control that knows only one topic in each run."""
+    """This project's relay process; its control knows one topic in each run."""
 
     def __init__(self, name: str = "relay", *, recorded: bool = False) -> None:
         self.name = name
@@ -148,18 +143,17 @@ class Relay:
         self.pid: int | None = self._relay.process.pid
 
     def monitor(self, files: list[tuple[str, str]], definitions: dict[str, str]) -> None:
-        """Put these specifications in force."""
         self._link.send(stated(1, files, definitions, {}, restarted=False))
         answer = self._link.wait_for(lambda one: isinstance(one, SpecificationsTaken | SpecificationsRefused))
         if isinstance(answer, SpecificationsRefused):
             raise SystemExit(f"the relay does not take the specifications: {answer.findings}")
 
     def target(self, publisher: int) -> tuple[int, str]:
-        """Make a new incarnation with this run's publisher; return port and topic."""
+        """Makes a new incarnation; returns port and topic."""
         return self.place(publisher, "/load")
 
     def place(self, publisher: int, topic: str) -> tuple[int, str]:
-        """Make a new incarnation that publishes this topic; return port and topic for its subscriber."""
+        """Makes a new incarnation that publishes this topic; returns port and topic for its subscriber."""
         key = str(len(self._publishers) + 1)
         self._publishers[key] = publisher
         with socket.create_server((LOOPBACK, 0)) as listening:
@@ -181,7 +175,7 @@ class Relay:
 
 
 class LoadApi:
-    """The node API of the load's nodes; `publisher` is the port of this run's publisher."""
+    """`publisher` is the port of this run's publisher."""
 
     def __init__(self) -> None:
         self.publisher = 0
@@ -201,7 +195,7 @@ class LoadApi:
 
 
 class RosRelay:
-    """A ROS node that relays, at a rosmaster, started again for each run."""
+    """Started again for each run."""
 
     def __init__(self, name: str = "topic_tools", command: Sequence[str] = (TOPIC_TOOLS,)) -> None:
         """`command` is called with the two topics."""
@@ -223,7 +217,7 @@ class RosRelay:
         self.pid: int | None = None
 
     def target(self, publisher: int) -> tuple[int, str]:
-        """Start a relay between two new topics and find the port it publishes on."""
+        """Finds the port that the relay publishes on."""
         self.stop_relay()
         self._api.publisher = publisher
         self._runs += 1
@@ -252,7 +246,6 @@ class RosRelay:
             self._relay.wait(10)
 
     def close(self) -> None:
-        """End everything that this object started."""
         self.stop_relay()
         self._api.close()
         self._master.terminate()
@@ -268,7 +261,6 @@ class RosRelay:
 def table(
     results: dict[tuple[str, int, str], list[Result]], mode: str, sizes: list[int], names: list[str]
 ) -> None:
-    """Print one mode's medians and ratios."""
     print(f"\n{mode}: " + ("p50 in microseconds" if mode == "paced" else "messages a second"))
     print("x: ratio to topic_tools; in brackets: CPU microseconds a message of what is in the middle")
     print(f"{'':<12}" + "".join(f"{size:>30,}" for size in sizes))

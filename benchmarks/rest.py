@@ -1,9 +1,10 @@
 """REST beside a bare FastAPI route on uvicorn: `python -m benchmarks.rest [--seconds 2] [--rounds 3]`.
 
-Both run at once; in every round they take turns at every load, so that whatever else the machine does falls on both.
-Requests a second are medians of the rounds, the ratio is the median of the rounds' ratios; the CPU time of a request is
-that of the api and of control together. Then: what REST at full load does to the delay of a call of RVMaster, beside
-the same call in a quiet second of the same round.
+Both run at once and take turns at every load. Requests a second are medians of the rounds, the ratio is the median of
+the rounds' ratios; the CPU time of a request is that of the api and of control together.
+
+Then: what REST at full load does to the delay of a call of RVMaster, beside the same call in a quiet second of the
+same round.
 """
 
 import argparse
@@ -55,7 +56,7 @@ def free_port() -> int:
 
 
 class Client:
-    """A kept connection with one request at a time."""
+    """One request at a time."""
 
     def __init__(self, port: int, data: bytes) -> None:
         self.sock = socket.create_connection(("127.0.0.1", port))
@@ -69,7 +70,7 @@ class Client:
         self.sock.sendall(self.data)
 
     def receive(self) -> bool:
-        """Read the available data; return whether the answer is complete."""
+        """Returns whether the answer is complete."""
         piece = self.sock.recv(1 << 20)
         if not piece:
             raise RuntimeError(f"the server closed the connection: {self.got[:300]!r}")
@@ -84,7 +85,7 @@ class Client:
 
 
 def load(port: int, path: str, token: str, clients: int, seconds: float) -> float:
-    """Return requests a second in a closed loop."""
+    """Requests a second in a closed loop."""
     head = f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {token}\r\n\r\n".encode()
     everybody = {one.sock.fileno(): one for one in (Client(port, head) for _ in range(clients))}
     poll = select.epoll()
@@ -106,7 +107,6 @@ def load(port: int, path: str, token: str, clients: int, seconds: float) -> floa
 
 
 def cpu(pids: list[int]) -> float:
-    """Return the CPU seconds that processes have used so far."""
     ticks = 0
     for pid in pids:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -115,7 +115,7 @@ def cpu(pids: list[int]) -> float:
 
 
 class Appliance:
-    """The appliance with REST in clear text, and some nodes registered."""
+    """REST is in clear text, and some nodes are registered."""
 
     def __init__(self, home: Path) -> None:
         home.chmod(0o755)
@@ -144,7 +144,7 @@ class Appliance:
         self.pids = [int(row["pid"]) for row in rows if row["role"] in ("api", "control")]
 
     def status(self) -> dict[str, Any]:
-        """Return `/v1/status`, once REST answers."""
+        """Waits until REST answers."""
         client = Client(
             self.port,
             f"GET /v1/status HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {self.token}\r\n\r\n".encode(),
@@ -157,7 +157,7 @@ class Appliance:
         return found
 
     def delays(self, seconds: float) -> list[float]:
-        """Return the seconds of calls of getSystemState, one after the other."""
+        """Seconds of calls of getSystemState, one after the other."""
         found = []
         with xmlrpc.client.ServerProxy(self.master) as master:
             end = time.perf_counter() + seconds
@@ -176,7 +176,6 @@ def quantile(values: list[float], share: float) -> float:
 
 
 def rates(appliance: Appliance, bare: int, seconds: float, rounds: int) -> list[dict[str, Any]]:
-    """Return requests a second, compared with the bare route."""
     rows = []
     for clients in CLIENTS:
         for path in PATHS:
@@ -198,7 +197,6 @@ def rates(appliance: Appliance, bare: int, seconds: float, rounds: int) -> list[
 
 
 def effects(appliance: Appliance, seconds: float, rounds: int) -> list[dict[str, Any]]:
-    """Return the delay of a call of RVMaster without load, and with REST at full load."""
     rows = []
     for path in ("/healthz", "/v1/status", "/v1/graph", "/v1/audit?limit=50"):
         quiet, loaded = [], []

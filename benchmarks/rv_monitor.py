@@ -71,7 +71,7 @@ public class Made { public static String of(String text) {
 
 
 class Formula(NamedTuple):
-    """A formula for both sides: its random tree, and its text with all parentheses."""
+    """The text has all parentheses."""
 
     logic: str
     events: Sequence[str]
@@ -80,7 +80,6 @@ class Formula(NamedTuple):
 
 
 def _shown(tree: Any) -> str:
-    """Return the text of a formula of either logic."""
     kind, *operands = tree
     if kind == "event":
         return str(operands[0])
@@ -94,7 +93,7 @@ def _shown(tree: Any) -> str:
 
 
 def drawn(random: Random, count: int) -> Iterator[Formula]:
-    """Yield `count` random formulas of each logic."""
+    """`count` of each logic."""
     arity = ltl.UNARY | dict.fromkeys(("previously", "once"), 1)
     operators = (*ltl.TEMPORAL, "previously", "once", "since")
     for _ in range(count):
@@ -106,7 +105,7 @@ def drawn(random: Random, count: int) -> Iterator[Formula]:
 
 
 def automata(checkout: Path, javacc: Path, formulas: Sequence[Formula]) -> list[str]:
-    """Return RV-Monitor's automaton of each formula; empty if it cannot make one."""
+    """Empty if RV-Monitor cannot make the automaton."""
     with tempfile.TemporaryDirectory() as made:
         sources, classes = Path(made) / "sources", Path(made) / "classes"
         for logic in ("ere", "ltl"):
@@ -131,7 +130,7 @@ def _run(command: list[str], given: str = "") -> str:
 
 
 def theirs(automaton: str, logic: str, trace: Sequence[str]) -> list[tuple[bool, bool]]:
-    """Return, after each event of a trace, whether the automaton matches, and whether no continuation can match."""
+    """After each event: whether the automaton matches, and whether no continuation can match."""
     states: dict[str, dict[str, str]] = {}
     for name, body in re.findall(r"(\w+) ?\[([^\]]*)\]", automaton):
         states[name] = dict(re.findall(r"(\w+) -> (\w+)", body))
@@ -155,7 +154,6 @@ def _violated(tree: Any, trace: tuple[str, ...]) -> bool:
 
 
 def main(arguments: list[str]) -> int:
-    """Compare both sides; see the head of this file."""
     parser = argparse.ArgumentParser(usage=__doc__)
     parser.add_argument("checkout", type=Path)
     parser.add_argument("javacc", type=Path)

@@ -44,20 +44,20 @@ WITHIN = SPECIFICATION % (
 
 
 def ids(count: int) -> list[bytes]:
-    """Return messages with ids in the form of actionlib's."""
+    """In the form of actionlib's ids."""
     made = (b"/planner-%d-%d.%09d" % (number, 1_700_000_000 + number, number) for number in range(count))
     return [struct.pack("<I", len(one)) + one for one in made]
 
 
 def monitors(text: str) -> MonitorSet:
-    """Return the monitors of a specification after their start."""
+    """After their start."""
     loaded = MonitorSet.of(compiled_from({"slices.rv": text}, standard_definitions()), slices=MANY)
     loaded.start(0)
     return loaded
 
 
 def microseconds(action: Callable[[], object], times: int, rounds: int = ROUNDS) -> float:
-    """Return the processor time of one of `times` repetitions."""
+    """Processor time of one of `times` repetitions."""
     found = []
     for _ in range(rounds):
         started = time.process_time()
@@ -67,7 +67,7 @@ def microseconds(action: Callable[[], object], times: int, rounds: int = ROUNDS)
 
 
 def visited(text: str, messages: Sequence[bytes]) -> float:
-    """Return the processor time of a message when the slices get messages in turn."""
+    """Slices get messages in turn."""
     loaded = monitors(text)
 
     def visit() -> None:

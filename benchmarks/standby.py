@@ -47,7 +47,7 @@ _SECONDS = 60.0  # until a takeover counts as failed
 
 
 class Successes:
-    """The times at which something worked, such as a message that arrived."""
+    """For example, messages that arrived."""
 
     def __init__(self) -> None:
         self.times = [time.monotonic()]
@@ -59,7 +59,7 @@ class Successes:
             self._new.notify_all()
 
     def until_after(self, moment: float, seconds: float = _SECONDS) -> float:
-        """Wait for a success after this time; return the time of the first. Raises `TimeoutError`."""
+        """Raises `TimeoutError`."""
         with self._new:
             if not self._new.wait_for(lambda: self.times[-1] > moment, seconds):
                 raise TimeoutError(f"nothing worked for {seconds:g} s")
@@ -70,7 +70,7 @@ class Successes:
 
 
 class Watch:
-    """Watch topics, services and the Master API of a robot while the block runs."""
+    """Watches topics, services and the Master API while the block runs."""
 
     def __init__(self, robot: StandbyRobot) -> None:
         self._robot = robot
@@ -115,7 +115,7 @@ class Watch:
 
 
 def _events(process: Process, event: str) -> Callable[[], None]:
-    """Return a function that waits for the next event of this name."""
+    """Waits for the next event of this name."""
     mark = [process.mark()]
 
     def once() -> None:
@@ -135,7 +135,7 @@ def _calls(robot: StandbyRobot, caller: Process) -> Callable[[], None]:
 
 @contextlib.contextmanager
 def busy(number: int) -> Iterator[None]:
-    """Run processes that do nothing but compute."""
+    """The processes only compute."""
     burning = [multiprocessing.Process(target=_burn, daemon=True) for _ in range(number)]
     for one in burning:
         one.start()
@@ -184,7 +184,7 @@ def print_pauses(pauses: dict[str, list[float]], title: str) -> None:
 
 
 def one_takeover(site: StandbySite, robot: StandbyRobot, *, planned: bool) -> dict[str, float]:
-    """Return the longest pause of everything; then both appliances are in sync again."""
+    """Returns the longest pause of everything; then both appliances are in sync again."""
     active, passive = site.pair()
     with Watch(robot) as watch:
         if planned:
@@ -246,7 +246,7 @@ def _behind(*, pair: bool) -> Iterator[Callable[[], list[float]]]:
 
 
 def _registered(master: str) -> list[float]:
-    """Register and unregister a topic; return the seconds of each call."""
+    """Seconds of each call."""
     times = []
     with xmlrpc.client.ServerProxy(master) as proxy:
         proxy.getPid("/bench")

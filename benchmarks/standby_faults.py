@@ -107,7 +107,7 @@ FAULTS: dict[str, tuple[Fault, float, float, bool]] = {
 
 
 def faults(kind: str, number: int, load: int = 0, seed: int = 1) -> int:
-    """Print a table of the faults of one kind; return the number of lost subscriptions."""
+    """Returns the number of lost subscriptions."""
     make, least, most, after = FAULTS[kind]
     chance, pauses, lost = random.Random(seed), dict[str, list[float]](), 0
     with (
@@ -141,7 +141,7 @@ def faults(kind: str, number: int, load: int = 0, seed: int = 1) -> int:
 
 
 def _put_nodes_on(robot: StandbyRobot, arm: Host) -> None:
-    """Start nodes on the second computer: each client subscribes to each client, in both directions."""
+    """Each client subscribes to each client, in both directions."""
     there = robot.ros.on(arm)
     for talker in CLIENTS:
         there.talker(talker, f"/arm_{talker}", "--rate", str(_RATE), name=f"arm_talker_{talker}")
@@ -161,7 +161,7 @@ def _one(
     after: bool,
     in_sync: int,
 ) -> tuple[dict[str, float], int]:
-    """Return the times without service, and the number of lost subscriptions.
+    """Returns the times without service, and the number of lost subscriptions.
 
     `in_sync`: the number of appliances in sync some time after the fault.
     """

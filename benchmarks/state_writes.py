@@ -27,7 +27,7 @@ Keep = Callable[[RegistrationRow], None]
 
 
 def main() -> None:
-    """Print both, with trees of parameters as small and large robots have them."""
+    """Trees of parameters are those of small and large robots."""
     arguments = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     arguments.add_argument("--rate", type=int, default=500, help="registrations a second")
     arguments.add_argument("--seconds", type=float, default=10)
@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def ahead(folder: Path, tree: bytes, rate: int, seconds: float) -> list[float]:
-    """Register as the program does: ahead of the database."""
+    """As the program does it."""
     store = StateStore(folder, failed=print)
     try:
         return _registering(
@@ -55,7 +55,7 @@ def ahead(folder: Path, tree: bytes, rate: int, seconds: float) -> list[float]:
 
 
 def commit(folder: Path, tree: bytes, rate: int, seconds: float) -> list[float]:
-    """Commit each statement in the answering thread."""
+    """In the answering thread."""
     StateStore(folder, failed=print).close()
     registrations, parameters = _opened(folder), _opened(folder)
 
@@ -83,7 +83,7 @@ def _opened(folder: Path) -> sqlite3.Connection:
 def _registering(
     keep: Keep, keep_tree: Callable[[], None], tree: bytes, rate: int, seconds: float
 ) -> list[float]:
-    """Return the seconds that each registration took."""
+    """Seconds of each registration."""
     over = threading.Event()
 
     def keep_trees() -> None:

@@ -7,7 +7,7 @@ from typing import Self
 
 
 class Sink:
-    """A receiver on a loopback `port`; `messages` counts octet-counted messages of RFC 5424."""
+    """`messages` counts octet-counted messages of RFC 5424."""
 
     def __init__(self) -> None:
         self.messages = 0

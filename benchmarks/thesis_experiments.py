@@ -37,7 +37,7 @@ EXTRA = "copy = MESSAGE; PUBLISH(/extra, std_msgs/String, copy);"
 
 @dataclass(frozen=True)
 class Experiment:
-    """One experiment of the thesis: its seconds, the roles of its two nodes, and the monitor's additional action."""
+    """`nodes` are the roles of both nodes, `extra` is an additional action of the monitor."""
 
     name: str
     seconds: float
@@ -58,7 +58,6 @@ EXPERIMENTS = (
 
 @contextlib.contextmanager
 def plain(home: Path, _experiment: Experiment) -> Iterator[str]:
-    """Yield the URI of a plain `rosmaster`."""
     with PlainMaster(home) as master:
         yield master.master_uri
 
@@ -77,7 +76,7 @@ def appliance(enable: str, experiment: Experiment) -> Iterator[str]:
 
 
 def measure(master_uri: str, home: Path, experiment: Experiment, seconds: float) -> str:
-    """Run both nodes for this number of seconds; return the messages sent and received for each topic."""
+    """Returns the messages sent and received for each topic."""
     with RosSession(master_uri, home) as session:
         nodes = [
             session.start(
@@ -93,7 +92,7 @@ def measure(master_uri: str, home: Path, experiment: Experiment, seconds: float)
 
 
 def counted(node: Process, seconds: float) -> dict[str, int]:
-    """Return the counts that a node prints at its end."""
+    """The node prints them at its end."""
     event = node.wait_for(event="counted", timeout=seconds + 60)
     return {name: int(event[name]) for name in ("sent", "received", "lost")}
 

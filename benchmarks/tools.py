@@ -2,8 +2,7 @@
 
 `rosbag record -a` records a robot with a hundred topics. Two times are measured: from the first topic's first message
 in the bag to the last topic's, and from the start of the tool. `rosgraph`'s library, which rqt_graph draws from,
-queries the whole graph. Both masters run at once and take turns, so that other load on the machine affects both; ratios
-are of medians.
+queries the whole graph. Both masters run at once and take turns; ratios are of medians.
 """
 
 import argparse
@@ -42,7 +41,7 @@ print(time.monotonic() - began)
 
 
 class Robot:
-    """A robot of ten nodes with ten topics each, behind one master."""
+    """Ten nodes with ten topics each, behind one master."""
 
     def __init__(self, session: RosSession) -> None:
         self.session = session
@@ -55,9 +54,8 @@ class Robot:
             node.wait_for(event="ready")
 
     def record(self, bag: Path) -> tuple[float, float, float]:
-        """Record a bag; return two times in seconds, and the number of missing topics.
-
-        The times end at the last topic's first message; they begin at the first topic's, and at the start.
+        """Returns two times in seconds, from the first topic's first message and from the start to the last topic's
+        first message; and the number of missing topics.
         """
         began = time.time()
         self.session.run(
@@ -68,7 +66,7 @@ class Robot:
         return max(at) - min(at), max(at) - began, _NODES * _TOPICS - len(at)
 
     def graph(self) -> float:
-        """Return the seconds to get the whole graph."""
+        """In seconds."""
         return float(self.session.run(PYTHON, "-c", _GRAPH, timeout=90).stdout)
 
 

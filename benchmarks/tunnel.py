@@ -1,11 +1,13 @@
 """A tunnel beside the clear path, in one run: `python -m benchmarks.tunnel [--seconds 5] [--rounds 3] [--machine]`.
 
-The same host, once by its virtual address through its tunnel and once by its own in clear text, publishes to the robot
-(rospy at both ends, through the relay) and calls RVMaster. The two take turns in every round, so that whatever else the
-machine does falls on both; cells are medians of the rounds, ratios are medians of the rounds' ratios. Then: the time
-from `host add` to the first message through the tunnel. ESP runs where this machine has it; `--machine` runs all of it
-in the tests' virtual machine, whose kernel has ESP (without KVM every figure there is some ten times slower: look at
-the ratios). Needs root.
+The same host, once by its virtual address through its tunnel and once by its own in clear text, publishes to the
+robot (rospy at both ends, through the relay) and calls RVMaster. They take turns; cells are medians of the rounds,
+ratios are medians of the rounds' ratios. Then: the time from `host add` to the first message through the tunnel.
+
+ESP runs where this machine has it; `--machine` runs all of it in the tests' virtual machine, whose kernel has ESP
+(without KVM every figure there is some ten times slower).
+
+Needs root.
 """
 
 import argparse
@@ -40,8 +42,6 @@ PACED = 200.0  # messages a second
 
 @dataclass(frozen=True)
 class Way:
-    """A path from the host to the appliance."""
-
     name: str
     master: str
     host: AnyHost
@@ -51,15 +51,13 @@ class Way:
 
 @dataclass(frozen=True)
 class Measure:
-    """A measured quantity: its unit, and whether more is better."""
-
     name: str
     unit: str
     run: Callable[[Way], float]
 
 
 class Bench:
-    """The site, with the trusted host behind its tunnel and, at its own address, in clear text."""
+    """The trusted host is behind its tunnel and, at its own address, in clear text."""
 
     def __init__(self, site: TunnelSite, joined: JoinedHost, seconds: float) -> None:
         self.site, self.joined, self.seconds = site, joined, seconds
@@ -96,7 +94,7 @@ class Bench:
         return counted["received"] / counted["seconds"], statistics.median(counted["delays"])
 
     def _calls(self, path: Way) -> float:
-        """Return calls a second over one kept connection."""
+        """A second, over one kept connection."""
         body = xmlrpc.client.dumps(("/bench",), "getSystemState").encode()
 
         def work() -> float:
@@ -114,7 +112,7 @@ class Bench:
 
 
 def first_message(site: TunnelSite) -> tuple[JoinedHost, list[tuple[str, float]]]:
-    """Let the host join; return the duration of each step."""
+    """Returns the duration of each step of joining."""
     moments = [("", time.monotonic())]
     kit = site.kit()
     moments.append(("`host add`: the kit is there", time.monotonic()))
@@ -164,7 +162,6 @@ def in_the_machine(seconds: float, rounds: int) -> None:
 
 
 def main() -> None:
-    """Measure here or in the virtual machine."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--rounds", type=int, default=3)

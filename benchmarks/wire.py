@@ -34,14 +34,13 @@ HEADER = {
 
 
 def measure(label: str, work: Callable[[], object], rounds: int = 5) -> None:
-    """Print the microseconds of one run of `work`."""
+    """The microseconds of one run."""
     number, _ = timeit.Timer(work).autorange()
     best = min(timeit.repeat(work, number=number, repeat=rounds)) / number
     print(f"{label:44} {best * 1e6:10.2f}")
 
 
 def main() -> None:
-    """Measure every format."""
     call, answer, state = build_call("registerPublisher", CALL), build_response(ANSWER), build_response(STATE)
     header = encode_header(HEADER)
     loads, dumps = xmlrpc.client.loads, xmlrpc.client.dumps  # noqa: TID251 - what it is measured against

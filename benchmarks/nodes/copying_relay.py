@@ -11,7 +11,6 @@ import sys
 
 
 def tuned(sock):
-    """Set the options that `copying_relay.c` sets."""
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, b"cubic")
     return sock
@@ -23,7 +22,6 @@ def pass_header(source, target):
 
 
 def main():
-    """Relay until one side closes its connection."""
     listening = socket.create_server(("127.0.0.1", 0))
     print(listening.getsockname()[1], flush=True)
     subscriber = tuned(listening.accept()[0])

@@ -22,7 +22,7 @@ NAMES = [word for word in sys.argv if word.startswith("__")]
 
 
 def base(arrivals):
-    """Be the base: write the time and the number of each command, and end with the other node."""
+    """Ends with the other node."""
 
     def arrived(command):
         os.write(arrivals, ARRIVED.pack(time.monotonic(), command.linear.x))
@@ -34,7 +34,7 @@ def base(arrivals):
 
 
 def next_of(arrivals, speed):
-    """Return the time of the next command with this speed, or None."""
+    """None if there is no such command."""
     while select.select([arrivals], [], [], PATIENCE)[0]:
         at, found = ARRIVED.unpack(os.read(arrivals, ARRIVED.size))
         if found == speed:
@@ -43,7 +43,7 @@ def next_of(arrivals, speed):
 
 
 def cut(publisher, arrivals, number, silent, pause):
-    """Drive, and fall silent; return the milliseconds by which the stop is late, or None without a stop."""
+    """Returns the milliseconds by which the stop is late, or None without a stop."""
     command = Twist()
     command.linear.x = 1.0 + number
     for place in range(COMMANDS):

@@ -24,7 +24,6 @@ def arrived(_message):
 
 
 def main():
-    """Listen until terminated."""
     rospy.init_node("gap_node")
     subscriber = rospy.Subscriber(sys.argv[1], rospy.AnyMsg, arrived, tcp_nodelay=True)
     rospy.spin()

@@ -10,7 +10,6 @@ TYPE = "relay_load/Sample"
 
 
 def main():
-    """Decode each message, do a monitor's work on it, and publish it."""
     given, taken = rospy.myargv(sys.argv)[1:]
     text = (Path(__file__).parent / "msg" / f"{TYPE}.msg").read_text()
     sample = genpy.dynamic.generate_dynamic(TYPE, text)[TYPE]

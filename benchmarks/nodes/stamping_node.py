@@ -17,7 +17,7 @@ NANOSECONDS = 1_000_000_000
 
 
 def publish(topic, size, hertz, seconds):
-    """Publish for this number of seconds, once there is a subscriber."""
+    """Waits for a subscriber first."""
     publisher = rospy.Publisher(topic, String, queue_size=None)
     while not publisher.get_num_connections() and not rospy.is_shutdown():
         threading.Event().wait(0.05)
@@ -31,7 +31,7 @@ def publish(topic, size, hertz, seconds):
 
 
 def subscribe(topic):
-    """Count messages until the input ends."""
+    """Ends with the input."""
     seen = []
     rospy.Subscriber(topic, String, lambda message: seen.append((time.monotonic_ns(), message.data[:20])))
     print(json.dumps({"event": "ready"}), flush=True)
@@ -48,7 +48,6 @@ def subscribe(topic):
 
 
 def main():
-    """Publish or subscribe, as the arguments say."""
     words = rospy.myargv()[1:]
     rospy.init_node(f"stamping_{words[0]}", anonymous=True)
     if words[0] == "publish":

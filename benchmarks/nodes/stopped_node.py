@@ -25,7 +25,7 @@ NAMES = [word for word in sys.argv if word.startswith("__")]
 
 
 def receive(arrivals):
-    """Be the node that drives: write the time of each received command, and end with the other node."""
+    """Ends with the other node."""
 
     def arrived(_command):
         os.write(arrivals, ARRIVED.pack(time.monotonic()))
@@ -39,7 +39,7 @@ def receive(arrivals):
 
 
 def measure(publisher, message, arrivals, patience=LIMIT):
-    """Publish once; return the milliseconds until the command arrives, or None."""
+    """Returns the milliseconds until the command arrives, or None."""
     began = time.monotonic()
     publisher.publish(message)
     if not select.select([arrivals], [], [], patience)[0]:
