@@ -1,5 +1,3 @@
-"""Fixtures of tests with real nodes, each of which ends what it started; workers and order."""
-
 import contextlib
 import gc
 import os
@@ -44,20 +42,17 @@ def common_lab() -> Iterator[Lab]:
 
 @pytest.fixture(scope="module")
 def own_appliance(common_lab: Lab) -> Iterator[Appliance]:
-    """An appliance for a file that crashes or restarts it, with an open policy, on 10.77.0.2 of the common lab."""
     with Appliance(common_lab.host("appliance", "10.77.0.2/24"), options=("--api", "off")) as running:
         yield running
 
 
 @pytest.fixture(scope="module")
 def common_robot(common_lab: Lab) -> Host:
-    """The host of the common lab that the robot's nodes run on (10.77.0.10)."""
     return common_lab.host("robot", "10.77.0.10/24")
 
 
 @pytest.fixture
 def robot(lab: Lab) -> Host:
-    """The host the robot's nodes run on (10.77.0.10)."""
     return lab.host("robot", "10.77.0.10/24")
 
 
@@ -84,7 +79,6 @@ def site(request: pytest.FixtureRequest, masters: Masters) -> Iterator[Site]:
 
 @pytest.fixture
 def ros(request: pytest.FixtureRequest, appliance: Appliance, tmp_path: Path) -> Iterator[RosSession]:
-    """The nodes and tools of one test behind its appliance: on this machine, or on the robot if that is in a lab."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     robot = None if isinstance(appliance.host, ThisMachine) else request.getfixturevalue("common_robot")
     with RosSession(appliance.master_uri, tmp_path, robot) as session:
@@ -104,13 +98,13 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Have programs listen to SIGINT; give each worker of pytest-xdist a loopback of its own, as root.
+    """Give each worker of pytest-xdist a loopback of its own, as root, and let programs hear SIGINT.
 
     A script's background process ignores SIGINT, and so does every program that it starts: a test that interrupts
     such a program would wait for its end until the time limit.
 
-    A node that a test killed is remembered by its master with a port; on a common loopback the next node that takes
-    this port may belong to another worker. It would answer for the dead node, or get its order to shut down.
+    A node that a test killed is remembered by its master with a port, which the next node on a common loopback may
+    take: it would answer for the dead node, or get its order to shut down.
     """
     # The collected tests stay in memory: the garbage collector would scan their millions of objects again and again.
     gc.set_threshold(700, 10, 100)
@@ -125,7 +119,6 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)  # of pytest-xdist
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """`-n auto`: twice as many as there are cores, for all wait much; `-n logical`: one more, for few wait."""
     cores = len(os.sched_getaffinity(0))
     return cores + 1 if config.option.numprocesses == "logical" else 2 * cores
 

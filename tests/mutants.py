@@ -1,10 +1,10 @@
 """Change the kernel in small wrong ways, and list the changes that no test of the gate finds: `make mutants N=200`.
 
-Every module of the kernel (docs/dev/architecture.md) is loaded with all its mutants inside, each switched by a number.
-A first run records which tests reach which mutant. Then each chosen mutant is switched on in a fork of this process,
-which runs only those tests, until one fails. With `--all`, it also runs the tests that are left out of the gate.
-`--module master` changes the modules whose path contains `master` instead of the kernel. A seed then chooses the same
-mutants whatever the tests reach, so that two states of the tests can be compared.
+Every module of the kernel (docs/dev/architecture.md) is loaded with all its mutants inside, each switched by a
+number. A first run records which tests reach which mutant. Then each chosen mutant is switched on in a fork of this
+process, which runs only those tests, until one fails. With `--all`, it also runs tests outside the gate. `--module
+master` changes the modules whose path contains `master` instead of the kernel. A seed then chooses the same mutants
+whatever the tests reach, so that two states of the tests can be compared.
 """
 
 import argparse
@@ -49,8 +49,6 @@ def modules_of(part: str) -> dict[str, Path]:
 
 
 class _Switches(ast.NodeTransformer):
-    """Puts a switch beside each place that can be changed: `wrong if __reached_mutant__(7) else right`."""
-
     def __init__(self, module: str, first: int) -> None:
         self._module, self._number, self._functions = module, first, 0
         self.described: list[str] = []
@@ -128,8 +126,6 @@ class _Switches(ast.NodeTransformer):
 
 
 class MutantLoader(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Loads modules with their switches; `described` says what each number changes."""
-
     def __init__(self, modules: dict[str, Path]) -> None:
         self.modules = modules
         self.described: list[str] = []
@@ -151,8 +147,6 @@ class MutantLoader(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 class Hunt:
-    """A plugin of pytest that runs the collected tests once to learn what they reach, then once for each mutant."""
-
     def __init__(
         self, loader: MutantLoader, number: int, seed: int, seconds: int, *, everything: bool
     ) -> None:
@@ -175,7 +169,6 @@ class Hunt:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
-        """Run everything in forks, so that no run affects another."""
         items = session.items
         learned = self._fork(session, items, self._seconds * 10)
         if learned["failed"]:
@@ -202,7 +195,6 @@ class Hunt:
         return True
 
     def _fork(self, session: pytest.Session, items: list[pytest.Item], seconds: int) -> dict[str, Any]:
-        """Run tests in a fork until one fails; return the ids of failed tests, and what was reached."""
         with tempfile.NamedTemporaryFile("r") as answer:
             child = os.fork()
             if not child:

@@ -46,7 +46,7 @@ LANES = {
 
 @dataclass(frozen=True)
 class Stage:
-    """Tests that run side by side: on `workers` of pytest-xdist, or one after the other."""
+    """Tests run side by side on `workers` of pytest-xdist, or one after the other."""
 
     name: str
     folders: tuple[str, ...]
@@ -134,13 +134,12 @@ def outcomes_of(report: Path) -> Iterator[tuple[str, str, float]]:
 
 
 def unsteady() -> set[str]:
-    """Return the tests that are known to fail by chance; each line has the id, a date and the reason."""
+    """Each line of the file has the id, a date and the reason."""
     lines = UNSTEADY.read_text(encoding="utf-8").splitlines()
     return {line.split()[0] for line in lines if line and not line.startswith("#")}
 
 
 def run_stage(stage: Stage, files: list[str]) -> tuple[list[tuple[str, str, float]], str]:
-    """Run the files of a stage; return the outcomes, and what went wrong beside them."""
     report = FOLDER / f"{stage.name}.xml"
     report.unlink(missing_ok=True)
     command = [sys.executable, "-m", "pytest", *files, *stage.options(), "--quiet", "--tb=short"]
@@ -164,7 +163,6 @@ def run_stage(stage: Stage, files: list[str]) -> tuple[list[tuple[str, str, floa
 
 
 def main() -> int:
-    """Run the stages, print a summary, and return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--lane", choices=["core", *LANES], help="run the tests of one lane only")
     lane = parser.parse_args().lane

@@ -14,7 +14,7 @@ from tests.support.sources import ROOT
 
 
 def largest_chance(failures: int, runs: int, confidence: float = 0.95) -> float:
-    """Return the upper bound of Clopper and Pearson for the chance of a failure; about 3/n without a failure."""
+    """Clopper and Pearson's upper bound; about 3/n without a failure."""
     low, high = failures / runs, 1.0
     for _ in range(60):
         middle = (low + high) / 2
@@ -26,7 +26,6 @@ def largest_chance(failures: int, runs: int, confidence: float = 0.95) -> float:
 
 
 def main() -> int:
-    """Run the test and return 1 if it ever failed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("test", help="a file or id for pytest")
     parser.add_argument("runs", type=int, help="how often to run it")

@@ -1,5 +1,3 @@
-"""Small specifications and messages for tests: each test gives an action and compares its result."""
-
 import functools
 from collections.abc import Mapping
 from typing import Any
@@ -29,7 +27,7 @@ def definitions() -> Definitions:
 
 
 def message(kind: str, **fields: object) -> bytes:
-    """Return a message from another library's encoder; missing fields are zero, and `a__b` is the path `a.b`."""
+    """From another library's encoder; missing fields are zero, and `a__b` is the path `a.b`."""
     return bytes(STORE.serialize_ros1(_value(_long(kind), _tree(fields)), _long(kind)))
 
 
@@ -82,7 +80,6 @@ def _value(kind: str, given: object) -> Any:
 def load(
     text: str, on_fault: OnFault = "drop", patience: Patience = lambda: lambda: False, **others: str
 ) -> MonitorSet:
-    """Return the monitors of a text (and of other files, by name), started at time 0."""
     sources = {"x.rv": text, **{f"{name}.rv": other for name, other in others.items()}}
     monitors = MonitorSet.of(compiled_from(sources, definitions()), on_fault, patience)
     monitors.start(0)
@@ -90,15 +87,12 @@ def load(
 
 
 def action(body: str, *, before: str = "") -> str:
-    """Return a specification with an action on `/t`, `std_msgs/Int32` bound to `x`; `before` are declarations."""
+    """The action is on `/t`, `std_msgs/Int32` bound to `x`; `before` are declarations."""
     return f"s() {{ {before} event e(int x) /t std_msgs/Int32 '{{data:x}}' {{ {body} }} }}"
 
 
 def act(body: str, *, before: str = "", data: int = 0, most: int = BUDGET) -> Outcome:
-    """Return the result of an action on `/t`, `std_msgs/Int32` bound to `x`; `before` are declarations and functions.
-
-    `most` is the number of instructions that a message may take.
-    """
+    """`most` is the number of instructions that a message may take."""
     text = action(body, before=before)
     told = message("std_msgs/Int32", data=data)
     monitors = load(text)
@@ -114,7 +108,6 @@ def shown(expression: str, *, conversion: str = "%s", before: str = "", data: in
 
 
 def refused(text: str) -> list[Diagnostic]:
-    """Return the errors of a specification; fail if it has none."""
     try:
         MonitorSet.of(compiled_from({"x.rv": text}, definitions()))
     except SpecificationError as error:
@@ -123,6 +116,6 @@ def refused(text: str) -> list[Diagnostic]:
 
 
 def refused_action(body: str, *, before: str = "") -> list[Diagnostic]:
-    """Return the errors of an action on `/t`, `std_msgs/Int32` bound to `x`; columns count from the action."""
+    """Columns count from the action."""
     text = f"s() {{ {before}\nevent e(int x) /t std_msgs/Int32 '{{data:x}}' {{\n{body}\n}} }}"
     return refused(text)

@@ -20,14 +20,12 @@ STAMPED = struct.pack("<I3sIIdhI2dBI", 3, b"abc", 9, 8, 2.5, 1, 2, 0.5, 7.0, 1, 
 
 
 def plain(count: int = 0, x: float = 0.0, kind: int = 0, rest: bytes = b"") -> bytes:
-    """Return the bytes of an `own/Plain`."""
     return struct.pack("<BidfBII3qI", kind, count, x, 0.0, 0, 5, 7, 1, 2, 3, len(rest)) + rest
 
 
 def stamped(
     frame: bytes = b"abc", count: int = 0, names: tuple[bytes, ...] = (), values: tuple[float, ...] = ()
 ) -> bytes:
-    """Return the bytes of an `own/Stamped`."""
     body = struct.pack("<I", len(frame)) + frame + struct.pack("<IIdhI", 9, 8, 2.5, count, len(values))
     body += struct.pack(f"<{len(values)}dBI", *values, 0, len(names))
     return body + b"".join(struct.pack("<I", len(name)) + name for name in names)
@@ -38,8 +36,6 @@ def frames(bodies: Iterable[bytes]) -> bytes:
 
 
 class BothWays:
-    """A set with its module, and the same set run by the interpreter; both are started."""
-
     def __init__(self, *texts: str, on_fault: OnFault = "drop", margins: bool = False) -> None:
         sources = {f"{place}.rv": text for place, text in enumerate(texts)}
         self.monitors = on_module(compiled_from(sources, definitions(), margins=margins), on_fault)
@@ -62,13 +58,12 @@ class BothWays:
         """Whether messages are in the module's memory; this changes with each check."""
 
     def lane(self, topic: str = "/plain") -> FastLane:
-        """Return the fast path of a topic, which must have one."""
         found = self.monitors.lane(topic)
         assert found is not None
         return found
 
     def check(self, bodies: list[bytes], topic: str = "/plain", time: int = 1) -> list[bytes]:
-        """Fail if a batch of messages makes a difference; return the messages that pass."""
+        """Returns the messages that pass; fails if a batch makes a difference."""
         expected = []
         began, self.counts = len(self.interpreted), Counter()
         lines: list[LogLine] = []
@@ -135,7 +130,6 @@ class BothWays:
 
 
 def state_of(monitors: MonitorSet) -> list[str]:
-    """Return variables, states of properties, and how close comparisons came."""
     state = []
     for monitor in monitors.monitors:
         names = monitors.interpreter.variables

@@ -1,5 +1,3 @@
-"""Settings shared by all tests of the language."""
-
 from hypothesis import settings
 
 from rosmop.tests.examples import examples

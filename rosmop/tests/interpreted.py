@@ -15,13 +15,12 @@ def sent(functions: Mapping[str, nodes.Function]) -> dict[str, nodes.Function]:
 
 
 def beside(monitors: MonitorSet) -> MonitorSet:
-    """Return the same set, from the form as it is sent, with its own state and without a module; not started."""
+    """From the form as it is sent, with its own state and without a module; not started."""
     compiled = replace(monitors.compiled, functions=sent(monitors.compiled.functions))
     return MonitorSet(compiled, monitors.on_fault, monitors.patience)
 
 
 def check_same(one: Outcome, other: Outcome) -> None:
-    """Fail if the two ways had different outcomes."""
     assert _told(one) == _told(other)
     for fault, other_fault in zip(one.faults, other.faults, strict=True):
         assert repr(sorted(fault.values.items())) == repr(sorted(other_fault.values.items()))

@@ -1,5 +1,3 @@
-"""Make a set whose messages are handled by a module, as in the relay."""
-
 from collections.abc import Collection
 
 from rosmop.fast.build import fast_path_of

@@ -1,5 +1,3 @@
-"""Random messages of any type: whole, cut short, and with false lengths."""
-
 import math
 import struct
 from collections.abc import Sequence
@@ -21,7 +19,7 @@ LIES = (0, 1, 3, 4, 200, 2**29, 2**31 - 1, 2**31, 2**32 - 5, 2**32 - 1)
 
 
 class RandomMessages:
-    """Draws messages. Most numbers are small, so that conditions of programs are sometimes true."""
+    """Most numbers are small, so that conditions of programs are sometimes true."""
 
     def __init__(self, definitions: Definitions, random: Random) -> None:
         self._definitions = definitions
@@ -31,7 +29,6 @@ class RandomMessages:
         return b"".join(map(self._field, self._definitions.message(kind).fields))
 
     def read(self, kind: str) -> list[bytes]:
-        """Return the messages of one read: similar or not, some of them cut or with a false length."""
         random, whole = self._random, self.whole(kind)
         bodies = [
             whole if random.random() < 0.3 else self.whole(kind) for _ in range(random.choice((1, 2, 6, 12)))

@@ -1,5 +1,3 @@
-"""Random specifications and messages, for comparing two implementations."""
-
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -70,7 +68,7 @@ def definitions() -> Definitions:
 
 @dataclass(frozen=True)
 class Traffic:
-    """Messages of one topic (`EventCode.channel`) as consecutive frames, and their number."""
+    """Frames of `EventCode.channel`, one after another."""
 
     topic: str
     frames: bytes
@@ -85,10 +83,7 @@ class Traffic:
 
 
 class Specifications:
-    """Random texts of specifications.
-
-    With `numbers`, they only have parts that a module handles: numbers and conditions.
-    """
+    """With `numbers`, they only have parts that a module handles: numbers and conditions."""
 
     def __init__(self, seed: int, *, numbers: bool = False) -> None:
         self._random = Random(seed)  # noqa: S311  draws examples, not keys
@@ -228,7 +223,6 @@ class Specifications:
         return random.choice(choices)
 
     def _publications(self, texts: list[str], value: str) -> list[str]:
-        """Return statements that make messages, change kept messages, and publish."""
         text = self._random.choice(texts)
         return [
             f"{{ std_msgs::String m; m.data = {text}; PUBLISH(/text, std_msgs/String, m); }}",
@@ -246,14 +240,11 @@ class Specifications:
 
 
 class Messages:
-    """Random messages of the two topics and of a service (`EventCode.channel`)."""
-
     def __init__(self, seed: int) -> None:
         self._random = Random(seed)  # noqa: S311  draws examples, not keys
         self._ways = ways(seed)
 
     def traffic(self) -> Traffic:
-        """Return messages of one topic: mostly of equal length, sometimes not of the topic's type."""
         random = self._random
         topic = random.choice(self._ways)
         make = self._plain if topic in PLAIN else self._stamped

@@ -1,4 +1,4 @@
-"""Run stories about specifications: messages and other steps, each with its outcome.
+"""Stories about specifications: messages and other steps, each with its outcome.
 
     # The title of a story, which names its test
     % on_fault=pass shadows=a slices=2        how the set is made
@@ -36,8 +36,6 @@ UNITS = {"s": 10**9, "ms": 10**6, "ns": 1}
 
 @dataclass(frozen=True)
 class Step:
-    """A step, the specifications that follow it, and its expected lines."""
-
     words: str
     loaded: str
     expected: tuple[str, ...]
@@ -103,12 +101,11 @@ def tell(story: Story) -> Iterator[tuple[Step, list[str]]]:
 
 
 def _without_places(lines: Sequence[str]) -> list[str]:
-    """Return the lines without the positions of statements, which a module does not know."""
+    """A module does not know positions of statements."""
     return [re.sub(r" at \d\S*", "", line) for line in lines]
 
 
 def _done(monitors: MonitorSet, step: Step, *, judged: bool) -> tuple[MonitorSet, list[str]]:
-    """Carry out a step with a set; return the set after the step, and the lines of the outcome."""
     first, *words = step.words.split(" ")
     outcomes: Sequence[Outcome] = ()
     kind = ""
@@ -148,7 +145,7 @@ def _done(monitors: MonitorSet, step: Step, *, judged: bool) -> tuple[MonitorSet
 
 
 def body_of(kind: str, given: Sequence[str]) -> bytes:
-    """Return a message from fields given as text; a single `hex=…` gives the bytes themselves."""
+    """A single `hex=…` gives the bytes themselves."""
     pairs = [field.split("=", 1) for field in given]
     if pairs and pairs[0][0] == "hex":
         return bytes.fromhex(pairs[0][1])
@@ -163,7 +160,7 @@ def _read(value: str) -> object:
 
 
 def fields_of(kind: str, data: bytes) -> str:
-    """Return the fields of a message that are not zero, by another library's decoder, and check its encoder.
+    """Return the fields that are not zero, by another library's decoder, and check its encoder.
 
     A space in a string is `␠`. Parts of services are in bytes.
     """
@@ -194,10 +191,7 @@ def _fields(path: str, value: Any) -> Iterator[str]:
 
 
 def lines_of(outcome: Outcome, monitors: MonitorSet, kind: str = "") -> list[str]:
-    """Return all lines of an outcome: earlier effects, result and events, verdicts, output, publications and faults.
-
-    Without a message type there is no result.
-    """
+    """Without a message type there is no result."""
     lines = [line for one in outcome.before for line in lines_of(one, monitors)]
     head: str = outcome.result
     if outcome.result == "changed":
@@ -230,7 +224,6 @@ def lines_of(outcome: Outcome, monitors: MonitorSet, kind: str = "") -> list[str
 
 
 def nanoseconds(text: str) -> int:
-    """Return a time, such as `1500ms`, as a number."""
     number = text.rstrip("msn")
     return int(number) * UNITS[text.removeprefix(number)]
 

@@ -1,5 +1,3 @@
-"""The processor time of one message is limited, whatever the message makes monitors do."""
-
 from collections.abc import Callable
 
 import pytest

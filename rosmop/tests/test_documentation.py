@@ -1,5 +1,3 @@
-"""The page on the language is correct: its examples load, and its functions and limits are those of the code."""
-
 import re
 from pathlib import Path
 
@@ -25,7 +23,6 @@ EXAMPLE, GIVEN, ORDER, SAFE, WITHHELD, CALLS, VARIABLES, FUNCTIONS, PROPERTY, SL
 
 
 def test_the_example_loads() -> None:
-    """Each example file of the page is valid."""
     assert [monitor.name for monitor in load(EXAMPLE).monitors] == ["safeTrigger"]
 
 
@@ -44,7 +41,6 @@ def test_the_code_of_library_functions_is_on_the_page() -> None:
 
 
 def in_specification(members: str, action: str = "") -> str:
-    """Return a file with these members of a specification, and an event whose action is given."""
     events = "event go() /t std_msgs/Empty '{}' { } event stop() /u std_msgs/Empty '{}' { }"
     drive = f"event drive(double v) /cmd_vel geometry_msgs/Twist '{{linear.x:v}}' {{ {action} }}"
     return f"s() {{ {members} {events} {drive} }}"

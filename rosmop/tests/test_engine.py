@@ -1,5 +1,3 @@
-"""The running monitors: order, shared variables, properties and handlers, time, faults, swaps, services."""
-
 # ruff: noqa: E501  the rows of tables
 
 from collections.abc import Callable
@@ -23,12 +21,10 @@ SECOND = 10**9
 
 
 def number(value: int) -> bytes:
-    """Return a `std_msgs/Int32`."""
     return message("std_msgs/Int32", data=value)
 
 
 def on(topic: str, name: str = "e", body: str = "", parameters: str = "") -> str:
-    """Return an event on a topic of `std_msgs/Int32`, with its value bound to `x`."""
     return f"event {name}(int x{parameters}) {topic} std_msgs/Int32 '{{data:x}}' {{ {body} }}\n"
 
 
@@ -103,7 +99,7 @@ def test_the_events_of_a_change_are_those_found_by_comparing_all_bytes() -> None
 def _compared(
     name: str, function: Callable[[WireMessage | None], bool], found: list[str]
 ) -> Callable[[WireMessage | None], bool]:
-    """Wrap the function of an event; add its name to `found` if any byte has changed."""
+    """Add the name to `found` if the event has changed any byte."""
 
     def compared(seen: WireMessage | None) -> bool:
         assert seen is not None
@@ -160,7 +156,6 @@ def test_late_ticks_are_skipped_and_deadlines_wait() -> None:
 
 
 def test_faults_are_counted() -> None:
-    """Counting lets a monitor be shown as failing."""
     monitors = load("a() {" + on("/t", "e", "x = 1 / x;") + "}")
     seen = []
     for i in range(12):

@@ -1,5 +1,3 @@
-"""A set's module has the results of the interpreter: bytes, drops, variables, states; the rest it leaves."""
-
 import struct
 from collections import Counter
 from pathlib import Path
@@ -37,10 +35,7 @@ PROGRAMS = Path(__file__).parent / "programs.txt"
 @FEW
 @given(seed=st.integers(0, 1 << 30), wild=st.lists(st.binary(max_size=80), max_size=4))
 def test_random_specifications_and_messages(seed: int, wild: list[bytes]) -> None:
-    """Covers actions, conditions, helper functions, loops and properties, on several topics, with invalid bytes.
-
-    How close comparisons came is also the same, if it is recorded.
-    """
+    """How close comparisons came is also the same, if it is recorded."""
     try:
         both = BothWays(
             *Specifications(seed).texts(), on_fault=("drop", "pass")[seed % 2], margins=seed % 4 > 1
@@ -105,7 +100,6 @@ EXPRESSIONS = (
 
 @pytest.mark.parametrize("expression", EXPRESSIONS)
 def test_expressions_at_the_limits(expression: str) -> None:
-    """Covers numbers that overflow or do not fit, and NaN."""
     before = "double d = 0; long n = 0; float f = 0;"
     both = BothWays(
         event(f"d = {expression}; n = d; f = d; x = n;", "int x, double y", "count:x, x:y", before)
@@ -122,7 +116,7 @@ def test_expressions_at_the_limits(expression: str) -> None:
 
 @table(PROGRAMS)
 def test_each_program_does_the_same_in_the_module_and_the_interpreter(case: Case) -> None:
-    """The messages are random, several in a read, also cut after each byte, and with false lengths.
+    """Messages are also cut after each byte, and have false lengths.
 
     The module handles messages of programs marked `module`, and none of those marked `engine`. For each difference
     between module and interpreter that was found or suspected, one row is added.
@@ -262,10 +256,7 @@ def test_fuel_lasts_for_many_calls_and_is_renewed(
 
 
 def test_only_the_beginning_of_a_long_message_is_copied() -> None:
-    """The module changes and drops long messages; it leaves events that read past the copied beginning.
-
-    The limit does not apply to a message that is completely in the module's memory.
-    """
+    """The limit does not apply to a message that is completely in the module's memory."""
     picture = bytes(range(256)) * (BEGINNING // 128)
     both = BothWays(event("if (count == 3) { return; } count = count + 1; n++;"))
     both.check([plain(1, rest=picture), plain(2), plain(3, rest=picture), plain(4, rest=picture), plain(5)])
@@ -397,7 +388,7 @@ CLOCKED = (
 
 @pytest.mark.parametrize("text", CLOCKED)
 def test_properties_with_clocks_do_the_same_in_the_module(text: str) -> None:
-    """States, clocks, deadlines, handlers and explanations equal the interpreter's, over far more steps than are kept.
+    """Covers explanations over far more steps than are kept.
 
     If a message sets an earlier deadline, that deadline precedes the next message.
     """

@@ -57,7 +57,6 @@ OTHER = """t() { int m = 0; std::string own;
 @SOME
 @given(seed=st.integers(0, 1 << 30))
 def test_random_programs_of_strings(seed: int) -> None:
-    """Strings are assigned, compared, printed, passed on, dropped and faulted on two topics, by module and engine."""
     random = Random(seed)  # noqa: S311  draws examples, not keys
     body, other = (" ".join(random.choices(STATEMENTS, k=random.randint(1, 6))) for _ in range(2))
     event = f"event o(std::string f, int x) /stamped own/Stamped '{{frame:f, count:x}}' {{ {other} }}"

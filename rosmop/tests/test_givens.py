@@ -1,5 +1,3 @@
-"""Constants with a unit and a range are set while a monitor runs; topics are given at a load."""
-
 from struct import pack, unpack
 
 import pytest
@@ -129,7 +127,6 @@ def test_invalid_givens_are_refused(given: str, why: str) -> None:
 
 
 def test_another_specification_reads_a_given_constant() -> None:
-    """As any shared variable; its own first values cannot."""
     reader = "r() { event e(int x) /n std_msgs/Int32 '{data:x}' { x = n; } }"
     monitors = load(CAP, y=reader)
     monitors.give({"cap": {"n": 4}})

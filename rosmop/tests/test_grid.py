@@ -1,5 +1,3 @@
-"""Each back end has a row for each kind of node, and everything left by the module has a position and a reason."""
-
 from collections.abc import Collection
 from types import UnionType
 from typing import get_args

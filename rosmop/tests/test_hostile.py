@@ -101,7 +101,6 @@ LARGE_VALUES = """std::string s(1000000, 'x'), t(1000000, 'x'); char c[1000001];
 
 @pytest.mark.parametrize("body", COSTLY)
 def test_expensive_operations_are_charged(body: str) -> None:
-    """An operation on a million bytes costs thousands of instructions, so that a loop of them ends in time."""
     text = f"s() {{ {LARGE_VALUES} event e() /t std_msgs/Empty '{{}}' {{ {body} }} }}"
     monitors = load(text)
     outcome = monitors.process("/t", b"", 1)

@@ -1,4 +1,4 @@
-"""Phases: who sees what a monitor inserts, compared with a naive composition of edit automata."""
+"""Phases decide which monitors see an inserted message: compared with a naive composition of edit automata."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -20,10 +20,10 @@ Timed = list[tuple[int, str]]
 
 @dataclass
 class Phase:
-    """A specification: what it forbids, inserts at deadlines (trigger, answer, bound), and inserts at events at once.
+    """Forbids, inserts at deadlines (trigger, answer, bound), and inserts at events.
 
-    `seen` is its trace: the messages that subscribers got, without what later phases insert. `tried` is the number of
-    its messages whose triggers each insertion has answered, or tried to.
+    `seen` is its trace: the messages that subscribers got, without what later phases insert. `tried` counts, for each
+    insertion, the triggers that it has answered or tried to.
     """
 
     forbidden: Sequence[Meaning]
@@ -52,7 +52,6 @@ class Phase:
         return any(one.unmet((*self.seen, (time, event)), time)[0] for one in self.forbidden)
 
     def deadlines(self) -> Iterator[tuple[int, int]]:
-        """Yield each insertion (time, number) that some trigger waits for."""
         self.tried = self.tried or [0] * len(self.due)
         for number, (trigger, answer, within) in enumerate(self.due):
             for place, (time, event) in enumerate(self.seen):
@@ -113,7 +112,6 @@ def drawn(random: Random) -> Phase:
 
 
 def drawn_ban(random: Random) -> Meaning:
-    """Draw what a phase forbids, in any scope; an event is rarely forbidden for ever."""
     kind = random.choice(("no", "forbids", "requires"))
     opens, closes = random.choice((None, None, *ABC)), random.choice((None, None, *ABC))
     within = None if random.random() < 0.3 else random.randint(0, 5)
@@ -122,14 +120,13 @@ def drawn_ban(random: Random) -> Meaning:
 
 
 def sent(outcome: Outcome, time: int, event: str) -> Timed:
-    """Return what subscribers get because of a message, in order; with what was due before it."""
+    """In order; with what was due before the message."""
     found = [one for before in outcome.before for one in published(before)]
     found += [] if outcome.result == "dropped" else [(time, event)]
     return found + published(outcome)
 
 
 def published(outcome: Outcome) -> Timed:
-    """Return the published messages that subscribers get, each followed by what it caused."""
     found: Timed = []
     for number, one in enumerate(outcome.published):
         judged = outcome.judged.get(number)
@@ -140,7 +137,6 @@ def published(outcome: Outcome) -> Timed:
 
 
 def compare(random: Random, traces: int) -> tuple[int, int]:
-    """Compare random sets of phases; return how many messages were suppressed and inserted."""
     suppressed = inserted = 0
     for _ in range(traces // 10):
         phases = [drawn(random) for _ in range(random.randint(1, 3))]
@@ -171,7 +167,6 @@ def compare(random: Random, traces: int) -> tuple[int, int]:
 
 
 def test_random_phases() -> None:
-    """Each message is passed, suppressed or inserted exactly as by the definition."""
     suppressed, inserted = compare(seeded(51), 200)
     assert suppressed > 10 and inserted > 60
 
@@ -179,7 +174,6 @@ def test_random_phases() -> None:
 @pytest.mark.nightly
 @pytest.mark.parametrize("seed", range(52, 56))
 def test_many_random_phases(seed: int) -> None:
-    """Ten thousand traces together, without a difference."""
     suppressed, inserted = compare(seeded(seed), 2_500)
     assert suppressed > 100 and inserted > 700
 

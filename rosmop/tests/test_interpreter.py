@@ -1,5 +1,3 @@
-"""For any specification, module and interpreter agree on bytes, records, faults and state."""
-
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +28,6 @@ FEW = settings(max_examples=examples(120), suppress_health_check=list(HealthChec
 
 
 def check(given: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) -> None:
-    """Fail if the two ways differ for any of these messages, or in the variables at the end."""
     other, monitors = beside(given), on_module(given.compiled, given.on_fault)
     check_same(monitors.start(0), other.start(0))
     for number, (topic, body) in enumerate(traffic):
@@ -116,7 +113,6 @@ def a_value(values: ValueCodec, kind: value_types.Type) -> st.SearchStrategy[Any
 @FEW
 @given(data=st.data())
 def test_shipped_specifications(data: st.DataObject) -> None:
-    """The messages on their topics are random, and some are cut short."""
     monitors = shipped()
     values = ValueCodec(MessageTypes(monitors.definitions))
     traffic = []

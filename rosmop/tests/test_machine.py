@@ -1,5 +1,3 @@
-"""A module runs within its limits: what it may do, how it is stopped, and that nothing is left behind."""
-
 import contextlib
 import resource
 import struct
@@ -67,7 +65,6 @@ def test_arguments_and_results_by_name_and_number() -> None:
 
 @pytest.mark.parametrize("arguments", [(), (1, 2), (1 << 63,), (0.5,)])
 def test_other_arguments(arguments: tuple[int, ...]) -> None:
-    """Missing, surplus, oversized or non-integer arguments are refused before any code runs."""
     one = made("""(func (export "mark") (param i64) (i32.store (i32.const 0) (i32.const 1)))""")
     with pytest.raises(struct.error):
         one.call("mark", *arguments, fuel=FUEL)
@@ -238,7 +235,6 @@ RICH = bytes(
     argument=st.sampled_from([0, 1, -1, 5, PAGE - 4, PAGE, 1 << 31, (1 << 63) - 1]),
 )
 def test_damaged_modules(changes: list[tuple[int, int]], length: int, argument: int) -> None:
-    """Damaged modules are refused, trap, or only affect their own memory."""
     code = bytearray(RICH)
     for at, value in changes:
         code[at] = value
@@ -255,7 +251,6 @@ def test_damaged_modules(changes: list[tuple[int, int]], length: int, argument: 
 
 
 def resident() -> int:
-    """Return the resident bytes of this process."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 

@@ -1,5 +1,3 @@
-"""The part of a set that one relay runs: its specifications, and the machine code of their module."""
-
 import hashlib
 import os
 import subprocess
@@ -68,7 +66,7 @@ def story(outcome: Outcome, names: set[str]) -> Iterator[object]:
 
 
 def test_a_part_is_the_same_whatever_else_is_in_the_set() -> None:
-    """Bytes and machine code stay the same, so a relay gets nothing new when others change."""
+    """A relay gets nothing new when other specifications change."""
     alone = encoded_part(part_of(compiled("a"), ["a"], []))
     assert encoded_part(part_of(compiled("a", "b", "c"), ["a"], [])) == alone
     assert encoded_part(part_of(compiled("c", "b", "a"), ["a"], [])) == alone

@@ -13,7 +13,6 @@ FAMILIES = ("i32", "i64", "f32", "f64", "local", "memory")
 
 
 def literals(source: str) -> Iterator[str]:
-    """Yield the bytes in a file that may become instructions: literals, and numbers converted to bytes."""
     tree = ast.parse(source)
     compared = {
         id(part) for node in ast.walk(tree) if isinstance(node, ast.Compare) for part in ast.walk(node)
@@ -49,7 +48,6 @@ def test_opcodes_are_in_the_table(path: Path) -> None:
     ],
 )  # fmt: skip
 def test_literals_are_found(source: str) -> None:
-    """Covers each way to write an opcode without its name."""
     assert list(literals(source))
 
 

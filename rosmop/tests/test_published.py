@@ -1,5 +1,3 @@
-"""Published messages go through the monitors behind their publisher, and never in a circle."""
-
 import pytest
 
 from rosmop.run.engine import MonitorSet
@@ -76,7 +74,7 @@ def test_a_disabled_monitor_judges_nothing(name: str) -> None:
     [(CAP, MUX, True), (MUX, CAP, False), (COUNT, MUX, True), (MUX.replace("mux", "m"), MUX, False)],
 )
 def test_a_pair_in_the_wrong_order_is_a_warning(first: str, second: str, warned: bool) -> None:
-    """Only the order of the files decides who sees a published message, so `check` and `load` name the pair."""
+    """Only the order of the files decides which monitors see a published message."""
     warnings = [str(one) for one in load(first, y=second).warnings if "does not see them" in one.text]
     assert bool(warnings) is warned
     assert not warned or warnings[0].startswith("y.rv:2:5: warning: mux publishes /cmd_vel, but ")

@@ -33,7 +33,6 @@ FORMULAS = {
 
 
 def compiled(formula: str) -> MonitorSet:
-    """Return a specification with this property over three events, on /e0, /e1 and /e2."""
     events = " ".join(f"event e{n}() /e{n} std_msgs/Empty '{{}}' {{ }}" for n in range(3))
     if formula.startswith("ptcaret"):
         events = events.replace("event e0", "event begin").replace("event e1", "event end")
@@ -73,7 +72,7 @@ def test_an_invalid_state_of_a_property_is_refused(name: str, data: object) -> N
 
 
 def test_a_deep_stack_is_too_large_to_keep() -> None:
-    """The data written with each message is limited, so a deeply nested grammar is not kept, and this is reported."""
+    """The data written with each message is limited."""
     formula = compiled(FORMULAS["cfg"]).compiled.specifications[0].properties[0].property
     run = formula.start(0)
     for _ in range(2 * MOST_PARTS):

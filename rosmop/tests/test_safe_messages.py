@@ -1,4 +1,4 @@
-"""A monitor that cannot judge sends its safe message, and passes no other; `STOP;` replaces a message by it."""
+"""A monitor that cannot judge sends its safe message and passes no other."""
 
 from itertools import product
 from typing import Any
@@ -30,7 +30,7 @@ def guard(*members: str, head: str = "guard()") -> str:
 
 
 def command(speed: float = 1.0, frame: str = "joy", turn: float = 0.0) -> bytes:
-    """Return a command with seq 7 and stamp 3 s."""
+    """Seq 7 and stamp 3 s."""
     return message(TWIST, header__seq=7, header__stamp__sec=3, header__frame_id=frame, twist__linear__x=speed,
                    twist__angular__z=turn)  # fmt: skip
 
@@ -39,7 +39,7 @@ SAFE_BYTES = command(0.0, "base", 0.5)
 
 
 def drive(monitors: MonitorSet, data: bytes, time: int = 5) -> bytes:
-    """Return what the base gets of a command; empty if it gets nothing."""
+    """Empty if the base gets nothing."""
     outcome = monitors.process("/cmd_vel", bytearray(data), time)
     return b"" if outcome.result == "dropped" else bytes(outcome.buffer)
 
@@ -103,7 +103,6 @@ def test_time_that_one_monitor_used_up_is_given_again() -> None:
 
 
 def held(how: str) -> MonitorSet:
-    """Return monitors that cannot judge."""
     monitors = load(
         guard(*(["init() { near = 1 / int(near - 9); }", SAFE, SCAN, DRIVE] if how == "broken" else ()))
     )
@@ -151,7 +150,6 @@ def test_a_monitor_that_starts_again_sends_until_the_first_command() -> None:
 
 @pytest.mark.parametrize("on_fault", ["drop", "pass"])
 def test_a_monitor_that_is_disabled_or_in_shadow_mode_sends_nothing(on_fault: OnFault) -> None:
-    """Neither while it would hold its topics, nor after a restart."""
     compiled_set = compiled_from({"x.rv": guard()}, definitions())
     shadowed = MonitorSet.of(compiled_set, on_fault, shadows=["guard"])
     shadowed.start(0, restarted=True)
@@ -201,14 +199,13 @@ def test_old_files_may_use_the_new_words_as_names() -> None:
 
 
 def stopping(formula: str) -> str:
-    """Return a specification over the topics /a, /b and /c whose property's handler stops."""
     parts = [f"event {name}() /{name} std_msgs/Int32 '{{}}' {{ }} safe std_msgs/Int32 {{data:-1}} on /{name} every 1s;"
              for name in ABC]  # fmt: skip
     return f"s() {{ {' '.join(parts)} {formula} @violation {{ STOP; }} }}"
 
 
 def passed(monitors: MonitorSet, trace: Timed) -> list[bool]:
-    """Return whether each message of a trace passes unchanged; the others must be the safe message."""
+    """Each other message must be the safe one."""
     found = []
     for event, time in ((event, time) for time, event in trace):
         outcome = monitors.process(f"/{event}", bytearray(message("std_msgs/Int32", data=1)), time)

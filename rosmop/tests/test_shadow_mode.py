@@ -34,7 +34,6 @@ PROPERTIES = {
 
 
 def number(data: int) -> bytes:
-    """Return a std_msgs/UInt8."""
     return bytes([data])
 
 
@@ -59,7 +58,6 @@ class Both:
         assert not self.story(outcome)
 
     def give(self, topic: str, body: bytes, time: int) -> None:
-        """Send a message to all three; it passes as it does without the specification in shadow mode."""
         done = self.enabled.process(topic, bytearray(body), time)
         self.stories[0] += self.story(done)
         left = self.with_shadow.process(topic, bytearray(body), time)
@@ -89,7 +87,6 @@ class Both:
         self.stories[1] += self.story(self.with_shadow.process(topic, bytearray(body), time))
 
     def check(self, time: int) -> list[object]:
-        """Fail if both reports differ so far; return them."""
         for place, sets in enumerate(([self.enabled], [self.with_shadow, *self.with_shadow.shadows])):
             for outcome in [outcome for one in sets for outcome in one.advance(time)]:
                 self.stories[place] += self.story(outcome)
@@ -118,7 +115,6 @@ class Both:
 @example(seed=11435, wild=[])  # this one publishes, and follows others that publish
 @given(seed=st.integers(0, 1 << 30), wild=st.lists(st.binary(max_size=80), max_size=3))
 def test_random_specifications_and_messages(seed: int, wild: list[bytes]) -> None:
-    """Effects of the others are as without it, and its own reports as if enabled; this continues after `promote`."""
     texts = {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())}
     try:
         both = Both(texts, f"s{seed % len(texts)}", ("drop", "pass")[seed % 2])
@@ -159,7 +155,6 @@ def test_the_random_specifications_reach_every_outcome() -> None:
 
 @pytest.mark.parametrize("logic", LOGICS)
 def test_every_logic(logic: str) -> None:
-    """Events come in any order and deadlines pass, while an enabled specification changes and drops messages."""
     names = ("begin", "end") if logic == "ptcaret" else ("e0", "e1")
     events = "".join(
         f"event {name}() /n std_msgs/UInt8 '{{data:{at}}}' {{ }} " for at, name in enumerate(names)
@@ -181,7 +176,6 @@ def test_every_logic(logic: str) -> None:
 
 @pytest.mark.parametrize("logic", ["fsm", "ere", "cfg", "ltl", "ptltl", "ptcaret", "tick"])
 def test_every_parametric_logic(logic: str) -> None:
-    """Each slice has its own state, variables and ticks, from its first message on."""
     names = ("begin", "end") if logic == "ptcaret" else ("e0", "e1")
     events = "".join(
         f"event {name}(int n) /n{at} std_msgs/UInt8 '{{data:n}}' {{ seen++; }} "
@@ -237,7 +231,7 @@ def shadow(*texts: str, shadowed: Collection[str]) -> MonitorSet:
 
 
 def test_requests_and_responses() -> None:
-    """Shadow mode also works for services; only the other specifications decide about their definition."""
+    """Only the other specifications decide about the definition of a service."""
     text = """s() { event asked(bool on) service /mode std_srvs/SetBool request '{data:on}' { if (on) { return; } } }"""
     monitors = shadow(text, shadowed=["s"])
     assert monitors.process_service("/mode", "request", b"\x01", 1).result == "passed"
@@ -247,10 +241,7 @@ def test_requests_and_responses() -> None:
 
 
 def test_specifications_that_share_variables_are_in_shadow_mode_together() -> None:
-    """This also holds for indirect sharing, in the same order.
-
-    A message that one would have dropped is hidden from the next.
-    """
+    """A message that one would have dropped is hidden from the next."""
     monitors = shadow(
         f"a() {{ int k = 0; event e({NUMBER} {{ k = n; if (n == 3) {{ return; }} }} }}",
         f"b() {{ event e({NUMBER} when (k > 1) {{ return; }} }}",

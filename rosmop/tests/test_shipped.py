@@ -1,5 +1,3 @@
-"""The specifications in `monitors/` keep their promises on the topics of the LandShark."""
-
 import gc
 import math
 from collections.abc import Callable
@@ -24,7 +22,6 @@ SECOND = 10**9
 
 
 def shipped(*names: str, made: Callable[[Compiled], MonitorSet] = MonitorSet.of) -> MonitorSet:
-    """Shipped specifications, started at time 0."""
     trigger = MONITORS / "msg" / "landshark_msgs" / "PaintballTrigger.msg"
     own = Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": trigger.read_text()})
     sources = {f"{name}.rv": (MONITORS / f"{name}.rv").read_text() for name in names}
@@ -155,7 +152,6 @@ def test_a_silent_laser_stops_the_robot() -> None:
 
 
 def test_logging_changes_nothing() -> None:
-    """The log is written, and every message passes unchanged."""
     monitors = shipped("logging")
     lines = []
     for time, charge in enumerate((1.0, 0.98, 0.94, 0.2)):
@@ -176,7 +172,6 @@ def test_logging_changes_nothing() -> None:
 
 
 def goal(monitors: MonitorSet, part: str, name: str, time: float) -> Outcome:
-    """Return a message of the action `/count` about the goal with this id."""
     types = {
         "goal": "actionlib/TestActionGoal",
         "result": "actionlib/TestActionResult",

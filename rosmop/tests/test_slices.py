@@ -46,8 +46,6 @@ TWO = {"ere": ("match", "fail"), "fsm": ("match", "fail"), "cfg": ("match", "fai
 
 @dataclass(frozen=True)
 class Made:
-    """A random specification: the parameters of each event, the events that create a slice, and the body."""
-
     parameters: str
     binds: dict[str, str]
     creation: str
@@ -96,7 +94,7 @@ Trace = Sequence[tuple[str, dict[str, object]]]
 
 
 def trace(random: Random, length: int) -> Trace:
-    """Draw events with the values of all fields; the specification decides which of them are bound."""
+    """The specification decides which fields are bound."""
     few = random.randint(1, 3)
     return [
         (
@@ -115,7 +113,6 @@ Told = list[tuple[str, str]]
 
 
 def told(outcome: Outcome) -> Told:
-    """Return the effects of a message, without the order of slices."""
     assert not outcome.faults, outcome.faults
     return sorted(
         [("verdict", verdict.category) for verdict in outcome.verdicts]
@@ -187,7 +184,6 @@ def test_the_named_events_of_a_slice_alone_give_its_verdict() -> None:
 
 
 def slice_of(one: Made, trace: Trace, binding: Mapping[str, object]) -> Sequence[int]:
-    """Return the positions of the events that bind no other value, from the first that may begin a slice."""
     shown = {name: str(given) for name, given in binding.items()}
     own = [
         place
@@ -259,7 +255,7 @@ def test_a_long_binding_is_a_fault() -> None:
 
 
 def test_finished_slices_are_collected_and_do_not_begin_again() -> None:
-    """An answered goal uses no memory, but its id cannot be reused; the number of known ids is limited."""
+    """An answered goal uses no memory, but its id cannot be reused."""
     counted = ANSWERED.replace("again = again + 1;", "if (again < 1) again = again + 1;")
     monitors = MonitorSet.of(compiled_from({"x.rv": counted}, definitions()), slices=3)
     monitors.start(0)
@@ -304,7 +300,7 @@ def test_slices_stay_when_specifications_are_loaded_again() -> None:
 
 
 def test_nan_is_one_binding() -> None:
-    """NaN equals no value, but still has only one slice."""
+    """NaN equals no value."""
     monitors = load(
         "s(double x) { event e(double x) /e std_msgs/Float64 '{data:x}' { } ere: e e @match { } @fail { } }"
     )

@@ -1,4 +1,4 @@
-"""Time for each binding equals one specification for each binding, deadlines included, within limits."""
+"""Deadlines for each binding equal those of one specification for each binding."""
 
 # ruff: noqa: E501  the rows of tables
 
@@ -69,7 +69,7 @@ def entries(outcomes: Iterable[Outcome], place: int) -> list[Entry]:
 
 
 def passed(monitors: MonitorSet, end: int) -> list[Outcome]:
-    """Return the reports of the deadlines until the end, which may take several calls."""
+    """Several calls may be needed."""
     found: list[Outcome] = []
     for _ in range(1000):
         found += monitors.advance(end)
@@ -115,7 +115,6 @@ def naive(one: Made, trace: Timed, end: int) -> list[Entry]:
 
 
 def agree(one: Made, trace: Timed, deadlines: int = sys.maxsize) -> None:
-    """Fail if the slices differ from the definition."""
     end = trace[-1][0] + 20 * SECOND
     monitors = running(one.text(binding=True), 0, deadlines)
     found: list[Entry] = []
@@ -155,7 +154,7 @@ def timed(random: Random) -> Made:
 
 
 def trace_of(random: Random, length: int) -> Timed:
-    """Draw events with the values of all fields, often exactly at a time bound."""
+    """Events are often exactly at a time bound."""
     few, time, found = random.randint(1, 3), SECOND, []
     for _ in range(length):
         time += random.choice((0, 0, SECOND, SECOND, SECOND // 2, 2 * SECOND, 3 * SECOND + 1))
@@ -242,7 +241,7 @@ def test_deadlines_beyond_the_limit_wait_but_precede_messages_of_their_slice() -
 
 
 def slices_in_memory() -> int:
-    """Return the number of slices in this process, including those that only a deadline refers to."""
+    """Slices that only a deadline refers to count too."""
     gc.collect()
     return sum(isinstance(thing, Slice) for thing in gc.get_objects())
 

@@ -5,6 +5,5 @@ from rosmop.tests.stories import Story, stories, tell
 
 @stories(Path(__file__).parent / "stories.txt")
 def test_story(story: Story) -> None:
-    """Each step has the outcome written after it, in the interpreter, the engine and the module."""
     for step, lines in tell(story):
         assert tuple(lines) == step.expected, step.words

@@ -41,7 +41,6 @@ FORMULAS = [
 
 
 def guard(formula: str, handler: str = "DROP;", name: str = "s", event: str = "") -> str:
-    """Return a specification over the topics /a, /b and /c whose property's handler may drop."""
     events = "".join(f"event {name} () /{name} std_msgs/Empty '{{}}' {{ {event} }}\n" for name in ABC)
     return f"{name}() {{ {events} {formula} @violation {{ {handler} }} }}"
 
@@ -61,7 +60,6 @@ def violates(tree: Tree, before: Timed, event: tuple[int, str]) -> bool:
 
 
 def told(property_: CompiledProperty, trace: Timed) -> tuple[str, ...]:
-    """Return the verdict of a fresh run at the last event of a trace."""
     run = property_.start(0)
     categories: tuple[str, ...] = ()
     for time, event in trace:
@@ -101,7 +99,7 @@ def test_an_interlock_neither_sticks_nor_forgets(handler: str) -> None:
 
 @pytest.mark.parametrize("formula", FORMULAS)
 def test_all_short_traces(formula: str) -> None:
-    """A message passes if it does not violate the formula after the messages that passed; time always passes."""
+    """A message passes if it does not violate the formula after the messages that passed."""
     logic, _, text = formula.partition(": ")
     property_ = compiled(logic, text)
     for length in (3, 5):
@@ -160,7 +158,6 @@ def test_random_patterns_by_definition() -> None:
 
 
 def test_random_linear_formulas() -> None:
-    """Random `ltl` formulas behave the same, compared with runs that have seen only the passed messages."""
     random, dropped = seeded(28), 0
     for _ in range(examples(300)):
         tree = draw(
@@ -315,7 +312,6 @@ def test_the_module_takes_back_what_the_interpreter_takes_back() -> None:
 
 @pytest.mark.parametrize("creation", ["", "creation "])
 def test_slices_take_back_theirs(creation: str) -> None:
-    """Each binding of a parametric specification is handled alone, as without parameters."""
     random, dropped = seeded(31), 0
 
     def text(formula: str, parameters: str) -> str:

@@ -57,7 +57,6 @@ def past(random: Random) -> str:
 
 
 def caret(random: Random) -> str:
-    """Draw a formula of ptcaret, with an operator about calls."""
     inner = _PTLTL.show(draw(random, 2, _PAST, _UNARY, CALLS), random)
     other = _PTLTL.show(draw(random, 2, _PAST, _UNARY, CALLS), random)
     return random.choice(
@@ -157,7 +156,6 @@ def gives(
 def explained(
     made: CompiledProperty, random: Random, length: int
 ) -> list[tuple[Explanation | None, EventOccurrence, str, Run | None]]:
-    """Return each explanation of a verdict on a random trace and, if the explanation is cut, the run before it."""
     run, history, now = made.start(0), history_of(made, 0), 0
     found = []
     copies: dict[int, Run] = {}

@@ -1,5 +1,3 @@
-"""A topic is withheld from hosts while a variable is true, and while the monitor cannot judge."""
-
 from collections.abc import Callable
 
 import pytest

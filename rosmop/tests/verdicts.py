@@ -1,10 +1,10 @@
-"""Verdicts beside the definitions of the logics, on all short traces and on random ones, of random properties.
+"""Compare verdicts with the definitions of the logics, on all short traces and on random ones, of random properties.
 
     .venv/bin/python -m rosmop.tests.verdicts [TRACES] [--seed SEED] [--logic LOGIC]   # a million, unless said
 
-The tests of each logic define the meaning of a property, from the definition alone (`rosmop/tests/logics`); parametric
-specifications are one specification for each binding (`rosmop/tests/test_slices.py`). For each property all
-short traces and some random ones are judged, with every verdict on the way. Each logic has the same share of the
+The tests of each logic define the meaning of a property, from the definition alone (`rosmop/tests/logics`);
+parametric specifications are one specification for each binding (`rosmop/tests/test_slices.py`). For each property
+all short traces and some random ones are judged, with every verdict on the way. Each logic has the same share of the
 random traces; parametric specifications a hundredth of it more, for each of theirs is judged once for each binding.
 Differences are printed with property and trace, and the exit status is 1.
 """
@@ -40,8 +40,6 @@ _EACH = 50
 
 @dataclass(frozen=True)
 class Drawn:
-    """A random property: its text, its short traces, how another one is drawn, its verdicts and its meaning."""
-
     text: str
     short: Sequence[Any]
     long: Callable[[], Any]
@@ -78,7 +76,6 @@ def _true(values: Sequence[bool]) -> list[tuple[str, ...]]:
 
 
 def _timed(events: Sequence[str], longest: int, last: int) -> list[mtl.Timed]:
-    """Yield all with at most this number of events at times 0 to `last`."""
     return [
         list(zip(times, names, strict=True))
         for length in range(1, longest + 1)

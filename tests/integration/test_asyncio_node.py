@@ -54,8 +54,6 @@ def string(text: str) -> bytes:
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_topics_in_both_directions(site: Site, ros: RosSession, client: Client) -> None:
-    """The node hears a talker with its definition, and a listener hears the node's latched message."""
-
     async def work() -> None:
         async with node(site) as door:
             heard: asyncio.Queue[tuple[bytes, str]] = asyncio.Queue()
@@ -79,8 +77,6 @@ def test_topics_in_both_directions(site: Site, ros: RosSession, client: Client) 
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_services_in_both_directions(site: Site, ros: RosSession, client: Client) -> None:
-    """The node calls a server that knows its type, and a client gets the node's answer or its reason."""
-
     async def work() -> None:
         async with node(site) as door:
             await asyncio.to_thread(ros.service_server, client, "/theirs")

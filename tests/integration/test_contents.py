@@ -1,5 +1,3 @@
-"""Only authorized roles see the contents of messages: tested on every path of REST, for each role."""
-
 import itertools
 import json
 import re
@@ -31,7 +29,6 @@ publishes() { event e(std::string text) /f std_msgs/String '{data:text}' {
 
 @pytest.fixture
 def appliance() -> Iterator[Appliance]:
-    """Run an appliance with monitors that use every feature, and a recorder."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     settings = (
         "recorder: {enabled: true, memory: 16MiB, before: 5, after: 1, longest: 8, disk: 512MiB,"
@@ -44,10 +41,6 @@ def appliance() -> Iterator[Appliance]:
 
 
 def test_no_path_shows_contents_of_messages_to_a_viewer(appliance: Appliance, tmp_path: Path) -> None:
-    """Operators also do not see the messages of a recording, which are for investigators.
-
-    No log line and no metric has them.
-    """
     tokens: dict[str, Rest] = {}
     for role in ("viewer", "operator", "investigator"):
         made = appliance.rosrv("token", "add", f"the-{role}", "--role", role, "--json").stdout
@@ -89,7 +82,6 @@ def test_no_path_shows_contents_of_messages_to_a_viewer(appliance: Appliance, tm
 
 
 def places_with(word: str, rest: Rest, values: dict[str, list[str]]) -> Iterator[str]:
-    """Yield the paths, of all GET paths and streams, whose answer contains the text."""
     asked = {
         "/v1/audit": "?limit=500", "/v1/evidence": "?since=1h", "/v1/monitors": "?texts=true",
         "messages": "?at=1970-01-01", "/v1/audit/stream": "?after=1",

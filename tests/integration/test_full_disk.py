@@ -1,5 +1,3 @@
-"""If the disk of the state is full, each change is stored, or refused before it has any effect."""
-
 from collections.abc import Iterator
 from typing import Any
 
@@ -19,7 +17,6 @@ REQUEST = "a signing request"
 
 
 def of_feature(verb: str, **fields: Any) -> list[admin.AdminRequest[Any]]:
-    """Return the request of a feature, if the appliance has the feature."""
     request = request_named(verb)
     return [] if request is None else [request(**fields)]
 
@@ -69,8 +66,6 @@ LOOKS: tuple[admin.AdminRequest[Any], ...] = (
 
 
 class SmallDisk:
-    """An appliance with its state on a separate disk."""
-
     def __init__(self, appliance: Appliance) -> None:
         self.appliance = appliance
         self.filler = appliance.state / "filler"
@@ -93,7 +88,6 @@ class SmallDisk:
 
 @pytest.fixture
 def small() -> Iterator[SmallDisk]:
-    """Run an appliance with a disk of 32 MiB, a token `guest` and a monitor."""
     appliance = Appliance()
     try:
         with small_disk(appliance.state, "32m", "mode=755"):

@@ -1,5 +1,3 @@
-"""The simulated LandShark is an ordinary robot: without the appliance it is as unprotected as ROS 1."""
-
 from collections.abc import Iterator
 
 import pytest
@@ -27,7 +25,6 @@ ATTACKS = [  # attacks that end a node come after attacks that need it
 
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
-    """Run the robot and its operator behind a plain ROS master."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     home = tmp_path_factory.mktemp("master")
@@ -49,7 +46,6 @@ def operator(stage: Stage) -> Actor:
 
 
 def test_mission(operator: Actor) -> None:
-    """The operator drives the robot, aims, and fires once."""
     assert operator.expect("drove")["metres"] >= 3
     assert operator.expect("aimed")["tilt"] == pytest.approx(0.2, abs=0.02)
     assert operator.expect("fired")["shots"] == 1
@@ -60,5 +56,4 @@ def test_mission(operator: Actor) -> None:
 
 @pytest.mark.parametrize("name", ATTACKS)
 def test_attack_succeeds_against_a_plain_master(stage: Stage, operator: Actor, name: str) -> None:
-    """Each attack of the demonstration is real, because it succeeds without the appliance."""
     assert stage.attack(name).succeeded

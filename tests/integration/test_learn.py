@@ -10,7 +10,6 @@ TRIAL += "[Options]\naudit-only = all\n"
 
 
 def run_nodes(appliance: Appliance, home: Path) -> None:
-    """Run a talker, a listener that hears it, a service and a client, and a stock tool that reads parameters."""
     home.mkdir()
     with RosSession(appliance.master_uri, home) as ros:
         ros.talker("rospy", "/chatter", name="talker")

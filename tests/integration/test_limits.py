@@ -1,5 +1,3 @@
-"""`[Limits]` of a policy with real nodes: floods, throttles, and a change while the nodes run."""
-
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,7 +34,6 @@ def lab() -> Iterator[Lab]:
 
 @pytest.fixture(scope="module")
 def appliance(lab: Lab) -> Iterator[Appliance]:
-    """Run an appliance with limits, and a monitor on /watched."""
     middle, monitors = lab.host("master", "10.77.0.2/24"), {"counter": MONITOR}
     with Appliance(middle, policy=LIMITED, monitors=monitors, options=("--api", "off")) as appliance:
         yield appliance
@@ -54,7 +51,7 @@ def ros(appliance: Appliance, hosts: tuple[Host, Host], tmp_path: Path) -> Itera
 
 
 def seconds_for(listener: Process, count: int, since: float) -> float:
-    """Return the seconds from a moment (monotonic clock) until `count` messages have arrived in all.
+    """Return the seconds since `since` (monotonic clock) until `count` messages have arrived.
 
     The moment is before the first message, so a busy machine can only make the time longer.
     """
@@ -72,10 +69,6 @@ def judged(appliance: Appliance) -> int:
 def test_only_the_publisher_beyond_its_limit_loses_messages(
     appliance: Appliance, ros: RosSession, client: Client, topic: str
 ) -> None:
-    """With or without a monitor, five of a hundred messages a second pass, and a record says so.
-
-    The other topic loses no message.
-    """
     before = judged(appliance)
     listener, other = ros.listener(client, topic), ros.listener(client, "/quiet")
     ros.talker(client, "/quiet", "--rate", "50")

@@ -1,5 +1,3 @@
-"""Monitors between real rospy and roscpp nodes drop, change, publish and report; they are loaded during traffic."""
-
 import itertools
 import json
 import sqlite3
@@ -48,7 +46,6 @@ def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
 
 
 def monitor(appliance: Appliance, name: str) -> dict[str, object]:
-    """Return the row of one monitor in `rosrv monitor list`."""
     lines = appliance.rosrv("monitor", "list", "--json").stdout.splitlines()
     rows: list[dict[str, object]] = [json.loads(line) for line in lines]
     return next(row for row in rows if row["name"] == name)
@@ -289,10 +286,6 @@ gate() {
 def test_requests_are_refused_and_responses_changed(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """Clients of both libraries call both services.
-
-    A client gets the reason as the service's error, and the service no request.
-    """
     for to in CLIENTS:
         spec = tmp_path / f"gate_{to}.rv"
         spec.write_text(GATE.replace("gate()", f"gate_{to}()").replace("/mode", f"/mode_{to}"))

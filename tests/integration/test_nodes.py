@@ -1,5 +1,3 @@
-"""Unmodified rospy and roscpp nodes communicate behind a plain master and behind the appliance."""
-
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -68,7 +66,6 @@ def test_talker_notices_that_the_listener_left(ros: RosSession, by: Client) -> N
 @pytest.mark.parametrize("to", CLIENTS)
 @pytest.mark.parametrize("by", CLIENTS)
 def test_service(ros: RosSession, by: Client, to: Client) -> None:
-    """A service answers its client repeatedly, and learns the client's name."""
     server = ros.service_server(by, "/negate")
     client = ros.service_client(to, "/negate", name="asker")
     for number, given in enumerate(("true", "false", "true")):
@@ -139,7 +136,6 @@ def test_relative_and_private_names(ros: RosSession) -> None:
 
 @pytest.mark.real
 def test_action(ros: RosSession) -> None:
-    """An action server accepts a goal, sends feedback in order, and a result: five topics both ways."""
     server = ros.node("rospy", "action", "server", name="counter")
     client = ros.node("rospy", "action", "client", name="asker")
     assert client.wait_for(event="result") == {"event": "result", "result": 3, "state": 3}

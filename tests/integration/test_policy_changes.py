@@ -1,5 +1,3 @@
-"""The policy changes while a robot works: revoked rights end at once, restored rights work without a restart."""
-
 import signal
 
 import pytest
@@ -73,7 +71,6 @@ def test_a_policy_changed_during_downtime_applies_to_running_nodes(
 
 @pytest.mark.real
 def test_sighup_reloads_the_policy(appliance: Appliance) -> None:
-    """SIGHUP works like `rosrv policy reload`; a file with errors changes nothing, and the log names them."""
     assert appliance.process is not None
     revision = appliance.status()["policy"]["revision"]
     appliance.policy_file.write_text(NO_CHATTER)

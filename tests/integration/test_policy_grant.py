@@ -1,5 +1,3 @@
-"""Grant a denied call of the running appliance from its record, by command and over REST."""
-
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -34,7 +32,6 @@ def common_appliance() -> Iterator[Appliance]:
 
 @pytest.fixture
 def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
-    """Provide the appliance with its first policy: only the operator's station may command. No node is registered."""
     yield common_appliance
     common_appliance.reload(POLICY)
     with ServerProxy(common_appliance.master_uri) as master:

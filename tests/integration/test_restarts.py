@@ -1,5 +1,3 @@
-"""A process of the appliance is killed while a robot works: running nodes continue, and new ones can join."""
-
 import itertools
 
 import pytest
@@ -19,7 +17,6 @@ def appliance(own_appliance: Appliance) -> Appliance:
 @pytest.mark.real
 @pytest.mark.parametrize("role", ROLES)
 def test_kill(appliance: Appliance, ros: RosSession, role: str) -> None:
-    """Messages arrive again, a service answers, parameters are kept, and a node started afterwards is heard."""
     listeners = [ros.listener(client, "/chatter") for client in CLIENTS]
     ros.talker("rospy", "/chatter", name="python_voice")
     ros.talker("roscpp", "/chatter", name="cpp_voice")

@@ -19,7 +19,6 @@ exit 100
 
 
 def run_setup(folder: Path, *, busy: int, said: str) -> subprocess.CompletedProcess[str]:
-    """Run `scripts/setup` with an `apt-get` that fails `busy` times with this text; every package is missing."""
     for name, text in (("apt-get", _APT), ("dpkg-query", "#!/bin/sh\n"), ("sleep", "#!/bin/sh\n")):
         (folder / name).write_text(text)
         (folder / name).chmod(0o755)
@@ -65,7 +64,6 @@ def test_it_does_not_begin_without_space(tmp_path: Path) -> None:
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """Return a checkout whose environment has fake programs; `calls` lists how uv was called."""
     folder = tmp_path / "a checkout"
     for name in ("scripts/setup", "pyproject.toml", "appliance/__init__.py"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -87,13 +85,11 @@ def checkout(tmp_path: Path) -> Path:
 
 
 def set_up(checkout: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    """Run `scripts/setup` of this checkout, for a user with umask 077."""
     command = [str(checkout / "scripts/setup"), *options]
     return subprocess.run(command, capture_output=True, text=True, umask=0o077, timeout=60, check=False)
 
 
 def test_it_does_nothing_twice(checkout: Path) -> None:
-    """A second run prints and installs nothing, even over a symbolic link; the programs' own warnings are hidden."""
     done = set_up(checkout)
     assert (done.returncode, "WARNING" in done.stderr, "ready in" in done.stderr) == (0, False, True)
     calls = (checkout / "calls").read_text()

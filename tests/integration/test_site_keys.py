@@ -20,7 +20,6 @@ NO_SIGNATURE = "it has no signature of the site (site_keys in appliance.yaml)"
 
 @contextlib.contextmanager
 def of_a_site() -> Iterator[Appliance]:
-    """Return an appliance with a site key, a signed policy and an empty folder of specifications, before its start."""
     options = ("--api", "127.0.0.1:0", "--api-tls", "off")
     appliance = Appliance(settings=f"site_keys:\n  - {LINE}\n", monitors={}, options=options)
     sign(appliance.policy_file)
@@ -32,7 +31,6 @@ def of_a_site() -> Iterator[Appliance]:
 
 @pytest.fixture(scope="module")
 def started() -> Iterator[Appliance]:
-    """Run the appliance; some tests load policies, others specifications."""
     with of_a_site() as appliance:
         yield appliance.start()
 
@@ -47,7 +45,6 @@ def post(appliance: Appliance, path: str, **body: Any) -> Answer:
 
 
 def in_force(appliance: Appliance) -> dict[str, Any] | None:
-    """Return `GET /v1/policy`; None while control is away."""
     answer = appliance.rest().get("/v1/policy")
     return answer.json if answer.status == 200 else None
 

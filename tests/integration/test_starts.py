@@ -1,5 +1,3 @@
-"""A start believes no more than a reload, and serves the robot also with little disk space."""
-
 import json
 import os
 

@@ -1,5 +1,3 @@
-"""The stock command line tools work as usual, behind a plain master and behind the appliance."""
-
 import re
 import signal
 from collections.abc import Iterator
@@ -73,7 +71,7 @@ def test_rostopic_hz(ros: RosSession) -> None:
 
 
 def _window(event: Event) -> int:
-    """Return of how many messages `rostopic hz` has taken the average; 0 for other lines."""
+    """The number of messages of the average that `rostopic hz` prints; 0 for other lines."""
     _, found, count = event.get("text", "").rpartition("window: ")
     return int(count) if found else 0
 
@@ -168,7 +166,6 @@ def test_rosbag(ros: RosSession, tmp_path: Path) -> None:
 
 
 def package_of_two_nodes(workspace: Path) -> Path:
-    """Make a ROS package with a rospy talker, a roscpp listener and a launch file, and return the launch file."""
     package = workspace / "pair"
     package.mkdir(parents=True)
     (package / "package.xml").write_text(PACKAGE)
@@ -183,7 +180,6 @@ def package_of_two_nodes(workspace: Path) -> Path:
 
 @pytest.mark.real
 def test_roslaunch(ros: RosSession, tmp_path: Path) -> None:
-    """Arguments, parameters, namespaces, remappings and anonymous names work, and both nodes end when interrupted."""
     file = package_of_two_nodes(tmp_path / "workspace")
     command = ["roslaunch", "--wait", str(file), "text:=told"]
     launch = ros.start(command, ROS_PACKAGE_PATH=str(tmp_path / "workspace"))

@@ -1,5 +1,3 @@
-"""Echo topics of real nodes by command and over REST, by role, with a record."""
-
 import json
 from pathlib import Path
 

@@ -26,8 +26,6 @@ NOBODY = "[Nodes]\n[Publishers]\n[Subscribers]\n[Commands]\n[Services]\n[Clients
 
 
 class Upgraded(NamedTuple):
-    """The appliance on the old state, the running nodes, and the texts of two tokens."""
-
     appliance: Appliance
     nodes: FakeNodes
     token: str
@@ -35,7 +33,6 @@ class Upgraded(NamedTuple):
 
 
 def old_state(directory: Path, nodes: FakeNodes) -> tuple[str, str]:
-    """Write the state file with the addresses of this test's nodes; return the texts of a valid and a revoked token."""
     directory.mkdir(parents=True)
     sql = DUMP.read_text()
     for name in NODES:
@@ -49,7 +46,7 @@ def old_state(directory: Path, nodes: FakeNodes) -> tuple[str, str]:
 
 
 def make_secret(database: sqlite3.Connection, name: str) -> str:
-    """Give a token a new secret, stored as version 0.2.0 did: the repository contains no secret."""
+    """The repository contains no secret."""
     [token_id, salt] = database.execute("SELECT id, salt FROM token WHERE name = ?", (name,)).fetchone()
     secret = secrets.token_urlsafe(32)
     kept = hashlib.scrypt(secret.encode(), salt=salt, n=1 << 14, r=8, p=1, dklen=32, maxmem=64 << 20)
@@ -61,7 +58,6 @@ def make_secret(database: sqlite3.Connection, name: str) -> str:
 
 @pytest.fixture(scope="module")
 def upgraded() -> Iterator[Upgraded]:
-    """Start this version on the old state, with the policy file that 0.2.0 read at its start."""
     with FakeNodes() as nodes:
         appliance = Appliance(options=("--api", "127.0.0.1:0"), relays=2)
         try:
@@ -89,7 +85,6 @@ def test_the_policy_in_force_survives(upgraded: Upgraded) -> None:
 
 
 def test_tokens_survive(upgraded: Upgraded) -> None:
-    """A token keeps its rights, and a revoked token has none."""
     appliance = upgraded.appliance
     assert appliance.rest(upgraded.token).get("/v1/tokens").status == 200
     assert appliance.rest(upgraded.revoked).get("/v1/policy").status == 401
@@ -108,7 +103,6 @@ def test_specifications_in_force_survive(upgraded: Upgraded) -> None:
 
 
 def test_registrations_and_parameters_survive(upgraded: Upgraded) -> None:
-    """The new ROS master has the parameters and the nodes, which did not register again."""
     publishers, subscribers, services = call(upgraded.appliance, "getSystemState")[2]
     assert ["/chatter", ["/voice"]] in publishers
     assert ["/chatter", ["/ears"]] in subscribers
@@ -122,7 +116,6 @@ def test_registrations_and_parameters_survive(upgraded: Upgraded) -> None:
 
 
 def test_grants_survive(upgraded: Upgraded) -> None:
-    """Permissions of 0.2.0 are in force: a policy that denies one of them reports it, and the store still has it."""
     ends = upgraded.appliance.rest(upgraded.token).post("/v1/policy?dry_run=1", NOBODY).json["ends"]
     live = {(end["caller_id"], end["what"], end["resource"]) for end in ends}
     assert {

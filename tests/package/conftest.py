@@ -1,5 +1,3 @@
-"""Build the Debian package once for all its tests, and provide clean machines to install it on."""
-
 import os
 import subprocess
 import sys
@@ -23,12 +21,10 @@ _NODE_PACKAGES = (
 LATER = "+40h"
 SLOW_SECONDS = 1200.0  # for work that takes seconds on a machine of its own
 PACKAGER = {"DEBFULLNAME": "A packager", "DEBEMAIL": "packager@example.org"}
-"""The maintainer's name and address, in the variables of Debian's tools."""
 
 
 @pytest.fixture(scope="session")
 def package() -> Path:
-    """Build dist/rosrv_VERSION_amd64.deb now, with the documented command."""
     for program, debian in (("dh", "debhelper"), ("dpkg-buildpackage", "dpkg-dev"), ("lintian", "lintian")):
         need_program(program, debian)
     done = subprocess.run(
@@ -44,7 +40,7 @@ def package() -> Path:
 
 
 def elsewhere(folder: Path) -> Path:
-    """Copy the checkout to this new folder, as another user has it, readable for its owner only."""
+    """Another user has the checkout like this, readable for its owner only."""
     git = ["git", "-c", f"safe.directory={ROOT}", "-c", f"safe.directory={ROOT}/.git"]
     subprocess.run(
         [*git, "clone", "--quiet", "--no-hardlinks", str(ROOT), str(folder)], umask=0o077, check=True
@@ -58,7 +54,6 @@ def elsewhere(folder: Path) -> Path:
 
 
 def build_later(module: str, *options: str, folder: Path, **environment: str) -> Path:
-    """Run a module of `distribution` in this folder `LATER`, by a later clock; return the files that it names first."""
     command = [need_program("faketime", "faketime"), "-f", LATER, sys.executable, "-m", module, *options]
     done = subprocess.run(
         command,

@@ -41,7 +41,6 @@ def write(machine: Machine, path: str, text: str) -> None:
 
 
 def boot(machine: Machine, user_data: str, instance: str) -> str:
-    """Boot with this user data as on the first boot; return cloud-init's status and its log."""
     write(machine, f"{SEED}/meta-data", f"instance-id: {instance}\n")
     write(machine, f"{SEED}/user-data", user_data)
     assert machine.stop(), machine.story()
@@ -51,9 +50,6 @@ def boot(machine: Machine, user_data: str, instance: str) -> str:
 
 
 def test_the_first_boot_makes_an_appliance(package: Path, tmp_path: Path) -> None:
-    """With the package's checksum filled in, the vehicle has its master; with the shipped example, nothing is
-    installed.
-    """
     machine = clean_machine(
         tmp_path, package, {package.name: package}, more=("cloud-init", "chrony"), name="cloud"
     )

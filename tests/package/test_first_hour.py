@@ -1,5 +1,3 @@
-"""docs/first-hour.md, followed command by command by root, in root's home, with the installed package."""
-
 import os
 import signal
 import subprocess
@@ -30,7 +28,6 @@ def hosts() -> Iterator[dict[str, Host]]:
 
 @pytest.fixture
 def installed(package: Path, tmp_path: Path) -> Iterator[Path]:
-    """Return the root of this machine with the package installed: a layer in memory, which ends with the test."""
     need_root()
     subprocess.run(["mount", "-t", "tmpfs", "tmpfs", tmp_path], check=True)
     root = tmp_path / "root"

@@ -1,5 +1,3 @@
-"""The collector, installed by pip as in docs/fleet.md, without a checkout, has its command and all that it imports."""
-
 import re
 import subprocess
 from pathlib import Path
@@ -15,7 +13,6 @@ pytestmark = pytest.mark.timeout(600)
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Install the collector with the versions of its lock file."""
     needs(Path("/usr/lib/x86_64-linux-gnu/libpq.so.5").exists(), "libpq5")
     folder = tmp_path_factory.mktemp("fleet")
     lock = (ROOT / "fleet" / "requirements.lock").read_text()

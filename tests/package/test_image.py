@@ -1,5 +1,3 @@
-"""`make site`: the released image, its list of components, and the archive for a site without a network."""
-
 import hashlib
 import io
 import json
@@ -92,7 +90,6 @@ def parts(unpacked: Path) -> list[dict[str, Any]]:
 
 
 def run(engine: Engine, *command: str, text: str = "") -> str:
-    """Return the output of a program of the image, run without a network."""
     options = ("run", "--rm", "--interactive", "--network", "none", "--entrypoint", command[0], NAME)
     return engine.docker(*options, *command[1:], text=text).stdout
 

@@ -36,7 +36,6 @@ TALKER = ("rostopic", "pub", "--rate=10", "/chatter", "std_msgs/String", "data: 
 
 @pytest.fixture
 def system(tmp_path: Path) -> Path:
-    """Return the root of a Debian 11, which the test may change."""
     return make_base(tmp_path / "system", PACKAGES, suite=SUITE)
 
 
@@ -68,7 +67,6 @@ def test_a_robot_beside_the_container(system: Path, tmp_path: Path) -> None:
 
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[TunnelSite]:
-    """Run an appliance whose REST the lab's network may reach."""
     need_strongswan()
     (tmp_path / "appliance.yaml").write_text(CONFIG)
     with Lab("rosrv-noetic") as lab:
@@ -85,7 +83,6 @@ LOST = (
 
 
 def lose_pings(site: TunnelSite, laptop: ScriptHost) -> None:
-    """Assert that strongSwan 5.9.1, which would add a CHILD_SA to an open tunnel, gets one CHILD_SA per tunnel."""
     count = "grep -c 'CHILD_SA ros{[0-9]*} established' /run/rosrv/charon.log"
 
     def whole() -> bool:
@@ -105,9 +102,6 @@ def lose_pings(site: TunnelSite, laptop: ScriptHost) -> None:
 def test_a_laptop_joins_renews_and_leaves_without_python(
     site: TunnelSite, system: Path, tmp_path: Path
 ) -> None:
-    """The kit's unchanged scripts work with OpenSSL 1.1.1; the laptop's nodes, which need Python, start after it
-    joined.
-    """
     hidden = tmp_path / "hidden"
     hidden.mkdir()
     pythons = [path for path in (system / "usr/bin").iterdir() if path.name.startswith("python3")]

@@ -68,14 +68,12 @@ def state_of(machine: Machine) -> dict[str, str]:
 
 
 def ros(machine: Machine, *command: str) -> Done:
-    """Run a stock tool on the robot's machine, with ROS_MASTER_URI as the only setting."""
     return machine.run(
         "env", *(f"{key}={value}" for key, value in EVERYWHERE.items()), *command, seconds=SLOW_SECONDS
     )
 
 
 def denies_a_visitor(machine: Machine) -> None:
-    """Assert that a host on the network that no rule names is denied, with a record."""
     machine.run("sh", "-euc", VISITOR)
     there = ("env", "ROS_MASTER_URI=http://192.168.1.5:11311", "ROS_IP=192.168.1.66", "rosnode", "list")
     denied = machine.run("ip", "netns", "exec", "visitor", *there, seconds=SLOW_SECONDS, check=False)
@@ -85,7 +83,6 @@ def denies_a_visitor(machine: Machine) -> None:
 
 
 def serves(machine: Machine) -> dict[str, object]:
-    """Return the status of the appliance, once systemd reports that it is ready."""
     machine.run("systemctl", "start", "rosrv", seconds=SLOW_SECONDS)  # waits for a start in progress
     status: dict[str, object] = json.loads(machine.run("rosrv", "status", "--json", check=False).output)
     return status

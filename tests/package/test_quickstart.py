@@ -1,5 +1,3 @@
-"""docs/quickstart.md, followed command by command on a clean machine: the page shows the real output."""
-
 import re
 from pathlib import Path
 
@@ -22,7 +20,6 @@ _DRIVES = "until ROS_MASTER_URI=http://localhost:11311 rosnode ping -c 1 /drive;
 
 
 def test_the_page_is_true(package: Path, tmp_path: Path) -> None:
-    """Every block ends and prints as the page says, on a robot and a visitor that is a namespace of its machine."""
     record = "ID"
     with clean_machine(
         tmp_path, package, {package.name: package}, more=("sudo",), name="quickstart"

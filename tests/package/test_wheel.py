@@ -1,5 +1,3 @@
-"""The wheel, installed by pipx as in docs/install.md, without a checkout, contains the whole `rosrv`."""
-
 import json
 import os
 import re
@@ -21,7 +19,6 @@ pytestmark = pytest.mark.timeout(600)
 
 @pytest.fixture(scope="module")
 def rosrv() -> Iterator[Path]:
-    """Install the command with the page's `make wheel` and `pipx install`, without a compiler."""
     pipx = need_program("pipx", "pipx")
     subprocess.run(["make", "--silent", "wheel"], cwd=ROOT, check=True, capture_output=True)
     built = ROOT / "dist" / f"rosrv_appliance-{__version__}"
@@ -78,7 +75,6 @@ def test_its_selftest_names_a_policy_to_begin_with(rosrv: Path, tmp_path: Path) 
 
 
 def test_its_demonstration_works(rosrv: Path, tmp_path: Path) -> None:
-    """Robot, operator and attacker are included, and the demonstration succeeds."""
     need_root()
     needs(has_ros(), "ROS 1 (run `make setup`)")
     done = run(rosrv, "demo", "--json", "--picture", str(tmp_path / "way.svg"), folder=tmp_path, seconds=280)

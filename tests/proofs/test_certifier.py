@@ -1,5 +1,3 @@
-"""The checks of `ptltl`, `ere` and `fsm` automata are proved sound in Coq; the Python check at each load agrees."""
-
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -90,7 +88,6 @@ def _machine(formula: str, events: list[str], tables: AutomatonTables) -> str:
 
 
 def _compare(program: Path, logic: str, line: Callable[[str, list[str], AutomatonTables], str]) -> None:
-    """Compare both on a thousand random formulas, with the automata of the compiler and with broken ones."""
     random = Random(4)  # noqa: S311  no secret
     lines, answers = [], []
     for compiled in properties(logic, 5, 1000):

@@ -1,5 +1,3 @@
-"""Check that the promises of the model (`proofs/insertion.pml`) can be broken by a single fault."""
-
 from pathlib import Path
 
 import pytest
@@ -22,7 +20,6 @@ MUTANTS = {
     "NOT_REDECIDED": ("barred", ONE_OF_EACH),
     "NOBODY_REMINDED": ("connected", Bounds(crashes=1, sending=False)),
 }
-"""For each mutant, the property that it breaks, and the bounds within which it does."""
 
 
 @pytest.mark.parametrize("mutant", MUTANTS)

@@ -37,7 +37,6 @@ Trace = list[Step]
 
 
 def steps(appliance: Appliance) -> Trace:
-    """Return the log's records of the topic, the oldest first."""
     found: Trace = []
     for record in appliance.audit("--limit", "10000", "--oldest-first"):
         event, detail = record["event"], record["detail"]
@@ -74,7 +73,6 @@ def followed(appliance: Appliance, ros: RosSession, folder: Path) -> Trace:
     talker = ros.talker("rospy", "/chatter", "--rate", "20")
 
     def hear(revision: int, opened: int) -> None:
-        """Receive a message sent from now on, once the log has the revision and this number of connections."""
         last = max((one["number"] for one in talker.seen(event="sent")), default=0)
         heard = listener.wait_for(lambda event: number(event) >= last + 2)
 

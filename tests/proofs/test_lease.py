@@ -1,8 +1,3 @@
-"""Check the model of the lease (`proofs/lease.pml`) exhaustively.
-
-Bounds that take longer are in `test_lease_at_large.py`, wrong rules in `test_lease_mutants.py`.
-"""
-
 from pathlib import Path
 
 import pytest

@@ -1,4 +1,4 @@
-"""Check the model of the lease within bounds that take minutes, with `make prove` only."""
+"""These bounds take minutes, with `make prove` only."""
 
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Check that each rule of the lease (`proofs/lease.pml`) is needed: without it, a property breaks."""
-
 from pathlib import Path
 
 import pytest
@@ -36,7 +34,6 @@ MUTANTS = {
     "NEVER_REMOVES": ("served", AFTER_THE_LAST_FAULT),
     "RENEWED_SHUT": ("served", AFTER_THE_LAST_FAULT),
 }
-"""For each mutant, the property that it breaks, and the bounds within which it does."""
 
 
 @pytest.mark.parametrize("mutant", MUTANTS)

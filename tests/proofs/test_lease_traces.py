@@ -92,7 +92,6 @@ TAMPERED = {
     "an answer of a witness that is down": (REBOOT, "started witness\n", ""),
     "active again with an old epoch": (PAUSED, "active b 2\n", "active b 2\nactive a 1\n"),
 }
-"""For each fault, the execution, and the lines that are replaced."""
 
 
 @pytest.mark.parametrize("trace", VALID)

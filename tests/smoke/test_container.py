@@ -25,7 +25,6 @@ def machine() -> Iterator[Host]:
 
 @pytest.fixture(scope="module")
 def demo(machine: Host, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Compose]:
-    """Run the appliance, the LandShark, its operator and a visitor."""
     with Engine(machine) as engine:
         compose = engine.compose(project(tmp_path_factory.mktemp("project")), "smoke")
         compose("--profile", "demo", "up", "--detach", "--no-build")
@@ -35,7 +34,6 @@ def demo(machine: Host, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Co
 
 @pytest.fixture(scope="module")
 def rest(machine: Host, demo: Compose, tmp_path_factory: pytest.TempPathFactory) -> Rest:
-    """Return a client with the first token, as a user on the engine's machine has it."""
     token = demo.exec("appliance", "cat", "/var/lib/rosrv/first-token").stdout.strip()
     certificate = tmp_path_factory.mktemp("rest") / "certificate.pem"
     address = ("127.0.0.1", 8443)

@@ -10,7 +10,6 @@ _EMPTY: dict[Any, Any] = {int: 0, float: 0.0, str: "", bool: False, list: [], di
 
 
 def example(kind: type[A], **given: Any) -> A:
-    """Return a struct with these fields; nested structs are given as dictionaries."""
     return msgspec.convert(_fields(kind, given), kind)
 
 

@@ -1,4 +1,4 @@
-"""Run the real appliance in a test: start `rosrv up` as a user would, and read its audit log and processes.
+"""Start `rosrv up` as a user would, and read its audit log and processes.
 
 with Appliance(host, state, policy=OPEN_POLICY) as appliance:
     ros = RosSession(appliance.master_uri, home, robot)
@@ -42,7 +42,7 @@ _FLAGS = {"event": "--event", "host": "--host"}
 
 
 class Appliance:
-    """A running appliance; a context manager."""
+    """A running appliance, as a context manager."""
 
     def __init__(
         self,
@@ -56,10 +56,10 @@ class Appliance:
         json: bool = True,
         relays: int = 1,
     ) -> None:
-        """Prepare the start. With `json=False` the output is for a person: no `ready`, only lines in `process`.
+        """With `json=False` the output is for a person: no `ready`, only lines in `process`.
 
-        `settings` is the text of appliance.yaml. `monitors` are the specifications in its folder, by name.
-        `relays` is the number of relay processes, the same on every machine.
+        `settings` is the text of appliance.yaml. `monitors` are the specifications in its folder, by name. `relays`
+        is the number of relay processes, the same on every machine.
         """
         self.relays = relays
         self.host: Host = host or ThisMachine()
@@ -123,13 +123,13 @@ class Appliance:
         return self
 
     def stop(self) -> int:
-        """Send SIGTERM and return the exit status; a clean stop takes less than five seconds."""
+        """A clean stop takes less than five seconds."""
         return self.process.stop(with_signal=signal.SIGTERM, timeout=10) if self.process else 0
 
     def rosrv(
         self, *arguments: str, check: bool = True, state: bool = True
     ) -> subprocess.CompletedProcess[str]:
-        """Run another verb of the command with `--state` of this appliance (unless the verb does not accept it).
+        """Add `--state`, unless the verb does not accept it.
 
         With `check`, raises `NoAnswerError` if it fails.
         """
@@ -164,7 +164,7 @@ class Appliance:
         return self.row("status")
 
     def audit(self, *flags: str, **fields: Any) -> list[dict[str, Any]]:
-        """Run `rosrv audit search --json` with these flags, and return the records that have these fields.
+        """Return the records of `rosrv audit search --json` that have these fields.
 
         Without `--limit`, all records count, not only the newest.
         """
@@ -180,13 +180,13 @@ class Appliance:
         ]
 
     def ignore_earlier_records(self) -> None:
-        """Make `audit` and `recorded` leave out all earlier records, such as those of another test."""
+        """Such as those of another test."""
         self._looked_at = max(
             (record["sequence"] for record in self.audit("--limit", "1")), default=self._looked_at
         )
 
     def recorded(self, *flags: str, count: int = 1, **fields: Any) -> list[dict[str, Any]]:
-        """Wait for this number of records: writing takes a moment, and reports of a relay a little longer."""
+        """Writing takes a moment, and reports of a relay a little longer."""
 
         def found() -> list[dict[str, Any]] | None:
             records = self.audit(*flags, **fields)
@@ -199,7 +199,7 @@ class Appliance:
         self.rosrv("policy", "reload")
 
     def rest(self, token: str | None = None) -> Rest:
-        """Return a REST client with this token or the first one; it trusts the appliance's certificate."""
+        """The default token is the first one; the client trusts the appliance's certificate."""
         url = str(self.ready["api"])
         certificate = None
         if url.startswith("https:"):
@@ -214,7 +214,7 @@ class Appliance:
         return client
 
     def processes(self) -> dict[str, dict[str, Any]]:
-        """Return the row of each role in `rosrv status`, once every process has reported its sandbox."""
+        """Wait until every process has reported its sandbox."""
 
         def told() -> dict[str, dict[str, Any]] | None:
             rows = self.status()["processes"]
@@ -225,11 +225,11 @@ class Appliance:
         return eventually(told, self.story)
 
     def pids(self, role: str) -> list[int]:
-        """Return the ids of a role's running processes, from `rosrv status`. One that waits for its start has 0."""
+        """A process that waits for its start has 0."""
         return [row["pid"] for row in self.status()["processes"] if row["role"] == role and row["pid"]]
 
     def kill(self, role: str) -> int:
-        """Send SIGKILL to the (first) process of a role, once it runs, and return its id."""
+        """Return the id of the first process of the role."""
         pid = eventually(lambda: self.pids(role), self.story)[0]
         os.kill(pid, signal.SIGKILL)
         return pid

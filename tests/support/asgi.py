@@ -1,5 +1,3 @@
-"""Send requests to an ASGI application that runs in the test's own process, without sockets and threads."""
-
 from typing import Any
 
 import httpx

@@ -1,5 +1,3 @@
-"""Make records for tests of the audit log, and wait until they are on disk."""
-
 import asyncio
 from typing import Any
 
@@ -11,8 +9,6 @@ from tests.support.engines import let_pass
 
 
 class RecordingTrail(AuditTrail):
-    """A trail that keeps its records for the test: (event, its reason and other fields)."""
-
     def __init__(self, log: AuditLog) -> None:
         super().__init__(log, strict=False, deny_when_failed=False, details=lambda *_: {})
         self.heard: list[tuple[str, dict[str, Any]]] = []

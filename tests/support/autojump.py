@@ -1,9 +1,10 @@
 """An event loop with virtual time, so that a test waits for nothing and runs the same way each time.
 
 1. The loop and `appliance.base.clock` have one `VirtualClock`. When nothing is ready, it jumps to the next timer.
-2. `run_in_executor` and `asyncio.to_thread` run the function in the loop, in the order of the calls, without a thread.
-3. If nothing is ready and there is no timer, the test would wait for ever: `DeadlockError` names what each task
-   waits for.
+2. `run_in_executor` and `asyncio.to_thread` run the function in the loop, in the order of the calls, without a
+   thread.
+3. If nothing is ready and there is no timer, the test would wait forever: `DeadlockError` names what each task waits
+   for.
 4. The loop has no selector. Sockets, signals, programs and calls of other threads raise `RealLoopError`.
 """
 
@@ -25,11 +26,11 @@ _MOST_JUMPS = 200_000
 
 
 class DeadlockError(Exception):
-    """The tasks of a test wait for something that cannot happen."""
+    pass
 
 
 class RealLoopError(Exception):
-    """A test used something that only a loop of the operating system has."""
+    pass
 
 
 class AutojumpLoop(asyncio.BaseEventLoop):
@@ -44,11 +45,9 @@ class AutojumpLoop(asyncio.BaseEventLoop):
         self._jumps = 0
 
     def time(self) -> float:
-        """Return the virtual time in seconds."""
         return self.machine.now_ns() / 1e9
 
     def select(self, timeout: float | None) -> list[Never]:
-        """Jump to the next timer, which is due in `timeout` seconds (None: there is no timer)."""
         if timeout is None:
             raise DeadlockError(f"deadlock: {self._waiting()}")
         if timeout > 0:
@@ -60,11 +59,9 @@ class AutojumpLoop(asyncio.BaseEventLoop):
         self._clock_resolution = max(1e-9, 2 * math.ulp(self.time()))
         return []
 
-    def _process_events(self, _events: list[Never]) -> None:
-        """Do nothing: the loop has no selector."""
+    def _process_events(self, _events: list[Never]) -> None: ...
 
-    def _write_to_self(self) -> None:
-        """Do nothing: only another thread would have to wake the loop."""
+    def _write_to_self(self) -> None: ...
 
     def _waiting(self) -> str:
         tasks = sorted(asyncio.all_tasks(self), key=lambda task: task.get_name())
@@ -74,7 +71,6 @@ class AutojumpLoop(asyncio.BaseEventLoop):
     def call_soon_threadsafe(
         self, callback: Callable[[*_Arguments], object], *args: *_Arguments, context: Context | None = None
     ) -> asyncio.Handle:
-        """Call the function soon, if this is the loop's own thread."""
         if self._thread_id not in (None, threading.get_ident()):
             self._refuse()
         return self.call_soon(callback, *args, context=context)
@@ -82,7 +78,7 @@ class AutojumpLoop(asyncio.BaseEventLoop):
     def run_in_executor(
         self, _executor: object, func: Callable[[*_Arguments], _Result], *args: *_Arguments
     ) -> asyncio.Future[_Result]:
-        """Run the function in the next turn of the loop; it finds no running loop, as in a thread."""
+        """As in a thread, the function finds no running loop."""
         future: asyncio.Future[_Result] = self.create_future()
         self.call_soon(self._run_inline, future, func, args)
         return future
@@ -127,7 +123,6 @@ class AutojumpLoop(asyncio.BaseEventLoop):
 
 
 def _place(coroutine: Any) -> str:
-    """Return the file, line and name of the innermost coroutine that waits."""
     while isinstance(coroutine, CoroutineType) and isinstance(coroutine.cr_await, CoroutineType):
         coroutine = coroutine.cr_await
     frame = getattr(coroutine, "cr_frame", None)

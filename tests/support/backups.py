@@ -1,5 +1,3 @@
-"""Make archives as an attacker could write them, for tests of restoring a backup."""
-
 import gzip
 import tarfile
 from pathlib import Path
@@ -8,7 +6,6 @@ LOG = "control/audit.db"  # part of every backup
 
 
 def header(name: str, size: int = 0, kind: bytes = tarfile.REGTYPE, **fields: object) -> bytes:
-    """Return the header of one entry, as a foreign program could write it."""
     entry = tarfile.TarInfo(name)
     entry.size, entry.type = size, kind
     for key, value in fields.items():

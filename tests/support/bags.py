@@ -1,5 +1,3 @@
-"""Write recordings for tests."""
-
 from pathlib import Path
 
 from rosbags.rosbag1 import Writer
@@ -9,7 +7,6 @@ from roswire.standard import standard_definitions
 
 
 def make_bag(path: Path, messages: list[tuple[str, str, float, bytes]], md5sum: str | None = None) -> Path:
-    """Write a recording of (topic, type, seconds, bytes)."""
     definitions = standard_definitions()
     with Writer(path) as writer:
         connections = {}
@@ -28,5 +25,4 @@ def make_bag(path: Path, messages: list[tuple[str, str, float, bytes]], md5sum: 
 
 
 def number(value: int) -> bytes:
-    """Return a `std_msgs/Int32`."""
     return message("std_msgs/Int32", data=value)

@@ -41,10 +41,7 @@ def everywhere(signed: float | None = None, *rings: Ring) -> Terms:
 
 
 class SupportsClose(Protocol):
-    """A connection of a robot, which ends with the server."""
-
-    def close(self) -> None:
-        """Close it."""
+    def close(self) -> None: ...
 
 
 class BundleSite:
@@ -110,7 +107,6 @@ class BundleSite:
             server.server_close()
 
     def answer(self, path: str) -> bytes | None:
-        """Return the honest answer at a path, or None."""
         if path == "/v1/bundles/metadata/timestamp.json":
             return self.timestamp
         if path.startswith("/v1/bundles/selection/"):
@@ -126,8 +122,7 @@ class BundleSite:
 class _Server(http.server.ThreadingHTTPServer):
     daemon_threads = True
 
-    def handle_error(self, request: object, client_address: object) -> None:
-        """Ignore clients that end their connection."""
+    def handle_error(self, request: object, client_address: object) -> None: ...
 
 
 def _handler(site: BundleSite) -> type[http.server.BaseHTTPRequestHandler]:
@@ -166,13 +161,12 @@ def _handler(site: BundleSite) -> type[http.server.BaseHTTPRequestHandler]:
                     self.wfile.flush()
 
         def log_message(self, format: str, *args: object) -> None:  # noqa: A002  the base class names it
-            """Print nothing."""
+            ...
 
     return Handler
 
 
 def give(handler: http.server.BaseHTTPRequestHandler, body: bytes | None) -> None:
-    """Answer with a body, or with 404."""
     tag = f'"{hash(body)}"'
     if body is None:
         handler.send_response(404)

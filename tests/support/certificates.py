@@ -1,5 +1,3 @@
-"""Make certificates for tests: a certificate authority, and one certificate that it signed."""
-
 import datetime
 import ipaddress
 import ssl
@@ -16,7 +14,7 @@ from cryptography.x509.oid import NameOID
 
 @dataclass(frozen=True)
 class Certificates:
-    """PEM files: an authority, and a certificate of it with its key, for an address and logs.example."""
+    """For an address and logs.example."""
 
     ca: Path
     certificate: Path
@@ -58,7 +56,6 @@ def make_certificates(
 
 
 def self_signed(file: Path, address: str, begin: datetime.datetime, end: datetime.datetime) -> Path:
-    """Write a certificate for an address, which is its own authority, and beside it its key; return the key's file."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "rosrv")])
     made = x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number(), begin, end)
@@ -73,7 +70,6 @@ def self_signed(file: Path, address: str, begin: datetime.datetime, end: datetim
 
 
 def own_certificate_until(end: bytes) -> bytes:
-    """Return a certificate (PEM) that is its own authority; `end` is the DER of the end of its validity, any bytes."""
     key = ed25519.Ed25519PrivateKey.generate()
     algorithm = _der(0x30, bytes.fromhex("06032b6570"))
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "own")]).public_bytes()

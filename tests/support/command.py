@@ -1,7 +1,6 @@
-"""Run `rosrv` within the process of a test: the same entry point, without a new Python for each verb.
+"""Run `rosrv` within the process of a test, without a new Python for each verb.
 
-done = rosrv("audit", "search", "--json", "--state", str(state))
-assert done.returncode == 0
+done = rosrv("audit", "search", "--json", "--state", str(state)) assert done.returncode == 0
 
 tests/integration/supervisor/test_up.py and tests/integration/cli/ start the installed command.
 """
@@ -26,7 +25,6 @@ _ONE_AT_A_TIME = threading.Lock()  # a process has one standard output
 
 
 def rosrv(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Return the output and exit status of the command; `environment` adds other variables."""
     command = [ROSRV, *arguments]
     out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True) for _ in range(2))
     with (

@@ -1,7 +1,7 @@
 """Connect registry, graph, revocation, liveness and reconcile loop as control connects them.
 
-Around them are models of the relays, of `rosmaster`, of the deliveries to nodes, and of the nodes. The models remember
-their calls and give the answers that a test sets. Nothing is sent over a network.
+Models of the relays, of `rosmaster`, of deliveries and of nodes remember their calls and give the answers that a test
+sets.
 """
 
 import asyncio
@@ -54,8 +54,6 @@ _TABLES = {"Publisher": Kind.PUBLICATION, "Subscriber": Kind.SUBSCRIPTION, "Serv
 
 
 class Denied(NamedTuple):
-    """The record of a denied call, with the recorded parameters of a command."""
-
     category: str
     resource: str
     decision: Decision
@@ -205,7 +203,6 @@ class HiddenMaster:
         self.go.set()
 
     async def call(self, method: str, *params: Value) -> Value:
-        """Carry out one call, or the calls of a multicall, which takes a turn of the loop."""
         await asyncio.sleep(0)
         await self.go.wait()
         if method == "system.multicall":
@@ -323,8 +320,6 @@ class Inner:
 
 
 class Clients:
-    """Calls to nodes; nodes in `silent` do not answer, nodes in `gone` refuse connections."""
-
     def __init__(self) -> None:
         self.silent: set[str] = set()
         self.gone: set[str] = set()
@@ -345,8 +340,6 @@ class Clients:
 
 
 class Modes:
-    """Relay all topics and services under proxy endpoints."""
-
     stand_ins = True
 
     def hides_publishers(self, _topic: str) -> bool:
@@ -360,8 +353,6 @@ class Modes:
 
 
 class Addresses:
-    """One address that every node gets."""
-
     async def learn(self, _peer: Peer) -> None:
         """Do nothing."""
 
@@ -370,7 +361,7 @@ class Addresses:
 
 
 class ControlParts:
-    """The parts, with an open policy; `reload(text)` puts another in force, `settle()` waits for its consequences."""
+    """`reload(text)` puts another policy in force, `settle()` waits for its consequences."""
 
     def __init__(self, *, silent: float = 0.0) -> None:
         """Make the parts; `silent` is the number of seconds without an answer until a node is lost."""
@@ -473,8 +464,7 @@ class ControlParts:
         )
         self._serve = self._serving()
 
-    def surround(self) -> None:
-        """Place other parts around control, before it is connected with them."""
+    def surround(self) -> None: ...
 
     def arrivals(self) -> Any:
         return self.faces
@@ -490,7 +480,6 @@ class ControlParts:
         return [one.life for one in self.registry.all()]
 
     def node(self, name: str, number: int = 1, host: Address = HOST) -> Incarnation:
-        """Return a node on a host that has registered nothing yet; `number` tells its incarnations apart."""
         uri = f"http://{host}:{4000 + number}/"
         node = Incarnation(new_key(), name, host, parse_node_uri(uri), uri, "10.0.0.1", 1, 2)
         self.registry.add(node)
@@ -504,7 +493,7 @@ class ControlParts:
         target: Incarnation | None = None,
         own: bool = False,
     ) -> Value:
-        """Return the answer to a call of RVMaster or `target`, by a node at `host` (or by our `own` node)."""
+        """`own` is the appliance's node; `target` is a node instead of RVMaster."""
         peer = Peer(ipaddress.ip_address(host), host, "10.0.0.1")
         serve = self._serving(own=own, target=target) if own or target is not None else self._serve
         return parse_response(await serve(HttpRequest(peer, "/", build_call(method, params), 0)))

@@ -62,7 +62,7 @@ _REGISTER = {Kind.PUBLICATION: "registerPublisher", Kind.SUBSCRIPTION: "register
 
 
 class Conversation:
-    """RVMaster and its clients; `policies` maps the names in `policy NAME` to texts."""
+    """`policies` maps the names in `policy NAME` to texts."""
 
     def __init__(self, parts: ControlParts, policies: dict[str, str], *, only_answers: bool = False) -> None:
         self.parts = parts
@@ -96,7 +96,6 @@ class Conversation:
         return [*answers, *refused, *filter(None, shown), *withheld]
 
     async def _settle(self) -> None:
-        """Wait until all work is done, or, while work waits for the ROS master, for the work that does not wait."""
         for _ in range(50):
             await asyncio.sleep(0)
         if not self._held and all(task.done() for task in self._begun.values()):
@@ -109,7 +108,6 @@ class Conversation:
             self._names.setdefault(node.key, f"{node.name}:{life}" if life in range(2, 10) else node.name)
 
     def _finished(self) -> list[str]:
-        """Return the answers of calls that were begun earlier and have one now."""
         finished = [line for line, task in self._begun.items() if task.done()]
         return [
             f"answered {line}: {answer}"
@@ -145,7 +143,7 @@ class Conversation:
             self._name_nodes()
 
     def _answered(self, method: str, answer: Any, *, raw: bool = False) -> list[str]:
-        """Return the lines of an answer; none if a call was only carried out."""
+        """A call that is only carried out has no lines."""
         if isinstance(answer, dict):
             return [f"fault: {answer['faultString']}"]
         if raw and not (answer and isinstance(answer[0], int)):
@@ -165,7 +163,6 @@ class Conversation:
         return self._answered("", part[0] if isinstance(part, list) else part, raw=True)
 
     def _denied(self, text: str) -> list[str]:
-        """Return the lines of an answer with the code 0, and take its decision from the records."""
         denied = self.parts.records.denied
         for place, one in enumerate(denied):
             told = text_for_caller(one.decision, self.parts.current.tell)
@@ -181,7 +178,6 @@ class Conversation:
         return [f"refused: {text}"]
 
     async def _event(self, line: str) -> list[str]:
-        """Apply an event that is not a call; return the lines to show beside its effects."""
         parts = self.parts
         match shlex.split(line):
             case ["state"]:
@@ -251,7 +247,6 @@ class Conversation:
                 raise ValueError(f"unknown action: {' '.join(happening)!r}")
 
     def _state(self) -> list[str]:
-        """Return the registrations and grants of all nodes, and the registrations at `rosmaster`."""
         nodes, parts = self._names, self.parts
         found = [
             f"{nodes[one.key]} is {one.life}: {_listed(one.registrations)}"
@@ -337,8 +332,6 @@ def _listed(registrations: Iterable[tuple[Kind, str]]) -> str:
 
 
 class ConversationFile(NamedTuple):
-    """The policies and conversations of a file, by name and title."""
-
     only_answers: bool
     policies: dict[str, str]
     conversations: dict[str, str]

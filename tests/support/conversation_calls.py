@@ -1,5 +1,3 @@
-"""Read the calls in conversations with RVMaster (`conversation.py` describes their form)."""
-
 import json
 import re
 import shlex
@@ -35,8 +33,6 @@ _RAW = re.compile(r"(\S+) calls (\S+) (\[.*\])(?: of (\S+))?")
 
 @dataclass(frozen=True)
 class WrittenCall:
-    """A call by `host`; `node` is the name of the node whose API is called, `parts` the methods of a multicall."""
-
     host: str
     method: str
     params: Sequence[Any]

@@ -51,19 +51,17 @@ rm -f "$root/etc/machine-id" "$root/etc/hostname"
 
 
 class DebianBaseError(RuntimeError):
-    """The tree cannot be made; the text ends with the last lines of the failed command."""
+    pass
 
 
 @dataclass(frozen=True)
 class MachineSettings:
-    """The settings for fetching packages on this machine, as files of the tree."""
-
     mirror: str
     files: Mapping[str, str]  # path in the tree -> text
 
 
 def make_base(directory: Path, packages: Sequence[str] = (), *, suite: str = SUITE) -> Path:
-    """Make `directory` a Debian root file system with these packages, and return it; the caller may change it.
+    """Make `directory` a Debian root file system with these packages; the caller may change it.
 
     Needs root, debootstrap and the machine's Debian mirror. Raises `DebianBaseError`.
     """
@@ -74,7 +72,7 @@ def make_base(directory: Path, packages: Sequence[str] = (), *, suite: str = SUI
 
 
 def base_archive(packages: Sequence[str] = (), *, suite: str = SUITE) -> Path:
-    """Return the tar archive that `make_base` unpacks and `docker import` reads; make it if it does not exist."""
+    """`make_base` unpacks the archive and `docker import` reads it."""
     need_root()
     need_program("debootstrap", "debootstrap")
     settings = machine_settings(suite)
@@ -89,7 +87,6 @@ def base_archive(packages: Sequence[str] = (), *, suite: str = SUITE) -> Path:
 
 
 def machine_settings(suite: str = SUITE) -> MachineSettings:
-    """Return this machine's sources of the suite, proxy, certificate authorities and pip settings."""
     sources = debian_sources(
         _output("apt-get", "indextargets", "--format", _TARGET, "Created-By: Packages"), suite
     )
@@ -116,7 +113,6 @@ _TARGET = "$(REPO_URI) $(RELEASE) $(COMPONENT) $(ORIGIN)"
 
 
 def debian_sources(targets: str, suite: str) -> list[str]:
-    """Return sources.list lines for a suite and its updates, from `apt-get indextargets`; the suite first."""
     found: dict[tuple[str, str], set[str]] = {}
     for fields in map(str.split, targets.splitlines()):
         if len(fields) >= 4 and fields[1].split("-")[0] == suite and fields[3] == "Debian":
@@ -126,7 +122,6 @@ def debian_sources(targets: str, suite: str) -> list[str]:
 
 
 def apt_settings(dump: str, proxies: Mapping[str, str]) -> str:
-    """Return apt's network settings, from `apt-config dump` and the proxies of the environment."""
     lines = [line for line in dump.splitlines() if line.startswith(_APT_KEYS)]
     for scheme in ("http", "https"):
         if scheme in proxies and not any(line.startswith(f"Acquire::{scheme}::Proxy ") for line in lines):

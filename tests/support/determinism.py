@@ -1,9 +1,9 @@
 """Keep a test from what chance can decide: threads, processes, sockets, pauses and real clocks.
 
-A test of the gate must not fail by chance, so it uses none of them, unless it is one of the few marked `real`. Tests
-marked `nightly` also use them, and run with `make nightly`. An audit hook of Python sees processes and sockets, in our
-code and in libraries. Threads, processes of multiprocessing, pauses and clocks have no hook in Python 3.11, so their
-functions are replaced; of the reads of a clock, only those by our own code count.
+A test of the gate must not fail by chance; tests marked `real` or `nightly` may use them. An audit hook of Python
+sees processes and sockets, in our code and in libraries. Threads, processes of multiprocessing, pauses and clocks
+have no hook in Python 3.11, so their functions are replaced; of the reads of a clock, only those by our own code
+count.
 """
 
 import functools
@@ -33,18 +33,17 @@ _OURS = ("appliance", "rosmop", "roswire", "rosrv_fleet", "tests")
 
 
 class ChanceError(RuntimeError):
-    """A test that must be deterministic did something that chance can decide."""
+    pass
 
 
 class Watch:
-    """Watches the running test; there is one, because an audit hook cannot be removed."""
+    """There is one, because an audit hook cannot be removed."""
 
     def __init__(self) -> None:
         self._watched = False
         self._found: list[str] = []
 
     def install(self) -> None:
-        """Begin to see audit events and clock reads, which `watching` then forbids."""
         sys.addaudithook(self._event)
         for owner, name, what in (
             (threading.Thread, "start", "starts a thread"),
@@ -102,7 +101,6 @@ def may_depend_on_chance(item: pytest.Item) -> bool:
 
 
 def callers(depth: int) -> Iterator[str]:
-    """Yield the modules of the functions that are being executed, from the `depth`th caller outwards."""
     frame = inspect.currentframe()
     while frame is not None:
         if depth < 0:

@@ -8,7 +8,7 @@
 
 The engine runs on a host of the lab. Its bridges and rules are in the namespace of that host, not in this machine's.
 Images are built earlier, by an engine in this machine's own network that does not change it (no bridge, no rules).
-Both use the same data in the cache of this machine, so that a second build is quick, also in a fresh clone.
+Both use the same data in the cache of this machine, so a second build is quick, also in a fresh clone.
 """
 
 import contextlib
@@ -57,7 +57,7 @@ Output = subprocess.CompletedProcess[str]
 
 
 class DockerError(AssertionError):
-    """A command of the engine or of compose failed; the text contains its output."""
+    pass
 
 
 class Engine:
@@ -98,21 +98,17 @@ class Engine:
         return found[0]
 
     def compose(self, directory: Path, project: str, *files: str, **environment: str) -> "Compose":
-        """Return the project of the compose files in `directory`; without `files`, compose finds its own."""
         return Compose(self, directory, project, files, {"LANDSHARK_REPORTS": "json", **environment})
 
     def build(self, target: str, tag: str, context: Path = ROOT) -> None:
-        """Run `docker build` for one target of the Dockerfile, on the base image made here."""
         arguments = ("--network", "host", "--build-arg", f"BASE={BASE}", "--target", target, "--tag", tag)
         self.docker("build", *arguments, str(context), timeout=BUILD_SECONDS)
 
     def go_ahead(self, ahead: str) -> None:
-        """Set the clock of the containers of later builds ahead by a time such as `+40h`."""
         need_program("faketime", "faketime")
         self._runtime.write_text(_RUNTIME.format(ahead=ahead, library=_FAKETIME))
 
     def clear(self) -> None:
-        """Remove every container, network and volume that an earlier run may have left; images stay."""
         left = self.docker("ps", "--all", "--quiet").stdout.split()
         if left:
             self.docker("rm", "--force", "--volumes", *left)
@@ -143,7 +139,7 @@ class Engine:
         return self
 
     def stop(self) -> None:
-        """Stop the engine by its process id, and remove its leftovers; its data stays."""
+        """The data stays."""
         if self._process is not None and self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
             try:
@@ -175,7 +171,6 @@ class Engine:
         timeout: float,
         text: str | None = None,
     ) -> Output:
-        """Run a client program of this engine. Raises `DockerError`."""
         kept = {
             key: value
             for key, value in os.environ.items()
@@ -215,8 +210,6 @@ class Engine:
 
 
 class MachineInside:
-    """The engine's machine as a host of nodes, by the address at which the appliance of compose.host.yaml sees it."""
-
     address = "172.29.76.1"
 
     def __init__(self, machine: Host) -> None:
@@ -224,7 +217,7 @@ class MachineInside:
 
 
 class Compose:
-    """One project of docker-compose; `compose("up", "-d")` runs its commands."""
+    """`compose("up", "-d")` runs a command of docker-compose."""
 
     def __init__(
         self, engine: Engine, directory: Path, project: str, files: Sequence[str], environment: dict[str, str]
@@ -273,7 +266,7 @@ class Compose:
         raise DockerError(f"{service} is not healthy: {json.dumps(state)[:2000]}\n{self.story()}")
 
     def wait_for_log(self, service: str, text: str, *, timeout: float = 60, since: str = "0s") -> str:
-        """Return the first line of a service's output that contains `text`; `since` is a time in Docker's format."""
+        """`since` is a time in Docker's format."""
         moment = [] if since == "0s" else ["--since", since]
         for line in self._follow(["logs", "--follow", *moment, self.container(service)], timeout):
             if text in line:
@@ -281,7 +274,6 @@ class Compose:
         raise DockerError(f"{service} did not log {text!r} within {timeout:.0f} s\n{self.story()}")
 
     def _follow(self, command: Sequence[str], seconds: float) -> Iterator[str]:
-        """Yield the lines of a running docker command as they come, for at most `seconds`."""
         with subprocess.Popen(
             ["timeout", str(seconds), shutil.which("docker") or "docker", *command],
             env=os.environ | {"DOCKER_HOST": self.engine.address},
@@ -298,7 +290,6 @@ class Compose:
                 follow.terminate()
 
     def audit(self, *flags: str, **fields: Any) -> list[dict[str, Any]]:
-        """Return the records of `rosrv audit search --json` in the appliance that have these fields."""
         lines = self.exec("appliance", "rosrv", "audit", "search", "--json", "--limit", "1000", *flags).stdout
         records: list[dict[str, Any]] = [
             json.loads(line) for line in lines.splitlines() if line.startswith("{")
@@ -318,7 +309,6 @@ class Compose:
 
 
 def build_fleet() -> None:
-    """Build the images of the collector and of its PostgreSQL with the command of docs/fleet.md."""
     with builder() as engine, tempfile.TemporaryDirectory() as folder:
         network_and_base = {"network": "host", "args": {"BASE": BASE}}
         services = {name: {"build": network_and_base} for name in ("collector", "postgres")}
@@ -337,7 +327,6 @@ def build_images() -> None:
 
 @contextlib.contextmanager
 def builder(*, clock: bool = False) -> Iterator[Engine]:
-    """Return an engine that only builds, and has the base of the images; for `clock` see `Engine`."""
     archive = base_archive()
     with Engine(builds=True, clock=clock) as engine:
         label = f"base={archive.stem}"
@@ -348,7 +337,6 @@ def builder(*, clock: bool = False) -> Iterator[Engine]:
 
 
 def project(directory: Path) -> Path:
-    """Make a user's directory: the compose files and the three folders to edit."""
     for name in ("compose.yaml", "compose.host.yaml", "compose.standby.yaml"):
         shutil.copy(ROOT / name, directory)
     for name in ("policies", "monitors"):
@@ -363,8 +351,6 @@ def namespace_of(engine: Engine, container: str) -> Namespace:
 
 
 class _ContainerNamespace(Namespace):
-    """A namespace by process id instead of by name."""
-
     def __init__(self, pid: int) -> None:
         self.name = f"container-{pid}"
         self.path = Path(f"/proc/{pid}/ns/net")

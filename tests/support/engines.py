@@ -1,5 +1,3 @@
-"""Drivers of engines for tests: no thread calls their turns (`appliance/base/engine_thread.py`)."""
-
 import asyncio
 import contextlib
 import math
@@ -16,7 +14,7 @@ from tests.support.virtual_clock import VirtualClock
 
 
 class ByHand(InCaller):
-    """Calls turns only while a caller waits; otherwise the test calls them, with `let_pass`."""
+    """Otherwise the test calls the turns, with `let_pass`."""
 
     def __init__(self, name: str, turn: Turn, gather: float) -> None:
         self._wanted = False
@@ -24,7 +22,6 @@ class ByHand(InCaller):
         super().__init__(name, turn, gather)
 
     def wake(self) -> None:
-        """Leave new work to a later turn, unless it comes during one."""
         if self._turning.locked():
             self._wanted = True
 
@@ -40,8 +37,6 @@ class ByHand(InCaller):
 
 
 class Inline(ByHand):
-    """Calls a turn with new work, before the call that brought the work returns."""
-
     def wake(self) -> None:
         super().hurry()
 
@@ -67,12 +62,9 @@ def let_pass(engine: AuditLog | Database, seconds: float) -> None:
 
 
 def open_log(path: Path, **settings: Any) -> AuditLog:
-    """Open an audit log that writes each record at once, without a thread."""
     return AuditLog(path, drive=Inline, **settings)
 
 
 class InlineDatabase(Database):
-    """A state file that writes each change at once, without a thread."""
-
     def __init__(self, path: Path, schema: str, *, failed: Callable[[str], None]) -> None:
         super().__init__(path, schema, failed=failed, drive=Inline)

@@ -1,5 +1,3 @@
-"""Robots in the data folder of a collector."""
-
 import ssl
 from pathlib import Path
 
@@ -21,8 +19,6 @@ def enrolled_robots(data: Path, *names: str) -> Robots:
 
 
 class JoiningAppliance:
-    """The keys of an appliance that joins as arm7."""
-
     def __init__(self) -> None:
         public = Ed25519PrivateKey.generate().public_key()
         self.raw = public.public_bytes_raw()
@@ -30,11 +26,9 @@ class JoiningAppliance:
         self.certificate = make_own_certificate("arm7", 1)[1]
 
     def join(self, robots: Robots, appliance: str = "") -> Robot:
-        """Join with an invitation for arm7, or for one appliance of it."""
         return robots.join("arm7", self.key, self.certificate, "", appliance)
 
     def of(self, robots: Robots) -> str:
-        """Return the appliance that the collector takes this machine for; empty for none."""
         der = ssl.PEM_cert_to_DER_cert(self.certificate.decode())
         robot = robots.with_certificate(der)
         return "" if robot is None else f"{robot.name}/{robot.appliance_with(der)}"

@@ -1,5 +1,3 @@
-"""Make ESP packets by hand, with the keys of an own tunnel: packets of a dishonest host in a tunnel."""
-
 import os
 import re
 from dataclasses import dataclass
@@ -13,13 +11,12 @@ _IPV4 = 4
 
 @dataclass(frozen=True)
 class EspKeys:
-    """One direction of a tunnel; `key` is the cipher's key and, in its last four bytes, the salt (RFC 4106)."""
+    """`key` is the cipher's key and, in its last four bytes, the salt (RFC 4106)."""
 
     spi: int
     key: bytes
 
     def seal(self, sequence: int, packet: bytes) -> bytes:
-        """Return the ESP packet that contains this IPv4 packet."""
         head = self.spi.to_bytes(4) + sequence.to_bytes(4)
         vector = os.urandom(8)
         padding = -(len(packet) + 2) % 4
@@ -28,7 +25,6 @@ class EspKeys:
 
 
 def initiators_keys(charon: Process) -> EspKeys:
-    """Return the sending keys of the host that initiated its tunnel, from its charon's log (`chd = 4`)."""
     lines = [str(event.get("text")) for event in charon.events]
     begin = max(number for number, line in enumerate(lines) if "encryption initiator key => 36 bytes" in line)
     dump = lines[begin + 1 : begin + 4]

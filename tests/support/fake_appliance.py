@@ -34,7 +34,7 @@ Answer = Callable[[dict[str, Any]], AdminAnswer[Any]]
 
 
 class FakeAppliance:
-    """The fake appliance; each of its two servers starts when it is first needed."""
+    """Each server starts when it is first needed."""
 
     def __init__(self, context: ssl.SSLContext | None = None) -> None:
         self.requests: list[str] = []
@@ -62,7 +62,7 @@ class FakeAppliance:
         self.decide(verb, lambda _request: AdminAnswer(False, None, error, list(findings), trouble))
 
     def decide(self, verb: str, answer: Answer) -> None:
-        """Call this function for each answer from now on; `ConnectionResetError` closes the connection instead."""
+        """`ConnectionResetError` closes the connection instead."""
         assert verb in _KINDS, f"{verb!r} is not one of {sorted(_KINDS)}"
         self._answers[verb] = answer
 
@@ -135,7 +135,7 @@ class FakeAppliance:
             do_POST = do_PATCH = do_DELETE = do_PUT = do_GET  # noqa: N815  the same
 
             def log_message(self, format: str, *args: Any) -> None:  # noqa: A002  as http.server names it
-                """Log nothing."""
+                ...
 
         return Handler
 

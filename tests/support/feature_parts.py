@@ -1,5 +1,3 @@
-"""Make the parts of features for tests that do not call them."""
-
 from typing import Any
 
 from appliance.audit.log.log import AuditLog
@@ -33,7 +31,6 @@ def idle_parts() -> FeatureParts:
 
 
 def answered_later() -> list[tuple[Feature, type[Any]]]:
-    """Return the requests that parts answer which control makes at its start, with their features."""
     return [
         (feature, request)
         for feature in FEATURES

@@ -1,4 +1,4 @@
-"""Run an appliance under attack: a robot and its operator talk, a rogue host attacks, a test reads the audit log.
+"""A robot and its operator talk, a rogue host attacks, a test reads the audit log.
 
 with Field(lab, home, POLICY) as field:
     answer = field.rogue("lookupNode", "/looker", "/voice")
@@ -71,7 +71,7 @@ class Field:
     # --- actions of the rogue ---
 
     def rogue(self, method: str, *parameters: Any, uri: str | None = None) -> Any:
-        """Make one XML-RPC call from the attacker's host; a fault or an HTTP error is raised as an exception."""
+        """A fault or an HTTP error is raised as an exception."""
         return self.call(self.attacker, method, *parameters, uri=uri)
 
     def call(self, host: Host, method: str, *parameters: Any, uri: str | None = None) -> Any:
@@ -122,7 +122,6 @@ class Field:
         assert self.listener.running
 
     def memory(self, role: str = "control") -> int:
-        """Return the resident bytes of a process of the appliance."""
         status = Path(f"/proc/{self.appliance.pids(role)[0]}/status").read_text()
         return int(re.search(r"VmRSS:\s+(\d+) kB", status)[1]) << 10  # type: ignore[index]  # the kernel always writes it
 
@@ -131,8 +130,6 @@ class Field:
 
 
 class Impostor:
-    """A TCP server on a host that answers with `behave(connection, request)`, and counts its clients."""
-
     def __init__(
         self, host: Host, behave: Callable[[socket.socket, bytes], object], address: str | None = None
     ) -> None:
@@ -190,8 +187,6 @@ def whole(message: bytes) -> bool:
 
 
 def answering(value: Any) -> Callable[[socket.socket, bytes], None]:
-    """Return the behaviour of a node that answers every call with this value."""
-
     def behave(connection: socket.socket, _request: bytes) -> None:
         connection.sendall(response(value))
 

@@ -1,5 +1,3 @@
-"""Make the certificates of a fleet for tests: one authority, the collector's certificate, one for each robot."""
-
 import datetime
 import ipaddress
 import ssl
@@ -14,8 +12,6 @@ from cryptography.x509.oid import NameOID
 
 
 class FleetAuthority:
-    """An authority of a fleet, and the certificates that it signed, as PEM files in `folder`."""
-
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         folder.chmod(0o755)
@@ -31,7 +27,6 @@ class FleetAuthority:
         self._write(self.ca, self._name, self._key, extensions)
 
     def issue(self, name: str, address: str | None = None) -> tuple[Path, Path]:
-        """Return the files of a certificate and its key, for a robot's name or the collector's address."""
         key = ec.generate_private_key(ec.SECP256R1())
         certificate, key_file = self.folder / f"{name}.pem", self.folder / f"{name}.key"
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
@@ -44,7 +39,6 @@ class FleetAuthority:
 
     @cached_property
     def server_context(self) -> ssl.SSLContext:
-        """Return the TLS context of a collector on the loopback, which demands a robot's certificate."""
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.load_cert_chain(*self.issue("collector", "127.0.0.1"))
         context.load_verify_locations(self.ca)

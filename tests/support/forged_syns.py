@@ -17,7 +17,6 @@ _PIECES = 100  # a second
 
 
 def syn(source: str, target: str, port: int, from_port: int) -> bytes:
-    """Return a SYN with its header of IPv4 or IPv6."""
     ends = ipaddress.ip_address(source).packed, ipaddress.ip_address(target).packed
     segment = struct.pack("!HHIIBBHHH", from_port, port, 0, 0, 5 << 4, _SYN, 64240, 0, 0)
     pseudo = b"".join(ends) + struct.pack("!IHH", len(segment), 0, _TCP)
@@ -34,7 +33,6 @@ def send_syn(source: str, target: str, port: int, from_port: int = 40000) -> Non
 
 
 def syn_sources(wire: socket.socket) -> list[str]:
-    """Return the sources of all SYNs that have arrived at a packet socket (SOCK_DGRAM) so far."""
     wire.setblocking(False)
     found: list[str] = []
     while True:
@@ -51,7 +49,7 @@ def syn_sources(wire: socket.socket) -> list[str]:
 
 
 def flood_command(source: str, target: str, port: int, *, per_second: int, seconds: float) -> list[str]:
-    """Return a program that sends SYNs evenly, and prints their number when it ends.
+    """The program sends SYNs evenly, and prints their number when it ends.
 
     All have the same source address, and each has another ephemeral port.
     """

@@ -1,5 +1,3 @@
-"""Forge an audit log as root on the appliance can, with the signer's key, its memory and the program."""
-
 import hashlib
 import sqlite3
 from contextlib import closing
@@ -19,7 +17,7 @@ _EVENT, _DETAIL = _FIELDS.index("event"), _FIELDS.index("detail")
 
 
 def write_anew(path: Path, key: Ed25519PrivateKey, signer: Path, change: str) -> None:
-    """Change records as root can, and compute all hashes, checkpoints, signatures and the signer's memory again."""
+    """Change records as root can, with all hashes, checkpoints, signatures and the signer's memory."""
     with closing(sqlite3.connect(path)) as connection:
         connection.execute(change)
         rows = connection.execute(f"SELECT {COLUMNS} FROM record ORDER BY sequence").fetchall()

@@ -30,8 +30,6 @@ _ONE_AT_A_TIME = threading.Lock()
 
 
 class Forking:
-    """A host on which programs of Debian's Python are forks; all other programs start as usual."""
-
     def __init__(self, host: Host) -> None:
         self.host = host
 
@@ -87,7 +85,6 @@ class Fork(subprocess.Popen[Any]):
         self.pid = int(self._report.recv(16))
 
     def poll(self) -> int | None:
-        """Return the exit status, minus the signal; None while it runs."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.wait(0)
         return self.returncode
@@ -101,7 +98,6 @@ class Fork(subprocess.Popen[Any]):
         return self.returncode
 
     def send_signal(self, sig: int) -> None:
-        """Send a signal, unless the fork has ended."""
         if self.poll() is None:
             with contextlib.suppress(ProcessLookupError):  # its server may have seen its end first
                 os.kill(self.pid, sig)
@@ -135,7 +131,6 @@ def _is_python(program: str) -> bool:
 
 
 def _of_python(args: list[str], path: str) -> list[str] | None:
-    """Return the Python program and arguments for the server, if it can run them."""
     if args[0] == PYTHON:
         return args[1:] if args[1] == "-c" or not args[1].startswith("-") else None
     program = shutil.which(args[0], path=path)

@@ -1,5 +1,3 @@
-"""Keep the messages at one end of a channel in a test, and wait for a number of them."""
-
 import asyncio
 from collections.abc import Callable
 from typing import Any
@@ -8,8 +6,6 @@ from appliance.channel.channel import Channel
 
 
 class Heard:
-    """The messages of a channel, in order; attached to the running loop."""
-
     def __init__(self, channel: Channel, closed: Callable[[], None] = lambda: None) -> None:
         self.messages: list[Any] = []
         self._changed = asyncio.Event()

@@ -19,7 +19,6 @@ REQUEST = b"POST / HTTP/1.1\r\nContent-Type: text/xml\r\nContent-Length: %d\r\n\
 
 
 def connected(master: str, own: str) -> socket.socket | None:
-    """Return a connection to the master, or None if it does not open."""
     try:
         return socket.create_connection((master, PORT), 1, (own, 0))
     except OSError:

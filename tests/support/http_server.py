@@ -1,4 +1,4 @@
-"""Run an `HttpServer` in a unit test, with clients, and check that it keeps no state of a client at the end."""
+"""Check at the end that the server keeps no state of a client."""
 
 import asyncio
 import contextlib
@@ -41,8 +41,6 @@ def _named(_host: object) -> QuotaClass:
 
 @dataclass(frozen=True)
 class Shares:
-    """The pools of a server of a test."""
-
     connections: Bounds = RVMASTER_CONNECTIONS.bounds
     held: Bounds = RVMASTER_BYTES.bounds
     farewells: Bounds = RVMASTER_FAREWELLS.bounds
@@ -85,7 +83,6 @@ class Client:
         return int(status.split()[1]), headers, body
 
     async def ended(self) -> bytes:
-        """Return the data until the server closes; fail if it does not."""
         async with asyncio.timeout(WAIT):
             try:
                 return await self.reader.read()
@@ -99,8 +96,6 @@ class Client:
 
 
 class Server:
-    """A server of a test, its requests, and its reported errors."""
-
     def __init__(
         self, handler: Handler | None, limits: HttpLimits, refusal: bytes | None, shares: "Shares"
     ) -> None:
@@ -158,7 +153,7 @@ class Server:
         )
 
     async def connect(self, host: str = "127.0.0.1") -> Client:
-        """Return a new connection from this address; it is closed at the end of the test."""
+        """The connection is closed at the end of the test."""
         client = Client(*await asyncio.open_connection("127.0.0.1", self.port, local_addr=(host, 0)))
         self.clients.append(client)
         return client
@@ -176,7 +171,6 @@ async def serving(
     refusal: bytes | None = None,
     shares: "Shares | None" = None,
 ) -> AsyncIterator[Server]:
-    """Run a server; check that it keeps no state of a client at the end."""
     server = Server(handler, limits, refusal, shares or Shares())
     await server.http.start()
     sweep = asyncio.get_running_loop().create_task(server.connection_table.sweep())
@@ -193,7 +187,6 @@ async def serving(
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    """Wait until the condition holds, while the loop runs."""
     async with asyncio.timeout(WAIT):
         while not condition():
             await asyncio.sleep(0.01)

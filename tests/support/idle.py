@@ -1,5 +1,3 @@
-"""Make replacements for the parts that a test does not use."""
-
 import functools
 import inspect
 from collections.abc import Callable
@@ -14,7 +12,7 @@ def idle(part: type[T]) -> T:
 
 
 def idle_class(part: type[object]) -> Any:
-    """Return a class like `part` whose public methods do nothing, and reject arguments that `part`'s reject.
+    """The class has the public methods of `part`, which do nothing, and reject arguments that `part`'s reject.
 
     So a renaming in the product fails in its tests. `part` is not instantiated: an object has no attributes.
     """

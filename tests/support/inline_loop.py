@@ -1,5 +1,3 @@
-"""Run asyncio code that uses threads without any thread: the work of a thread is done at once, by the event loop."""
-
 import asyncio
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar

@@ -49,8 +49,6 @@ _FORMS = {
 
 @dataclass(frozen=True, slots=True)
 class TraceBounds:
-    """The epochs of a trace: that before its first grant, and the last."""
-
     first: int
     last: int
 
@@ -64,7 +62,7 @@ class TraceBounds:
 
 
 def lease_accepts(folder: Path, events: Sequence[str], names: tuple[str, str] = ("a", "b")) -> bool:
-    """Whether an execution of the model leaves these events. Raises `ValueError` for a line that is not an event."""
+    """Raises `ValueError` for a line that is not an event."""
     fields = [_fields(line, names) for line in events]
     numbers = [one["number"] for one in fields if "number" in one]
     if len(numbers) != len(set(numbers)):
@@ -79,7 +77,6 @@ def lease_accepts(folder: Path, events: Sequence[str], names: tuple[str, str] = 
 
 
 def _fields(line: str, names: tuple[str, str]) -> dict[str, str]:
-    """Return the parts of an event. Raises `ValueError`."""
     event, _, rest = line.partition(" ")
     form = _FORMS.get(event)
     if form is None:

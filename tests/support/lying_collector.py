@@ -1,5 +1,3 @@
-"""A collector that misbehaves on the level of bytes: in the handshake, in the head or in the body of its answers."""
-
 import re
 import socket
 import ssl
@@ -8,11 +6,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 Lie = Callable[["Visitor"], None]
-"""The behaviour of a lying collector towards a client."""
 
 
 class Visitor:
-    """A client's connection. Its methods raise `OSError` after the client has closed it."""
+    """The methods raise `OSError` after the client has closed the connection."""
 
     def __init__(self, stream: socket.socket, ending: threading.Event) -> None:
         self.stream = stream
@@ -40,12 +37,10 @@ class Visitor:
         self.stream.sendall("\r\n".join(lines).encode() + b"\r\n\r\n" + body)
 
     def repeat(self, data: bytes, pause: float) -> None:
-        """Send data again and again until the client closes the connection."""
         while not self.ending.wait(pause):
             self.stream.sendall(data)
 
     def wait(self) -> None:
-        """Send nothing until the client closes the connection."""
         while self.stream.recv(65_536):
             pass
 
@@ -54,7 +49,7 @@ class Visitor:
 def lying_collector(
     context: ssl.SSLContext, answer: Lie, before_tls: Lie = lambda _visitor: None
 ) -> Iterator[str]:
-    """Serve the loopback until the block ends, and return the URL; `answer` serves a whole connection."""
+    """`answer` serves a whole connection."""
     listener = socket.create_server(("127.0.0.1", 0))
     ending = threading.Event()
 

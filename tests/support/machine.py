@@ -44,20 +44,18 @@ _NICE = "-5"
 
 
 class MachineError(AssertionError):
-    """The machine failed; the text contains the end of its console."""
+    pass
 
 
 @dataclass(frozen=True)
 class Done:
-    """The outcome of a program in the machine."""
-
     status: int
     output: str
     seconds: float
 
 
 class Machine:
-    """One machine; a context manager. `directory` keeps its sockets and the text of its console.
+    """`directory` keeps its sockets and the text of its console.
 
     `disk` is written to; without it the machine has a snapshot of the tests' disk. `freight` writes the archive that
     the agent unpacks before it takes orders; the default is the checkout.
@@ -116,7 +114,6 @@ class Machine:
         return self
 
     def run(self, *argv: str, seconds: float = 600.0, check: bool = True) -> Done:
-        """Run a program as root in the checkout's folder; with `check`, a status other than 0 is a failure."""
         assert self._line is not None, "the machine is not running"
         self._number += 1
         order = {"number": self._number, "argv": argv, "seconds": seconds}
@@ -190,7 +187,6 @@ class Machine:
                 return line
 
     def _hear(self, seconds: float, still: float = math.inf) -> dict[str, Any]:
-        """Return the next answer; stop waiting once the machine has computed nothing for `still` seconds."""
         assert self._line is not None
         assert self._process is not None
         began, progress = time.monotonic(), ProcessActivity(self._process.pid)
@@ -224,7 +220,7 @@ class Machine:
 
 @cache
 def accelerator(program: str, kernel: Kernel) -> str:
-    """Return `kvm` where a kernel prints its first line with it, else `tcg`; a device file alone proves nothing."""
+    """A device file alone proves nothing, so a kernel must print its first line with `kvm`."""
     if not KVM.exists():
         return "tcg"
     arguments = [*_hardware("kvm"), "-m", "256", "-kernel", str(kernel.image), "-serial", "stdio"]
@@ -244,7 +240,6 @@ def accelerator(program: str, kernel: Kernel) -> str:
 
 
 def _hardware(accelerator: str) -> list[str]:
-    """Return the options of a machine without hardware that the tests do not use."""
     processor = "host" if accelerator == "kvm" else "max"
     how = "kvm" if accelerator == "kvm" else "tcg,thread=multi"
     return [

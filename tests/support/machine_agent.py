@@ -19,7 +19,6 @@ LONGEST_OUTPUT = 4 << 20  # bytes
 
 
 def main() -> None:
-    """Serve until the machine is switched off."""
     words = Path("/proc/cmdline").read_text(encoding="ascii").split()
     root = next(word.removeprefix("rosrv.root=") for word in words if word.startswith("rosrv.root="))
     Path(root).mkdir(parents=True, exist_ok=True)

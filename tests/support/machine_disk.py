@@ -1,4 +1,4 @@
-"""The disk of the tests' virtual machine: Debian, its cloud kernel's modules, the project's environment, the agent.
+"""Debian, its cloud kernel's modules, the project's environment, and the agent of the virtual machine.
 
 The image is under `build/machine/`, named by a key of its inputs, and never changed: a machine works on a snapshot.
 The checkout is on a second disk that is made for each start (`checkout_archive`).
@@ -49,8 +49,6 @@ _QUIET_TOO = ("apt-daily-upgrade.timer", "dpkg-db-backup.timer", "e2scrub_all.ti
 
 @dataclass(frozen=True)
 class Kernel:
-    """The cloud kernel of this machine, with its initial RAM disk."""
-
     release: str
     image: Path
     initrd: Path
@@ -61,7 +59,6 @@ class Kernel:
 
 
 def newest_kernel() -> Kernel:
-    """Return the newest installed cloud kernel, as `packages-system.txt` asks for it."""
     found = [
         Kernel(release, image, initrd)
         for image in sorted(
@@ -76,7 +73,6 @@ def newest_kernel() -> Kernel:
 
 
 def machine_disk(kernel: Kernel) -> Path:
-    """Return the image of the tests' disk (ext4 without partitions), and make it if there is none."""
     return _disk("disk", kernel, _packages(), environment=True)
 
 

@@ -20,7 +20,6 @@ _ended = threading.Event()
 
 
 def ask(name: str, uri: str) -> None:
-    """Ask one of them until the input ends."""
     place = urllib.parse.urlsplit(uri)
     while not _ended.wait(_PAUSE):
         connection = http.client.HTTPConnection(str(place.hostname), place.port, timeout=_SECONDS)
@@ -36,7 +35,6 @@ def ask(name: str, uri: str) -> None:
 
 
 def main() -> None:
-    """Start a thread for each, and end with the input."""
     for given in sys.argv[1:]:
         threading.Thread(target=ask, args=given.split("=", 1), daemon=True).start()
     sys.stdin.read()

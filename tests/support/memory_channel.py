@@ -1,5 +1,3 @@
-"""A link between two processes of the appliance, both of which are in the test: messages are encoded and decoded."""
-
 import asyncio
 from collections import deque
 from collections.abc import Callable
@@ -31,7 +29,6 @@ class MemoryChannel(Channel):
         self.send_raw(self._encode(message))
 
     def send_raw(self, body: bytes) -> None:
-        """Send bytes that need not be a message of the link."""
         if not self.peer.closed:
             self.peer.arrived.append(body)
             self.peer.schedule(self.peer.deliver)
@@ -64,7 +61,6 @@ class MemoryChannel(Channel):
             self._received(message, ())
 
     def close(self) -> None:
-        """End the link; the other end hears of it after the messages before."""
         if not self.closed:
             self.closed = True
             if not self.peer.closed:

@@ -28,7 +28,6 @@ class MemoryNetwork:
         return server
 
     def connect(self, source: str, address: tuple[str, int]) -> "tuple[asyncio.StreamReader, MemoryWriter]":
-        """Return a connection. Raises `ConnectionRefusedError`."""
         if address not in self.servers:
             raise ConnectionRefusedError(111, "Connection refused")
         self.connections.append((source, address))
@@ -51,13 +50,10 @@ class MemoryNetwork:
 
 @dataclass
 class MemoryHost:
-    """The network from one source address; satisfies `NodeNetwork`."""
-
     network: MemoryNetwork
     source: str
 
     async def connect(self, host: str, port: int) -> tuple[asyncio.StreamReader, ByteWriter]:
-        """Return a connection. Raises `ConnectionRefusedError`."""
         await asyncio.sleep(0)
         return self.network.connect(self.source, (host, port))
 
@@ -82,7 +78,6 @@ class _Reader(asyncio.StreamReader):
     _buffer: bytearray
 
     def discard(self) -> bool:
-        """Drop the unread bytes; return whether there were any."""
         unread = bool(self._buffer)
         self._buffer.clear()
         return unread
@@ -90,8 +85,6 @@ class _Reader(asyncio.StreamReader):
 
 @dataclass(eq=False)
 class MemoryWriter:
-    """One end of a connection: its reader, and itself as writer and as the reader's transport."""
-
     address: tuple[str, int]
     closed: bool = False
     reader: _Reader = field(init=False)
@@ -104,7 +97,6 @@ class MemoryWriter:
         self.has_room.set()
 
     def write(self, data: bytes) -> None:
-        """Send bytes."""
         if not self.closed and not self.peer.closed:
             self.peer.reader.feed_data(data)
 

@@ -1,5 +1,3 @@
-"""The hosts' certificate authority without a signer process, for tests of its users."""
-
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
@@ -12,8 +10,6 @@ from appliance.ipsec.proof_of_possession import RequestRefusedError
 
 
 class NearAuthority(Authority):
-    """The real authority, asked without a link."""
-
     def __init__(self, directory: Path) -> None:
         super().__init__(Link(lambda _message: None))
         self._near = CertificateAuthority(directory)

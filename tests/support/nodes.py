@@ -1,4 +1,4 @@
-"""Real ROS nodes: Debian's unmodified rospy and roscpp, and the stock tools, started against a master.
+"""Debian's unmodified rospy and roscpp nodes, and the stock tools, started against a master.
 
     with RosSession(master_uri, home) as ros:
         ros.talker("rospy", "/chatter")
@@ -37,8 +37,6 @@ _IN_ITS_OWN_WAY = re.compile(
 
 
 class RosSession:
-    """The nodes and tools of one test; all end with it."""
-
     def __init__(self, master_uri: str, home: Path, host: Host | None = None) -> None:
         self.master_uri, self.home = master_uri, home
         self.host: Host = host or ThisMachine()
@@ -78,7 +76,6 @@ class RosSession:
         return process
 
     def node(self, client: Client, program: str, *arguments: str, name: str | None = None) -> Process:
-        """Start a node of the tests and wait until it reports its registration; it runs until the session ends."""
         name = name or f"{program}_{len(self.processes)}"
         if client == "rospy":
             command = [PYTHON, str(HERE / "rospy_nodes" / f"{program}.py")]
@@ -111,7 +108,7 @@ class RosSession:
     def run(
         self, *command: str, timeout: float = LIMIT, check: bool = True, text: str | None = None
     ) -> subprocess.CompletedProcess[str]:
-        """Run a stock tool to its end and return its output. With `check`, a failure fails the test."""
+        """With `check`, a failure fails the test."""
         with (
             tempfile.TemporaryFile("w+") as given,
             tempfile.TemporaryFile("w+") as out,
@@ -170,7 +167,7 @@ def without_gap(numbers: Sequence[int]) -> bool:
 
 @functools.cache
 def roscpp_program(name: str) -> Path:
-    """Return the compiled node; it is compiled on first use and after changes of its source."""
+    """Compile the node on first use and after changes of its source."""
     source, header = HERE / "roscpp_nodes" / f"{name}.cpp", HERE / "roscpp_nodes" / "report.hpp"
     target = BUILD / name
     BUILD.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,3 @@
-"""Network namespaces of tests: turns for the one of `rosrv up`, and loopbacks that nothing else shares."""
-
 import contextlib
 import fcntl
 import os

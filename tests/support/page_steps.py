@@ -1,4 +1,4 @@
-"""Pages whose commands a test runs: each block is marked with its machine, and the block after it has the output.
+"""Each block of a page is marked with its machine, and the block after it has the output.
 
     <!-- on: robot, stays -->
 
@@ -18,8 +18,6 @@ _STEP = re.compile(
 
 @dataclass(frozen=True)
 class Step:
-    """One block of commands: the machine, whether it fails or keeps running, and its output."""
-
     host: str
     how: str | None
     script: str

@@ -1,5 +1,3 @@
-"""Make mirrors of the parameter tree for tests."""
-
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -12,8 +10,6 @@ from roswire.xmlrpc import Value
 
 
 class Owners:
-    """The journal of parameter owners: keys and hosts."""
-
     def __init__(self, kept: Iterable[tuple[str, str]] = ()) -> None:
         self.kept = dict(kept)
 
@@ -39,7 +35,7 @@ def mirror(
     note: Callable[[str, Value], None] = lambda _key, _value: None,
     **more: Any,
 ) -> ParameterMirror:
-    """Return a mirror of this tree; one host may have all of it (`whole`), or the limits in `bounds`."""
+    """One host may have all of the tree (`whole`), or the limits in `bounds`."""
     pool = Pool("bytes of parameters", bounds or Bounds(whole, whole, 0, 0), quota_class)
     owners = owners or Owners()
     charges = ParameterCharges(pool, owners, list(owners.kept.items()))
@@ -47,5 +43,4 @@ def mirror(
 
 
 def put(there: ParameterMirror, key: str, value: Value, host: Address) -> None:
-    """Set a parameter for a host. Raises `LimitReachedError`."""
     there.set(key, value, there.reserve(key, measure(value)[0], host))

@@ -37,7 +37,6 @@ def _is_scan(node: Any) -> bool:
 
 
 def _sequence(nodes: Any, size: int, scan: int) -> tuple[float, float]:
-    """Return the ways in which the nodes can match, one behind the other, and the steps to try them all."""
     ways, cost = 1.0, 0.0
     for node in nodes:
         its_ways, its_cost = _node(node, size, scan)

@@ -1,5 +1,3 @@
-"""Read what `rosrv … --json` printed."""
-
 import json
 import subprocess
 from typing import Any
@@ -8,10 +6,6 @@ from tests.support.waiting import NoAnswerError
 
 
 def rows_of(done: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
-    """Return the objects that a verb with --json printed; its exit status may report problems.
-
-    Raises `NoAnswerError` if no appliance answers, or if the appliance rejects the verb, as a standby does.
-    """
     rows: list[dict[str, Any]] = [json.loads(line) for line in done.stdout.splitlines()]
     if done.returncode not in {0, 1} or any(row.keys() == {"error", "findings"} for row in rows):
         raise NoAnswerError(
@@ -21,7 +15,7 @@ def rows_of(done: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
 
 
 def row_of(done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
-    """Return the object that a verb with --json printed. Raises `NoAnswerError`, as `rows_of` does or for no object."""
+    """Raises `NoAnswerError`, as `rows_of` does or for no object."""
     rows = rows_of(done)
     if not rows:
         raise NoAnswerError(f"{' '.join(done.args)}: exit status {done.returncode}\n{done.stderr}")

@@ -1,7 +1,7 @@
-"""A process of a test: read its events as they are printed, end it by its own id, show its output on failure.
+"""Events are read as they are printed, and a failure shows the whole output.
 
-Programs of the tests print one JSON object per line; a test waits for the line it needs, with a limit, and
-never sleeps. Other lines (stock tools, warnings) are kept as `{"text": line}`.
+Programs of the tests print one JSON object per line; a test waits for the line it needs, with a limit, and never
+sleeps. Other lines (stock tools, warnings) are kept as `{"text": line}`.
 """
 
 import contextlib
@@ -21,19 +21,13 @@ LIMIT = 30.0 * float(os.environ.get("TESTS_PATIENCE", "1"))
 
 
 class Host(Protocol):
-    """A place to run processes: this machine, or a host of the lab (`examples.landshark.lab.Host`)."""
-
     @property
-    def address(self) -> str:
-        """The address of the host."""
+    def address(self) -> str: ...
 
-    def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
-        """Start a process there."""
+    def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]": ...
 
 
 class ThisMachine:
-    """The machine the tests run on, by its loopback address."""
-
     address = "127.0.0.1"
 
     def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
@@ -49,8 +43,6 @@ def runs(pid: int | str) -> bool:
 
 
 class Process:
-    """A running program, its events in order, and its standard error."""
-
     def __init__(
         self,
         host: Host,
@@ -101,9 +93,9 @@ class Process:
         since: int = 0,
         **fields: Any,
     ) -> Event:
-        """Return the first event (from index `since` on) that `wanted` accepts and that has these fields.
+        """`since` is an index of events.
 
-        Fails with the whole output of the process if the event does not come within `timeout` seconds.
+        Fails with the whole output of the process after `timeout` seconds.
         """
 
         def accepts(event: Event) -> bool:
@@ -133,7 +125,6 @@ class Process:
         return said(self.wait_for(lambda event: text in said(event), timeout=timeout, since=since))
 
     def wait_for_error(self, text: str, *, timeout: float = LIMIT) -> None:
-        """Wait until a line that contains `text` is on its standard error."""
         with self._changed:
             there = self._changed.wait_for(lambda: any(text in line for line in self.errors), timeout)
         assert there, f"it did not print {text!r} within {timeout:.0f} s\n{self.story()}"
@@ -141,7 +132,7 @@ class Process:
     def wait_for_count(
         self, count: int, *, timeout: float = LIMIT, since: int = 0, **fields: Any
     ) -> list[Event]:
-        """Return the first `count` events (from index `since` on) with these fields; each within `timeout` seconds."""
+        """Each may take `timeout` seconds; `since` is an index of events."""
         found: list[Event] = []
         position = since
         deadline = time.monotonic() + timeout
@@ -177,7 +168,6 @@ class Process:
         self.popen.stdin.flush()
 
     def wait(self, *, timeout: float = LIMIT) -> int:
-        """Return the exit status, once the process has ended and all its output is read."""
         try:
             status = self.popen.wait(timeout)
         except subprocess.TimeoutExpired:
@@ -193,7 +183,6 @@ class Process:
             )
 
     def interrupt(self, with_signal: int = signal.SIGINT) -> None:
-        """Ask the process to end without waiting for it, as `stop` does."""
         if self.popen.stdin is not None:
             with contextlib.suppress(BrokenPipeError):
                 self.popen.stdin.close()  # ends a program that waits for its next order
@@ -202,9 +191,7 @@ class Process:
         self._asked = True
 
     def stop(self, *, with_signal: int = signal.SIGINT, timeout: float = 20) -> int:
-        """End the process with the signal, then with SIGABRT (a Python program then prints its stack) and
-        SIGKILL to its session if it does not end.
-        """
+        """The signal is followed by SIGABRT (a Python program then prints its stack) and SIGKILL to the session."""
         if not self._asked:
             self.interrupt(with_signal)
         if self.running:

@@ -50,7 +50,6 @@ _EVENTS = (
     select.EPOLLIN | select.EPOLLET, select.EPOLLOUT, select.EPOLLIN | select.EPOLLONESHOT,
 )  # fmt: skip
 OUTCOMES = frozenset({"left: judged", "left: received", "left: sent", "left: unarmed", "module"})
-"""Outcomes that a run must have caused at least once."""
 
 _INVOKE = ctypes.CFUNCTYPE(
     ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.POINTER(ctypes.c_int64), ctypes.c_size_t,
@@ -59,16 +58,12 @@ _INVOKE = ctypes.CFUNCTYPE(
 
 
 class FuzzedConnection:
-    """A publisher's connection: its two ends, its topic, and the pump's part."""
-
     def __init__(self, ours: socket.socket, theirs: socket.socket, pumped: Any, topic: Any) -> None:
         self.ours, self.theirs, self.pumped, self.topic = ours, theirs, pumped, topic
         self.owed = b""  # the rest of a frame that was torn
 
 
 class PumpFuzzer:
-    """A pump with connections that come and go; `step` performs one random action."""
-
     def __init__(self, pump: Any, seed: int) -> None:
         self._pump = pump
         self._random = Random(seed)  # noqa: S311  repeats a run
@@ -92,7 +87,6 @@ class PumpFuzzer:
         self._weights = [weight for weight, _ in self._actions]
 
     def step(self) -> None:
-        """Perform one action; count it, and the exception that it raised."""
         ((_, action),) = self._random.choices(self._actions, self._weights)
         name = action.__name__.strip("_")
         try:
@@ -187,7 +181,6 @@ class PumpFuzzer:
         self._random.choice(self._connections).pumped.disarm()
 
     def _replace(self) -> None:
-        """Give up a connection at any time, and make another, which may get the same descriptors."""
         number = self._random.randrange(len(self._connections))
         gone = self._connections[number]
         if self._random.random() < 0.8:
@@ -341,7 +334,6 @@ class PumpFuzzer:
         return bytes(changed)
 
     def _use(self, area: Any) -> None:
-        """Receive into this area, unless it is unfit."""
         self._waiting.receive_into(area)
         self._area = area
 
@@ -353,7 +345,6 @@ class PumpFuzzer:
         return self._pump.ModuleCall(*self._call(), offset=offset, until=until)
 
     def _call(self) -> tuple[Any, Any, Any, Any]:
-        """Return what a call of a module is made of; most places are right."""
         memory = memoryview(self._module_memory)
         places = {
             "frames": _FRAMES,
@@ -391,7 +382,6 @@ class PumpFuzzer:
         return self._preparation, native, options, place
 
     def _answer(self, _context: int, _function: int, slots: Any, _count: int, trap: Any) -> int:
-        """Answer as the module: all messages pass, with changes or drops; or with nonsense, an error or a trap."""
         memory, end = self._module_memory, slots[2]
         self.done["module"] += 1
         if len(memory) > _FRAMES and self._random.random() < 0.5:
@@ -439,7 +429,6 @@ def fuzz(seed: int, size: int) -> str:
 
 
 def main(arguments: list[str]) -> None:
-    """Run the command line that the head of this file describes."""
     if "LD_PRELOAD" not in os.environ:
         build(SANITIZED)
         library = subprocess.check_output(["gcc", "-print-file-name=libasan.so"], text=True).strip()

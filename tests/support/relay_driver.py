@@ -71,8 +71,6 @@ class _Handler(SimpleXMLRPCRequestHandler):
 
 
 class ChannelPeer:
-    """One end of a channel, served by a thread; keeps its messages and lets tests wait for them."""
-
     def __init__(
         self, sock: socket.socket, union: Any, received: Callable[[Any], None] | None = None
     ) -> None:
@@ -93,11 +91,9 @@ class ChannelPeer:
         self._wake.send(b"x")
 
     def send_bytes(self, data: bytes) -> None:
-        """Send bytes that are not a message."""
         os.write(self._channel.fileno(), data)
 
     def wait_for(self, wanted: Callable[[Any], bool], seconds: float = 20.0, after: int = 0) -> Any:
-        """Return the first message (from index `after` on) that fits; fail when none comes."""
         deadline = time.monotonic() + seconds
         with self._changed:
             while True:
@@ -112,7 +108,6 @@ class ChannelPeer:
                 self._changed.wait(left)
 
     def close(self) -> None:
-        """Close the channel as the death of a process would."""
         if self._closed:
             return
         self._closed = True
@@ -150,8 +145,6 @@ class ChannelPeer:
 
 
 class RelayProcess:
-    """A real relay process with its lifeline, and the links to the controls that a test plays."""
-
     def __init__(self, limits: str = "None") -> None:
         ours, theirs = socket.socketpair()
         code = (
@@ -198,8 +191,6 @@ class RelayProcess:
 
 
 class Face:
-    """The proxy endpoint of one node: its API, and the relay's port for its topics and services."""
-
     def __init__(self, driver: "RelayDriver", name: str, uri: str) -> None:
         self.driver = driver
         self.name = name
@@ -245,8 +236,6 @@ class Face:
 
 
 class RelayDriver:
-    """rosmaster, relay, and the master in front; a context manager."""
-
     def __init__(self, port: int = 0, rosmaster_port: int = 0, limits: str = "None") -> None:
         self.granting = True
         self._server = _Server((LOOPBACK, port), _Handler, logRequests=False, allow_none=True)
@@ -313,7 +302,6 @@ class RelayDriver:
             return face
 
     def _dispatch(self, method: str, parameters: tuple[Any, ...]) -> Any:
-        """Serve the Master API: registrations get the endpoint's URI, services the relay's port."""
         arguments = list(parameters)
         if method in {
             "registerPublisher",

@@ -1,5 +1,3 @@
-"""Quotas of the relay's memory for tests of its parts."""
-
 from appliance.quotas.pool import Bounds, QuotaClass
 from appliance.relay.transport.memory import HostMemory, MemoryPool
 

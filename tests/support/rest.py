@@ -1,9 +1,3 @@
-"""A client of the appliance's REST interface, written as a user's script would be, with the standard library.
-
-rest = Rest(appliance.ready["api"], appliance.ready["token"], certificate)
-assert rest.get("/v1/policy").status == 200
-"""
-
 import contextlib
 import http.client
 import json
@@ -21,8 +15,6 @@ from tests.support.processes import LIMIT
 
 @dataclass(frozen=True)
 class Answer:
-    """One answer; header names in lower case."""
-
     status: int
     headers: dict[str, str]
     body: bytes
@@ -46,7 +38,6 @@ class Rest:
     def __init__(
         self, url: str, token: str | None = None, certificate: Path | None = None, *, patient: bool = True
     ) -> None:
-        """Take the address and token; `certificate` verifies an https server."""
         self.url = urllib.parse.urlsplit(url)
         self.token = token
         self.certificate = certificate

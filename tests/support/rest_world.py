@@ -101,13 +101,10 @@ class Tokens:
     def usable_row(self, token_id: str) -> TokenRow | None:
         return self.rows.get(token_id)
 
-    def used(self, token_id: str) -> None:
-        """Ignore the use of a token."""
+    def used(self, token_id: str) -> None: ...
 
 
 class Trail:
-    """The audit trail: keeps the records."""
-
     obstacle: str | None = None
 
     def __init__(self) -> None:
@@ -117,8 +114,7 @@ class Trail:
         self.records.append({"event": event, "reason": reason, **fields})
         return "id"
 
-    async def durable(self) -> None:
-        """Return as if the records were written."""
+    async def durable(self) -> None: ...
 
 
 class RestWorld:
@@ -183,7 +179,7 @@ class RestWorld:
         self, method: str, target: str, body: Any = None, role: str | None = "admin", tag: str | None = None,
         *, kind: str = "text/plain",
     ) -> httpx.Response:  # fmt: skip
-        """Return the answer to a request by a role (None: without a token), after its record was made.
+        """Without a role, there is no token; the request's record is made before the return.
 
         A body that is a text or bytes has the content type `kind`; any other is sent as JSON.
         """

@@ -54,7 +54,6 @@ def nodes() -> Iterator[tuple[str, str]]:
 
 
 def publications() -> Iterator[tuple[str, str]]:
-    """Return the publications: two topics for each node; those with messages have names of their own."""
     own = {("/arm/planner", 0): "/arm/command", ("/arm/driver", 0): "/arm/joint", ("/base/planner", 0): "/base/cmd_vel",
            ("/lidar/driver", 0): "/lidar/range", ("/camera/driver", 0): "/camera/exposure"}  # fmt: skip
     for node, _machine in nodes():
@@ -63,7 +62,6 @@ def publications() -> Iterator[tuple[str, str]]:
 
 
 def subscriptions() -> Iterator[tuple[str, str]]:
-    """Return the subscriptions: each node to the one before it in its namespace; a few to other parts of the robot."""
     outputs: dict[str, str] = {}
     for node, topic in publications():
         outputs.setdefault(node, topic)
@@ -81,8 +79,6 @@ def subscriptions() -> Iterator[tuple[str, str]]:
 
 
 class Robot:
-    """Register the whole robot on entering; on leaving its nodes stop without unregistering."""
-
     def __init__(self, master_uri: str) -> None:
         self._master_uri = master_uri
         self._machine = dict(nodes())
@@ -119,8 +115,6 @@ class Robot:
 
 
 class _Machine:
-    """One machine of the robot: an API that accepts everything, a listener, and subscribers."""
-
     def __init__(self, address: str) -> None:
         self._address = address
         self._stack = contextlib.ExitStack()
@@ -154,7 +148,6 @@ class _Machine:
         return [1, "", 4711 if method == "getPid" else 0]
 
     def hear(self, node: str, topic: str, publisher: str) -> None:
-        """Subscribe: ask the publisher for its port, and read until either end closes."""
         with _proxy(publisher, self._address) as api:
             _code, _text, (_protocol, host, port) = api.requestTopic(node, topic, [["TCPROS"]])
         connection = socket.create_connection((host, port), source_address=(self._address, 0))
@@ -176,8 +169,6 @@ class _Listener(ThreadingTCPServer):
 
 
 class _From(xmlrpc.client.Transport):
-    """Make calls from an address of this machine."""
-
     def __init__(self, address: str) -> None:
         super().__init__()
         self._address = address
@@ -200,7 +191,6 @@ _DEFINITIONS = standard_definitions()
 
 
 def _publish(connection: socket.socket, over: threading.Event) -> None:
-    """Answer one subscriber, and send it the topic at its rate, or nothing without a rate, until it ends."""
     with contextlib.suppress(ConnectionError):  # it may end at any time
         _serve(connection, over)
 

@@ -1,5 +1,3 @@
-"""Run the collector's bundles in a test: the real routes and rollouts, PostgreSQL, TLS with certificates."""
-
 import asyncio
 import threading
 import time
@@ -26,8 +24,6 @@ T = TypeVar("T")
 
 
 class _Protocol(HttpToolsProtocol):
-    """HTTP with the name in the client's certificate."""
-
     def on_message_begin(self) -> None:
         super().on_message_begin()
         certificate = self.transport.get_extra_info("peercert") or {}
@@ -42,7 +38,7 @@ def _operator(request: Request) -> str:
 
 
 class RolloutCollector:
-    """A running collector; `call` runs a coroutine in its event loop. Its clock is `ahead` seconds ahead."""
+    """`call` runs a coroutine in the event loop; the clock is `ahead` seconds ahead."""
 
     def __init__(self, folder: Path, authority: FleetAuthority, address: str, ahead: float = 0) -> None:
         self._address = address

@@ -15,7 +15,6 @@ _PORT = "port-root"
 
 @contextlib.contextmanager
 def root_host(lab: Lab, address: str) -> Iterator[Host]:
-    """Connect the machine to the lab under an address such as `10.77.0.2/24`, until the block ends."""
     own = Namespace.own()
     switch = lab.switch
     interfaces.create_veth(own, INTERFACE, switch, _PORT)

@@ -1,5 +1,3 @@
-"""Run the plain ROS master, as `roscore` starts it, to compare the appliance with it."""
-
 import socket
 import threading
 import time
@@ -24,7 +22,6 @@ class PlainMaster:
         self.master_uri = ""
 
     def start(self) -> Self:
-        """Start both; return when the master answers and `/rosout` is registered, as after `roscore`."""
         port = free_port() if isinstance(self.host, ThisMachine) else PORT
         self.master_uri = f"http://{self.host.address}:{port}"
         session = RosSession(self.master_uri, self.home, self.host)
@@ -56,7 +53,6 @@ def master_at(uri: str) -> Any:
 
 
 def call_on(host: Host, uri: str, method: str, *parameters: Any) -> Any:
-    """Make one XML-RPC call from that host and return the answer unchanged."""
     run = getattr(host, "run", None)
 
     def call() -> Any:
@@ -96,7 +92,7 @@ def _await(attempt: Callable[[], object], complaint: str, process: Process | Non
 
 
 def free_port() -> int:
-    """Return a port that is free now (the kernel does not hand it out again soon)."""
+    """The kernel does not hand it out again soon."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -62,7 +62,6 @@ class ScriptHost:
         eventually(self._left, lambda: f"programs of {self.outer.name} have ended: {self._programs()}")
 
     def _programs(self) -> dict[int, str]:
-        """Return the kit's processes in this network, by id; their pid files may be lost."""
         found = {}
         for pid in self.outer.namespace.processes():
             with contextlib.suppress(OSError):
@@ -72,7 +71,7 @@ class ScriptHost:
         return found
 
     def _left(self) -> bool:
-        """Return whether the ports are free for the next host of this network; a remaining process is terminated."""
+        """Return whether the ports are free for the next host; a remaining process is terminated."""
         programs = self._programs()
         self._looks += 1
         if self._looks == _PATIENT_LOOKS:
@@ -102,6 +101,5 @@ class ScriptHost:
         return self.run("sh", "-c", "tail -n 40 /run/rosrv/charon.log 2>/dev/null; true").stdout
 
     def files(self) -> list[str]:
-        """Return all files written below /etc, as seen on this host."""
         upper = self._upper / "upper"
         return self.run("find", str(upper), "-type", "f").stdout.replace(str(upper), "/etc").split()

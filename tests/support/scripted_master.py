@@ -1,5 +1,3 @@
-"""A master for nodes in virtual time, on a network in memory."""
-
 from collections.abc import Callable
 from typing import Any
 
@@ -12,8 +10,6 @@ MASTER = "http://10.0.0.1:11311/"
 
 
 class ScriptedMaster:
-    """A master that keeps registrations, notifies subscribers, and denies what a test names."""
-
     def __init__(self, network: MemoryNetwork) -> None:
         self.network = network
         self.publishers: dict[str, list[str]] = {}

@@ -1,5 +1,3 @@
-"""Build RVMaster's pipeline from parts of a test, with substitutes for the others."""
-
 from collections.abc import Callable
 from typing import Any
 
@@ -47,7 +45,7 @@ def serving(
     own: bool = False,
     target: Incarnation | None = None,
 ) -> Handler:
-    """Return the handler of RVMaster's listener; `own`: of our own listener; `target`: of its endpoint."""
+    """`own` is our own listener, `target` an endpoint."""
     gate = CallGate(policy, registry, HostLimits())
     parameters = ParameterCalls(rosmaster, mirror, subscribers, rights, offload)
     execution = Execution(

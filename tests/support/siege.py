@@ -58,8 +58,6 @@ _BURST = 256  # simultaneous connections in progress
 
 
 class Crowd:
-    """Many addresses on one machine, and their open connections."""
-
     def __init__(self, lab: Lab) -> None:
         self.guests = [f"10.77.1.{number}" for number in range(1, 101)]
         self.unknown_hosts = [f"10.77.2.{number}" for number in range(1, 101)]
@@ -75,7 +73,6 @@ class Crowd:
         each: int,
         data: bytes = b"",
     ) -> int:
-        """Open `each` connections from each address, send `data`, and keep them open; return their number."""
         before = len(self.held)
         self.host.run(lambda: self._connect([one for _ in range(each) for one in addresses], port, data))
         return len(self.held) - before
@@ -122,7 +119,6 @@ class Crowd:
         self.held.clear()
 
     def call(self, address: str, method: str, *parameters: Any, port: int = 11311) -> Any:
-        """Make one call of the Master API (or of an endpoint) from this address, and return the answer or the fault."""
         answer = self.ask(address, method, *parameters, port=port)
         try:
             return parse_response(answer.partition(b"\r\n\r\n")[2])
@@ -145,8 +141,6 @@ class Crowd:
 
 
 class Siege:
-    """The appliance, the working robot, and the crowd; a context manager."""
-
     def __init__(self, lab: Lab, home: Path, settings: str) -> None:
         self.middle = lab.host("appliance", f"{APPLIANCE}/16")
         self.robot = lab.host("robot", "10.77.0.10/16")
@@ -182,8 +176,6 @@ class Siege:
         self._closing.close()
 
     def calls(self, count: int = 50) -> float:
-        """Make `count` calls from the robot, each on its own connection, and return the longest time."""
-
         def each() -> float:
             begun = time.monotonic()
             server: Any = xmlrpc.client.ServerProxy(self.appliance.master_uri)
@@ -201,7 +193,6 @@ class Siege:
         return self.robot.run(make)
 
     def parameters(self, large: str) -> None:
-        """Load the robot's parameters as at a start: small and large ones, and some twice."""
         for number in range(50):
             assert self.call("setParam", "/starter", f"/robot/gains/{number}", number)[0] == 1
         for value in (large, large, {"description": large}):
@@ -231,7 +222,6 @@ class Siege:
         assert without_gap(numbers(heard)), "messages are missing or repeated"
 
     def memory(self, role: str) -> int:
-        """Return the resident bytes of a process."""
         pid = self.appliance.pids(role)[0]
         status = Path(f"/proc/{pid}/status").read_text()
         return int(status.partition("VmRSS:")[2].split()[0]) << 10
@@ -240,7 +230,7 @@ class Siege:
         self.appliance.rosrv("policy", "reload")
 
     def throughout(self, attack: Callable[[], None], *, slowest: float) -> None:
-        """Assert that the robot works during this attack and afterwards, including a reload."""
+        """The robot works during this attack and afterwards, including a reload."""
         attack()
         self.works(slowest=slowest)
         self.reload()

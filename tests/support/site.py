@@ -29,10 +29,10 @@ _ASKER = "/reset"
 
 
 class Site:
-    """A master of one mode, with an open policy; a context manager.
+    """A context manager; the policy is open.
 
-    On the loopback the appliance has REST. In a lab the firewall is in force, and the master has the address 10.77.0.2,
-    `robot` 10.77.0.10 and `ocu` 10.77.0.20.
+    On the loopback the appliance has REST. In a lab the firewall is in force, and the master has the address
+    10.77.0.2, `robot` 10.77.0.10 and `ocu` 10.77.0.20.
     """
 
     def __init__(self, mode: Mode, home: Path, lab: Lab | None = None) -> None:
@@ -68,7 +68,6 @@ class Site:
         return self.master.story()
 
     def state(self) -> dict[str, Any]:
-        """Return everything that a test must leave as it was."""
         if isinstance(self.master, PlainMaster):
             of_master: dict[str, Any] = {"running": [one.running for one in self.master.processes]}
         else:

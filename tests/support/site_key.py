@@ -1,5 +1,3 @@
-"""A site key, and signatures that `ssh-keygen` made with it."""
-
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.signing.site_keys import public_line, sign

@@ -1,5 +1,3 @@
-"""File systems that are full after a few bytes."""
-
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,10 +8,8 @@ from tests.support.requirements import need_root
 
 @contextmanager
 def small_disk(place: Path, size: str, *options: str) -> Iterator[Path]:
-    """Mount an empty file system at a folder, which is made if necessary.
-
-    `size` and `options` are those of `mount -t tmpfs`. The end does not wait for open files: a process that was killed
-    a moment ago may still have one.
+    """`size` and `options` are those of `mount -t tmpfs`. The end does not wait for open files: a process that was
+    killed a moment ago may still have one.
     """
     need_root()
     place.mkdir(exist_ok=True)
@@ -27,7 +23,6 @@ def small_disk(place: Path, size: str, *options: str) -> Iterator[Path]:
 
 @contextmanager
 def filled(place: Path) -> Iterator[None]:
-    """Leave no free space on the disk of a folder while the block runs."""
     filler = place / "filler"
     with filler.open("wb", buffering=0) as file:
         part = b"x" * (1 << 20)

@@ -1,5 +1,3 @@
-"""List the Python files that rules of the project apply to."""
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Run Spin on the models in `proofs/`: bounds, mutants, and the result of an exhaustive search."""
-
 import re
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -17,8 +15,6 @@ _STEPS = 200  # of a trace in an inline, whose text Spin limits to 64 KB
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A model, with the first name in each assertion and the property's name in the head of the model."""
-
     path: Path
     properties: Mapping[str, str]
 
@@ -41,20 +37,16 @@ LEASE = Model(
 
 
 class Bounded(Protocol):
-    """The bounds within which a model is searched."""
+    @property
+    def model(self) -> Model: ...
 
     @property
-    def model(self) -> Model:
-        """Return the model."""
-
-    @property
-    def defined(self) -> list[str]:
-        """Return the definitions for the model."""
+    def defined(self) -> list[str]: ...
 
 
 @dataclass(frozen=True, slots=True)
 class LeaseBounds:
-    """The number of grants of the lease; with `last_fault`, each state is also followed without further faults."""
+    """With `last_fault`, each state is also followed without faults."""
 
     grants: int
     last_fault: bool = False
@@ -73,7 +65,7 @@ class LeaseBounds:
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """The number of nodes and of events; with `sending`, publishers send for ever.
+    """With `sending`, publishers send forever.
 
     With `refusing`, there are specifications that the relay cannot take.
     """
@@ -111,8 +103,6 @@ class Bounds:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """The result of a search: the broken property (empty if none), and the number of states."""
-
     broken: str
     states: int
 
@@ -120,7 +110,7 @@ class Found:
 def search(
     folder: Path, bounds: Bounded, mutant: str = "", traced: Path | None = None, *, large: bool = False
 ) -> Found:
-    """Check every reachable state of the model, or of its copy with a trace, in `folder`.
+    """`folder` gets the model, or its copy with a trace.
 
     Fails when the states do not fit into memory.
 
@@ -154,7 +144,6 @@ def search(
 
 
 Step = tuple[str, int, int]
-"""A step of a trace: the event, and the two numbers that it is about."""
 
 
 def accepts(folder: Path, bounds: Bounded, trace: Sequence[Step]) -> bool:

@@ -1,5 +1,3 @@
-"""Make control's statements to a relay, from texts that are compiled here as the compiler does it."""
-
 from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
@@ -31,7 +29,7 @@ def stated(
     restarted: bool = False,
     **more: Any,
 ) -> SpecificationsStated:
-    """Return a statement of these files; only monitors in `enabled` run. Invalid files give an empty one."""
+    """Only monitors in `enabled` run. Invalid files give an empty statement."""
     if not files:
         return SpecificationsStated(revision, b"", {}, restarted, **more)
     known = _standard().extended(Definitions.from_files(definitions))

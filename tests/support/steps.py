@@ -1,5 +1,3 @@
-"""Measure work without a clock: count the executed lines of Python."""
-
 import sys
 from collections.abc import Callable
 from types import FrameType

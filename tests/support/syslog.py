@@ -81,7 +81,6 @@ class _Collector:
         self._changed = threading.Condition()
 
     def wait_for(self, condition: Callable[[list[Message]], object], timeout: float = LIMIT) -> list[Message]:
-        """Wait until the received messages satisfy the condition."""
         with self._changed:
             assert self._changed.wait_for(lambda: condition(self.messages), timeout), (
                 len(self.messages),
@@ -131,8 +130,6 @@ class DatagramCollector(_Collector):
 
 
 class StreamCollector(_Collector):
-    """Receive octet-counted messages at `port`, with TLS if there is a context; can close and open again."""
-
     def __init__(self, host: str = "127.0.0.1", context: ssl.SSLContext | None = None, port: int = 0) -> None:
         super().__init__()
         self._place = (host, port)
@@ -196,7 +193,6 @@ class StreamCollector(_Collector):
 
 
 def _counted(read: Callable[[int], bytes]) -> bytes | None:
-    """Return one message with its length before it (RFC 6587, 3.4.1); None at the end."""
     digits = b""
     while (one := read(1)) != b" ":
         if not one:

@@ -72,8 +72,6 @@ _PATH = f"{Path(ROSRV).parent}:{os.environ.get('PATH', '')}"
 
 
 class Section(NamedTuple):
-    """A section of a transcript: its steps, and those before the first title, which come first."""
-
     file: Path
     title: str
     head: str
@@ -84,7 +82,6 @@ class Section(NamedTuple):
         return f"{self.head}\n{self.steps}".strip()
 
     def played(self, transcript: "Transcript") -> str:
-        """Return the transcript with its actual output; with `TRANSCRIPTS=write` also write it into the file."""
         played = transcript.play(self.text)
         if os.environ.get("TRANSCRIPTS") == "write":
             steps = played.removeprefix(self.head).strip()
@@ -106,7 +103,7 @@ def sections(*files: Path) -> list[Any]:
 
 
 class Transcript:
-    """The actions of a transcript, in the working folder; `run` replaces the command, `more` adds actions."""
+    """`run` replaces the command, `more` adds actions."""
 
     def __init__(
         self, fake: FakeAppliance, run: Runner = rosrv, more: Mapping[str, Callable[..., None]] | None = None
@@ -127,7 +124,6 @@ class Transcript:
         return "\n".join(played)
 
     def _act(self, action: str, below: list[str]) -> list[str]:
-        """Carry out an action; return the lines that belong below it."""
         match action.split():
             case ["$", *_]:
                 came = self._command(action.removeprefix("$ "))
@@ -165,7 +161,6 @@ class Transcript:
         self._url = self._fake.url
 
     def _command(self, command: str) -> list[str]:
-        """Run a command; return the requests that it made, its output, and its exit status unless it is 0."""
         self._fake.requests.clear()
         found = _ROSRV.fullmatch(command)
         done = self._bash(command) if found is None else self._rosrv(found[1], found[2])
@@ -204,7 +199,6 @@ class Transcript:
 
 @contextlib.contextmanager
 def _frozen(now: float | None) -> Iterator[None]:
-    """Stop the clock at this time; None: do not."""
     if now is None:
         yield
     else:
@@ -239,7 +233,6 @@ def _pattern(line: str) -> str:
 
 
 def _fields(output: str, names: list[str]) -> str:
-    """Return these fields of each line in JSON; `a.b` is `b` in `a`."""
     rows = [json.loads(line) for line in output.splitlines()]
     return "".join(" ".join(_field(row, name) for name in names) + "\n" for row in rows)
 

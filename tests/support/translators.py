@@ -14,8 +14,6 @@ from examples.landshark.lab import Host
 
 @dataclass(frozen=True)
 class Translator:
-    """A program that translates addresses of hosts on `interface`; `form` is the restore program for its rules."""
-
     program: str
     form: str  # nft, iptables-legacy-restore, iptables-nft-restore, ip6tables-…
     interface: str
@@ -210,7 +208,6 @@ TRANSLATORS = (
 
 
 def load(machine: Namespace, form: str, rules: str) -> None:
-    """Pass rules to nft, or to the iptables restore program, which adds them to existing rules."""
     command = ["nft", "-f", "-"] if form == "nft" else [form, "--noflush"]
     process = machine.popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -220,7 +217,7 @@ def load(machine: Namespace, form: str, rules: str) -> None:
 
 
 def guest_behind(machine: Namespace, guest: Namespace, translator: Translator) -> Host:
-    """Make a guest of `translator`: a bridge on the machine with the guest's end, then the program's rules."""
+    """The guest's end is on a bridge; then the program's rules are loaded."""
     interfaces.create_bridge(machine, translator.interface)
     interfaces.add_address(machine, translator.interface, f"{translator.network}.1/24")
     interfaces.add_address(machine, translator.interface, "fd88::1/64")
@@ -234,7 +231,7 @@ def guest_behind(machine: Namespace, guest: Namespace, translator: Translator) -
 
 
 def plugged(machine: Namespace, guest: Namespace, bridge: str, network: str) -> Host:
-    """Make a guest at .2 of `network`, connected to a bridge of the machine with the address .1."""
+    """The guest has .2 of `network`; the bridge, on the machine, has .1."""
     interfaces.create_veth(guest, "eth0", machine, "vguest")
     interfaces.attach(machine, "vguest", bridge)
     interfaces.set_link(guest, "lo", up=True)

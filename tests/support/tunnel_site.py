@@ -44,8 +44,6 @@ default = trusted
 
 
 class TunnelSite:
-    """The appliance and its neighbours; a context manager."""
-
     trail: Process
 
     def __init__(self, lab: Lab, home: Path, *, policy: str = POLICY, options: tuple[str, ...] = ()) -> None:
@@ -111,18 +109,16 @@ class TunnelSite:
         return list(map(json.loads, self.appliance.rosrv("host", "list", "--json").stdout.splitlines()))
 
     def state(self, name: str = "ocu-1") -> str:
-        """Return the state of a host in `rosrv host list`."""
         return next(str(row["state"]) for row in self.hosts() if row["name"] == name)
 
     def is_up(self, name: str = "ocu-1") -> dict[str, Any]:
-        """Wait until a host's tunnel is up for the appliance; the host itself sees it slightly earlier."""
+        """The host itself sees its tunnel up slightly earlier."""
         return eventually(
             lambda: next((one for one in self.hosts() if (one["name"], one["state"]) == (name, "up")), None),
             f"the tunnel of {name} is up",
         )
 
     def recorded(self, since: int, timeout: float = LONG, **fields: Any) -> Event:
-        """Return the first audit record with these fields after `mark`."""
         return self.trail.wait_for(since=since, timeout=timeout, **fields)
 
     def refused(self, since: int, host: str | None = None) -> Event:
@@ -139,7 +135,7 @@ class TunnelSite:
         return self.appliance.story()
 
     def rest(self) -> Rest:
-        """Return a REST client of the first admin, for the management network (here the attacker's machine)."""
+        """It uses the management network, here the attacker's machine."""
         # The kernel accepts connections before the process is ready: one answer shows that it is.
         served = self.attacker.run(partial(ssl.get_server_certificate, (MIDDLE, API), timeout=LONG))
         (self.home / "api.pem").write_text(served)

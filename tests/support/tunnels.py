@@ -41,14 +41,13 @@ charon-systemd {{
 
 
 def need_strongswan() -> None:
-    """Require charon, swanctl and the ping of `keep.sh`."""
     need_program("charon-systemd", "charon-systemd libcharon-extra-plugins")
     need_program("swanctl", "strongswan-swanctl")
     need_program("ping", "iputils-ping")
 
 
 class JoinedHost:
-    """A host of the lab behind its tunnel; `address` is its virtual one, as `RosSession` needs it."""
+    """`address` is the virtual one, as `RosSession` needs it."""
 
     def __init__(
         self,
@@ -80,7 +79,6 @@ class JoinedHost:
         return self.outer.popen(args, **options)
 
     def start(self) -> Self:
-        """Start charon with the kit; it begins to ask for the tunnel."""
         conf = self.directory / "strongswan.conf"
         text = _CONFIGURATION.format(
             plugins=plugins(choose_esp(self.outer.namespace)),
@@ -107,7 +105,6 @@ class JoinedHost:
         return self
 
     def wait_until_up(self, since: int = 0) -> None:
-        """Wait until the tunnel is up on this side."""
         assert self.charon is not None
         self.charon.wait_for(
             lambda event: (
@@ -128,7 +125,6 @@ class JoinedHost:
         return len(self.charon.events)
 
     def wait_until_refused(self, since: int = 0) -> None:
-        """Wait until the appliance has refused the tunnel: this host, or all hosts if none is enrolled."""
         assert self.charon is not None
         self.charon.wait_for(
             lambda event: (

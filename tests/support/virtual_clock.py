@@ -37,7 +37,6 @@ class VirtualClock:
         self._wall += round(seconds * _SECOND)
 
     def set_wall(self, seconds: float) -> None:
-        """Set the system time, in seconds since the epoch."""
         self._wall = round(seconds * _SECOND)
 
 

@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 class NoAnswerError(AssertionError):
-    """Report that a program gives no answer now; it may start, or stand by for another."""
+    pass
 
 
 def eventually(

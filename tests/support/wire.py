@@ -23,7 +23,6 @@ class Frame:
 
     @property
     def ipv4(self) -> bool:
-        """Whether the frame has an IPv4 packet."""
         return self.data[12:14] == b"\x08\x00"
 
     @property
@@ -32,22 +31,18 @@ class Frame:
 
     @property
     def source(self) -> str:
-        """Return the IPv4 source address."""
         return socket.inet_ntoa(self.data[26:30])
 
     @property
     def destination(self) -> str:
-        """Return the IPv4 destination address."""
         return socket.inet_ntoa(self.data[30:34])
 
     @property
     def protocol(self) -> int:
-        """Return the protocol number of the IPv4 packet."""
         return self.data[23]
 
     @property
     def header(self) -> int:
-        """Return the offset of the IPv4 packet's payload."""
         return 14 + (self.data[14] & 15) * 4
 
     @property
@@ -83,7 +78,7 @@ class Frame:
 
     @property
     def esp(self) -> bool:
-        """Whether the frame is ESP in UDP (not IKE, whose packets on port 4500 begin with four zeros)."""
+        """Not IKE, whose packets on port 4500 begin with four zeros."""
         return (
             self.ipv4
             and self.protocol == _UDP
@@ -94,7 +89,7 @@ class Frame:
 
 
 class Capture:
-    """The frames on an interface in both directions during the block; a context manager."""
+    """Captures both directions during the block."""
 
     def __init__(self, namespace: Namespace, interface: str = INTERFACE) -> None:
         self.frames: list[Frame] = []
@@ -144,7 +139,7 @@ def hardware_address(host: Host) -> bytes:
 
 
 def send_frames(host: Host, frames: list[bytes]) -> None:
-    """Send frames from a host under its own Ethernet address, whatever their IP source."""
+    """Uses the host's own Ethernet address, whatever the IP source is."""
     own = hardware_address(host)
     with host.entered(), socket.socket(socket.AF_PACKET, socket.SOCK_RAW) as raw:
         raw.bind((INTERFACE, 0))
@@ -153,7 +148,7 @@ def send_frames(host: Host, frames: list[bytes]) -> None:
 
 
 def udp_packet(source: tuple[str, int], destination: tuple[str, int], payload: bytes) -> bytes:
-    """Return an IPv4 packet with a UDP datagram, without UDP's checksum."""
+    """UDP's checksum is missing."""
     udp = (
         source[1].to_bytes(2)
         + destination[1].to_bytes(2)
@@ -174,7 +169,7 @@ def _checksum(header: bytes) -> bytes:
 
 
 def connect(host: Host, source: str, target: str, port: int = 11311) -> str:
-    """Return the result of a TCP connection from this source address: `connected`, `refused` or `nothing`."""
+    """Returns `connected`, `refused` or `nothing`."""
 
     def work() -> str:
         with socket.socket() as client:

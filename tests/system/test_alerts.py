@@ -1,5 +1,3 @@
-"""Check the shipped alert rules, scrape configuration and dashboard queries with Prometheus's tool."""
-
 import json
 import shutil
 import subprocess

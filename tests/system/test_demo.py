@@ -1,5 +1,3 @@
-"""`rosrv demo`, a newcomer's first command, works, tells the truth, and leaves nothing behind."""
-
 import json
 import os
 import re
@@ -32,7 +30,7 @@ def machine() -> None:
 
 @pytest.fixture
 def temporary() -> Iterator[Path]:
-    """Yield a folder for the demonstration's files, and require at the end that none is left."""
+    """Requires at the end that no file is left."""
     folder = Path(tempfile.mkdtemp(prefix="demo-"))
     folder.chmod(0o755)
     yield folder
@@ -42,12 +40,11 @@ def temporary() -> Iterator[Path]:
 
 
 def require_no_hosts(pid: int) -> None:
-    """Require that no host of a demonstration is left; another one may run on this machine."""
+    """Another demonstration may run on this machine."""
     assert not namespaces(f"rosrv-demo.{pid}.")
 
 
 def test_demo(tmp_path: Path, temporary: Path) -> None:
-    """The robot obeys only its operator, a rule denies every attack, and the exit status is 0."""
     picture = tmp_path / "drive.svg"
     command = [ROSRV, "demo", "--json", "--picture", str(picture)]
     output: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
@@ -98,7 +95,6 @@ def test_the_console_of_the_demo_is_reachable_from_this_machine() -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
 def test_demo_interrupted(number: signal.Signals, temporary: Path) -> None:
-    """Interrupted, it ends at once and leaves no host, no process and no folder."""
     environment = os.environ | {"TMPDIR": str(temporary)}
     with Process(ThisMachine(), [ROSRV, "demo"], env=environment, label="rosrv demo") as demo:
         demo.wait_for_text("drove", timeout=LIMIT)
@@ -107,7 +103,6 @@ def test_demo_interrupted(number: signal.Signals, temporary: Path) -> None:
 
 
 def test_demo_without_space(tmp_path: Path) -> None:
-    """With little space for temporary files, an error names the folder before anything starts."""
     small = f"mount -t tmpfs -o size=100m tmpfs {tmp_path} && exec {ROSRV} demo"
     command = ["unshare", "--mount", "sh", "-c", small]
     environment = os.environ | {"TMPDIR": str(tmp_path)}

@@ -63,7 +63,6 @@ def test_bytes_pass_both_ways(host: Host, echo: tuple[str, int]) -> None:
 
 
 def test_no_listener_behind_it(host: Host) -> None:
-    """Without a listener the caller's connection ends, and a later one is served again."""
     unused = host.run(lambda: socket.create_server(("127.0.0.1", 0)))
     target = unused.getsockname()
     unused.close()

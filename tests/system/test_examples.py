@@ -28,7 +28,6 @@ def debian(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def run(tree: Path, *command: str) -> str:
-    """Return the output of a program in the tree; it must succeed."""
     done = tried(tree, *command)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout + done.stderr
@@ -89,8 +88,6 @@ _POLICY = "[Groups]\nvehicle = 10.0.0.5\n[Nodes]\ndefault = vehicle\n"
 
 
 class Robot:
-    """A robot's machine, as far as the role sees it; Ansible runs on the same machine."""
-
     def __init__(self, tree: Path) -> None:
         self.tree = tree
         package = tree / "srv/package"
@@ -107,7 +104,7 @@ class Robot:
         path.chmod(0o755 if executable else 0o644)
 
     def play(self, **given: object) -> tuple[subprocess.CompletedProcess[str], list[str]]:
-        """Run the playbook on this robot with these variables; return the calls of systemd and `rosrv`."""
+        """Returns the calls of systemd and `rosrv`."""
         asked = self.tree / "srv/asked"
         asked.write_text("")
         settings = {

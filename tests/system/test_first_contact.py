@@ -37,7 +37,7 @@ DEMO_SECONDS: Final = 600  # for one that hangs
 
 @dataclass(frozen=True)
 class Way:
-    """One way to clone: owner and mode of the home, the umask, and the name of the checkout in the home."""
+    """Owner and mode of the home, the umask, and the name of the checkout."""
 
     owner: int = 0
     mode: int = 0o700
@@ -56,7 +56,7 @@ WAYS: Final = {
 
 @dataclass(frozen=True)
 class Checkout:
-    """A checkout in a home; `path` is the path by which its owner uses it."""
+    """`path` is the path by which the owner uses it."""
 
     home: Path
     path: Path
@@ -99,7 +99,7 @@ def checkout(request: pytest.FixtureRequest) -> Iterator[Checkout]:
 
 
 def clone(place: Path, way: Way) -> None:
-    """Write the files of this checkout as their owner would, under the umask of the way."""
+    """Files are written as their owner would, under the umask of the way."""
     listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
     files = subprocess.run(
         ["tar", "--null", "--files-from=-", "--create", "--mode=u+w,go+rX"],

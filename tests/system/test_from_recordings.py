@@ -1,5 +1,3 @@
-"""docs/from-recordings.md, followed command by command: the page shows the real output."""
-
 import os
 import re
 import subprocess

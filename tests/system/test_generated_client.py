@@ -214,8 +214,6 @@ def register() -> Any:
 
 
 class Client:
-    """The generated client at work on a host of the lab."""
-
     def __init__(self, program: Path, folder: Path, rest: Rest, host: Host, address: str) -> None:
         url = f"https://{address}:{rest.url.port}"
         command = [str(program), "-c", DRIVER, str(folder), url, str(rest.certificate)]
@@ -224,7 +222,7 @@ class Client:
         )
 
     def ask(self, *call: Any) -> Any:
-        """Make one call; return status, type of the parsed answer, parsed answer, raw JSON."""
+        """Returns status, type of the parsed answer, parsed answer, raw JSON."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         with contextlib.suppress(BrokenPipeError):
@@ -251,7 +249,7 @@ def generate(generator: Path, contract: Any, folder: Path) -> None:
 
 
 def same(read: Any, said: Any) -> bool:
-    """Return whether a JSON answer was parsed without loss; timestamps have fewer digits."""
+    """Timestamps have fewer digits."""
     if isinstance(read, dict) and isinstance(said, dict):
         return read.keys() == said.keys() and all(same(read[name], said[name]) for name in said)
     if isinstance(read, list) and isinstance(said, list):
@@ -264,7 +262,6 @@ def same(read: Any, said: Any) -> bool:
 def test_every_operation_is_called_and_its_answer_parsed(
     generator: Path, site: TunnelSite, tmp_path: Path
 ) -> None:
-    """Every operation of the contract must have a call here, with an answer as in the contract."""
     rest = site.rest()
     contract = site.attacker.run(lambda: rest.get("/v1/openapi.json")).json
     assert not [name for name in contract["components"]["schemas"] if "." in name], "no module's name leaks"
@@ -301,7 +298,7 @@ def kit_of(done: Done, folder: Path) -> Path:
 
 
 def asked(client: Client, token: str, operation: dict[str, Any], call: Call, done: Done) -> Any:
-    """Call an operation; return its answer, which must be as the contract promises."""
+    """The answer must be as the contract promises."""
     arguments = call.arguments(done)
     if any(one["name"] == "If-Match" for one in operation.get("parameters", ())):
         arguments = arguments | {"if_match": "*"}
@@ -327,7 +324,7 @@ def asked(client: Client, token: str, operation: dict[str, Any], call: Call, don
 
 
 def body_of(operation: dict[str, Any], changes: dict[str, Any]) -> tuple[str, dict[str, Any]] | None:
-    """Return the type and the contract's example of an operation's body, with changes; None if it has no body."""
+    """None if the operation has no body."""
     if "requestBody" not in operation:
         return None
     kind = kind_of(operation["requestBody"]["content"]["application/json"])
@@ -335,5 +332,5 @@ def body_of(operation: dict[str, Any], changes: dict[str, Any]) -> tuple[str, di
 
 
 def kind_of(content: dict[str, Any]) -> str:
-    """Return the name of the type of a body or an answer; empty where it has none."""
+    """Empty where a body or an answer has no type."""
     return str(content["schema"].get("$ref", "")).rpartition("/")[2]

@@ -1,5 +1,3 @@
-"""Many recordings on a Ray cluster: the report of one process, also if a node of the cluster is killed."""
-
 import contextlib
 import os
 import secrets
@@ -52,7 +50,6 @@ class Cluster:
         return os.environ | own | {"TEST_NODE": f"{self.mark}.{node}"}
 
     def start(self, node: int) -> None:
-        """Start a node; 0 is the head."""
         head = [
             "--head", f"--port={PORT}", f"--ray-client-server-port={CLIENTS}", "--include-dashboard=false",
             f"--runtime-env-agent-port={AGENT}", f"--temp-dir={self.folder}",
@@ -97,7 +94,6 @@ class Cluster:
         )  # fmt: skip
 
     def rosrv(self, *words: str, **environment: str) -> tuple[int, str, str]:
-        """Run a command on the cluster; return the exit status and the output."""
         with self.start_rosrv(*words, **environment) as process:
             out, err = process.communicate(timeout=PATIENCE)
         return process.returncode, out, err
@@ -105,7 +101,7 @@ class Cluster:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
-    """Return a cluster with its head. Its folder has a short name, because its sockets have long ones.
+    """The folder has a short name, because Ray's sockets have long ones.
 
     Some of Ray's processes listen on all addresses, whatever is asked: here there is only a loopback.
     """
@@ -122,8 +118,6 @@ def cluster() -> Iterator[Cluster]:
 
 @dataclass(frozen=True)
 class Finished:
-    """The command, its standard output, and its report."""
-
     command: str
     out: str
     report: bytes

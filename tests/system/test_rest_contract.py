@@ -1,5 +1,3 @@
-"""REST keeps its own contract: fuzzed from its OpenAPI document, with the real appliance behind it."""
-
 import json
 import subprocess
 import sys

@@ -1,5 +1,3 @@
-"""Access to REST over the network: the firewall's rule for its port, in a container's namespace and in its own."""
-
 import http.client
 import ssl
 import subprocess

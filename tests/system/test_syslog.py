@@ -1,7 +1,3 @@
-"""The audit log on another machine: a real rsyslog, TLS on both sides, and a forwarder that reaches only its
-receiver.
-"""
-
 import json
 import os
 import shutil
@@ -41,8 +37,6 @@ action(type="omfile" file="{file}" template="asReceived" asyncWriting="off" flus
 
 
 class Keeper:
-    """The other machine: rsyslog, and the file it writes."""
-
     def __init__(self, host: Host, folder: Path) -> None:
         program = shutil.which("rsyslogd", path="/usr/sbin:/usr/bin")
         assert program is not None, "rsyslogd is missing: apt install rsyslog rsyslog-gnutls"
@@ -65,7 +59,7 @@ class Keeper:
             process.stop(with_signal=signal.SIGTERM)  # rsyslog ignores SIGINT
 
     def lines(self) -> list[str]:
-        """Return the complete lines of its file; rsyslog may be in the middle of one."""
+        """rsyslog may be in the middle of a line."""
         text = self.file.read_text(errors="replace") if self.file.exists() else ""
         return text.rpartition("\n")[0].splitlines()
 
@@ -98,7 +92,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def configure(folder: Path, tls: Certificates, to: str, backend: str = "auto") -> Path:
-    """Write the appliance's configuration: to this receiver, sealed every second; the key is the forwarder's."""
+    """The log is sealed every second; the key is the forwarder's."""
     mine = folder / "forwarder.key"
     shutil.copy(tls.key, mine)
     os.chown(mine, *FORWARDER)
@@ -156,7 +150,6 @@ def test_another_machine_keeps_the_log(lab: Lab, folder: Path, isolation: str) -
 
 
 def test_datagrams_to_rsyslog(lab: Lab, folder: Path) -> None:
-    """Over UDP rsyslog parses every message correctly."""
     machine = lab.host("machine", "10.83.0.2/24")
     keeper = Keeper(lab.host("keeper", f"{KEEPER}/24"), folder)
     config = configure(folder, keeper.tls, f"udp://{KEEPER}:514")

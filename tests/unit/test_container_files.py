@@ -48,7 +48,6 @@ def test_every_process_is_in_the_table_of_processes() -> None:
 
 
 def test_the_container_is_given_what_the_supervisor_knows() -> None:
-    """The container has no capability that the supervisor would drop at once."""
     assert granted() <= set(SUPERVISOR_CAPABILITIES)
 
 
@@ -61,7 +60,7 @@ def test_each_right_has_its_reason_beside_it() -> None:
 
 
 def environment(**outside: str) -> dict[str, str]:
-    """Return the appliance's environment from compose.yaml, with these variables in `.env`."""
+    """The variables are in `.env`."""
     told = yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]["environment"]
     return {
         key: re.sub(r"\$\{(\w+):-(.*?)\}", lambda found: outside.get(found[1], found[2]), value)

@@ -1,5 +1,3 @@
-"""docs/reference/iec-62443.md: every requirement of SL 2 has one row, with existing tests or a reason in words."""
-
 import re
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""The kernel in docs/dev/architecture.md: the modules that ensure "no message and no call passes undecided"."""
-
 import re
 import tokenize
 from pathlib import Path
@@ -42,7 +40,7 @@ _NO_CODE = {
 
 
 def _lines(path: str) -> int:
-    """Return the lines of code of a module (Python or Cython): neither blank, nor a comment, nor in a docstring."""
+    """Without blank lines, comments and docstrings."""
     lines: set[int] = set()
     statement: list[tokenize.TokenInfo] = []
     with (ROOT / "appliance" / path).open("rb") as file:

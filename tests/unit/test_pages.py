@@ -36,7 +36,6 @@ def test_every_page_is_in_the_list_for_readers(page: Path) -> None:
 
 @pytest.mark.parametrize("page", WITH_LINKS, ids=lambda page: page.name)
 def test_links_lead_somewhere(page: Path) -> None:
-    """Every file that a page links to, or names as a page, exists."""
     text = page.read_text()
     prose = re.sub(r"```.*?```|`[^`\n]*`", "", text, flags=re.DOTALL)
     linked = [page.parent / link for link in re.findall(r"\]\((?!https?:|#)([^)#]+)", prose)]
@@ -54,7 +53,7 @@ def test_links_lead_to_headings(page: Path) -> None:
 
 
 def headings(page: Path) -> set[str]:
-    """Return the anchors of a page's headings, as GitHub forms them."""
+    """As GitHub forms anchors."""
     prose = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
     titles = re.findall(r"^#+ (.*)$", prose, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}

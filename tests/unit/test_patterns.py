@@ -46,7 +46,7 @@ LIMITED = {
     "roswire.xmlrpc.common_documents:_ANSWER_IN": "32 KiB, `_LONGEST`",
     "roswire.xmlrpc.common_documents:_VALUE": "finds one value behind the other, in what another pattern has matched",
 }
-"""Patterns with more steps, and the limit of their text or the reason why the bound is too high."""
+"""The value is the limit of the text or the reason why the bound is too high."""
 
 LOCAL = {
     "appliance/api/console/console_bundle.py": "the console's own files, at the start",
@@ -72,7 +72,7 @@ _AT_ITS_PLACE = {"match", "fullmatch"}
 
 
 class Pattern(NamedTuple):
-    """A regular expression of the product; `anywhere`: it is not only matched at one place."""
+    """`anywhere`: it is not only matched at one place."""
 
     name: str
     pattern: str | bytes
@@ -81,7 +81,6 @@ class Pattern(NamedTuple):
 
 
 def files() -> Iterator[Path]:
-    """Yield every file of the product and of the collector, except local code."""
     for folder in ("appliance", "rosmop", "roswire", "fleet/rosrv_fleet"):
         for path in sorted((ROOT / folder).rglob("*.py")):
             local = str(path.relative_to(ROOT)).startswith(tuple(LOCAL))
@@ -90,7 +89,7 @@ def files() -> Iterator[Path]:
 
 
 def patterns_of(path: Path) -> Iterator[Pattern]:
-    """Yield the patterns of a file: constants of the module, constants in calls, and those of msgspec."""
+    """Constants of the module, constants in calls, and those of msgspec."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removeprefix("fleet.")
     used = _methods(tree)
@@ -109,7 +108,7 @@ def patterns_of(path: Path) -> Iterator[Pattern]:
 
 
 def _constants(tree: ast.Module, module: str) -> Iterator[tuple[str, str | bytes, int]]:
-    """Yield name, pattern and flags of each constant. Only if a pattern is made of parts, import the module."""
+    """Imports the module only if a pattern is made of parts."""
     compiled = [call for call in _calls(tree, "re") if _function(call) == "compile"]
     plain: dict[ast.expr, str] = {
         node.value: node.targets[0].id
@@ -146,7 +145,7 @@ def _function(call: ast.Call) -> str:
 
 
 def _methods(tree: ast.Module) -> dict[str, set[str]]:
-    """Return which methods of patterns are used, by the name of the pattern; by "" if it has another name there."""
+    """The name is "" if the pattern has another name there."""
     found: dict[str, set[str]] = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute) and node.attr in _FUNCTIONS - {"split"}:

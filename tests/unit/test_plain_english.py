@@ -91,7 +91,6 @@ _ANY = re.compile("|".join(f"(?:{habit.pattern})" for habit in HABITS), re.MULTI
 
 
 def bad_habits(prose: str) -> Iterator[tuple[int, str]]:
-    """Yield the line of each bad habit, with the words to write instead."""
     prose = CODE.sub(lambda found: re.sub(r"[^\n]", " ", found[0]), prose)
     if _ANY.search(prose):
         for habit in HABITS:

@@ -1,5 +1,3 @@
-"""The sizes in docs/dev/architecture.md: the code grows only on purpose, and a budget follows code that shrinks."""
-
 import re
 from pathlib import Path
 

@@ -27,8 +27,6 @@ class Source(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """Something that a rule saw at a place."""
-
     path: str
     line: int
     what: str
@@ -55,10 +53,7 @@ def _is_here(line: str) -> bool:
 
 
 def exactly(listed: Iterable[str], instead: str) -> Judge:
-    """Return a judge that compares what is seen with a list, in both directions.
-
-    The list may have lines of a feature that was removed with its folder.
-    """
+    """Lines of a feature that was removed with its folder may stay in the list."""
     allowed = {one for one in listed if _is_here(one)}
 
     def judge(seen: Sequence[Seen]) -> Iterator[str]:
@@ -84,7 +79,7 @@ def code_from_text(source: Source) -> Iterator[tuple[int, str]]:
 
 
 def narrow_handlers(source: Source) -> Iterator[tuple[int, str]]:
-    """Yield each error of `msgspec` that is named other than to raise it."""
+    """`msgspec` errors may be named only to raise them."""
     if "MsgspecError" not in source.text and "DecodeError" not in source.text:
         return
     raised = {id(part) for one in source.nodes if isinstance(one, ast.Raise) for part in ast.walk(one)}
@@ -220,7 +215,7 @@ def _is_lookup(node: ast.AST) -> bool:
 
 
 def slots(source: Source) -> Iterator[tuple[int, str]]:
-    """Yield the attributes that begin as an empty function, and the attributes of other objects that are set."""
+    """Attributes that begin as an empty function, and attributes of other objects that are set."""
     for node in source.nodes:
         match node:
             case ast.AnnAssign(target=target, annotation=kind, value=ast.expr() as value):
@@ -330,7 +325,7 @@ _CLOCKS = {"time", "time_ns", "localtime", "gmtime", "ctime"} | {
 
 
 def wall_clocks(source: Source) -> Iterator[tuple[int, str]]:
-    """Yield each read of the wall clock, which may be set while a robot runs."""
+    """The wall clock may be set while a robot runs."""
     for node in source.nodes:
         match node:
             case ast.ImportFrom(module="appliance.base.clock", names=names):
@@ -346,7 +341,7 @@ def wall_clocks(source: Source) -> Iterator[tuple[int, str]]:
 
 
 def direct_clocks(source: Source) -> Iterator[tuple[int, str]]:
-    """Yield each read of a clock other than by `base/clock.py`, where a test sets all clocks."""
+    """A test sets all clocks of `base/clock.py`."""
     for node in source.nodes:
         match node:
             case ast.ImportFrom(module="time"):  # a bare `time()` does not reveal which clock is used
@@ -363,7 +358,7 @@ def direct_clocks(source: Source) -> Iterator[tuple[int, str]]:
 
 
 def forged_signatures(source: Source) -> Iterator[tuple[int, str]]:
-    """Yield each use of a signature or of annotations that are not those of the function as written."""
+    """Signatures and annotations must be those of the function as written."""
     for node in source.nodes:
         # A class, `cls`, may get fields.
         owner = node.value if isinstance(node, ast.Attribute) else None
@@ -377,14 +372,14 @@ def forged_signatures(source: Source) -> Iterator[tuple[int, str]]:
 
 
 def lost_cancellations(source: Source) -> Iterator[tuple[int, str]]:
-    """Yield uses of `asyncio.wait_for`, which in Python 3.11 loses a cancellation that comes with the event."""
+    """In Python 3.11 `asyncio.wait_for` loses a cancellation that comes with the event."""
     for node in source.nodes:
         if isinstance(node, ast.Attribute) and ast.unparse(node) == "asyncio.wait_for":
             yield node.lineno, ast.unparse(node)
 
 
 def printed(source: Source) -> Iterator[tuple[int, str]]:
-    """Yield all strings; an f-string has a gap for each value."""
+    """An f-string has a gap for each value."""
     for node in source.nodes:
         match node:
             case ast.Constant(value=str(text)):
@@ -413,7 +408,7 @@ def habits(source: Source) -> Iterator[tuple[int, str]]:
 
 
 def shown_habits(source: Source) -> Iterator[tuple[int, str]]:
-    """Yield the bad habits in texts that people are shown: errors, help, descriptions of fields."""
+    """The texts are errors, help and descriptions of fields."""
     parts = {id(part) for node in source.nodes if isinstance(node, ast.JoinedStr) for part in node.values}
     for node in source.nodes:
         match node:

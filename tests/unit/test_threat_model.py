@@ -1,5 +1,3 @@
-"""docs/threat-model.md and docs/reference/iec-62443.md: existing tests check each of their claims."""
-
 import ast
 import re
 from pathlib import Path

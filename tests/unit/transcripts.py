@@ -14,7 +14,7 @@ def transcripts(file: Path) -> dict[str, list[str]]:
 
 
 async def played(written: list[str], say: Callable[[str], Awaitable[list[str]]]) -> list[str]:
-    """Play the actions; return them with their effects, with equal repeated effects on one line."""
+    """Equal repeated effects are on one line."""
     lines: list[str] = []
     for action in written:
         if not action.startswith(" "):

@@ -15,7 +15,6 @@ from tests.world.world import World, run
 
 
 def main(arguments: list[str]) -> int:
-    """Run the command line; return 1 if a promise was broken."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.world", description=(__doc__ or "").partition("\n")[0]
     )

@@ -102,11 +102,9 @@ class Relay:
         self._world.check()
 
     def refusal(self, connection: Connection) -> str:
-        """Return why a peer is not served; empty if it is."""
         return missing(self.table, connection.key, connection.host, connection.fields)
 
     def connect(self, port: int, kind: str, resource: str, host: str, caller_id: str) -> Connection | None:
-        """Serve a peer at a port, if it may have what it asks for."""
         connection = Connection(self.keys.get(port, ""), kind, resource, host, caller_id)
         if not self.process.alive:
             return None
@@ -122,7 +120,6 @@ class Relay:
         return connection if connection in self.connections else None
 
     def disconnect(self, connection: Connection, reason: str) -> None:
-        """End a connection, if it exists."""
         number = self.connections.pop(connection, None)
         if number is not None:
             self.link.send(messages.ConnectionClosed(number, reason))
@@ -136,8 +133,6 @@ class Relay:
 
 @dataclass(eq=False)
 class Appliance:
-    """A machine with the processes of an appliance."""
-
     world: "World"
     machine: Machine
     state: Path
@@ -252,7 +247,7 @@ class Appliance:
             self.world.loop.outside.call(seconds, setattr, self.lease, "paused", False)
 
     def _passivate(self) -> None:
-        """End everything that serves the robot; each process starts again, passive."""
+        """Each process starts again, passive."""
         self.world.say(f"{self.address} is passive")
         self.sockets.clear()
         self.restart_rosmaster()
@@ -260,7 +255,6 @@ class Appliance:
         self.kill_control()
 
     def restart_rosmaster(self) -> None:
-        """Start a new `rosmaster` without state, in place of the present one."""
         self._end_lapse()
         self.rosmaster.process.kill()
         self.start_rosmaster()
@@ -273,7 +267,6 @@ class Appliance:
             self._lifeline.send(messages.ProcessesChanged([]))
 
     def restart_relay(self) -> None:
-        """Start a new relay without state, in place of the present one."""
         self._end_lapse()
         self.relay.process.kill()
         self.start_relay()

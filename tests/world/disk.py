@@ -65,8 +65,6 @@ class EngineSteps:
 
 
 class WorldDatabase(Database):
-    """A state file without a thread."""
-
     def __init__(self, *given: Any, **named: Any) -> None:
         super().__init__(*given, **named, drive=EngineSteps)
 

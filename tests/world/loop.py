@@ -26,7 +26,7 @@ _THREAD_SECONDS = (0.0, 0.0, 0.0005, 0.003)  # until the result of a function th
 
 
 class BrokenPromiseError(AssertionError):
-    """A promise that a history broke."""
+    pass
 
 
 @dataclass(eq=False)
@@ -79,7 +79,7 @@ class Process:
         return self.context.copy().run(act, *given)
 
     def call(self, seconds: float, act: Callable[..., object], *given: Any) -> None:
-        """Call a function in this process after some seconds of the world's time."""
+        """Seconds of the world's time."""
         loop = self.machine.loop
         loop.at(loop.present + seconds, act, given, self.context.copy())
 
@@ -91,7 +91,7 @@ class Process:
                 happen()
 
     def kill(self) -> None:
-        """End the process between two callbacks: it runs no further one."""
+        """It runs no further callback."""
         if self.alive:
             self.alive = False
             self.ready.clear()
@@ -133,7 +133,7 @@ class WorldLoop(asyncio.BaseEventLoop):
         return super().call_at(when, callback, *args, context=context)
 
     def run_in_executor(self, _executor: Any, func: Callable[..., T], *args: Any) -> asyncio.Future[T]:  # type: ignore[override]  # no executor
-        """Call a function after a short time, in place of a thread."""
+        """After a short time, in place of a thread."""
         future: asyncio.Future[T] = self.create_future()
 
         def run() -> None:
@@ -163,7 +163,7 @@ class WorldLoop(asyncio.BaseEventLoop):
         file.readable = lambda: None
 
     def discard(self) -> None:
-        """End the world; what its tasks would do at their ends has no effect any more."""
+        """The ends of its tasks have no effect any more."""
         for task in [*self.tasks]:
             task._log_destroy_pending = False  # type: ignore[attr-defined]  # they were killed
             with contextlib.suppress(BaseException):
@@ -174,11 +174,9 @@ class WorldLoop(asyncio.BaseEventLoop):
     def _machine() -> Machine:
         return _process.get().machine
 
-    def _write_to_self(self) -> None:
-        """Do nothing: no thread can call."""
+    def _write_to_self(self) -> None: ...
 
-    def _process_events(self, event_list: Any) -> None:
-        """Do nothing: there are no files."""
+    def _process_events(self, event_list: Any) -> None: ...
 
     def _run_once(self) -> None:
         """Run some callbacks of one process; if none is ready, advance to the next timer."""

@@ -40,8 +40,7 @@ def _nothing(*_given: Any, **_named: Any) -> Any:
     return 0
 
 
-async def _at_once(*_given: Any, **_named: Any) -> None:
-    """Wait for nothing."""
+async def _at_once(*_given: Any, **_named: Any) -> None: ...
 
 
 _state_node, _state_fact = RelayControl._state_node, RelayControl._state_fact
@@ -158,7 +157,7 @@ def instead_of(place: Any, name: str, other: object) -> Iterator[None]:
 
 
 def first_broken(mutant: str, seeds: Sequence[int]) -> tuple[int, str] | None:
-    """Return the first seed whose history breaks a promise with a faulty product, and the promise."""
+    """Returns the seed and the broken promise."""
     kind = World if mutant in MUTANTS else PairWorld
     with instead_of(*(MUTANTS | PAIR_MUTANTS)[mutant]):
         for seed in seeds:

@@ -68,7 +68,7 @@ class Network:
                 self._later(self._fail, future, ConnectionResetError("the connection ended"))
 
     async def exchange(self, address: Address, body: bytes, seconds: float, source: str) -> bytes:
-        """Return the answer to a request. Raises `OSError` and `TimeoutError`, as the product's client does."""
+        """Raises `OSError` and `TimeoutError`, as the product's client does."""
         future: asyncio.Future[bytes] = self.loop.create_future()
         self._later(self._arrive, address, body, source, future)
         try:
@@ -157,7 +157,7 @@ class LinkEnd:
     def send(
         self, message: messages.Message, descriptors: tuple[Any, ...] = (), *, soon: bool = False
     ) -> None:
-        """Send a message; `soon` messages may take longer, but none overtakes another."""
+        """A `soon` message may take longer, but overtakes none."""
         del soon
         if not self.closed:
             self._carry(self.other.take, message, descriptors)

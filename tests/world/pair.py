@@ -86,7 +86,7 @@ class PairWorld(World):
         return self.robot.translated(address) if address[0] == APPLIANCE else address
 
     def _reaches(self, source: str, target: str) -> bool:
-        """Return whether packets of a host reach another one; those of nodes pass the robot's firewall."""
+        """Packets of nodes pass the robot's firewall."""
         ends = {source, target}
         if frozenset(ends) in self.network.cut:
             return False
@@ -112,7 +112,7 @@ class PairWorld(World):
         self.loop.outside.start(self._check_policy(appliance))
 
     async def _check_policy(self, appliance: Appliance) -> str | None:
-        """Return the policy in force, if the appliance answers as the active one."""
+        """None unless the appliance answers as the active one."""
         possible = self.possible
         answer = await self.order(admin.PolicyWanted())
         if answer is None or self.appliance is not appliance or self.possible != possible:
@@ -164,7 +164,6 @@ class PairWorld(World):
         self.loop.outside.start(self.order(standby_requests.StandbyPromote()))
 
     def lease_stalls(self) -> None:
-        """Pause the process `lease` of the appliance that became active last."""
         seconds = self.random.choice(_STALL_SECONDS)
         self.say(f"the lease of {self.appliance.address} is paused for {seconds} s")
         self.appliance.pause_lease(seconds)

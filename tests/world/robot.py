@@ -16,8 +16,6 @@ PORT = 7411
 
 
 class Robot:
-    """One computer, with one process `witness` at a time."""
-
     def __init__(self, world: "PairWorld", machine: Machine, settings: witness.WitnessSettings) -> None:
         self._world = world
         self._machine = machine
@@ -34,7 +32,6 @@ class Robot:
         self.process.run(self._serve, self._world.streams)
 
     def restart(self) -> None:
-        """Kill the witness; it starts again at once, with its stored lease."""
         self.process.kill()
         self.start()
 
@@ -71,6 +68,6 @@ class Robot:
         return f"ip saddr {address} drop" not in self._rules
 
     def translated(self, address: Address) -> Address | None:
-        """Return where packets to the fixed address go; None: nowhere."""
+        """None: packets to the fixed address go nowhere."""
         found = re.search(r"dnat to (\S+)", self._rules)
         return (found[1].rstrip(";"), address[1]) if found else None

@@ -33,7 +33,7 @@ class Subscription:
 
 
 class Node:
-    """A running node. `superseded`: another node has registered its name."""
+    """`superseded`: another node has registered its name."""
 
     def __init__(self, world: "World", process: Process, name: str, port: int) -> None:
         self.world = world
@@ -78,7 +78,7 @@ class Node:
     # --- calls ---
 
     async def call(self, uri: str, method: str, *params: Value) -> list[Any]:
-        """Return the answer of RVMaster or a proxy endpoint. Raises one of `LOST`."""
+        """Raises one of `LOST`."""
         there = parse_node_uri(uri)
         body = build_call(method, (self.name, *params))
         answer = await self.world.network.exchange((there.host, there.port), body, _CALL_SECONDS, self.host)
@@ -88,7 +88,7 @@ class Node:
             return [-1, str(error), 0]
 
     def register(self, method: str, resource: str) -> None:
-        """Start a registering call, and repeat it while its outcome is unknown."""
+        """Repeats the call while its outcome is unknown."""
         if (method, resource) not in self.calling:
             self.calling.add((method, resource))
             self.process.start(self._register(method, resource))
@@ -193,8 +193,6 @@ class Node:
 
 
 class RosMaster:
-    """A model of `rosmaster`: its registrations with their URIs, and its parameters."""
-
     def __init__(self, world: "World", process: Process, port: int) -> None:
         self._world = world
         self.pid = world.number()

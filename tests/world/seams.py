@@ -50,8 +50,7 @@ class Socket:
 
     detach = fileno = dup
 
-    def close(self) -> None:
-        """Do nothing: the supervisor keeps the socket open."""
+    def close(self) -> None: ...
 
 
 class _Server:
@@ -64,7 +63,6 @@ class _Server:
         self._refuse: Callable[[Peer], Refusal | None] = limits["refuse"]
 
     async def start(self) -> None:
-        """Serve until the process or the server ends."""
         self._network.serve(self._address, self._answer)
 
     def close(self) -> None:
@@ -87,8 +85,7 @@ class _AdminServer:
         sock.administration = self._administration, present_process()
         return self
 
-    def close(self) -> None:
-        """Do nothing: the next server of the socket takes its place."""
+    def close(self) -> None: ...
 
 
 def _assemble(base: Any) -> Any:

@@ -19,8 +19,6 @@ Serve = Callable[[Any, Any], Awaitable[None]]
 
 
 class StreamEnd:
-    """One end of a connection: its `reader`, and itself as writer and transport."""
-
     def __init__(self, network: Network, process: Process) -> None:
         self.reader = asyncio.StreamReader(loop=process.machine.loop)
         self.transport = self
@@ -32,7 +30,6 @@ class StreamEnd:
         process.ends.append(self.abort)
 
     def write(self, data: bytes) -> None:
-        """Send bytes, after all earlier ones."""
         if self.closed:
             return
         self._sent.append(data)
@@ -40,7 +37,7 @@ class StreamEnd:
             self._later(self._deliver)
 
     async def drain(self) -> None:
-        """Raise `OSError` if the connection has ended."""
+        """Raises `OSError` if the connection has ended."""
         if self.closed or self.other.closed:
             raise ConnectionResetError("the connection ended")
         await asyncio.sleep(0)
@@ -52,8 +49,7 @@ class StreamEnd:
             if len(self._sent) == 1:
                 self._later(self._deliver)
 
-    async def wait_closed(self) -> None:
-        """Do nothing more."""
+    async def wait_closed(self) -> None: ...
 
     def _later(self, act: Callable[[], None]) -> None:
         loop = self.process.machine.loop
@@ -70,7 +66,7 @@ class StreamEnd:
             self._later(self._deliver)
 
     def take(self, data: bytes) -> None:
-        """Receive bytes; none are the end."""
+        """Empty `data` is the end."""
         if self.process.alive and not self.reader.at_eof():
             self.process.run(self.reader.feed_data if data else self._eof, data)
 
@@ -79,21 +75,17 @@ class StreamEnd:
 
 
 class Streams:
-    """The servers of connections and the sockets of datagrams, by their addresses."""
-
     def __init__(self, network: Network) -> None:
         self._network = network
         self._servers: dict[Address, tuple[Process, Serve]] = {}
         self._sockets: dict[Address, DatagramSocket] = {}
 
     async def serve(self, port: int, serve: Serve) -> None:
-        """Accept connections at a port of this machine until cancelled."""
         process = present_process()
         self._servers[process.machine.name, port] = process, serve
         await asyncio.get_running_loop().create_future()
 
     async def connect(self, address: str, port: int) -> StreamEnd:
-        """Return a connection. Raises `OSError`."""
         process = present_process()
         await asyncio.sleep(process.machine.loop.random.choice(_SECONDS))
         served = self._servers.get((address, port))
@@ -130,8 +122,6 @@ async def _served(serve: Serve, end: StreamEnd) -> None:
 
 
 class DatagramSocket:
-    """A UDP socket; `readable` is called for each datagram."""
-
     def __init__(self, streams: Streams) -> None:
         self.process = present_process()
         self.readable: Callable[[], None] = lambda: None
@@ -140,7 +130,7 @@ class DatagramSocket:
         self._address: Address = (self.process.machine.name, 0)
 
     def setblocking(self, _blocking: bool) -> None:
-        """Do nothing: no call blocks."""
+        """No call blocks."""
 
     def bind(self, address: Address) -> None:
         self._address = self.process.machine.name, address[1]
@@ -150,13 +140,13 @@ class DatagramSocket:
         return self
 
     def sendto(self, data: bytes, target: Address) -> None:
-        """Send a datagram, from a free port of the machine if none is bound."""
+        """From a free port of the machine if none is bound."""
         if not self._address[1]:
             self.bind((self.process.machine.name, self._streams.free_port()))
         self._streams.send(data, self._address, target)
 
     def recvfrom(self, _size: int) -> tuple[bytes, Address]:
-        """Return the next datagram. Raises `BlockingIOError`."""
+        """Raises `BlockingIOError`."""
         if not self._waiting:
             raise BlockingIOError
         return self._waiting.popleft()
@@ -165,5 +155,4 @@ class DatagramSocket:
         self._waiting.append((data, source))
         self.readable()
 
-    def close(self) -> None:
-        """Do nothing: the process ends with its socket."""
+    def close(self) -> None: ...

@@ -1,5 +1,3 @@
-"""No history of a whole world breaks a promise; `python -m tests.world --seed N` replays one."""
-
 import os
 
 import pytest

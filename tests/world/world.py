@@ -128,8 +128,7 @@ class World:
     def start(self) -> None:
         self.appliance.start()
 
-    def activated(self, appliance: Appliance, epoch: int) -> None:
-        """Learn that one of two appliances has become active."""
+    def activated(self, appliance: Appliance, epoch: int) -> None: ...
 
     # --- services for the models ---
 
@@ -137,7 +136,7 @@ class World:
         return Machine(name, self.loop, self.random.uniform(0, 1000), 1 + self.random.uniform(-0.01, 0.01))
 
     def process(self, name: str, machine: Machine) -> Process:
-        """Return a new process; its end breaks off its connections."""
+        """Its end breaks off its connections."""
         process = Process(name, machine)
         process.ends.append(lambda: self.network.broken(process))
         self.processes.append(process)
@@ -155,7 +154,7 @@ class World:
         self.errors.append(BrokenPromiseError(text))
 
     def logged(self, _logger: object, level: str, event: MutableMapping[str, Any]) -> NoReturn:
-        """Report a line of the product's log; a fault is a broken promise."""
+        """A fault is a broken promise."""
         text = ", ".join(f"{key}={value!r}" for key, value in event.items())
         if level == "critical":
             self.fail(f"fault: {text}")
@@ -307,7 +306,7 @@ class World:
     # --- operators ---
 
     async def order(self, request: admin.AdminRequest[Any]) -> Any:
-        """Return the answer of control to an operator's order; None if control ended before, or could not do it."""
+        """None if control ended before, or could not carry out the order."""
         given = getattr(self.appliance.admin, "administration", None)
         if given is None:
             return None
@@ -352,7 +351,7 @@ class World:
             await self.find_out()
 
     async def find_out(self) -> None:
-        """Learn which policy is in force, after a kill of control during a reload."""
+        """After a kill of control during a reload."""
         while len(self.possible) > 1:
             await asyncio.sleep(_AGAIN_SECONDS)
             await self._learn()
@@ -438,7 +437,6 @@ class World:
         self.say(f"{sorted(pair)} {'are cut off' if pair in self.network.cut else 'reach each other'}")
 
     def reloads(self) -> None:
-        """Start an operator's reload, unless one is under way."""
         if not self.ordering:
             self.loop.outside.start(self.reload())
 
@@ -447,7 +445,7 @@ class World:
         self.appliance.restart_rosmaster()
 
     def rosmaster_breaks_off(self) -> None:
-        """Let calls to `rosmaster` fail now and then, before or after their effect."""
+        """Calls fail now and then, before or after their effect."""
         self.say("calls to rosmaster break off")
         self.network.flaky = ("127.0.0.1", ROSMASTER_PORT)
 
@@ -494,17 +492,14 @@ class World:
             self.relay_dies, self.control_dies,
         ]  # fmt: skip
 
-    async def settled(self) -> None:
-        """Do what must be done before the last check."""
+    async def settled(self) -> None: ...
 
     async def passes(self, seconds: float) -> None:
-        """Let time pass, and check the promises in between."""
         await asyncio.sleep(seconds)
         if self.errors:
             raise self.errors[0]
 
     def quiet(self) -> None:
-        """Check what must hold once all is settled."""
         parts = self.appliance.parts
         if not self.appliance.ready or parts is None:
             raise BrokenPromiseError("control is not ready")
@@ -513,7 +508,6 @@ class World:
         self._check_parameters(parts)
 
     def _check_master(self, parts: Parts) -> None:
-        """Assert that `rosmaster` has exactly the registrations of live nodes."""
         words = {Kind.PUBLICATION: "Publisher", Kind.SUBSCRIPTION: "Subscriber", Kind.SERVICE: "Service"}
         faces, rosmaster = parts.endpoints.faces, self.appliance.rosmaster
         wanted = {
@@ -531,7 +525,6 @@ class World:
             raise BrokenPromiseError(f"rosmaster has {there - wanted} and lacks {wanted - there}")
 
     def _check_connected(self, parts: Parts) -> None:
-        """Assert that live subscribers are connected to exactly the live publishers that the policy allows."""
         holders = {
             incarnation.key: node
             for incarnation in parts.core.registry.live()
@@ -578,7 +571,6 @@ class World:
                 )
 
     def check_chain(self) -> None:
-        """Assert that the audit log of all lives of control verifies."""
         for path in self._logs():
             found = verify(path)
             if found.findings:
@@ -592,7 +584,10 @@ def _dropped(_logger: object, _level: str, _event: MutableMapping[str, Any]) -> 
 def run(
     seed: int, say: Callable[[str], object] = lambda _line: None, kind: "type[World] | None" = None
 ) -> None:
-    """Run one history of a world of this kind (None: one appliance). Raises `BrokenPromiseError`."""
+    """`kind` None: one appliance.
+
+    Raises `BrokenPromiseError`.
+    """
     shared = Path("/dev/shm")
     folder = Path(tempfile.mkdtemp(prefix="world-", dir=shared if shared.is_dir() else None))
     before = structlog.get_config()

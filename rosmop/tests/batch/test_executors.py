@@ -1,5 +1,3 @@
-"""Jobs in processes: the same results as in this process, also if workers die."""
-
 import os
 from collections.abc import Iterator
 from pathlib import Path

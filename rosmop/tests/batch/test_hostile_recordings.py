@@ -1,5 +1,3 @@
-"""Many recordings with odd names, kinds and contents: each is a row, and none stops or misleads the others."""
-
 import json
 import os
 import resource
@@ -42,7 +40,6 @@ def rows_of(path: str) -> list[dict[str, object]]:
 @pytest.mark.nightly
 @pytest.mark.parametrize("command", ["run limit.rv", "learn", "coverage limit.rv"])
 def test_any_name_is_reported(command: str, folder: Path) -> None:
-    """Names may have any bytes: they are escaped on the screen, and the report is valid Unicode for any reader."""
     for seed, name in enumerate((b"a\n\x1b[2Jb.bag", b"c\xff.bag", "d\u202e\u00e9.bag".encode())):
         make_bag(Path("bags", os.fsdecode(name)), seed + 2)
         Path("bags", os.fsdecode(b"broken-" + name)).write_bytes(b"nonsense")
@@ -231,7 +228,6 @@ def children(pid: int) -> list[int]:
 
 
 def command_line(pid: int) -> bytes:
-    """Return the arguments of a process; nothing if it has ended."""
     try:
         return Path(f"/proc/{pid}/cmdline").read_bytes()
     except (FileNotFoundError, ProcessLookupError):

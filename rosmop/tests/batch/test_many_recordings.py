@@ -52,7 +52,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def rosmop(command: str) -> tuple[int, str, str]:
-    """Run a command; return the exit status and the output."""
     done = CliRunner().invoke(app, command.split())
     assert not isinstance(done.exception, Exception), done.exception
     return done.exit_code, done.stdout, done.stderr
@@ -108,7 +107,6 @@ def test_errors_of_a_specification_are_reported_once(folder: Path) -> None:
 
 @pytest.mark.nightly
 def test_mcap_files_are_recordings(folder: Path) -> None:
-    """The messages of an MCAP file have the outcomes of those of a bag, with each compression."""
     expected = rosmop("run limit.rv --bag bags/0.bag --json")[1]
     definitions = standard_definitions()
     for compression in CompressionType:
@@ -125,14 +123,12 @@ def test_mcap_files_are_recordings(folder: Path) -> None:
 
 
 def lines_of(path: Path) -> list[str]:
-    """Return the whole lines of a file; none if it is missing."""
     return path.read_text().rpartition("\n")[0].splitlines() if path.exists() else []
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT])
 def test_an_interrupted_command_continues(end: signal.Signals, folder: Path) -> None:
-    """After a kill or Ctrl-C the same command executes only the jobs that had not finished, with the same report."""
     for seed in range(6):  # long ones, so that the command does not end before it is interrupted
         make_bag(Path("bags", f"{seed}-long.bag"), seed, 3000)
     words = "run limit.rv --bags bags --workers 2 --resume journal --report report.ndjson"
@@ -177,7 +173,6 @@ def test_a_journal_is_bound_to_specifications_and_recordings(
 
 
 def test_a_journal_that_was_cut_off_is_continued(tmp_path: Path) -> None:
-    """Half a line is ignored and overwritten; another file is rejected; two commands cannot use one journal."""
     path = tmp_path / "journal"
     with ResumeJournal(path) as journal:
         journal.add(b"one", b"1")

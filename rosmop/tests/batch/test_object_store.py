@@ -1,5 +1,3 @@
-"""Recordings in S3, with a server of its interface."""
-
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +16,6 @@ pytestmark = pytest.mark.nightly
 
 @pytest.fixture
 def bucket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Return a client of a server with the bucket `robots`."""
     for name, value in (
         ("ACCESS_KEY_ID", "key"),
         ("SECRET_ACCESS_KEY", "secret"),
@@ -38,7 +35,6 @@ def bucket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 def test_objects_are_recordings(bucket: Any) -> None:
-    """All recordings of a prefix are read, by processes too; their rows have the URIs."""
     Path("limit.rv").write_text(SPECIFICATION)
     for seed in range(3):
         bucket.upload_file(str(make_bag(Path(f"{seed}.bag"), seed)), "robots", f"lab/{seed}.bag")

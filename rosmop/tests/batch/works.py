@@ -1,5 +1,3 @@
-"""Functions for workers in tests."""
-
 import os
 import signal
 from pathlib import Path

@@ -15,8 +15,6 @@ _PAIRS = (("add", "sub"), ("and", "or"), ("eq", "ne"), ("shl", "shr_u"), ("lt_s"
 
 
 class _Reader(decoding.Reader):
-    """Records the position of each instruction."""
-
     def __init__(self, data: bytes) -> None:
         super().__init__(data)
         self.found: list[tuple[int, int, decoding.WasmInstruction]] = []
@@ -30,7 +28,6 @@ class _Reader(decoding.Reader):
 
 
 def _others(one: decoding.WasmInstruction, kinds: list[str]) -> Iterator[tuple[str, bytes]]:
-    """Yield faulty forms of an instruction, as kind of fault and bytes."""
     yield from _calculations(one)
     yield from _places(one, kinds)
     yield from _ways(one)
@@ -115,7 +112,6 @@ def walks(module: WasmModule) -> Iterator[tuple[str, str, WasmModule]]:
 
 
 def tables(module: WasmModule) -> Iterator[tuple[str, str, WasmModule]]:
-    """Yield the same for each cell (2 bytes) of all data."""
     code = module.code
     reader = _Reader(code)
     reader.at = 8

@@ -25,8 +25,6 @@ Draw = Callable[[Random, int, Sequence[str]], str]
 
 
 def drawn(unary: Sequence[str], binary: Sequence[str], leaves: Sequence[str]) -> Draw:
-    """Return a function that draws a formula over these operators."""
-
     def draw(random: Random, depth: int, events: Sequence[str]) -> str:
         if depth == 0 or random.random() < 0.15:
             return random.choice([*events, *events, *leaves])
@@ -48,7 +46,7 @@ def expression(random: Random, depth: int, events: Sequence[str]) -> str:
 
 
 def pattern(random: Random, _depth: int, events: Sequence[str]) -> str:
-    """Draw a pattern without a time bound; no event both opens and closes its scope."""
+    """Without a time bound; no event both opens and closes the scope."""
     a, b, c, d = (random.choice(events) for _ in range(4))
     scopes = ["globally", f"after {a}", f"until {b}"] + [f"after {a} until {b}"] * (a != b)
     bodies = [f"no {c}", f"some {c}", *(f"{c} {verb} {d}" for verb in ("causes", "requires", "forbids"))]
@@ -117,7 +115,6 @@ def properties(logic: str, seed: int, count: int) -> list[CompiledProperty]:
 
 @pytest.mark.parametrize("logic", LOGICS)
 def test_compiled_properties_are_proved(logic: str) -> None:
-    """Two readings of the definitions agree on random formulas."""
     for compiled in properties(logic, 1, 150):
         certificate = certificate_of(compiled)
         assert certificate.proved, (compiled.formula, compiled.events, certificate.text)
@@ -131,7 +128,6 @@ def tables_of(compiled: CompiledProperty) -> AutomatonTables:
 
 
 def same_verdicts(one: AutomatonTables, other: AutomatonTables) -> bool:
-    """Return whether two automata have the same verdicts after every trace, and after the same times."""
     seen = {(one.initial, other.initial)}
     waiting = list(seen)
     for left, right in waiting:
@@ -151,7 +147,7 @@ def same_verdicts(one: AutomatonTables, other: AutomatonTables) -> bool:
 
 
 def broken(random: Random, tables: AutomatonTables) -> AutomatonTables:
-    """Return an automaton with one compiler fault: a wrong transition, two merged states, or a wrong verdict."""
+    """One compiler fault: a wrong transition, two merged states, or a wrong verdict."""
     table, verdicts = [list(row) for row in tables.table], list(tables.verdicts)
     state, other = random.randrange(len(table)), random.randrange(len(table))
     timeouts = list(tables.timeouts)

@@ -1,5 +1,3 @@
-"""The steps of a finished module are run in every state; modules with one fault are rejected."""
-
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace

@@ -71,7 +71,6 @@ def expression(random: Random, depth: int) -> str:
 
 
 def program(random: Random) -> str:
-    """Return declarations, expressions to print, and assignments after which the variable is printed."""
     first = ("3", "-5", "120", "0", "1", "77", "-128", "1000000")
     lines = [f"{kind} {name} = {random.choice(first)};" for kind, name in zip(TYPES, NAMES, strict=True)]
     lines += [f'printf("%.9g\\n", (double) ({expression(random, 4)}));' for _ in range(60)]
@@ -85,7 +84,6 @@ def program(random: Random) -> str:
 
 
 def vector_program(random: Random) -> str:
-    """Return changes of two kept vectors, their copies and an array, with their contents printed after each change."""
     lines = []
     for _ in range(80):
         a, b = random.sample(("v", "w"), 2)
@@ -135,7 +133,6 @@ def vector_program(random: Random) -> str:
 
 
 def float_program(random: Random) -> str:
-    """Return every function of `<math.h>` on floats, by its plain name and with `f`, also with a double or an int."""
     lines = []
     for name, (count, _) in MATH.items():
         for _ in range(20):
@@ -159,7 +156,7 @@ def float_program(random: Random) -> str:
 
 
 def compiler_of_cpp() -> str:
-    """Return the path of g++. Without it the test is skipped, or fails in CI."""
+    """Without it the test is skipped, or fails in CI."""
     path = shutil.which("g++")
     if path is None and os.environ.get("CI", "").lower() in ("1", "true", "yes"):
         pytest.fail("needs `g++` (Debian: sudo apt install g++), which this CI machine lacks", pytrace=False)
@@ -182,7 +179,6 @@ def test_functions_on_floats_are_the_compilers(tmp_path: Path) -> None:
 
 
 def in_module(body: str) -> list[str]:
-    """Return the output of a program in a module that keeps its values in variables."""
     begins = 'printf("%.9g\\n", '
     lines: list[str] = []
     names: list[str] = []
@@ -220,10 +216,7 @@ def printed(body: str, before: str, directory: Path, *options: str) -> list[str]
 def test_the_language_agrees_with_a_compiler(
     seed: int, make: tuple[Callable[[Random], str], str], tmp_path: Path
 ) -> None:
-    """More than a hundred values of each random program equal the compiler's.
-
-    The interpreter computes all of them, the module the numbers.
-    """
+    """The interpreter computes all of them, the module the numbers."""
     write, before = make
     body = write(Random(seed))  # noqa: S311  draws examples, not keys
     expected = [line.replace("-nan", "nan") for line in printed(body, before, tmp_path)]

@@ -1,5 +1,3 @@
-"""`age`, `seen`, `host` and `caller`, compared with a naive account of the same messages."""
-
 from math import inf
 from random import Random
 

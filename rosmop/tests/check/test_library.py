@@ -1,7 +1,4 @@
-"""The functions of the library, compared with naive accounts in Python.
-
-`rosmop/tests/programs.txt` compares them in the module with the interpreter.
-"""
+"""`rosmop/tests/programs.txt` compares them in the module with the interpreter."""
 
 import math
 import struct
@@ -24,7 +21,6 @@ CORNERS = ", ".join(f"{x}, {y}" for x, y in POLYGON)
 
 
 def called(expression: str, kind: str = "double") -> Callable[..., object]:
-    """Return an expression of `x`, `y` and `z` as a function."""
     monitors = load(f"""s() {{ const double P[] = {{{CORNERS}}}; {kind} r;
         event e(double x, double y, double z) /v geometry_msgs/Vector3 '{{x:x, y:y, z:z}}' {{
             r = {expression}; }} }}""")
@@ -49,7 +45,6 @@ def test_clamp_maps_nan_to_the_allowed_value_nearest_to_zero() -> None:
 
 
 def winding(x: Fraction, y: Fraction) -> int:
-    """Return how often the polygon goes around a point, exactly."""
     number = 0
     for (ax, ay), (bx, by) in pairwise((*POLYGON, POLYGON[0])):
         left = (bx - ax) * (y - ay) - (x - ax) * (by - ay)
@@ -98,7 +93,6 @@ def test_yaw_is_the_angle_of_any_multiple_of_a_quaternion() -> None:
 
 
 def ecef(lat: float, lon: float) -> tuple[float, float, float]:
-    """Return a point of the ellipsoid WGS 84."""
     lat, lon = math.radians(lat), math.radians(lon)
     n = 6378137 / math.sqrt(1 - 0.00669437999014 * math.sin(lat) ** 2)
     flat = n * math.cos(lat)
@@ -163,7 +157,6 @@ def test_isfinite_of_a_message_covers_all_its_numbers() -> None:
 
 
 def error(value: float, other: float) -> float:
-    """Return the difference in units in the last place; 0 for two NaN."""
     if value == other or (math.isnan(value) and math.isnan(other)):
         return 0 if math.copysign(1, value) == math.copysign(1, other) or math.isnan(value) else math.inf
     return abs(value - other) / math.ulp(other)

@@ -1,7 +1,4 @@
-"""Fields are found at their positions.
-
-A bound parameter equals the decoded field, and changing it equals encoding the whole changed message.
-"""
+"""A bound parameter equals the decoded field, and changing it equals encoding the whole changed message."""
 
 from collections.abc import Iterator
 from random import Random
@@ -53,7 +50,6 @@ def paths(kind: value_types.Type, value: object, path: str = "") -> Iterator[tup
 
 
 def change(kind: value_types.Type, name: str) -> str:
-    """Return a statement that changes a variable of this type; empty for whole messages and fixed arrays."""
     if isinstance(kind, value_types.StringType):
         return f'{name} += "longer";'
     if isinstance(kind, value_types.BoolType):

@@ -1,5 +1,3 @@
-"""Margins record how close comparisons of numbers came, and change nothing else."""
-
 import struct
 from collections.abc import Sequence
 
@@ -25,14 +23,12 @@ NEAR = """near() {
 
 
 def started(text: str, *, margins: bool = True) -> MonitorSet:
-    """Start the specifications in `text`, with their module if there is one."""
     monitors = on_module(compiled_from({"a.rv": text}, standard_definitions(), margins=margins))
     monitors.start(0)
     return monitors
 
 
 def give(monitors: MonitorSet, form: str, *values: int | float, walking: bool = True) -> list[str]:
-    """Send messages with these numbers on /t; return the results."""
     judge = monitors.judge if walking else monitors.process
     return [
         judge("/t", bytearray(struct.pack(form, value)), time).result for time, value in enumerate(values, 1)

@@ -1,4 +1,4 @@
-"""Order of evaluation: random statements with side effects have the results of g++ for C++17."""
+"""Random statements with side effects have the results of g++ for C++17."""
 
 import re
 from pathlib import Path
@@ -93,7 +93,6 @@ class Programs:
         return [self._statement() for _ in range(count)]
 
     def _draw(self, choices: list[str]) -> str:
-        """Draw one of these; in a statement of numbers only, draw one with numbers only."""
         return self._random.choice([one for one in choices if not (self._plain and _NOT_PLAIN.search(one))])
 
     def _call(self) -> str:
@@ -104,7 +103,6 @@ class Programs:
         return f"({one} & 3)"
 
     def _value(self) -> str:
-        """Return a number from parts with effects, in an order that C++ specifies."""
         call = self._call
         choices = [
             call(), call(), f"{call()} + 2", "i++", "--j", "b", f"v[{self._index()}]", f"f[{self._index()}]",
@@ -131,7 +129,7 @@ class Programs:
         return self._draw(choices)
 
     def _target(self) -> str:
-        """Return an assignable expression. g++ 12 evaluates an array index without effects before the right side."""
+        """g++ 12 evaluates an array index without effects before the right side."""
         choices = ["i", "j", "b", "total", "d", f"v[{self._index()}]", "f[2]", f"v.at({self._index()})",
                    "v.front()", "v.back()"]  # fmt: skip
         if self._kind == "others":
@@ -178,10 +176,7 @@ class Programs:
 
 
 def check(programs: Programs, count: int, directory: Path | None) -> BothWays:
-    """Fail unless the compiler, interpreter and module have the same state after each of this number of statements.
-
-    Without a directory, the program is not compiled.
-    """
+    """Without a directory, the program is not compiled."""
     before, statements = programs.declarations(), programs.statements(count)
     body = "\n".join(f'{one} printf("%ld\\n", look());' for one in statements)
     outcome = act(body, before=before, most=1_000_000_000)

@@ -23,7 +23,6 @@ VALUES = (-1.0, 0.0, 0.5, 1.0, 2.0, math.inf, -math.inf, math.nan)
 
 
 def formula(random: Random) -> tuple[str, str, str, bool, str, int | None]:
-    """Return a random formula with its scope, verb, whether the reference comes first, operator and bound (ms)."""
     scope = random.choice(("globally", "after p", "until q", "after p until q"))
     verb, sign, swapped = (
         random.choice(("forbids", "requires")),
@@ -69,7 +68,7 @@ def test_violations_are_those_of_a_naive_account(seed: int) -> None:
 def _holds(
     compare: Callable[[float, float], bool], verb: str, swapped: bool, late: float, early: float
 ) -> bool:
-    """Evaluate the condition: `other` is a value of the second event of the text, `named` of the one named `A`."""
+    """`other` is a value of the second event of the text, `named` of the one named `A`."""
     named, other = (early, late) if verb == "forbids" else (late, early)
     return compare(named, other + 0.25) if swapped else compare(other, named + 0.25)
 

@@ -80,7 +80,6 @@ def test_each_thing_has_its_line_and_its_count() -> None:
 
 
 def test_recordings_add_up() -> None:
-    """Recordings add up; each begins with monitors in their initial state."""
     counts = exercised(
         recorded("a", [("/open", 1)]),
         recorded("b", [("/shut", 0), ("/open", 0), ("/other", 0), ("/shut", 0)]),

@@ -1,5 +1,3 @@
-"""Learnt bounds lie slightly beyond the observed values; tested on samples with known extremes."""
-
 import random
 
 import pytest

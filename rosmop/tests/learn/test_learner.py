@@ -43,12 +43,10 @@ class Recorded:
 
 
 def number(value: float) -> bytes:
-    """Return a `std_msgs/Float64`."""
     return message("std_msgs/Float64", data=value)
 
 
 def drive(seed: int, seconds: float = 60.0) -> Recorded:
-    """Return a speed that swings slowly at about 20 Hz, a mode that cycles, and questions that are answered at once."""
     chance = random.Random(seed)  # noqa: S311  no secret
     modes = ["idle", "armed", "firing"]
     rows: list[Row] = []
@@ -187,7 +185,6 @@ def test_nothing_to_learn_from_is_an_error() -> None:
 
 
 def test_omitted_conditions_are_listed() -> None:
-    """Eighteen numbers of one topic get no more conditions than a person can read; the comment counts the others."""
     chance = random.Random(7)  # noqa: S311  no secret
 
     def joints() -> bytes:

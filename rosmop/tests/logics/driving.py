@@ -1,5 +1,3 @@
-"""Compile and drive properties for the tests of the logics."""
-
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import product
 from random import Random
@@ -18,7 +16,7 @@ ABC = ("a", "b", "c")
 
 
 def compiled(logic: str, formula: str, events: Sequence[str] = ABC) -> CompiledProperty:
-    """Return the property; its formula begins at line 7, column 11."""
+    """The formula begins at line 7, column 11."""
     return compile_property(logic, formula, events, ORIGIN)
 
 
@@ -30,7 +28,7 @@ def told(compiled: CompiledProperty, trace: Iterable[str]) -> list[tuple[str, ..
 def play(
     run: Run, events: Sequence[str], trace: Iterable[tuple[int, str]], end: int = 0
 ) -> list[tuple[int, tuple[str, ...]]]:
-    """Return times and categories, with all deadlines that pass up to and including ``end``."""
+    """Times and categories, with all deadlines up to and including ``end``."""
     record = []
     for time, event in trace:
         record += _expired(run, time)
@@ -51,7 +49,7 @@ def traces(events: Sequence[str], longest: int) -> Iterator[tuple[str, ...]]:
 
 
 def refusal(logic: str, formula: str, events: Sequence[str] = ABC) -> list[str]:
-    """Return the findings of a refused formula, as ``line:column: text``."""
+    """As ``line:column: text``."""
     try:
         compile_property(logic, formula, events, ORIGIN)
     except FormulaError as error:

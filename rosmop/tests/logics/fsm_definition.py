@@ -1,13 +1,9 @@
-"""``fsm``: the machine behaves as it is written."""
-
 from random import Random
 
 from rosmop.tests.logics.driving import ABC
 
 
 class Written:
-    """A random machine, kept as drawn; each step is a lookup."""
-
     def __init__(self, random: Random) -> None:
         self.states = [f"s{number}" for number in range(random.randint(1, 4))]
         targets = [*self.states, "fail"]
@@ -22,7 +18,6 @@ class Written:
         }
 
     def text(self, random: Random) -> str:
-        """Return the machine in the syntax of the logic, with or without commas."""
         parts = []
         for state in self.states:
             clauses = [f"{event} -> {target}" for event, target in self.moves[state].items()]

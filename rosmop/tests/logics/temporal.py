@@ -41,8 +41,6 @@ ARITY = {"not": 1}
 
 
 class Printer:
-    """Prints formulas; ``levels`` lists the operators of each strength, the tightest binary level first."""
-
     def __init__(
         self, spelled: Mapping[str, Sequence[str]], levels: Sequence[Sequence[str]], once: Sequence[str]
     ) -> None:

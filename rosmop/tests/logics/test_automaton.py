@@ -17,7 +17,7 @@ def drawn(random: Random) -> Automaton:
 
 
 def classes_by_refinement(automaton: Automaton) -> list[int]:
-    """Return the classes of equivalent states by definition: split until no class splits any more."""
+    """By definition: split until no class splits any more."""
     known: list[object] = list(automaton.verdicts)
     while True:
         signatures = [(known[s], tuple(known[t] for t in row)) for s, row in enumerate(automaton.table)]
@@ -36,7 +36,6 @@ def reached(automaton: Automaton) -> set[int]:
 
 
 def test_minimal_and_equivalent() -> None:
-    """The result has one state for each class of reachable states, and the same verdicts on every trace."""
     random = seeded(18)
     for _ in range(1500):
         automaton = drawn(random)
@@ -59,7 +58,6 @@ def test_a_long_chain_is_minimised_in_time() -> None:
 
 
 def test_exploring_stops_at_the_limit() -> None:
-    """States are counted as they are found, so that exploring can stop."""
     with pytest.raises(TooManyStatesError, match="more than 100 states"):
         explore(0, 1, lambda state, _: state + 1, lambda _: (), 100)
 

@@ -29,22 +29,20 @@ Truth = bool | None
 
 
 def least(values: list[Truth]) -> Truth:
-    """Return whether all hold; None if that is undecided."""
+    """None stands for an undecided value."""
     return False if False in values else None if None in values else True
 
 
 def most(values: list[Truth]) -> Truth:
-    """Return whether one holds; None if that is undecided."""
     return negated(least([negated(value) for value in values]))
 
 
 def negated(value: Truth) -> Truth:
-    """Return the opposite; None stays None."""
     return None if value is None else not value
 
 
 def worth(tree: Tree, trace: Timed, i: int, passed: int) -> Truth:  # noqa: PLR0911, PLR0912  # one per operator
-    """Return the value of a formula at event ``i`` of ``trace``, if no event follows until ``passed``."""
+    """At event ``i`` of ``trace``, if no event follows until ``passed``."""
     operator, *rest = tree
     low, high = 0, OVER
     if operator in (*PAST, *FUTURE):
@@ -98,7 +96,7 @@ def worth(tree: Tree, trace: Timed, i: int, passed: int) -> Truth:  # noqa: PLR0
 
 
 def expected(tree: Tree, trace: Timed, end: int) -> list[tuple[int, str]]:
-    """Return the verdicts with their events by the definition: each is due when it first becomes certain."""
+    """By the definition: each verdict is due when it first becomes certain."""
     record: list[tuple[int, str]] = []
     known: set[int] = set()
 
@@ -142,7 +140,7 @@ def is_about_the_future(tree: Tree) -> bool:
 
 
 def rtamt_text(tree: Tree) -> str:
-    """Return the formula in the language of the other monitor; a signal is 1 at its event, else -1."""
+    """A signal of the other monitor is 1 at its event, else -1."""
     operator, *rest = tree
     if operator == "event":
         return f"({rest[0]} >= 0)"
@@ -154,7 +152,7 @@ def rtamt_text(tree: Tree) -> str:
 
 
 def rtamt_knows(tree: Tree) -> bool:
-    """Whether the other monitor has all operators. (There `xor` and `iff` are distances, and the time before holds.)"""
+    """Some operators differ: in the other monitor, `xor` and `iff` are distances, and the time before holds."""
     if tree[0] == "event":
         return True
     endless = tree[0] in PAST and tree[-1][1] is None
@@ -211,7 +209,6 @@ def test_only_needed_values_are_kept() -> None:
 
 
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The number of waiting events is bounded; beyond the bound is a fault, and the run continues."""
     monkeypatch.setattr(bounded.BoundedProperty, "most", 100)
     run = compiled("mtl", "a => eventually[0,1s] b").start(0)
     for time in range(100):

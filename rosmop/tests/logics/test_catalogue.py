@@ -1,5 +1,3 @@
-"""The entry point of the logics: their names, positions of findings, and limits of every formula."""
-
 import json
 import subprocess
 import sys
@@ -98,7 +96,6 @@ def test_categories_that_may_block(logic: str) -> None:
 
 @pytest.mark.parametrize("logic", LOGICS)
 def test_the_documented_example_compiles(logic: str) -> None:
-    """The example of each logic in docs/reference/logics.md is accepted unchanged."""
     page = Path(__file__).parents[3].joinpath("docs", "reference", "logics.md").read_text(encoding="utf-8")
     example = page.split(f"\n## {logic}\n")[1].split("\n\n")[0]
     formula = example.split("```")[1] if "```" in example else example.strip("`")
@@ -130,7 +127,6 @@ def test_an_empty_formula_is_refused(logic: str) -> None:
 
 @pytest.mark.parametrize("logic", LOGICS)
 def test_comments_and_lines(logic: str) -> None:
-    """Comments are skipped, and positions count lines and columns through them."""
     assert compiled(logic, f"// first\n/* then\n */ {ROWS[logic][0]} // last").categories == ROWS[logic][1]
     assert refusal(logic, "// first\n  %")[0].startswith("8:3: `%` has no meaning")
 

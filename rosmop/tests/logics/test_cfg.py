@@ -13,7 +13,6 @@ Rules = dict[str, list[tuple[str, ...]]]
 
 
 def draw(random: Random) -> Rules:
-    """Draw a small random grammar, including empty right sides, cycles, ambiguity and useless symbols."""
     heads = ["S", "T", "U"][: random.randint(1, 3)]
     symbols = [*heads, *ABC[: random.randint(1, 3)]]
     return {
@@ -34,7 +33,7 @@ def show(rules: Rules, random: Random) -> str:
 
 
 def derives(rules: Rules, start: str, word: tuple[str, ...]) -> bool:
-    """Return whether a word is in the language, by the least table of spans closed under the rules."""
+    """By the least table of spans closed under the rules."""
     size = len(word)
     spans: dict[str, set[tuple[int, int]]] = {head: set() for head in rules}
     for event in (*ABC, *word):
@@ -54,7 +53,7 @@ def derives(rules: Rules, start: str, word: tuple[str, ...]) -> bool:
 
 
 def prefixes(rules: Rules) -> Rules:
-    """Return the grammar of all prefixes: ``A'`` derives the prefixes of ``A``. All symbols must be productive."""
+    """``A'`` derives the prefixes of ``A``; all symbols must be productive."""
     made = dict(rules)
     for head, bodies in rules.items():
         made[head + "'"] = [()]
@@ -66,7 +65,6 @@ def prefixes(rules: Rules) -> Rules:
 
 
 def productive(rules: Rules) -> Rules:
-    """Return only the rules whose symbols all derive some word."""
     good: set[str] = set(ABC)
     while fresh := {
         h for h, bodies in rules.items() if h not in good and any(good.issuperset(b) for b in bodies)
@@ -104,7 +102,6 @@ LONG: dict[str, dict[str, list[tuple[str, ...]]]] = {
 
 @pytest.mark.parametrize("text", LONG)
 def test_longer_traces(text: str) -> None:
-    """Grammars that are nested, ambiguous, nullable, left- and right-recursive agree on longer traces."""
     random = seeded(13)
     monitor = compiled("cfg", text)
     for _ in range(15):
@@ -115,7 +112,6 @@ def test_longer_traces(text: str) -> None:
 
 
 def _walk(monitor: object, random: Random) -> tuple[str, ...]:
-    """Return a trace that avoids failing where possible, so that it goes deep."""
     trace: tuple[str, ...] = ()
     for _ in range(12):
         choices = [event for event in ABC if told(monitor, (*trace, event))[-1] != ("fail",)]  # type: ignore[arg-type]  # a property
@@ -164,7 +160,6 @@ def test_flat_traces_take_no_memory() -> None:
 
 
 def test_deep_traces() -> None:
-    """A nesting of two hundred thousand levels can be entered and left again."""
     run = compiled("cfg", "S -> a S b | c", ABC).start(0)
     told_last = [run.step(0, 0) for _ in range(200_000)][-1]
     assert told_last == ()

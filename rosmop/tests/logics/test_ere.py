@@ -1,5 +1,3 @@
-"""``ere``: monitors are compared with the definition of the operators, and with another library's automata."""
-
 from functools import cache
 from random import Random
 from typing import Any
@@ -29,7 +27,6 @@ STRENGTH = {"|": 0, "&": 1, "cat": 2, "~": 3, "*": 4, "+": 4, "^": 4}
 
 
 def show(tree: Tree, random: Random) -> str:
-    """Return the tree as text, with the parentheses that the precedence needs (and sometimes more)."""
     kind = tree[0]
     if len(tree) == 1:
         return str(kind)
@@ -84,7 +81,7 @@ ALPHABET = [*LETTERS.values(), REST]
 
 
 def machine(finals: set[int], moves: dict[int, dict[str, int]]) -> Fsm:
-    """Return a small automaton of the other library; state 9 is dead."""
+    """State 9 is dead."""
     states = {*moves, *finals, 9}
     table = {
         state: dict.fromkeys(ALPHABET, 9)
@@ -141,5 +138,4 @@ def test_match_and_fail_against_another_library() -> None:
     ["(a|b)* a (a|b)^40", "a^999999", "((a^70)^70)^70", "(" * 5000 + "a", "~" * 5000 + "a", "a " * 400_000],
 )
 def test_hostile_expressions_are_refused(text: str) -> None:
-    """An expression whose monitor would be huge is refused with a reason before it is built."""
     assert len(refusal("ere", text)) == 1

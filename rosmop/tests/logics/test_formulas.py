@@ -1,4 +1,4 @@
-"""Formulas of all logics, from tables: verdicts on traces, errors, and facts known before they run.
+"""Tables of formulas: verdicts on traces, errors, and facts known before they run.
 
     ltl: a => <> b ==> b -> validation                  the verdict after each event; `-` is none
     mtl: once[5ns,inf] a ==> 3ns a, 9ns -> 3ns …        with times: each verdict with its own; the last time is the end

@@ -70,14 +70,12 @@ def test_shortest_traces_of_bounded_past_formulas_lead_to_the_category() -> None
 
 
 def test_categories_after_an_event() -> None:
-    """The categories that an event can lead to are known, so that a timer's handlers can be found."""
     machine = compiled("fsm", "s0 [ a -> s1, b -> s0 ] s1 [ a -> s1, b -> s0 ]", ("a", "b"))
     assert machine.categories_after(0) == {"s1", "fail"}
     assert machine.categories_after(1) == {"s0", "fail"}
 
 
 def test_picture() -> None:
-    """The picture has every state that can be entered, its categories, and one arrow per pair of states."""
     picture = to_dot(compiled("fsm", "s0 [ a -> s1, b -> s1, c -> s0 ] s1 [ default s0 ] alias bad = s1"))
     assert picture is not None
     assert picture.startswith('digraph "fsm" {')

@@ -27,7 +27,6 @@ Lasso = tuple[tuple[str, ...], int]
 
 
 def lassos(events: tuple[str, ...], stem: int, loop: int) -> list[Lasso]:
-    """Return all traces with at most this number of positions before and in their loop."""
     return [
         (word, length)
         for length in range(stem + 1)
@@ -37,7 +36,7 @@ def lassos(events: tuple[str, ...], stem: int, loop: int) -> list[Lasso]:
 
 
 def holds(tree: Tree, lasso: Lasso) -> list[bool]:  # noqa: PLR0911  # one per kind of operator
-    """Return a formula's truth at each position, by the definition of each operator; fixed points are iterated."""
+    """By the definition of each operator; fixed points are iterated."""
     word, back = lasso
     size = len(word)
     after = [*range(1, size), back]
@@ -79,7 +78,6 @@ def holds(tree: Tree, lasso: Lasso) -> list[bool]:  # noqa: PLR0911  # one per k
 
 
 def looking_back(operator: str, values: list[list[bool]]) -> list[bool]:
-    """Return the truth of an operator about the past at each position, by its definition."""
     truth: list[bool] = []
     for i, value in enumerate(values[-1]):
         if operator in ("previously", "dual previously"):
@@ -97,7 +95,7 @@ def looking_back(operator: str, values: list[list[bool]]) -> list[bool]:
 
 
 def by_enumeration(tree: Tree, words: list[Lasso], longest: int) -> dict[tuple[str, ...], tuple[str, ...]]:
-    """Return the verdict for each prefix that all enumerated continuations have in common."""
+    """The verdict that all enumerated continuations of a prefix have in common."""
     verdicts: dict[tuple[str, ...], set[bool]] = {}
     for lasso in words:
         truth = holds(tree, lasso)[0]
@@ -115,7 +113,6 @@ def by_enumeration(tree: Tree, words: list[Lasso], longest: int) -> dict[tuple[s
 
 
 def unrolled(lasso: Lasso, turns: int) -> Lasso:
-    """Return the same trace with its loop repeated several times before it leads back."""
     word, back = lasso
     loop = word[back:]
     return word + loop * turns, len(word) + len(loop) * (turns - 1)
@@ -162,12 +159,10 @@ def test_a_formula_with_too_many_operators_about_the_past_is_rejected() -> None:
     ],
 )
 def test_hostile_formulas_are_refused(text: str) -> None:
-    """Formulas whose monitor would be huge, or that are nested too deep, are refused with a reason."""
     assert len(refusal("ltl", text)) == 1
 
 
 def test_nested_parity_is_small() -> None:
-    """`xor` and `<=>`, nested to the limit, do not make the automaton explode."""
     text = "[] a"
     for number in range(60):
         text = f"({text}) {'xor' if number % 2 else '<=>'} b"

@@ -37,7 +37,6 @@ def bounded(tree: Tree, random: Random, largest: int) -> Tree:
 
 
 def holds(tree: Tree, trace: Timed, i: int) -> bool:  # noqa: PLR0911, PLR0912  # one per operator
-    """Return the truth of a formula at event ``i``, by the definition of each operator."""
     operator, *rest = tree
     low, high = (0, None)
     if operator in TEMPORAL and rest and isinstance(rest[-1][0], int):
@@ -92,7 +91,6 @@ def timed_trace(random: Random, length: int, gap: int) -> Timed:
 
 
 def test_long_traces_by_definition() -> None:
-    """On traces of hundreds of events, each operator with each kind of bounds agrees with its definition."""
     random = seeded(10)
     for low, high in ((0, 30), (10, None), (10, 40), (20, 20), (7, 9), (0, None), (0, 0)):
         for tree in (
@@ -130,7 +128,7 @@ def reelay_text(tree: Tree) -> str:  # noqa: PLR0911  # one per operator
 
 
 def expressible(tree: Tree) -> bool:
-    """Return whether the other monitor has all operators. (It reads `[0:0]` as no bounds.)"""
+    """The other monitor reads `[0:0]` as no bounds."""
     if isinstance(tree[-1], tuple) and tree[-1] == (0, 0):
         return False
     if tree[0] in ("true", "false", "xor", "iff") or (tree[0] == "previously" and len(tree) > 2):

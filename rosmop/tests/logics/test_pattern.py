@@ -12,8 +12,6 @@ Timed = tuple[tuple[int, str], ...]
 
 @dataclass(frozen=True)
 class Meaning:
-    """A pattern, read as a statement about the trace so far."""
-
     kind: str
     opens: str | None
     closes: str | None
@@ -36,7 +34,6 @@ class Meaning:
         return f"{scope}: {body}" + ("" if self.within is None else f" within {self.within} ns")
 
     def scopes(self, trace: Timed) -> Iterator[tuple[int, Timed, bool]]:
-        """Yield for each scope when it opened, the events inside it, and whether it is closed."""
         opened: int | None = 0 if self.opens is None else None
         inside: list[tuple[int, str]] = []
         for time, event in trace:
@@ -54,7 +51,7 @@ class Meaning:
             yield opened, tuple(inside), False
 
     def unmet(self, trace: Timed, now: int) -> tuple[bool, frozenset[tuple[int, int]]]:
-        """Return whether the pattern is violated already, and the duties that remain (as scope and position in it)."""
+        """The duties are a scope and a position in it."""
         results = [self._in_scope(*scope, now) for scope in self.scopes(trace)]
         due = {(number, place) for number, (_, places) in enumerate(results) for place in places}
         return any(violated for violated, _ in results), frozenset(due)
@@ -83,7 +80,7 @@ class Meaning:
         return any(j > i and near(t, u) for i, t in firsts for j, u in seconds), set()
 
     def verdict(self, trace: Timed, now: int, events: tuple[str, ...], ahead: int) -> tuple[str, ...]:
-        """Return the certain verdict. Validation: no violation or duty is possible. Violation: a duty cannot be met."""
+        """Validation: no violation or duty is possible. Violation: a duty cannot be met."""
         gaps = (0,) if self.within is None else (0, self.within + 1)
         _, due_now = self.unmet(trace, now)
         can_meet = can_miss = False
@@ -103,7 +100,7 @@ class Meaning:
 
 
 def meanings(events: tuple[str, ...], bounds: tuple[int | None, ...]) -> list[Meaning]:
-    """Return every pattern over some events, including those where one event has several parts."""
+    """Including patterns where one event has several parts."""
     scopes = [
         (None, None),
         *((e, None) for e in events),
@@ -120,7 +117,6 @@ def meanings(events: tuple[str, ...], bounds: tuple[int | None, ...]) -> list[Me
 
 
 def told_by(meaning: Meaning, trace: Timed, end: int) -> list[tuple[int, tuple[str, ...]]]:
-    """Return the certain verdicts at each instant before ``end``, by definition."""
     record = []
     decided = bool(meaning.verdict((), 0, ("a", "b", "c"), 3))
     seen: list[tuple[int, str]] = []
@@ -138,7 +134,7 @@ def told_by(meaning: Meaning, trace: Timed, end: int) -> list[tuple[int, tuple[s
 
 
 def _deadline(meaning: Meaning, seen: Timed, instant: int) -> tuple[str, ...]:
-    """Return the verdict that is certain only because no further event happens at this time."""
+    """The verdict is certain only because no further event happens at this time."""
     if meaning.unmet(seen, instant + 1)[0]:
         return ("violation",)
     windows = [opened + (meaning.within or 0) for opened, _, closed in meaning.scopes(seen) if not closed]
@@ -172,7 +168,7 @@ def with_answers(trace: list[tuple[int, str]], remedies: list[int], answer: str)
 def check_remedies(
     plain: CompiledProperty, trace: list[tuple[int, str]], remedies: list[int], answer: str
 ) -> None:
-    """Fail unless each remedy comes when the deadline would otherwise have violated the pattern."""
+    """Each remedy must come when the deadline would otherwise have violated the pattern."""
     for place, time in enumerate(remedies):
         before = [one for one in with_answers(trace, remedies[:place], answer) if one[0] <= time]
         assert play(plain.start(0), "abc", before, time + 1)[-1] == (time, ("violation",)), (trace, remedies)

@@ -24,7 +24,6 @@ PRINTER = Printer(
 
 
 def holds(tree: Tree, trace: tuple[str, ...], i: int) -> bool:  # noqa: PLR0911, PLR0912  # one per operator
-    """Return the truth of a formula at position ``i``, by the definition of each operator."""
     operator, *operands = tree
 
     def at(operand: int, position: int) -> bool:

@@ -13,7 +13,7 @@ Rule = tuple[list[str], list[str], bool, bool]
 
 
 def draw(random: Random) -> list[Rule]:
-    """Draw random rules that never lengthen the string."""
+    """The rules never lengthen the string."""
     symbols = [*ABC[: random.randint(1, 3)], *(["X"] if random.random() < 0.5 else [])]
     rules = []
     for _ in range(random.randint(1, 4)):
@@ -26,7 +26,7 @@ def draw(random: Random) -> list[Rule]:
 
 
 def show(rules: list[Rule]) -> str:
-    """Return the rules in the syntax of the logic; one of them writes X, which the test searches for."""
+    """One of the rules writes X, which the test searches for."""
     text = "a a a a a a a a a a a a a -> X . "
     for left, right, begins, ends in rules:
         written = f"#{right[1]}" if right[:1] == ["#"] else " ".join(right) or "#epsilon"

@@ -73,7 +73,6 @@ def _constant(one: WasmInstruction) -> Iterator[WasmInstruction]:
 
 
 def _check(one: WasmInstruction) -> Iterator[WasmInstruction]:
-    """Yield faults of a bound check: it is ignored, or the message continues after it."""
     if one.name == "if" and one.body:
         if not one.otherwise:
             yield WasmInstruction("drop")
@@ -99,7 +98,7 @@ def _trees(
 
 
 def operands(code: Code) -> Iterator[tuple[WasmInstruction, ...]]:
-    """Yield, for each variable that is read, the fault of reading the next one of its type."""
+    """Each fault reads the next variable of the same type."""
     kinds = [*code.parameters, *code.made]
 
     def change(one: WasmInstruction) -> Iterator[WasmInstruction]:
@@ -146,7 +145,6 @@ def compiled(text: str, known: Definitions | None = None) -> Compiled:
 
 
 def faulty(text: str, every: int = 1) -> Iterator[tuple[str, str]]:
-    """Yield the kind of each fault put into the function of a specification's event, and the result."""
     code = compiled(text)
     (group,) = groups(code.specifications)
     values = ValueCodec(code.messages)

@@ -1,5 +1,3 @@
-"""The code of an event is proved equal to its meaning, and every wrong module is found."""
-
 import itertools
 import time
 from collections import Counter
@@ -16,7 +14,6 @@ MONITORS = Path(__file__).parents[3] / "monitors"
 
 
 def answers(text: str, known: Definitions | None = None) -> dict[str, str]:
-    """Return the result for each event of a specification, without a time limit."""
     return {one.event: one.answer for one in findings_of(compiled(text, known), time.monotonic, patience=600)}
 
 

@@ -1,5 +1,3 @@
-"""Damaged and hostile MCAP files: bounded memory and time, and an error with the reason."""
-
 import random
 from collections.abc import Sequence
 from pathlib import Path
@@ -71,7 +69,6 @@ def test_repeated_reading_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_other_files_are_named(tmp_path: Path) -> None:
-    """A file of ROS 2, one that was cut off and an empty one give the reason."""
     rows = [(1, b"x")]
     assert "only of encoding cdr" in refusal(make_mcap(tmp_path / "2.mcap", rows, encoding="cdr"))
     whole = make_mcap(tmp_path / "1.mcap", rows).read_bytes()

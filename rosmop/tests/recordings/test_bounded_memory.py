@@ -25,7 +25,7 @@ print(count, most)
 
 
 def memory(path: Path, count: int) -> int:
-    """Return the most memory of a process that reads a recording, in KiB."""
+    """In KiB."""
     command = [sys.executable, "-P", "-c", PROGRAM, str(path)]
     read, most = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
     assert int(read) == count

@@ -1,5 +1,3 @@
-"""Numbers of the runtime are compared with `struct`, with C's library, and with exact arithmetic."""
-
 import ctypes
 import itertools
 import math
@@ -44,7 +42,6 @@ def test_wrapping_keeps_the_low_bits(value: int, bits: int, signed: bool) -> Non
 
 @given(st.integers(-(2**63), 2**63 - 1), st.integers(-(2**63), 2**63 - 1).filter(bool))
 def test_division_is_toward_zero(left: int, right: int) -> None:
-    """Quotient and remainder match, and the remainder has the sign of the dividend."""
     quotient, rest = numbers.divide(left, right, 0), numbers.remainder(left, right, 0)
     assert quotient * right + rest == left
     assert abs(rest) < abs(right)
@@ -53,7 +50,6 @@ def test_division_is_toward_zero(left: int, right: int) -> None:
 
 @pytest.mark.parametrize("name", sorted(numbers.MATH))
 def test_a_function_of_math_is_that_of_the_c_library(name: str) -> None:
-    """For ordinary and extreme arguments the result is C's, even where Python would raise."""
     count, function = numbers.MATH[name]
     theirs = getattr(LIBRARY, name)
     theirs.restype, theirs.argtypes = ctypes.c_double, [ctypes.c_double] * count
@@ -87,7 +83,6 @@ def test_a_function_of_math_is_that_of_the_c_library(name: str) -> None:
 
 @given(st.floats(allow_nan=False))
 def test_truncation_saturates(value: float) -> None:
-    """Truncation goes toward zero within the limits, to the nearest limit outside, and to 0 for NaN."""
     result = numbers.truncate(value, -100, 100)
     assert result == max(
         -100, min(100, math.trunc(value) if math.isfinite(value) else math.copysign(1e9, value))

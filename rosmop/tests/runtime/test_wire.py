@@ -1,5 +1,3 @@
-"""Messages during events: reading back written values, and whether the bytes differ at the end."""
-
 from random import Random
 
 import pytest

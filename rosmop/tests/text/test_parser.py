@@ -1,5 +1,3 @@
-"""The parser accepts ROSMOP's syntax as it is used; for any other text it reports the position and the reason."""
-
 # ruff: noqa: E501  the rows of tables
 
 import pytest
@@ -11,7 +9,6 @@ from rosmop.text.parser import MAX_CHARACTERS, _parser, parse
 
 
 def parsed(text: str) -> tree.Specification:
-    """Return the only specification of a text."""
     [found] = parse(text, "x.rv").specifications
     return found
 
@@ -103,7 +100,6 @@ TRIGGERS = [
 
 @pytest.mark.parametrize(("head", "expected"), TRIGGERS)
 def test_triggers_of_events(head: str, expected: tuple[str, str, str | None]) -> None:
-    """Covers topics and services, both spellings of types, and typographic quotes."""
     trigger = event(head=head).trigger
     assert isinstance(trigger, tree.MessageTrigger)
     assert (trigger.topic, trigger.type, trigger.part) == expected
@@ -123,7 +119,6 @@ DURATIONS = [
 
 @pytest.mark.parametrize(("text", "nanoseconds"), DURATIONS)
 def test_durations(text: str, nanoseconds: int) -> None:
-    """A space before the unit is optional; a bare number is in seconds."""
     trigger = event(head=f"event e() every {text}").trigger
     assert isinstance(trigger, tree.TimerTrigger)
     assert trigger.period_ns == nanoseconds
@@ -140,7 +135,6 @@ def test_a_comma_may_end_a_pattern() -> None:
 
 
 def test_patterns_are_paths() -> None:
-    """Nested patterns and dotted paths are equivalent, also with indexes and constants."""
     head = "event e(int a, int b) /t p/T '{x.y[2]:a, z:{w:{v:b}, c:-1.5}, s: \"on\", k: p::T::K, t: true}'"
     trigger = event(head=head).trigger
     assert isinstance(trigger, tree.MessageTrigger)
@@ -161,7 +155,6 @@ def test_the_older_brackets_of_actions() -> None:
 
 
 def test_properties() -> None:
-    """A property has its logic, the formula as written, its position, and the handlers."""
     found = parsed("""s() {
     event e() /t std_msgs/Empty '{}' { }
     ERE :  (e e)* // not @this

@@ -1,5 +1,3 @@
-"""The command reads regular files only, and with a size limit."""
-
 import errno
 import os
 from collections.abc import Callable

@@ -21,7 +21,6 @@ def run(*command: object, folder: Path = FOLDER) -> subprocess.CompletedProcess[
 
 
 def required(requirements: Iterable[str]) -> set[str]:
-    """Return the names of these distributions and of their dependencies, without extras."""
     found: set[str] = set()
     waiting = list(requirements)
     while waiting:
@@ -34,7 +33,7 @@ def required(requirements: Iterable[str]) -> set[str]:
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make a virtual environment with only the wheel and those dependencies that it loads."""
+    """The environment has only the wheel and the dependencies that it loads."""
     folder = tmp_path_factory.mktemp("installed")
     built = run(sys.executable, "-P", "-m", "hatchling", "build", "--target", "wheel", "--directory", folder)
     assert built.returncode == 0, built.stderr
@@ -59,7 +58,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_wheel_is_complete(environment: Path) -> None:
-    """The wheel has every module except the tests, and the wire format, but no appliance or WebAssembly compiler."""
+    """It has the wire format, but no tests, appliance or WebAssembly compiler."""
     packages = next(environment.glob("lib/python*/site-packages"))
     ours = {path.relative_to(FOLDER) for path in FOLDER.rglob("*.py") if "tests" not in path.parts}
     assert {path.relative_to(packages / "rosmop") for path in (packages / "rosmop").rglob("*.py")} == ours
@@ -78,7 +77,6 @@ def test_shipped_specifications_are_valid(environment: Path) -> None:
 
 
 def test_errors_name_the_command(environment: Path, tmp_path: Path) -> None:
-    """An invalid specification gives exit status 1, a missing file 2."""
     (tmp_path / "a.rv").write_text("a() {\n  event e() /t std_msgs/None '{}' { }\n}\n")
     wrong = run(environment / "bin/rosmop", "check", "a.rv", folder=tmp_path)
     assert (wrong.returncode, wrong.stdout.partition(" error")[0]) == (1, "a.rv:2:16:")

@@ -1,5 +1,3 @@
-"""Types of the language: C++'s usual arithmetic conversions, and which types convert into which."""
-
 import pytest
 
 from rosmop.types import value_types

@@ -4,7 +4,6 @@ from rosmop.types.messages import nearest
 
 
 def test_the_nearest_name() -> None:
-    """The error for a misspelt name suggests a similar name, or else lists the names if they are few."""
     assert nearest("positon", ["name", "position"]) == "; did you mean `position`?"
     assert nearest("xyz", ["name", "position"]) == "; known: name, position"
 

@@ -1,5 +1,3 @@
-"""Type names in the text: every C++ spelling of a type is accepted, and everything else is rejected."""
-
 import pytest
 
 from rosmop.form.findings import Position, SpecificationError
@@ -67,7 +65,6 @@ REFUSED = [
 
 @pytest.mark.parametrize(("words", "text"), REFUSED)
 def test_an_invalid_spelling(words: str, text: str) -> None:
-    """An unknown type is rejected with a suggestion."""
     with pytest.raises(SpecificationError) as caught:
         resolve(tree.TypeName(HERE, tuple(words.split())), MessageTypes(definitions()))
     assert text in caught.value.findings[0].text

@@ -1,5 +1,3 @@
-"""Run an appliance with REST, and a client that trusts the appliance's certificate."""
-
 from collections.abc import Iterator
 
 import pytest

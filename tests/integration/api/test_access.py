@@ -12,7 +12,6 @@ from tests.support.rest import Rest
 
 @pytest.fixture
 def rest(running: Appliance) -> Rest:
-    """Return a REST client with the first token at the current address, because a test restarts the appliance."""
     return running.rest()
 
 

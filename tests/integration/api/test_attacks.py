@@ -1,5 +1,3 @@
-"""Attacks that try to get access to REST or to stop it; floods are in `test_robustness.py`."""
-
 import gzip
 import http.client
 import re
@@ -30,7 +28,7 @@ def appliance() -> Iterator[Appliance]:
 
 @pytest.fixture
 def rest(appliance: Appliance) -> Iterator[Rest]:
-    """Return a REST client; after each attack the same process still serves, and its memory has grown little."""
+    """After each attack the same process still serves, and its memory has grown little."""
     rest = appliance.rest()
     pid = api_of(rest)
     before = resident(pid)
@@ -54,9 +52,7 @@ def resident(pid: int) -> int:
 
 
 def statuses(rest: Rest, data: bytes, idle: float = 2) -> list[int]:
-    """Send raw bytes, and return the status of each answer until the connection ends, or stays silent for `idle`
-    seconds after the first bytes.
-    """
+    """The connection ends, or stays silent for `idle` seconds after the first bytes."""
     assert rest.url.hostname is not None
     got = bytearray()
     with socket.create_connection((rest.url.hostname, rest.url.port), LIMIT) as sock:

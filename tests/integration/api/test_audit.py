@@ -1,5 +1,3 @@
-"""The audit log over REST: searched, followed live, verified, exported; it contains REST's own calls."""
-
 import json
 import xmlrpc.client
 from collections.abc import Iterator
@@ -15,7 +13,6 @@ POLICY = "[Nodes]\ndefault = *\n[Publishers]\n/allowed = *\n[Commands]\ndefault 
 
 @pytest.fixture(scope="module")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
-    """Run an appliance that denies every publisher except those of /allowed, with some decisions in its log."""
     config = tmp_path_factory.mktemp("config") / "appliance.yaml"
     config.write_text("audit: {durability: strict, checkpoint_seconds: 2}\napi: 127.0.0.1:0\napi_tls: off\n")
     with Appliance(policy=POLICY, options=("--config", str(config))) as running:

@@ -1,8 +1,3 @@
-"""Hosts over REST without tunnels (isolation none): rights, refusals, and their texts.
-
-With tunnels: tests/system/ipsec/test_enrolment.py.
-"""
-
 import pytest
 
 from appliance.ipsec.requests import make_key, signing_request
@@ -18,7 +13,6 @@ def nobody(rest: Rest) -> Rest:
 
 
 def problem(answer: Answer, status: int, kind: str) -> str:
-    """Return the detail of a problem, which must have this status and kind."""
     assert answer.status == status, answer.body
     assert answer.headers["content-type"] == "application/problem+json"
     assert answer.json["type"] == f"urn:rosrv:problem:{kind}"

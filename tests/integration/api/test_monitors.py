@@ -1,5 +1,3 @@
-"""Monitors over REST where real nodes and processes matter; `orders.txt` and tests/unit/api have the rest."""
-
 import json
 import os
 import subprocess
@@ -76,7 +74,6 @@ def nested_repetitions() -> str:
 
 
 def _compiler(appliance: Appliance) -> tuple[int, float]:
-    """Return the process id of the compiler and its processor time in seconds; zeros if none runs."""
     pid = int(appliance.processes().get("compiler", {"pid": 0})["pid"])
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -86,7 +83,6 @@ def _compiler(appliance: Appliance) -> tuple[int, float]:
 
 
 def _compiling(appliance: Appliance, before: tuple[int, float]) -> bool:
-    """Return whether the compiler is working: since `before`, it used more processor time than a start takes."""
     pid, seconds = _compiler(appliance)
     return seconds > 2.5 + (before[1] if pid == before[0] else 0)
 

@@ -1,5 +1,3 @@
-"""Policies over REST on the wire: in force at once, recorded and kept; tests/unit/api has the rest."""
-
 import json
 import re
 import xmlrpc.client
@@ -28,7 +26,6 @@ def common_appliance() -> Iterator[Appliance]:
 
 @pytest.fixture
 def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
-    """Provide the appliance with the open policy in force and only this test's log; the test may change the policy."""
     common_appliance.ignore_earlier_records()
     yield common_appliance
     common_appliance.reload(OPEN_POLICY)

@@ -1,5 +1,3 @@
-"""A killed, stopped or flooded api does not affect RVMaster, and the death of control does not end REST."""
-
 import os
 import signal
 import ssl
@@ -20,13 +18,11 @@ from tests.support.waiting import allowed, eventually
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """Run an appliance with REST in clear text on a free port; after each test all its processes run."""
     with Appliance(options=("--api", "127.0.0.1:0", "--api-tls", "off")) as running:
         yield running
 
 
 def seconds_of_a_call(appliance: Appliance) -> float:
-    """Return RVMaster's response time; the answer must be correct."""
     began = time.monotonic()
     with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
         answer = master.getSystemState("/tester")

@@ -1,5 +1,3 @@
-"""A script signs its requests, and never sends its token; tests/unit/master/test_fallen_api.py has the refusals."""
-
 from appliance.signing.request_signing import HEADER, proof_of, reading_key, statement
 from tests.support.appliance import Appliance
 

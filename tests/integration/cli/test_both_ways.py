@@ -1,7 +1,4 @@
-"""Every verb behaves the same over REST (`--api`) and over the state directory (`--state`).
-
-The output and the exit status are equal.
-"""
+"""Every verb has the same output and exit status over REST (`--api`) and over the state directory (`--state`)."""
 
 import json
 import re
@@ -93,7 +90,6 @@ LOOKING = [
 
 
 def comparable(done: Done) -> list[object]:
-    """Return the output without what changes over time: uptimes and layout of `status`, uses of tokens."""
     lines = [
         " ".join(line.split())
         for line in takewhile(lambda one: not one.startswith("process "), done.stdout.splitlines())

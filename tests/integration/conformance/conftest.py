@@ -1,5 +1,3 @@
-"""Masters on this machine's loopback, without namespaces and therefore fast."""
-
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,7 +30,6 @@ def fakes() -> Iterator[tuple[FakeNodes, FakeNodes]]:
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Site, Site]]:
-    """Start a plain ROS master and an appliance that get the same calls, once, because a master remembers old types."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with (
         Site("plain", tmp_path_factory.mktemp("plain")) as plain,

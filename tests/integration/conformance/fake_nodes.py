@@ -1,4 +1,4 @@
-"""Node APIs that tests register: one server, one path for each node and life; it records the master's calls.
+"""Node APIs that tests register: one path for each node and life; the master's calls are recorded.
 
     with FakeNodes() as nodes:
         master.registerPublisher("/talker", "/chatter", "std_msgs/String", nodes.uri("talker"))
@@ -27,8 +27,6 @@ _ANSWERS: dict[str, list[Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class NodeCalled:
-    """A call that a master made to a fake node."""
-
     node: str
     method: str
     params: tuple[Any, ...]
@@ -62,8 +60,6 @@ class _Server(ThreadingMixIn, SimpleXMLRPCServer):
 
 
 class FakeNodes:
-    """The fake nodes of one master, as a context manager."""
-
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._calls: list[NodeCalled] = []
@@ -76,12 +72,11 @@ class FakeNodes:
         return self.base + node
 
     def calls(self, node: str, method: str) -> list[tuple[Any, ...]]:
-        """Return the parameters of every call of `method` to `node` so far, in order, without the caller's name."""
         with self._changed:
             return [one.params[1:] for one in self._calls if (one.node, one.method) == (node, method)]
 
     def wait_until(self, wanted: Callable[[], bool], *, timeout: float = LIMIT) -> bool:
-        """Wait until `wanted()` is true, tested after each call; return False after `timeout` seconds without a call.
+        """`wanted()` is tested after each call; return False after `timeout` seconds without a call.
 
         Liveness checks do not count as calls.
         """

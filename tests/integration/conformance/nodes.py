@@ -1,5 +1,3 @@
-"""Start the nodes that only these tests need, in the same way as `tests.support.nodes`."""
-
 import json
 import subprocess
 from pathlib import Path
@@ -12,7 +10,6 @@ HERE = Path(__file__).parent
 
 
 def rospy_node(ros: RosSession, program: str, name: str, *arguments: str, **environment: str) -> Process:
-    """Start a program of `rospy_nodes/`, and wait until it is registered."""
     command = [PYTHON, str(HERE / "rospy_nodes" / f"{program}.py"), *arguments, f"__name:={name}"]
     process = ros.start(command, label=f"rospy {program}", **environment)
     process.wait_for(event="ready")
@@ -20,7 +17,6 @@ def rospy_node(ros: RosSession, program: str, name: str, *arguments: str, **envi
 
 
 def roscpp_node(ros: RosSession, program: str, name: str, *arguments: str) -> Process:
-    """Start a program of `roscpp_nodes/`, and wait until it is registered."""
     target = BUILD / program
     source = HERE / "roscpp_nodes" / f"{program}.cpp"
     subprocess.run([str(ROOT / "scripts" / "build-roscpp"), str(source), str(target)], check=True)

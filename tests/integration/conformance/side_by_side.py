@@ -30,38 +30,28 @@ _EPOCHS = itertools.count()
 
 @dataclass(frozen=True, slots=True)
 class Api:
-    """The API URI of a fake node: `life` 2 is another process of the same name."""
-
     node: str
     life: int = 1
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceApi:
-    """The `rosrpc` URI of a service of a fake node."""
-
     port: int
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """The answer was an XML-RPC fault."""
-
     code: int
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class Answers:
-    """The answers of the two masters, with names for URIs."""
-
     plain: Any
     appliance: Any
 
 
 class MasterSide:
-    """One of the two masters, and the fake nodes registered with it."""
-
     def __init__(self, uri: str, nodes: FakeNodes) -> None:
         self.uri = uri.rstrip("/")
         self.nodes = nodes
@@ -119,8 +109,6 @@ class MasterSide:
 
 
 class BothMasters:
-    """The two masters; `reset` undoes registrations and parameters."""
-
     def __init__(self, plain: MasterSide, appliance: MasterSide) -> None:
         self.plain, self.appliance = plain, appliance
         self._registered: dict[tuple[str, tuple[Any, ...]], None] = {}
@@ -184,7 +172,6 @@ def same(one: Any, other: Any) -> bool:
 
 
 def _told(message: str) -> str:
-    """Return a message without the reason why a parameter is invalid, or why an unregistration ends nothing."""
     if re.match(
         r"\[[^]]+\] is (not a registered node$|not a (known )?provider of|no longer the current)", message
     ):

@@ -1,5 +1,3 @@
-"""Behind the appliance, robots can do more than talk and listen, as behind a plain master."""
-
 import itertools
 import time
 from typing import Any
@@ -23,7 +21,6 @@ def texts(node: Process) -> list[str]:
 
 
 def test_own_topic_rospy(ros: RosSession) -> None:
-    """A rospy node that publishes and subscribes to one topic gets its own messages once, and the other node's."""
     node = rospy_node(ros, "orders", "loop")
     order(node, "subscribe", topic="/loop")
     order(node, "advertise", topic="/loop")
@@ -46,7 +43,6 @@ def test_own_topic_rospy(ros: RosSession) -> None:
 
 
 def test_own_topic_roscpp(ros: RosSession) -> None:
-    """A roscpp node, which gets its own messages inside its process, behaves in the same way."""
     node = roscpp_node(ros, "loop", "loop", "/loop")
     ros.talker("rospy", "/loop", "--text", "other", name="other")
     ear = ros.listener("rospy", "/loop")
@@ -103,7 +99,6 @@ def test_killed_node_is_replaced(ros: RosSession) -> None:
 
 
 def test_simulated_time(ros: RosSession) -> None:
-    """With /use_sim_time a node's clock follows /clock."""
     ros.run("rosparam", "set", "/use_sim_time", "true")
     try:
         node = rospy_node(ros, "orders", "dreamer")
@@ -126,7 +121,6 @@ def test_rosout_is_aggregated(ros: RosSession) -> None:
 
 
 def test_topic_tools(ros: RosSession) -> None:
-    """relay, throttle and mux, which accept any type, work together on one input."""
     ros.start([f"{TOPIC_TOOLS}/relay", "/in_a", "/out"])
     ros.start([f"{TOPIC_TOOLS}/throttle", "messages", "/in_a", "2", "/slow"])
     ros.start([f"{TOPIC_TOOLS}/mux", "/sel", "/in_a", "/in_b", "mux:=the_mux"])
@@ -206,7 +200,6 @@ def test_hundred_nodes_of_ten_topics(local: Site) -> None:
 
 
 def _told(nodes: FakeNodes) -> set[tuple[str, str]]:
-    """Return the subscribers that know a publisher, from an update or from their registration, each with its topic."""
     names = [f"n{node}" for node in range(100)]
     told = {(name, topic) for name in names for topic, _uris in nodes.calls(name, "publisherUpdate")}
     return told | {("n99", f"/n0/t{topic}") for topic in range(10)}

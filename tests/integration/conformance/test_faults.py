@@ -1,8 +1,8 @@
-"""A process of the appliance dies or hangs while a robot works: no node of the robot has to be restarted.
+"""A process of the appliance dies or hangs while a robot works, and no node has to be restarted.
 
-The robot has rospy and roscpp nodes: every subscriber receives every publisher, every client calls every service, and
-both libraries watch parameters. After each fault all traffic resumes (`pytest -rP` prints the gap), no registration or
-parameter is missing, and the audit log is complete.
+Every subscriber receives every publisher, every client calls every service, and both libraries watch parameters.
+After each fault all traffic resumes (`pytest -rP` prints the gap), no registration or parameter is missing, and the
+audit log is complete.
 """
 
 import os
@@ -31,8 +31,6 @@ TREE = {"arm": {"speed": 0.5, "joints": [1, 2, 3], "names": {"left": "l", "right
 
 @dataclass
 class RobotAtWork:
-    """The robot, its appliance, and the state recorded before each fault."""
-
     appliance: Appliance
     voices: dict[str, Process]
     ears: list[Process]
@@ -43,7 +41,6 @@ class RobotAtWork:
 
     @classmethod
     def started(cls, appliance: Appliance, ros: RosSession) -> Self:
-        """Return all nodes, once every subscriber receives every publisher."""
         voices = {
             f"/{by}_voice": ros.talker(by, "/chatter", "--rate", "50", name=f"{by}_voice") for by in CLIENTS
         }
@@ -85,7 +82,6 @@ class RobotAtWork:
             return str(master.lookupNode("/test", "/rosout")[2])
 
     def flows_again(self) -> dict[str, float]:
-        """Wait until everything works again; for each kind of traffic, return the seconds of the slowest pair."""
         start = time.monotonic()
         sent = {name: voice.seen(event="sent")[-1:] for name, voice in self.voices.items()}
         for ear in self.ears:
@@ -126,7 +122,6 @@ def _ask_until_answered(asker: Process) -> None:
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RobotAtWork]:
-    """Run one appliance and one robot for the whole module, so that damage from one fault shows in later tests."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     home: Path = tmp_path_factory.mktemp("robot")
@@ -137,7 +132,6 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RobotAtWork]:
 
 @pytest.fixture
 def unharmed(robot: RobotAtWork) -> Iterator[Callable[[str], None]]:
-    """Return a check to call with the fault's name right after it: traffic, registrations and records are complete."""
     before, rosout = robot.state(), robot.rosout()
 
     def check(fault: str) -> None:
@@ -154,18 +148,16 @@ def unharmed(robot: RobotAtWork) -> Iterator[Callable[[str], None]]:
 
 
 def _wait_for_state(robot: RobotAtWork, wanted: Any) -> None:
-    """Wait until the graph is as before; a new aggregator registers once it runs."""
     await_node(robot.appliance.master_uri, robot.appliance.host, "/rosout")
     eventually(lambda: robot.state()[0] == wanted, lambda: f"{wanted}; it is {robot.state()[0]}")
 
 
 def _wait_for_another_rosout(robot: RobotAtWork, old: str) -> None:
-    """Wait until the registration of a new aggregator has replaced that of the dead one."""
     eventually(lambda: robot.rosout() != old, robot.appliance.story)
 
 
 def processes(robot: RobotAtWork) -> dict[str, int]:
-    """Return the process of each role by `rosrv status`. Raises `NoAnswerError` while control is away."""
+    """Return the process of each role. Raises `NoAnswerError` while control is away."""
     return {row["role"]: row["pid"] for row in robot.appliance.status()["processes"] if row["pid"]}
 
 
@@ -214,6 +206,5 @@ def test_killed_at_once(robot: RobotAtWork, unharmed: Callable[[str], None], rol
 
 @pytest.mark.parametrize("role", ["control", "relay", "rosmaster"])
 def test_stopped(robot: RobotAtWork, unharmed: Callable[[str], None], role: str) -> None:
-    """A hanging process (SIGSTOP) counts as dead after five seconds."""
     strike(robot, signal.SIGSTOP, role)
     unharmed(f"{role} stopped")

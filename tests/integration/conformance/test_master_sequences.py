@@ -79,7 +79,6 @@ LOOKUPS = st.one_of(
 
 @st.composite
 def misformed(draw: st.DrawFn) -> Step:
-    """Generate a call with a missing, superfluous or wrong argument."""
     method, *arguments = draw(st.one_of(registrations(), PARAMETERS, LOOKUPS))
     match draw(st.sampled_from(["fewer", "more", "none", "wrong"])):
         case "fewer":
@@ -109,7 +108,6 @@ SEQUENCES = st.lists(
 )
 @given(sequence=SEQUENCES)
 def test_any_sequence(both: BothMasters, sequence: list[Step]) -> None:
-    """Answers are alike call by call; the graph, the types and the parameters are alike at the end."""
     both.reset()
     for step in sequence:
         answers = both.call(*step)

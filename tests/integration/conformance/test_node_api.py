@@ -26,9 +26,8 @@ _CONVERSATIONS = conversations_of(_TEXT.read_text(encoding="utf-8")).conversatio
 
 @pytest.fixture(scope="module")
 def pair(masters: Masters, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
-    """Return the URIs of a node that publishes /chatter and subscribes to /heard.
-
-    The first is by a plain master, the second by the appliance.
+    """One node is registered at a plain master, the other at the appliance. Each publishes /chatter and subscribes to
+    /heard.
     """
     with (
         masters.lend("plain", "loopback") as plain,
@@ -49,7 +48,6 @@ _HERE = ThisMachine()
 
 
 def formed(answer: Any) -> Any:
-    """Replace URIs and process ids by placeholders, without ports."""
     if isinstance(answer, list):
         return [formed(one) for one in answer]
     if isinstance(answer, str):

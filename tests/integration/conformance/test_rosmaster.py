@@ -28,7 +28,6 @@ _URI = re.compile(r"(http|rosrpc)://127\.0\.0\.1:(\d+)/?")
 
 
 def of_fake_nodes(name: Any, value: Any) -> Any:
-    """Return the URI of a fake node for each URI; the node belongs to the calling node."""
     match = _URI.fullmatch(value) if isinstance(value, str) else None
     if match is None:
         return value

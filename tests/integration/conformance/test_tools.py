@@ -1,5 +1,3 @@
-"""ROS tools that test_stock_tools.py leaves out print the same for a robot behind the appliance."""
-
 import json
 import re
 import signal
@@ -74,7 +72,6 @@ def test_rosnode_machine_and_list(local: Site, ros: RosSession) -> None:
 
 
 def test_rosnode_kill_all(ros: RosSession) -> None:
-    """`rosnode kill -a` ends every node of the robot; where the aggregator is supervised, it is restarted."""
     nodes = [
         ros.talker("rospy", "/chatter"),
         ros.listener("roscpp", "/chatter"),

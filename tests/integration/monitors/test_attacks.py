@@ -1,5 +1,3 @@
-"""Monitors change and a relay dies under a flood: only counted messages are missing, and the order is kept."""
-
 import os
 import signal
 import threading
@@ -27,7 +25,6 @@ ROUNDS = 25  # four changes in each round
 
 
 def tag(version: int) -> str:
-    """Return a monitor that appends its version to messages on /flood, and drops no message."""
     return (
         "tag() { event said(std::string text) /flood std_msgs/String '{data:text}'"
         f' {{ text = text + " v{version}"; }} }}'
@@ -49,7 +46,6 @@ def appliance() -> Iterator[Appliance]:
 
 
 def relays(appliance: Appliance) -> list[int]:
-    """Return the process ids of the relays; `rosrv status` fails while a relay is missing."""
     processes = appliance.ask(StatusWanted()).processes
     return [row.pid for row in processes if row.role == "relay"]
 
@@ -65,7 +61,6 @@ def counted(listener: Process) -> Event:
 
 
 def caught_up(listener: Process, last: int) -> Event:
-    """Return the messages of a counting listener, once the last one has arrived."""
     eventually(lambda: counted(listener)["last"] == last, f"message {last}", seconds=90)
     return counted(listener)
 
@@ -75,12 +70,10 @@ def missing(count: Event) -> int:
 
 
 def versions(count: Event) -> list[int]:
-    """Return the monitor versions that processed the messages, in the order of changes; 0 without a monitor."""
     return [int(word.removeprefix("v")) if word else 0 for word, _number in count["words"]]
 
 
 def change(appliance: Appliance, number: int) -> None:
-    """Make four changes: replace, disable and enable the monitor, and load or remove another one."""
     load(appliance, tag=tag(number))
     appliance.ask(MonitorSwitch(["tag"], False))
     appliance.ask(MonitorSwitch(["tag"], True))

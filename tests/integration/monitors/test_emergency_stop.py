@@ -1,5 +1,3 @@
-"""A latched emergency stop survives the death of every process until an operator releases it."""
-
 import contextlib
 import itertools
 import json
@@ -38,14 +36,12 @@ def stopped(common_lab: Lab) -> Iterator[Appliance]:
 
 
 def monitor(appliance: Appliance) -> dict[str, Any]:
-    """Return the row of the monitor in `rosrv monitor list`."""
     rows = map(json.loads, appliance.rosrv("monitor", "list", "--json").stdout.splitlines())
     found: dict[str, Any] = next(row for row in rows if row["name"] == "stop")
     return found
 
 
 def press(appliance: Appliance, ros: RosSession) -> None:
-    """Press the stop, and wait until three more messages are dropped."""
     before = monitor(appliance)["drops"]
     ros.run("rostopic", "pub", "-1", "/stop", "std_msgs/Bool", "data: true")
     eventually(lambda: monitor(appliance)["drops"] >= before + 3, appliance.story)
@@ -57,7 +53,6 @@ def kill_relays(appliance: Appliance) -> None:
 
 
 def kill_everything(appliance: Appliance) -> None:
-    """Send SIGKILL to the supervisor, then to its remaining processes, and start again."""
     assert appliance.process is not None
     processes = sorted(appliance.status()["processes"], key=lambda row: row["role"] != "supervisor")
     for row in processes:

@@ -1,5 +1,3 @@
-"""Several relay processes share monitors and topics, and each relay survives the death of another."""
-
 import json
 import os
 import signal
@@ -39,7 +37,6 @@ def specification(name: str, topic: str) -> str:
 
 @pytest.fixture(scope="module")
 def common_appliance() -> Iterator[Appliance]:
-    """Run two relays with a monitor each: `left` on /left, `right` on /right."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     monitors = {one: specification(one, one) for one in ("left", "right")}
     with Appliance(monitors=monitors, options=("--api", "off"), relays=2) as appliance:
@@ -48,7 +45,6 @@ def common_appliance() -> Iterator[Appliance]:
 
 @pytest.fixture
 def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
-    """Provide a fresh start for a test that loads or kills: both monitors begin again, with a separate log."""
     common_appliance.ignore_earlier_records()
     yield common_appliance
     for name in rows(common_appliance):
@@ -68,7 +64,6 @@ def is_connected(listener: Process) -> bool:
 
 
 def relay_of(appliance: Appliance, number: int) -> int:
-    """Return the process id of a relay, counted from 1, by its process name."""
     name = "rosrv: relay" if number == 1 else f"rosrv: relay-{number}"
     for pid in appliance.pids("relay"):
         if Path(f"/proc/{pid}/cmdline").read_bytes().rstrip(b"\0 ").decode() == name:

@@ -19,7 +19,7 @@ gate() {
 
 @pytest.fixture
 def appliance() -> Iterator[Appliance]:
-    """Run an appliance with two relays that puts the output of the monitor `gate` on /rosout."""
+    """It has two relays, and puts the output of the monitor `gate` on /rosout."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     settings, monitors = "monitors_on_rosout: true\n", {"gate": SPECIFICATION}
     with Appliance(settings=settings, monitors=monitors, options=("--api", "off"), relays=2) as appliance:
@@ -27,10 +27,6 @@ def appliance() -> Iterator[Appliance]:
 
 
 def test_output_and_verdicts_reach_rosout_agg(appliance: Appliance, ros: RosSession) -> None:
-    """They are `rosgraph_msgs/Log` of the node /rosrv.
-
-    The aggregator passes them on to rqt_console and `rostopic echo`.
-    """
     echo = ros.start(["/usr/bin/rostopic", "echo", "--filter", "m.name == '/rosrv'", "/rosout_agg"])
     await_node(appliance.master_uri, appliance.host, "/rosrv")
     assert "/rosrv" in ros.run("/usr/bin/rostopic", "info", "/rosout").stdout

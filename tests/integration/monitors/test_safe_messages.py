@@ -1,5 +1,3 @@
-"""A base gets the safe message, and no forbidden one, whenever its monitor cannot judge."""
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -54,7 +52,6 @@ def restart(appliance: Appliance, _: RosSession) -> None:
 
 
 def kill_control(appliance: Appliance, _: RosSession) -> None:
-    """Kill the control process, and wait until the next one answers."""
     appliance.kill("control")
     eventually(lambda: appliance.rosrv("monitor", "list", check=False).returncode == 0, appliance.story)
 

@@ -1,5 +1,3 @@
-"""The thesis's scenarios with the shipped monitors: on simulated drives, on a recording, on the running robot."""
-
 import json
 import math
 import re
@@ -57,7 +55,6 @@ def test_the_mission_fails_without_monitors(unguarded: Drive) -> None:
 
 
 def test_safe_triggering(unguarded: Drive) -> None:
-    """Only the shot at the robot itself is dropped; all other messages are unchanged, byte for byte."""
     guarded = Simulation(specification("safe_triggering")).run()
     assert [shot.fired for shot in guarded.shots] == [True, False, True]
     assert guarded.poses == unguarded.poses
@@ -66,7 +63,6 @@ def test_safe_triggering(unguarded: Drive) -> None:
 
 
 def test_safe_zone(unguarded: Drive) -> None:
-    """The robot stops at the border and comes back when it backs up and turns."""
     guarded = Simulation(specification("safe_zone")).run()
     assert 20 < guarded.farthest() < 20 + SLACK
     end = guarded.poses[-1]
@@ -79,7 +75,6 @@ def test_safe_zone(unguarded: Drive) -> None:
 
 
 def test_obstacle_avoidance() -> None:
-    """The robot never touches the obstacle, an alarm is published, and backing up and turning remain possible."""
     guarded = Simulation(specification("obstacle_avoidance")).run()
     assert 0.3 < guarded.nearest(OBSTACLE) < 1.3
     alarms = [one for one in guarded.messages if one.topic == "/landshark/obstacle_alarm"]
@@ -117,7 +112,6 @@ def test_a_blind_laser_is_an_obstacle() -> None:
 
 
 def test_all_monitors_together(unguarded: Drive) -> None:
-    """When all shipped monitors are loaded, each guards its own property, and none interferes."""
     guarded = Simulation(SHIPPED).run()
     assert guarded.nearest(OBSTACLE) > 0.3
     assert guarded.farthest() < 20 + SLACK
@@ -162,7 +156,6 @@ def appliance() -> Iterator[Appliance]:
 
 @pytest.fixture(scope="module")
 def robot(appliance: Appliance, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosSession]:
-    """Run the LandShark's nodes on this machine."""
     with RosSession(appliance.master_uri, tmp_path_factory.mktemp("robot")) as session:
         for program in (["base.py"], ["turret.py"], ["sensors.py", "gps"], ["sensors.py", "laser"]):
             session.start([PYTHON, str(NODES / program[0]), *program[1:]], label=program[-1])
@@ -176,8 +169,6 @@ def told(robot: RosSession, *command: str) -> Record:
 
 
 def fires(robot: RosSession, shots: int) -> None:
-    """Fire; if the count that the driver reports then is another, wait until it is `shots`."""
-
     def reported() -> int:
         said = robot.run("/usr/bin/rostopic", "echo", "-n", "1", "/landshark/shots").stdout
         return int(said.split()[1])

@@ -42,7 +42,7 @@ _CALLS = (
 
 @pytest.fixture(scope="module")
 def field() -> Iterator[tuple[Appliance, Host]]:
-    """Run an appliance behind its firewall, whose monitor `gate` publishes /alarm, and a robot (10.77.0.10)."""
+    """The monitor `gate` publishes /alarm; the robot is 10.77.0.10."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with Lab("rosrv-test") as lab:
@@ -61,7 +61,6 @@ def ros(field: tuple[Appliance, Host], tmp_path: Path) -> Iterator[RosSession]:
 
 
 def test_ping_reaches_every_node(ros: RosSession) -> None:
-    """`rosnode ping -a` reaches the nodes of robot, aggregator and monitors; `rosnode cleanup` finds nothing to do."""
     ros.talker("rospy", "/chatter", name="voice")
     pinged = ros.run("rosnode", "ping", "-a").stdout
     shown = ros.run("rosnode", "list").stdout.split()

@@ -1,5 +1,3 @@
-"""A topic is withheld from a host's nodes while a switch is on, and after a relay is killed until the switch speaks."""
-
 from pathlib import Path
 
 from examples.landshark.lab import Host, Lab

@@ -1,5 +1,3 @@
-"""A fork of a process that has rospy loaded behaves as a new process would."""
-
 import json
 import signal
 import subprocess

@@ -1,5 +1,3 @@
-"""The wire formats against unmodified rospy and roscpp nodes, in both directions."""
-
 import http.client
 import http.server
 import os
@@ -36,7 +34,6 @@ def standard() -> Definitions:
 
 
 def call(uri: str, method: str, *params: Any) -> Any:
-    """Make a call in our notation and return the value of a successful answer."""
     target = parse_node_uri(uri)
     connection = http.client.HTTPConnection(target.host, target.port, timeout=LIMIT)
     try:
@@ -50,7 +47,6 @@ def call(uri: str, method: str, *params: Any) -> Any:
 
 
 def receive_header(connection: socket.socket) -> tuple[dict[str, str], bytes]:
-    """Return the fields of the peer's connection header, and the bytes after it."""
     parser = HeaderParser()
     while (fields := parser.feed(received(connection))) is None:
         pass
@@ -58,7 +54,6 @@ def receive_header(connection: socket.socket) -> tuple[dict[str, str], bytes]:
 
 
 def received(connection: socket.socket) -> bytes:
-    """Return the peer's next bytes; it must not have closed."""
     data = connection.recv(65536)
     assert data, "the peer closed the connection"
     return data
@@ -66,7 +61,6 @@ def received(connection: socket.socket) -> bytes:
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_a_publisher_is_understood(ros: RosSession, standard: Definitions, client: Client) -> None:
-    """A publisher accepts our header; its header, its definition and its message are parsed."""
     topic = f"/{client}_chatter"
     name = f"{client}_talker"
     ros.talker(client, topic, name=name)
@@ -92,7 +86,6 @@ def test_a_publisher_is_understood(ros: RosSession, standard: Definitions, clien
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_a_subscriber_is_understood(ros: RosSession, standard: Definitions, client: Client) -> None:
-    """A subscriber's call and header are parsed, and it accepts our answer, our header and our message."""
     topic = f"/{client}_heard"
     with (
         socket.create_server((ros.host.address, 0)) as data_port,
@@ -120,7 +113,6 @@ def test_a_subscriber_is_understood(ros: RosSession, standard: Definitions, clie
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_a_service_is_understood(ros: RosSession, standard: Definitions, client: Client) -> None:
-    """A service accepts our header and request, with the md5sum of our definition, and its replies are parsed."""
     service = f"/{client}_negate"
     ros.service_server(client, service, name=f"{client}_server")
     target = parse_service_uri(call(ros.master_uri, "lookupService", "/test", service))
@@ -144,8 +136,6 @@ def test_a_service_is_understood(ros: RosSession, standard: Definitions, client:
 
 
 class NodeApi:
-    """A node API that offers TCPROS on one port; `calls` are its received calls."""
-
     def __init__(self, address: str, data_port: socket.socket) -> None:
         self.calls: list[MethodCall] = []
         calls, port = self.calls, data_port.getsockname()[1]
@@ -164,8 +154,7 @@ class NodeApi:
                 self.end_headers()
                 self.wfile.write(body)
 
-            def log_message(self, *_arguments: object) -> None:
-                """Log nothing."""
+            def log_message(self, *_arguments: object) -> None: ...
 
         self._server = http.server.ThreadingHTTPServer((address, 0), Handler)
         self._server.daemon_threads = True

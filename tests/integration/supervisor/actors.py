@@ -39,15 +39,10 @@ CROWD = 2_000  # two for each node of a robot with a thousand
 
 
 def control(lifeline_fd: int, config: Path) -> None:
-    """Act as control.
-
-    SIGUSR1 makes it send a message of the supervisor; SIGUSR2 makes it request the appliance's end.
-    """
     asyncio.run(_Control(lifeline_fd, load_resolved(config).rosmaster_port).run())
 
 
 def relay(lifeline_fd: int, index: int, config: Path) -> None:
-    """Act as the relay. SIGUSR1 makes it send a message that only control may send."""
     asyncio.run(_Actor("relay", lifeline_fd, RelayLink).run())
 
 
@@ -69,7 +64,6 @@ def failing(lifeline_fd: int, config: Path) -> None:
 
 
 def failing_again(lifeline_fd: int, config: Path) -> None:
-    """Act as a control that serves in its first life and fails in the next three, as with a full disk."""
     lives = config.parent.parent / "control" / "lives"
     with lives.open("a") as file:
         file.write(".")
@@ -84,8 +78,6 @@ def dying(lifeline_fd: int, config: Path) -> None:
 
 
 class _Actor:
-    """A process with a lifeline and links."""
-
     def __init__(self, name: str, lifeline_fd: int, union: Any) -> None:
         self.name = name
         self.union = union

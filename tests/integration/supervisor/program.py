@@ -1,8 +1,6 @@
 """Run the supervisor with the real rosmaster and rosout: `program.py STATE [ROLE=ENTRY…]`.
 
 Actors take the place of our processes.
-
-All processes print to standard output, one JSON object a line.
 """
 
 import json
@@ -26,8 +24,6 @@ from appliance.supervisor.supervisor import ControlReady
 
 
 class Leaky(NoIsolation):
-    """Surroundings that let other hosts reach rosmaster."""
-
     probes = True
 
     def probe(self) -> str | None:
@@ -35,8 +31,6 @@ class Leaky(NoIsolation):
 
 
 class Interrupted(NoIsolation):
-    """Surroundings that interrupt the program while they are built or removed, in several ways."""
-
     def __init__(self, when: str) -> None:
         self.when = when
 
@@ -55,7 +49,6 @@ class Interrupted(NoIsolation):
 
 
 def main() -> None:
-    """Run until told to stop."""
     os.dup2(1, 2)
     setproctitle.setproctitle("rosrv: supervisor")
     configure_logs("supervisor")

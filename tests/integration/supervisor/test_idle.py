@@ -14,7 +14,7 @@ COMPILED: Final = {
     "httptools",
     "_sqlite3",
 }
-"""Libraries whose compiled part shows in the memory of who has imported them."""
+"""Their compiled part shows in the memory of the process."""
 
 MAY_HAVE: Final = {
     "supervisor": {"pydantic_core", "yaml", "_sqlite3"},
@@ -26,7 +26,6 @@ MAY_HAVE: Final = {
 
 
 def loaded(pid: int) -> set[str]:
-    """Return the libraries of `COMPILED` that a process has loaded."""
     files = set(re.findall(r"\S+\.so\S*$", Path(f"/proc/{pid}/maps").read_text(), re.MULTILINE))
     return {one for one in COMPILED if any(re.search(rf"/{one}[/.]", file) for file in files)}
 

@@ -38,7 +38,6 @@ def hidden(host: Host) -> Iterator[int]:
 
 @pytest.fixture
 def isolation(host: Host, hidden: int) -> Iterator[ContainerIsolation]:
-    """Return the surroundings of an appliance whose rosmaster is the hidden port."""
     made = ContainerIsolation(
         AppliancePorts(master=11311, rosmaster=hidden, nodes=NODES, own_node=OWN_NODE), "auto", host.namespace
     )
@@ -84,7 +83,6 @@ def test_the_master_side_endpoint_is_closed_once_it_is_known(
 def test_failed_rules_are_retried(
     host: Host, isolation: ContainerIsolation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If the rule for a new master-side endpoint fails, it is an error, and the next check adds the rule."""
     isolation.build()
     firewall = isolation.firewall
     assert firewall is not None
@@ -103,7 +101,6 @@ def test_failed_rules_are_retried(
 
 
 def test_removed_rules_are_restored(host: Host, isolation: ContainerIsolation, hidden: int) -> None:
-    """After a flush of the rules the next check restores them, and they are reported in force."""
     isolation.build()
     backend = isolation.report().backend
     flush = ["nft", "flush", "ruleset"] if backend == "nft" else ["iptables", "-F"]
@@ -117,7 +114,7 @@ def test_removed_rules_are_restored(host: Host, isolation: ContainerIsolation, h
 def test_a_check_does_not_restore_rules_after_the_end(
     host: Host, isolation: ContainerIsolation, hidden: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A check that runs during or after the end restores nothing, because the end waits for it."""
+    """The end waits for a check that runs."""
     isolation.build()
     firewall = isolation.firewall
     assert firewall is not None

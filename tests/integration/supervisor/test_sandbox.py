@@ -80,8 +80,6 @@ def place() -> Iterator["Place"]:
 
 
 class Place:
-    """The surroundings in which the roles are started."""
-
     def __init__(self, directory: Path) -> None:
         self.roles = {role.name: role for role in ROLES}
         self.state = StateDirectory(directory / "state")
@@ -122,14 +120,12 @@ class Place:
         return wanted
 
     def inside(self, role: Role, entry: str = "main") -> tuple[dict[str, Any], Walled]:
-        """Return the results of this function of `trying` inside the role's sandbox, and the process's own report."""
         done, (said, *_more) = self.start(role, f"{trying.__name__}:{entry}")
         assert done.returncode == 0, done.stderr
         assert isinstance(said, Walled)
         return json.loads(done.stderr.splitlines()[-1]), said
 
     def start(self, role: Role, entry: str) -> tuple[subprocess.CompletedProcess[str], list[Lifeline]]:
-        """Start a function in the role's sandbox; return the ended process and its reports."""
         here, there = socket.socketpair()
         files = dict.fromkeys(("ca", "certificate", "key", "receipt_key"), Path("/etc/ssl/certs/none.pem"))
         receivers: dict[str, dict[str, Any]] = {
@@ -160,7 +156,6 @@ class Place:
             return done, [said for said, _fds in Channel(here, Lifeline).receive()]
 
     def outside(self, role: Role, account: Account) -> dict[str, Any]:
-        """Return the results for the same user without a sandbox."""
         done = subprocess.run(
             [sys.executable, "-P", "-m", trying.__name__],
             user=account.uid, group=account.gid, extra_groups=[], env={"PYTHONPATH": str(ROOT)},
@@ -233,10 +228,7 @@ def test_a_relay_runs_modules_in_its_sandbox(place: Place) -> None:
 
 
 def test_status_shows_the_sandbox(appliance: Appliance) -> None:
-    """`rosrv status` and REST show the sandbox of each process; this kernel lacks no limit.
-
-    A relay with a specification has the runtime of its module, and no writable memory for code.
-    """
+    """A relay with a specification has the runtime of its module, and no writable memory for code."""
     needs(landlock.version() >= landlock.SIGNALS, "a kernel with Landlock 6")
     rows = appliance.processes()
     rest = {row["role"]: row for row in appliance.rest().get("/v1/status").json["processes"]}
@@ -257,8 +249,6 @@ def test_status_shows_the_sandbox(appliance: Appliance) -> None:
 
 
 def test_status_shows_the_relays_congestion_control(appliance: Appliance) -> None:
-    """The relay's user gets cubic if the kernel allows it for all users, otherwise reno."""
-
     def congestion() -> str:
         said: str = appliance.processes()["relay"]["congestion"]
         return said

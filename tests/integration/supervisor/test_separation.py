@@ -45,7 +45,6 @@ def test_a_process_reads_only_its_own_files(appliance: Appliance, role: str) -> 
         user, group = account.uid, account.gid
 
     def found(flag: str) -> set[str]:
-        """Return all files that this user may read (or write), by `test`, except those of the role's own part."""
         files = [path for path in appliance.state.rglob("*") if path.is_file()]
         program = 'for one; do [ "$FLAG" "$one" ] && echo "$one"; done; true'
         command = ["/bin/sh", "-c", program.replace("$FLAG", flag), "sh", *map(str, files)]
@@ -60,7 +59,7 @@ def test_a_process_reads_only_its_own_files(appliance: Appliance, role: str) -> 
 
 
 def test_the_hidden_files_exist(appliance: Appliance) -> None:
-    """The keys and tables that must be hidden exist, so that the test above is meaningful."""
+    """Otherwise the test above would be meaningless."""
     for name in ("signer/ca.key", "signer/audit.key", "api/key.pem", "control/state.db", *LOG):
         assert (appliance.state / name).is_file(), name
 
@@ -76,7 +75,6 @@ def test_the_order_of_oom_kills(appliance: Appliance) -> None:
 
 
 def test_the_weights_of_processes(appliance: Appliance) -> None:
-    """No busy program delays a stop, also where sessions share the processor; the api yields, but never starves."""
     pids = {role: int(row["pid"]) for role, row in appliance.processes().items()}
     nice = {role: os.getpriority(os.PRIO_PROCESS, pid) for role, pid in pids.items()}
     own = os.getpriority(os.PRIO_PROCESS, 0)
@@ -89,7 +87,7 @@ def test_the_weights_of_processes(appliance: Appliance) -> None:
 
 
 def test_a_relay_has_short_turns(appliance: Appliance) -> None:
-    """A relay asks for the shortest turns, so that a message finds it running soon; Linux 6.12 and newer obey."""
+    """A message finds it running soon; Linux 6.12 and newer obey."""
     slices = {}
     for role in ("relay", "control"):
         attributes = (ctypes.c_uint32 * 12)()

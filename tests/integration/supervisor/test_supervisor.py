@@ -1,5 +1,3 @@
-"""The supervisor's promises for real processes that are killed, stopped and starved."""
-
 import contextlib
 import json
 import os
@@ -39,7 +37,6 @@ class Running:
         self.process = Process(ThisMachine(), command, env=environment, label="supervisor")
 
     def until_ready(self) -> "Running":
-        """Wait until nodes may connect and all processes run."""
         self.process.wait_for(event="ready", timeout=2 * LIMIT)
         for role in ALL:
             self.pid(role)
@@ -56,7 +53,6 @@ class Running:
         return self.pid(role, restarts=starts.index(pid) + 1)
 
     def living(self, role: str) -> int:
-        """Return the current process id of a role, once it works and has dropped its privileges."""
         pid = self.pid(role, restarts=self.restarts(role))
         # The system call filter is the last step.
         eventually(partial(_is_filtered, pid), f"{role} is in its sandbox")
@@ -69,7 +65,6 @@ class Running:
         return pid
 
     def echo(self) -> int:
-        """Connect to the socket that control keeps, and return the process id of the answering control."""
         uri = self.process.wait_for(event="ready")["master"]
         with socket.create_connection(("127.0.0.1", int(uri.rsplit(":", 1)[1])), timeout=20) as connection:
             return int(connection.recv(20))
@@ -79,7 +74,6 @@ class Running:
         return [pid for pid in started if Path(f"/proc/{pid}").exists()]
 
     def until_childless(self) -> None:
-        """Wait until no child is left; fail after ten seconds."""
         for pid in self.children():
             with _pidfd(pid) as descriptor:
                 if descriptor is not None:

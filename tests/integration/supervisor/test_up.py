@@ -40,14 +40,12 @@ def directory() -> Iterator[Path]:
 
 
 def command(directory: Path, *more: str) -> list[str]:
-    """Return `rosrv up` on free loopback ports."""
     fixed = ["--state", str(directory / "state"), "--policy", str(directory / "policy.ini")]
     return [ROSRV, "up", *fixed, *PLACE, *more]  # if a flag is repeated, the second value counts
 
 
 @contextlib.contextmanager
 def up(directory: Path, *more: str) -> Iterator[Process]:
-    """Run the appliance until the end of the block."""
     process = Process(ThisMachine(), command(directory, *more), env=ENVIRONMENT, label="rosrv up")
     try:
         yield process
@@ -56,7 +54,7 @@ def up(directory: Path, *more: str) -> Iterator[Process]:
 
 
 def refusal(directory: Path, *more: str, before: tuple[str, ...] = ()) -> str:
-    """Return the standard error of a failing start, which must print nothing on standard output.
+    """Return the standard error; standard output must be empty.
 
     `before` is a program, with its arguments, that runs the start.
     """
@@ -81,11 +79,6 @@ def pid_of_master(uri: str) -> str:
 
 @pytest.mark.real
 def test_it_says_when_nodes_may_connect_and_ends_cleanly_in_time(directory: Path) -> None:
-    """`rosrv up` prints a line for scripts and a sentence for people.
-
-    Ctrl-C and SIGTERM end it with status 0 within five seconds, and the next start on the same state serves.
-    """
-
     def end(running: Process, number: signal.Signals) -> None:
         began = time.monotonic()
         assert running.stop(with_signal=number) == 0
@@ -131,7 +124,6 @@ def test_invalid_configuration_is_reported_before_the_start(directory: Path) -> 
 
 
 def test_an_unreachable_state_directory_is_reported(directory: Path) -> None:
-    """Without SYS_ADMIN: if the children's users cannot reach their part, the message names the closed directory."""
     need_root()
     directory.chmod(0o700)
     said = refusal(directory, before=("setpriv", "--bounding-set=-sys_admin"))
@@ -140,10 +132,6 @@ def test_an_unreachable_state_directory_is_reported(directory: Path) -> None:
 
 
 def test_isolation_is_in_force_from_the_start_to_the_end(directory: Path) -> None:
-    """As root, on a host of the lab: the firewall is in force while the appliance runs.
-
-    After a crash there is one set of rules, and after the end none.
-    """
     need_root()
     with Lab("rosrv-up") as lab:
         host = lab.host("appliance", "10.80.0.2/24")
@@ -167,10 +155,6 @@ def test_isolation_is_in_force_from_the_start_to_the_end(directory: Path) -> Non
 
 
 def test_in_a_namespace_of_its_own_it_is_reached_through_the_host(directory: Path) -> None:
-    """As root, on a host of the lab: the processes run in a namespace, which is reached by the host's address.
-
-    After the end the namespace is gone.
-    """
     need_root()
     with own_namespace(), Lab("rosrv-up") as lab:
         host, robot = lab.host("machine", "10.81.0.2/24"), lab.host("robot", "10.81.0.10/24")

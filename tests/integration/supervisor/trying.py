@@ -1,5 +1,3 @@
-"""Attempts of an attacker in control of a process: run as its user, in its sandbox, with results as JSON."""
-
 import ctypes
 import errno
 import json
@@ -27,14 +25,12 @@ _ENDS_THE_TRIAL = {"reboot", "vhangup"}  # without the sandbox these calls would
 
 
 def main(*_given: Any) -> None:
-    """Make every attempt in the file `trial` of the role's part; this is the entry point of a role's actor."""
     told = sys.stderr  # the launcher has redirected standard output there
     told.write(json.dumps(tried(json.loads(Path("trial").read_text()))) + "\n")
     told.flush()
 
 
 def run_modules(*_given: Any) -> None:
-    """Run modules, the second much later than the first, and report; this is the entry point of a relay's actor."""
     from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, translated  # noqa: PLC0415  within the sandbox, as a relay loads it
 
     told: dict[str, Any] = {"before": len(_executable()), "results": [], "traps": []}
@@ -61,7 +57,6 @@ def _executable() -> list[str]:
 
 
 def tried(wanted: dict[str, Any]) -> dict[str, Any]:
-    """Return the result of each attempt: "done", or the name of the error."""
     return {
         "calls": {name: _call(name) for name in FORBIDDEN if name not in _ENDS_THE_TRIAL},
         "new namespace": _new_namespace(),
@@ -114,7 +109,7 @@ def _call(name: str) -> str:
 
 
 def _new_namespace() -> str:
-    """Use `clone`, because unshare is already among the calls: in a user namespace everything else would be allowed."""
+    """In a user namespace everything else would be allowed; unshare is already among the calls."""
     number = ctypes.CDLL(LIBRARY).seccomp_syscall_resolve_name(b"clone")
     libc = ctypes.CDLL(None, use_errno=True)
     arguments = (NEW_USER | signal.SIGCHLD, 0, 0, 0, 0)

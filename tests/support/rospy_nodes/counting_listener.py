@@ -1,8 +1,8 @@
-"""Subscribe to a topic of `flood_talker.py`: counting_listener.py TOPIC [--slow SECONDS].
+"""counting_listener.py TOPIC [--slow SECONDS], for a topic of `flood_talker.py`; `first` has the first number.
 
-`first` has the first number. For each line on the input, `counted` has the first and last number, the number of
-messages, gaps as pairs of the numbers around them, whether a number was not larger than its predecessor, and the
-texts that monitors appended to messages, in the order of changes, each with the number it began with.
+For each line on the input, `counted` has the first and last number, the number of messages, gaps as pairs of the
+numbers around them, whether a number was not larger than its predecessor, and the texts that monitors appended, each
+with the number it began with.
 """
 
 import argparse
@@ -54,7 +54,6 @@ class Count:
 
 
 def main():
-    """Listen until terminated."""
     arguments = argparse.ArgumentParser()
     arguments.add_argument("topic")
     arguments.add_argument("--slow", type=float, default=0.0)

@@ -13,7 +13,6 @@ from std_msgs.msg import String
 
 
 def main():
-    """Publish until a line on the input; then wait."""
     arguments = argparse.ArgumentParser()
     arguments.add_argument("topic")
     arguments.add_argument("--rate", type=float, default=1000)

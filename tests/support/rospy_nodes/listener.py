@@ -1,5 +1,3 @@
-"""Subscribe to std_msgs/String: listener.py TOPIC."""
-
 import argparse
 
 import rospy
@@ -12,7 +10,6 @@ def heard(message):
 
 
 def main():
-    """Listen until terminated."""
     arguments = argparse.ArgumentParser()
     arguments.add_argument("topic")
     options = arguments.parse_args(rospy.myargv()[1:])

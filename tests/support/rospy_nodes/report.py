@@ -1,5 +1,3 @@
-"""Report events to the test: one JSON object per line on standard output."""
-
 import json
 import os
 

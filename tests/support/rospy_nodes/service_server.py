@@ -13,7 +13,6 @@ def answer(request):
 
 
 def main():
-    """Serve until terminated."""
     arguments = argparse.ArgumentParser()
     arguments.add_argument("service")
     options = arguments.parse_args(rospy.myargv()[1:])

@@ -9,8 +9,6 @@ from std_msgs.msg import String
 
 
 class Watch(rospy.SubscribeListener):
-    """Report subscribers that connect and leave."""
-
     def peer_subscribe(self, topic_name, topic_publish, peer_publish):
         report("connected", topic=topic_name)
 
@@ -19,7 +17,6 @@ class Watch(rospy.SubscribeListener):
 
 
 def main():
-    """Publish until terminated."""
     arguments = argparse.ArgumentParser()
     arguments.add_argument("topic")
     arguments.add_argument("--latch", action="store_true")

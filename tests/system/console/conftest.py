@@ -1,5 +1,3 @@
-"""Start the browser, and an appliance whose console it opens."""
-
 import json
 import os
 import xmlrpc.client
@@ -54,7 +52,7 @@ def browser(chromium: str, playwright: Playwright) -> Iterator[Browser]:
 
 
 def launch(playwright: Playwright, program: str) -> Browser:
-    """Start a browser without a window; as root it cannot have its own sandbox."""
+    """As root it cannot have its own sandbox."""
     arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
     return playwright.chromium.launch(executable_path=program, args=arguments)
 
@@ -81,7 +79,7 @@ def token(appliance: Appliance) -> Callable[..., str]:
 
 @pytest.fixture
 def opened(browser: Browser, appliance: Appliance) -> Iterator[Callable[..., Reader]]:
-    """Return a function that opens the console, by default with the first token, an admin's."""
+    """The default token is the first, an admin's."""
     with ExitStack() as stack:
 
         def open_window(token: str | None = None, **look: Any) -> Reader:
@@ -93,8 +91,6 @@ def opened(browser: Browser, appliance: Appliance) -> Iterator[Callable[..., Rea
 
 @pytest.fixture
 def attempt(appliance: Appliance) -> Callable[..., Any]:
-    """Return a function that makes a call of the Master API as a node would."""
-
     def call(method: str, *arguments: Any) -> Any:
         with xmlrpc.client.ServerProxy(appliance.master_uri, allow_none=True) as master:
             try:

@@ -90,7 +90,6 @@ def main() -> None:
 
 
 def _demonstration(browser: Browser, demo: Process) -> None:
-    """Wait for the end of the demonstration, repeat its attack, and take the pictures of its robot."""
     demo.wait_for_text("Be the attacker:", timeout=_DEMO_SECONDS)
     said = "\n".join(str(event.get("text")) for event in demo.events)
     ((attacker, master),) = re.findall(
@@ -105,7 +104,6 @@ def _demonstration(browser: Browser, demo: Process) -> None:
 
 
 def _incident(reader: Reader) -> None:
-    """Take the pictures of docs/review-an-incident.md, up to the tighter policy with commit-confirm."""
     page = reader.go("now")
     refused = page.get_by_role("region", name="Recently denied")
     expect(refused.get_by_role("listitem").first).to_contain_text("/landshark_control/trigger")

@@ -88,7 +88,6 @@ class Reader:
         return self.page.locator(".toasts").get_by_text(text)
 
     def settle(self) -> None:
-        """Wait until the view is loaded and no animation runs."""
         expect(self.page.locator(".skeleton")).to_have_count(0)
         wait_until(
             self.page,
@@ -96,11 +95,10 @@ class Reader:
         )
 
     def fits(self) -> None:
-        """Wait until the page is at most as wide as its window."""
         wait_until(self.page, "document.documentElement.scrollWidth <= innerWidth")
 
     def axe(self) -> list[str]:
-        """Return the violations of WCAG 2.2 AA and best practices that axe-core finds in the settled view."""
+        """axe-core checks WCAG 2.2 AA and best practices."""
         self.settle()
         found = Axe().run(
             self.page,
@@ -155,8 +153,5 @@ def texts(locators: Iterable[Any]) -> list[str]:
 
 
 def wait_until(page: Page, condition: str) -> None:
-    """Wait until a JavaScript expression or function is true.
-
-    `Page.wait_for_function` evaluates it inside the page, where the content security policy forbids that.
-    """
+    """`Page.wait_for_function` evaluates inside the page, where the content security policy forbids that."""
     eventually(lambda: page.evaluate(condition), condition)

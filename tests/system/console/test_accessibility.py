@@ -1,5 +1,3 @@
-"""The console is accessible: axe finds nothing in any view and theme, and every function works by keyboard."""
-
 import re
 from collections.abc import Callable
 from typing import Any
@@ -71,7 +69,6 @@ def test_words_of_the_navigation_have_room(opened: Callable[..., Reader]) -> Non
 
 
 def test_the_door_is_accessible(browser: Browser, appliance: Appliance) -> None:
-    """The sign-in page has no violation in either theme."""
     for theme in ("light", "dark"):
         with Reader(browser, str(appliance.ready["api"]), theme=theme) as reader:
             reader.page.goto(reader.url)

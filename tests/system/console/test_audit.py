@@ -17,8 +17,6 @@ from tests.system.console.reader import Reader
 
 @pytest.fixture
 def refuse(appliance: Appliance, attempt: Callable[..., Any]) -> Callable[[str], None]:
-    """Return a function that makes an attempt of a node that the policy denies, and waits for its record."""
-
     def denied(node: str) -> None:
         assert (
             attempt("registerPublisher", node, "/guarded", "std_msgs/String", "http://127.0.0.1:1/")[0] != 1
@@ -51,7 +49,7 @@ def test_records_come_while_it_is_followed(
     expect(page.get_by_text("No record matches")).to_be_visible()
 
     def made_before(route: Route) -> None:
-        """Return whether the stream has begun: it has once there are records that were not in the list."""
+        """A stream has begun once there are records that were not in the list."""
         refuse("/other")
         refuse("/live_1")
         route.continue_()
@@ -247,7 +245,6 @@ def test_it_opens_on_what_matters(
 
 
 def test_changes_by_people(opened: Callable[..., Reader], appliance: Appliance) -> None:
-    """The person who switched a monitor can be found, and is shown in the node's column."""
     name = json.loads(appliance.rosrv("monitor", "list", "--json").stdout.splitlines()[0])["name"]
     appliance.rosrv("monitor", "disable", name)
     appliance.recorded("--who", "*", event="monitor disabled")
@@ -348,7 +345,6 @@ def test_rows_are_those_of_the_command(opened: Callable[..., Reader]) -> None:
 
 
 def test_a_host_that_makes_several_calls_in_turn_is_a_few_rows(opened: Callable[..., Reader]) -> None:
-    """Denials and monitors' actions of one kind are a row, unless a search names something."""
     entries = [denial(number, f"/arm{number % 3}") for number in range(1, 40)] + [
         drop(40),
         denial(41, "/leg"),

@@ -1,5 +1,3 @@
-"""Test the sign-in with tokens that are wrong, valid, of a lesser role, or revoked; none leaves anything behind."""
-
 from collections.abc import Callable
 
 from playwright.sync_api import Browser, Route, expect

@@ -18,7 +18,6 @@ class _Quiet(ThreadingMixIn, SimpleXMLRPCServer):
 
 @pytest.fixture(scope="module")
 def node_api() -> Iterator[str]:
-    """Serve the API of a node that accepts every call; all nodes of a test share it."""
     server = _Quiet(("127.0.0.1", 0), logRequests=False, allow_none=True)
 
     class Agree:

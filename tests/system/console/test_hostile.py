@@ -1,5 +1,3 @@
-"""Text from unknown hosts is shown as text: it runs nothing, hides nothing, reorders nothing, breaks no layout."""
-
 from collections.abc import Callable
 from typing import Any
 
@@ -29,7 +27,6 @@ def sent(appliance: Appliance, attempt: Callable[..., Any]) -> None:
 
 @pytest.mark.parametrize("view", ["now", "graph", "audit", "audit?text=img", "audit?severity=warning"])
 def test_names_are_text(view: str, opened: Callable[..., Reader]) -> None:
-    """No name becomes markup in any view, and the page is not wider than its window."""
     reader = opened(width=1280)
     page = reader.go(view)
     expect(page.locator("[data-standing=live]")).to_be_visible()
@@ -42,7 +39,6 @@ def test_names_are_text(view: str, opened: Callable[..., Reader]) -> None:
 
 
 def test_invisible_characters_are_shown(opened: Callable[..., Reader]) -> None:
-    """Direction, invisible and control characters are shown by their codes, and a long name with its length."""
     reader = opened()
     page = reader.go("audit?text=safe")
     expect(page.locator("tbody").get_by_text("RLO").first).to_be_visible()

@@ -42,10 +42,7 @@ def inside(appliance: Appliance, playwright: Playwright, chromium: str, tmp_path
 
 
 def test_a_host_is_enrolled_and_revoked(appliance: Appliance, inside: Browser) -> None:
-    """A saved kit contains a key, and the host is in the list; revoking asks for its name and removes its rights.
-
-    A token is shown once, with the script that uses it.
-    """
+    """A token is shown once, with the script that uses it."""
     with Reader(inside, "https://127.0.0.1:8443", str(appliance.ready["token"])) as reader:
         page = reader.go("hosts")
         expect(page.get_by_text("No host is enrolled")).to_be_visible()

@@ -1,5 +1,3 @@
-"""Review an incident in the console by keyboard, as in docs/review-an-incident.md; a recording; a shadow monitor."""
-
 import re
 import tempfile
 import zipfile
@@ -48,7 +46,6 @@ NAME() {
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """Run an appliance with a flight recorder, and monitors that drop messages on /rude and on /loud."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with tempfile.TemporaryDirectory(prefix="rosrv-incident-") as name:
         folder = Path(name)
@@ -65,7 +62,6 @@ def appliance() -> Iterator[Appliance]:
 
 @pytest.fixture(scope="module")
 def recording(appliance: Appliance, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Let /lout publish a rude message while /voice publishes: the monitor drops it, and the recorder saves it."""
     with RosSession(appliance.master_uri, tmp_path_factory.mktemp("ros")) as ros:
         ear = ros.listener("rospy", "/chatter", name="ear")
         ros.listener("rospy", "/rude", name="prude")
@@ -84,13 +80,10 @@ def recording(appliance: Appliance, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 def press(locator: Locator, key: str = "Enter") -> None:
-    """Press a key on an element, as a user without a pointer does."""
     locator.press(key)
 
 
 class Keys:
-    """Press keys on the page, wherever its focus is, and count them."""
-
     def __init__(self, page: Page) -> None:
         self.page = page
         self.count = 0
@@ -101,7 +94,6 @@ class Keys:
             self.count += 1
 
     def step_to(self, locator: Locator) -> None:
-        """Press `j` until the element has the focus."""
         expect(locator).to_be_visible()
         while not locator.evaluate("element => element === document.activeElement"):
             assert self.count < MOST_KEYS
@@ -222,7 +214,7 @@ def test_a_viewer_sees_which_role_may_read_messages(
 def test_a_monitor_in_shadow_mode_says_what_it_would_drop_and_is_promoted(
     appliance: Appliance, opened: Callable[..., Reader], tmp_path: Path
 ) -> None:
-    """In shadow mode its page counts and lists what it would have dropped, and it drops nothing; promoted, it drops."""
+    """In shadow mode the monitor counts what it would have dropped, and drops nothing."""
     appliance.rosrv("monitor", "disable", "hush")
     page = opened().go("monitors/hush", heading="hush")
     press(page.get_by_role("button", name="Try"))

@@ -1,5 +1,3 @@
-"""Look into a topic in the console: a real node's messages, for the permitted roles, and never as markup."""
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 

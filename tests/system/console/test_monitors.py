@@ -19,13 +19,11 @@ counting() {
 
 
 def state(appliance: Appliance, name: str) -> Any:
-    """Return the row of a monitor; None if it does not exist."""
     rows = appliance.rest().get("/v1/monitors").json["monitors"]
     return next((row for row in rows if row["name"] == name), None)
 
 
 def test_a_monitor_is_switched(appliance: Appliance, opened: Callable[..., Reader]) -> None:
-    """The switch shows the appliance's state and changes it; the audit log has who did it."""
     reader = opened()
     page = reader.go("monitors")
     switch = page.get_by_role("switch", name="safeZone enabled")

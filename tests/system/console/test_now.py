@@ -39,7 +39,6 @@ def test_health_says_what_the_appliance_says(appliance: Appliance, opened: Calla
 
 
 def test_several_relays_are_numbered(opened: Callable[..., Reader]) -> None:
-    """Several relay processes are numbered as in `rosrv status`; a single process is not."""
     page = opened().go("now")
     named = """async (processes) => {
       const { numbered } = await import("/console/static/js/now/view.js");

@@ -1,5 +1,3 @@
-"""Show a robot of a hundred nodes and two hundred topics: readable at a glance, opened in place, found by name."""
-
 from collections.abc import Callable, Iterator
 from itertools import combinations
 from typing import Any
@@ -39,7 +37,6 @@ _BEHIND = """() => {
 
 @pytest.fixture(scope="module")
 def robot(appliance: Appliance) -> Iterator[Robot]:
-    """Run the robot; a node of another machine has tried to command its arm."""
     with Robot(appliance.master_uri) as robot:
         refused = robot.call(
             "/operator/bridge",
@@ -97,7 +94,6 @@ def test_a_group_opens_where_it_stands(opened: Callable[..., Reader]) -> None:
 
 @pytest.mark.usefixtures("robot")
 def test_groups_by_host(opened: Callable[..., Reader]) -> None:
-    """The robot's machines are shown with the connections between them."""
     page = opened(width=WIDE[0], height=WIDE[1]).go("graph")
     page.get_by_label("Groups", exact=True).select_option("host")
     expect(page.locator(".box.many")).to_have_count(4)
@@ -120,7 +116,6 @@ def test_publishers_and_subscribers_of_the_arm(opened: Callable[..., Reader]) ->
 
 @pytest.mark.usefixtures("robot")
 def test_numbers_agree(opened: Callable[..., Reader], appliance: Appliance) -> None:
-    """Graph, Now and `rosrv status` count the same nodes and topics: the robot's, not the appliance's own."""
     reader = opened()
     expect(reader.go("graph").locator(".head-sub")).to_have_text("100 nodes, 200 topics, 0 services")
     card = reader.go("now").get_by_role("link", name="Nodes 1")
@@ -165,7 +160,7 @@ def _corner(box: Locator) -> tuple[float, float]:
 
 
 def _boxes(page: Page) -> list[_Box]:
-    """Return the places of all boxes at the same time: the drawing may move between two questions."""
+    """The drawing may move between two questions."""
     boxes: list[_Box] = page.eval_on_selector_all(
         ".box .shape",
         """all => all.map(one => {

@@ -28,8 +28,6 @@ api_limits: {{requests_per_second: 500, burst: 2000}}
 
 
 class PairConsoles:
-    """The consoles of both appliances, in a browser on an operator's machine."""
-
     def __init__(self, site: StandbySite, browser: Browser, tokens: dict[str, str]) -> None:
         self.site = site
         self.browser = browser
@@ -45,7 +43,6 @@ class PairConsoles:
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
-    """Run two appliances, of which `a` is active, and the witness."""
     need_root()
     home = tmp_path_factory.mktemp("pair")
     with Lab("rosrv-console") as lab, StandbySite(lab, home, settings=SETTINGS) as site:
@@ -58,7 +55,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
 
 @pytest.fixture(scope="module")
 def tokens(site: StandbySite) -> dict[str, str]:
-    """Return a token of each role, made on the active appliance, and known to the api of the standby."""
+    """They are made on the active appliance, and known to the api of the standby."""
     made = {}
     for role in ("viewer", "operator", "admin"):
         done = site.appliances["a"].rosrv(
@@ -83,7 +80,7 @@ def tokens(site: StandbySite) -> dict[str, str]:
 def remote_browser(
     site: StandbySite, chromium: str, playwright: Playwright, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Browser]:
-    """Start the browser on an operator's machine: the robot itself cannot reach the standby."""
+    """The robot itself cannot reach the standby."""
     host = site.lab.host("browser", "10.79.0.30/24")
     program = tmp_path_factory.mktemp("browser") / "chromium"
     program.write_text(f'#!/bin/sh\nexec ip netns exec {host.namespace.name} {chromium} "$@"\n')
@@ -115,10 +112,6 @@ def panel(page: Page) -> Any:
 @pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1440, 390])
 def test_both_appliances_are_shown(pair: PairConsoles, theme: str, width: int) -> None:
-    """The active appliance shows the standby in sync; the standby shows its state, and links to the active one.
-
-    Both pages are accessible, and no wider than the window.
-    """
     reader = pair.open("a", "viewer", theme=theme, width=width)
     page = reader.go("now")
     rows = panel(page).get_by_role("row")
@@ -185,7 +178,7 @@ def _listener() -> socket.socket | None:
 
 
 def test_only_admins_switch_over(pair: PairConsoles) -> None:
-    """An operator sees the button with the role that it needs; it opens no dialog."""
+    """It opens no dialog for an operator."""
     page = pair.open("a", "operator").go("now")
     button = panel(page).get_by_role("button", name="Switch over…")
     expect(button).to_have_attribute("aria-disabled", "true")
@@ -195,8 +188,8 @@ def test_only_admins_switch_over(pair: PairConsoles) -> None:
 
 
 def test_a_switchover_leads_to_the_other_console_and_back(pair: PairConsoles) -> None:
-    """After the order, the page becomes that of a standby; the same token opens the other console; the way back is the
-    same, and the first page is live again without a reload. Unsaved work survives.
+    """After the order, the page becomes that of a standby; the same token opens the other console. On the way back
+    the first page is live again without a reload, with unsaved work.
     """
     reader = pair.open("a", "admin")
     page = reader.go("policy")
@@ -219,7 +212,7 @@ def test_a_switchover_leads_to_the_other_console_and_back(pair: PairConsoles) ->
 
 
 def _switch_over(page: Page, name: str) -> None:
-    """Order the switchover once the standby is in sync; again if it did not store the last changes in time."""
+    """Order again if the standby did not store the last changes in time."""
     button = panel(page).get_by_role("button", name="Switch over…")
     expect(button).not_to_have_attribute("aria-disabled", "true", timeout=2 * LIMIT)
     button.click()

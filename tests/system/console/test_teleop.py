@@ -1,5 +1,3 @@
-"""The person's own door in the console: a camera's picture, a plot, and a pad that stops the robot."""
-
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -108,7 +106,7 @@ def test_a_person_sees_and_drives_the_robot_through_their_own_door(
 
 
 def drive(page: Page, base: Process) -> None:
-    """Take the group, drive with the keys and the mouse, and require that each end of a hold stops the robot."""
+    """Each end of a hold stops the robot."""
     own = page.get_by_role("region", name="Your door")
     pad = own.get_by_role("application")
     own.get_by_label("Commands").fill("/cmd_vel")
@@ -141,7 +139,7 @@ def stopped(base: Process) -> bool:
 
 
 def _last(base: Process) -> list[float]:
-    """Return the last command that the robot heard, as `rostopic echo -p` prints it: after its time."""
+    """`rostopic echo -p` prints the time first."""
     texts = [str(event.get("text", "")) for event in base.events]
     lines = [text for text in texts if re.fullmatch(r"\d+(,-?[\d.e-]+){6}", text)]
     return [float(number) for number in lines[-1].split(",")[1:]] if lines else [0.0]

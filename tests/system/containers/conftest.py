@@ -1,5 +1,3 @@
-"""A machine of the lab with a Docker engine, a laptop on its network, and the product there as containers."""
-
 import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -33,7 +31,7 @@ def images() -> None:
 
 @pytest.fixture(scope="module")
 def site(images: None) -> Iterator[Site]:
-    """Run the engine with the images; its data is for one engine, so it ends with the module."""
+    """The engine's data is for one engine, so it ends with the module."""
     with Lab("rosrv-engine") as lab:
         machine, laptop = lab.host("machine", "10.79.0.1/24"), lab.host("laptop", "10.79.0.50/24")
         with Engine(machine) as engine:
@@ -42,7 +40,6 @@ def site(images: None) -> Iterator[Site]:
 
 @pytest.fixture(scope="module")
 def demo(site: Site, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Compose]:
-    """Run `docker compose --profile demo up`: the appliance, the LandShark, its operator and a visitor."""
     folder = project(tmp_path_factory.mktemp("project"))
     # A clone of another user under umask 077: root of the container reads it with the rights of its owner.
     subprocess.run(["chown", "--recursive", "1000:1000", folder], check=True)

@@ -100,10 +100,6 @@ def test_the_story_ends_with_the_denials_and_the_console(
 
 
 def test_source_addresses_are_preserved(attacks: dict[str, dict[str, Any]], demo: Compose) -> None:
-    """A registration is recorded with its container's address.
-
-    A host that may read parameters may do so under any unused name.
-    """
     assert attacks
 
     def hosts_of_callers() -> dict[str, str] | None:
@@ -182,7 +178,6 @@ def test_an_unknown_container_reaches_nothing(demo: Compose) -> None:
 
 
 def test_nothing_listens_on_ipv6(demo: Compose) -> None:
-    """The networks have no IPv6, and no socket of the appliance is on a reachable IPv6 address."""
     listening = demo.exec("appliance", "ss", "-Htln6").stdout
     assert listening == ""
 

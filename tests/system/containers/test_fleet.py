@@ -63,7 +63,7 @@ except psycopg.OperationalError as error:
 
 @dataclass(frozen=True)
 class Walk:
-    """The page at work: its folder, the machine of the collector, the robots."""
+    """The machine is that of the collector."""
 
     folder: Path
     machine: Host
@@ -73,7 +73,7 @@ class Walk:
     contained: dict[str, Compose]
 
     def run(self, block: str, folder: str = "") -> str:
-        """Run a block of the page, in a folder of this one, and return its output; builds are done before."""
+        """Builds are done before."""
         environment = {
             "PATH": f"{self.folder}/bin:{Path(ROSRV).parent}:{os.environ['PATH']}",
             "HOME": str(self.folder), "DOCKER_HOST": self.compose.engine.address, "COMPOSE_HTTP_TIMEOUT": "120",
@@ -92,7 +92,7 @@ class Walk:
         return self.compose.exec("collector", "rosrv-fleet", *arguments, timeout=120).stdout
 
     def wait_healthy(self, service: str) -> None:
-        """Wait until a container is healthy. The engine keeps too few events to wait for an old one."""
+        """The engine keeps too few events to wait for an old one."""
         container = self.compose.container(service)
         eventually(
             lambda: self.compose.engine.inspect(container)["State"]["Health"]["Status"] == "healthy",
@@ -105,7 +105,7 @@ class Walk:
         return set(self.compose.exec("collector", *find).stdout.split())
 
     def proofs(self) -> dict[str, int]:
-        """Return the last proven record of each robot, after `verify` of all."""
+        """The last proven record of each robot."""
         found = map(json.loads, self.fleet("verify", "--json").splitlines())
         return {proof["robot"]: proof["last"] for proof in found if proof["ok"] and not proof["missing"]}
 
@@ -114,7 +114,6 @@ class Walk:
             self.machine.run(lambda robot=robot: push_joined(robot, self.folder / "robots" / robot.name))  # type: ignore[misc]  # mypy does not infer it
 
     def everything_is_proven(self) -> None:
-        """Wait until every record that the robots have now is collected, and verify it."""
         for robot in self.simulated:
             robot.record(10)
         self.push()
@@ -155,7 +154,6 @@ def _collected(appliance: Appliance) -> int:
 
 @pytest.fixture(scope="module")
 def walk(images: None) -> Iterator[Walk]:
-    """Follow steps 1 to 3 of the page."""
     build_fleet()
     folder = Path(tempfile.mkdtemp(prefix="rosrv-walk-"))
     folder.chmod(0o755)
@@ -180,7 +178,6 @@ def walk(images: None) -> Iterator[Walk]:
 
 
 def _prepared(folder: Path, lab: Lab, engine: Engine) -> Walk:
-    """Return the machines before the page's first command: the robots' appliances run."""
     shutil.copytree(ROOT / "fleet", folder / "fleet")
     programs = {
         "docker": DOCKER.format(docker=shutil.which("docker")), "ssh": SSH.format(robots=folder / "robots"),
@@ -338,7 +335,6 @@ def test_a_robot_is_added_with_its_files(walk: Walk) -> None:
 
 
 def test_prometheus_reads_the_metrics(walk: Walk) -> None:
-    """The page's commands make the two files that Prometheus needs."""
     said = walk.run(NAMED["metrics"])
     assert 'rosrv_fleet_gaps{robot="arm1"} 0' in said
 
@@ -364,7 +360,6 @@ def test_a_backup_restores_the_collector(walk: Walk) -> None:
 
 
 def test_both_containers_are_killed(walk: Walk) -> None:
-    """The engine starts both again on their volumes; no record is missing, and robots continue."""
     walk.everything_is_proven()
     before = walk.proofs()
     for service in ("postgres", "collector"):
@@ -409,7 +404,6 @@ def _of_arm4(walk: Walk) -> set[str]:
 
 
 def test_retention_removes_old_segments(walk: Walk) -> None:
-    """With the page's setting, the collector removes the beginning of a log, and proves the rest of all."""
     (setting,) = re.findall(r"^(retention: .*\n)", PAGE, re.MULTILINE)
     old = "ls /var/lib/rosrv-fleet/segments/arm4/*/*/*.gz | head -2 | xargs touch --date '-731 days'"
     walk.compose.exec("collector", "sh", "-c", old)

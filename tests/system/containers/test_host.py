@@ -19,7 +19,6 @@ LOCAL_PORTS = range(32768, 61000)
 
 @pytest.fixture
 def beside(site: Site, tmp_path: Path) -> Iterator[Compose]:
-    """Run `docker compose -f compose.yaml -f compose.host.yaml up`."""
     compose = site.engine.compose(project(tmp_path), "host", "compose.yaml", "compose.host.yaml")
     try:
         compose("up", "--detach", "--no-build")

@@ -27,7 +27,7 @@ MOST_MEGABYTES = (
 
 
 def members(site: Site, image: str) -> Iterator[tuple[str, tarfile.TarInfo, bytes]]:
-    """Yield every file of every layer of an image, deleted ones included: path, entry, the first megabyte."""
+    """Deleted files are included; the bytes are the first megabyte."""
     saved = site.engine.directory / "image.tar"
     site.engine.docker("save", "--output", str(saved), image, timeout=300)
     try:
@@ -102,7 +102,6 @@ def test_there_is_no_private_key(contents: list[tuple[str, tarfile.TarInfo, bool
 
 
 def test_no_program_raises_privileges(site: Site) -> None:
-    """No program is set-user-id or set-group-id, or has file capabilities."""
     found = run(site, "find", "/", "-xdev", "-type", "f", "-perm", "/6000")
     assert found == ""
 

@@ -19,7 +19,7 @@ STOP_SECONDS = 5.0
 
 @pytest.fixture
 def talking(site: Site, tmp_path: Path) -> Iterator[Compose]:
-    """Run the robot and its operator beside the appliance, both connected."""
+    """Robot and operator are connected."""
     compose = site.engine.compose(project(tmp_path), "life")
     try:
         compose("--profile", "demo", "up", "--detach", "--no-build", "landshark", "ocu")
@@ -30,7 +30,6 @@ def talking(site: Site, tmp_path: Path) -> Iterator[Compose]:
 
 
 def drives_on(compose: Compose) -> None:
-    """Wait until the operator, never restarted, receives the robot's position from now on."""
     moment = compose.engine.docker("info", "--format", "{{.SystemTime}}").stdout.strip()
     compose.wait_for_log("ocu", '"position"', since=moment, timeout=90)
     assert compose.engine.inspect(compose.container("ocu"))["RestartCount"] == 0
@@ -46,7 +45,7 @@ def test_a_stop_is_clean_and_quick(alone: Compose) -> None:
 
 
 def log_of_a_stop(alone: Compose) -> str:
-    """Start the appliance, unless it runs, and stop it cleanly and in time; return its log since that start."""
+    """Starts the appliance unless it runs; the log begins at that start."""
     alone("start")
     alone.wait_healthy()
     container = alone.container("appliance")
@@ -99,7 +98,6 @@ def test_a_recreated_container_keeps_its_certificate(site: Site, alone: Compose)
 
 
 def test_the_robot_may_restart(talking: Compose) -> None:
-    """The robot's container is killed and restarted while the appliance runs: the operator hears it again."""
     talking("kill", "landshark")
     talking("--profile", "demo", "up", "--detach", "--no-build", "landshark")
     drives_on(talking)
@@ -110,7 +108,6 @@ def test_the_robot_may_restart(talking: Compose) -> None:
 
 
 def test_down_leaves_nothing(site: Site, tmp_path: Path) -> None:
-    """After `down --volumes`, from a running appliance or a killed one, the machine is as it was."""
     compose = site.engine.compose(project(tmp_path), "gone")
 
     def machine() -> str:
@@ -181,7 +178,6 @@ def test_no_start_without_a_required_capability(right: str, site: Site) -> None:
 
 
 def hung_relay_ends(compose: Compose, seconds: float) -> bool:
-    """Hang the relay process by a stop, and return whether the supervisor ends it in time."""
     pid = next(row["pid"] for row in compose.status()["processes"] if row["role"] == "relay")
     compose(
         "exec", "-T", "--user", "rosrv-relay", "appliance", "python", "-c", f"import os; os.kill({pid}, 19)"
@@ -202,9 +198,6 @@ def test_a_hanging_process_is_ended_with_the_kill_capability(alone: Compose) -> 
 
 
 def test_no_other_capability_is_given(alone: Compose) -> None:
-    """compose.yaml lists exactly the capabilities that these tests need; the engine adds none, and memory is
-    limited.
-    """
     proven = {
         "NET_ADMIN",
         "SETUID",

@@ -13,7 +13,6 @@ _FILE = "compose.standby.yaml"
 
 @pytest.fixture
 def pair(site: Site, tmp_path: Path) -> Iterator[Compose]:
-    """Run both appliances, the robot and its operator, as the head of the file says."""
     compose = site.engine.compose(project(tmp_path), "pair", _FILE)
     try:
         compose("up", "--detach", "--no-build")

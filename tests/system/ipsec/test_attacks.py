@@ -1,5 +1,3 @@
-"""Attacks on the wire by hosts without a tunnel, and by tunnelled hosts that want more, against real tunnels."""
-
 import contextlib
 import os
 import queue
@@ -40,7 +38,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
 
 @pytest.fixture(scope="module")
 def kit(site: TunnelSite) -> Path:
-    """Return the kit of `ocu-1`, which the policy trusts."""
+    """The policy trusts `ocu-1`."""
     return site.kit()
 
 
@@ -51,7 +49,7 @@ def other(site: TunnelSite) -> Host:
 
 @pytest.fixture(scope="module")
 def others_kit(site: TunnelSite) -> Path:
-    """Return the kit of `ocu-2`, which is enrolled as well, but without rights."""
+    """`ocu-2` is enrolled, but without rights."""
     return site.kit("add", "ocu-2")
 
 
@@ -59,8 +57,6 @@ _LONG = b"second" * 150  # bytes
 
 
 class Datagrams:
-    """Datagrams that arrive at a UDP port of the appliance's address in the tunnels: data and sender."""
-
     def __init__(self, host: Host) -> None:
         with host.entered():
             self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -73,7 +69,7 @@ class Datagrams:
         return self._arrived.get(timeout=LIMIT)
 
     def first_of(self, word: bytes, send: Callable[[bytes], None]) -> str:
-        """Send numbered datagrams until one arrives; return its sender. No others may arrive."""
+        """No other datagrams may arrive."""
         for number in range(int(LIMIT)):
             send(b"%s %d" % (word, number))
             with contextlib.suppress(queue.Empty):
@@ -93,7 +89,6 @@ class Datagrams:
 
 @pytest.fixture
 def datagrams(site: TunnelSite, kit: Path) -> Iterator[Datagrams]:
-    """Open a port that accepts all datagrams, to see what the tunnel lets through."""
     host = site.appliance.host
     assert isinstance(host, Host)
     listening = Datagrams(host)
@@ -118,7 +113,7 @@ def esp_is_charons(site: TunnelSite) -> bool:
 
 @contextlib.contextmanager
 def deaf(host: Host) -> Iterator[None]:
-    """Block ESP in UDP for the host's programs; arriving packets are still captured on the wire."""
+    """Arriving packets are still captured on the wire."""
     table = "add table ip hold; add chain ip hold in { type filter hook prerouting priority -400; };"
     _nft(host, table + "add rule ip hold in udp dport 4500 drop")
     try:
@@ -345,7 +340,6 @@ def test_an_expired_certificate_ends_its_tunnel(site: TunnelSite, other: Host) -
 
 
 def charon_of(site: TunnelSite) -> int:
-    """Return the process id of the appliance's charon itself."""
     (parent,) = site.appliance.pids("charon")
     (child,) = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
     return int(child)
@@ -395,7 +389,7 @@ def _throw_garbage(host: Host) -> None:
 
 
 def _begin_handshakes(host: Host, first: Frame, count: int) -> None:
-    """Repeat the first packet of a real handshake, each time from another address and with another SPI."""
+    """Each packet has another address and SPI."""
     start = first.header
     frames = []
     for number in range(count):

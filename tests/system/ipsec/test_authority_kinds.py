@@ -1,5 +1,3 @@
-"""An authority with an encrypted Ed25519 key: real tunnels, and the effect of a wrong passphrase."""
-
 from pathlib import Path
 
 from examples.landshark.lab import Lab

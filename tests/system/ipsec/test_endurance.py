@@ -1,5 +1,3 @@
-"""Tunnels under everyday faults: hosts that move, ends that restart in either order, new keys during traffic."""
-
 import contextlib
 import signal
 from collections.abc import Iterator
@@ -39,7 +37,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
 
 
 def up_again(joined: JoinedHost, since: int) -> None:
-    """Wait until the tunnel is up again on the host's side."""
     assert joined.charon is not None
     joined.charon.wait_for(
         lambda event: "CHILD_SA ros" in str(event.get("text")) and "established" in str(event.get("text")),
@@ -49,7 +46,6 @@ def up_again(joined: JoinedHost, since: int) -> None:
 
 
 def test_a_host_moves(site: TunnelSite) -> None:
-    """A host whose address changes keeps its tunnel and its connections, and the log has the new address."""
     roamer = site.lab.host("roamer", "10.88.0.40/24")
     roamer.namespace.sysctl("net.ipv4.conf.all.promote_secondaries", "1")
     with site.joined(site.kit(), roamer) as joined, site.talking(joined) as (_, listener):
@@ -66,7 +62,6 @@ def test_a_host_moves(site: TunnelSite) -> None:
 
 
 def test_new_keys_under_traffic(site: TunnelSite) -> None:
-    """While ESP and IKE keys are changed every few seconds, no message is lost."""
     with (
         site.joined(site.kit(), settings=SHORT_LIVES) as joined,
         site.talking(joined, rate=100) as (talker, listener),
@@ -83,7 +78,6 @@ def test_new_keys_under_traffic(site: TunnelSite) -> None:
 
 
 def _told(charon: Process, text: str, count: int) -> None:
-    """Wait until charon has logged the text `count` times."""
     position = 0
     for _ in range(count):
         found = charon.wait_for(lambda event: text in str(event.get("text")), since=position, timeout=LONG)
@@ -92,7 +86,6 @@ def _told(charon: Process, text: str, count: int) -> None:
 
 @contextlib.contextmanager
 def restarted(site: TunnelSite, how: int) -> Iterator[None]:
-    """End the appliance with this signal, run the block, and start it again."""
     site.trail.stop()
     assert site.appliance.process is not None
     site.appliance.process.stop(with_signal=how)
@@ -103,7 +96,7 @@ def restarted(site: TunnelSite, how: int) -> Iterator[None]:
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
 def test_both_ends_restart(site: TunnelSite, how: int) -> None:
-    """Whatever order the two ends restart in, cleanly or not, the tunnel and its traffic return."""
+    """The tunnel returns in whatever order the ends restart."""
     kit = site.kit()
     host = site.join(kit)
     with host:

@@ -1,7 +1,7 @@
 """A host enrols with a one-time token, using the kit's own scripts: join, renew, leave.
 
-The laptop is a network namespace with its own /etc and /run, without systemd; strongSwan, nft, curl and openssl are
-Debian's. Before the tunnel is up, REST is reached from the management network.
+The laptop is a network namespace with its own /etc and /run, without systemd. Before the tunnel is up, REST is
+reached from the management network.
 """
 
 import contextlib
@@ -41,7 +41,6 @@ api_names: [{MIDDLE}]
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
-    """Run an appliance whose REST the lab's network may reach."""
     need_root()
     need_strongswan()
     for program, package in (("nft", "nftables"), ("curl", "curl"), ("openssl", "openssl")):
@@ -108,7 +107,6 @@ def nodes_talk(site: TunnelSite, laptop: ScriptHost, address: str) -> None:
 
 
 def closed(site: TunnelSite, laptop: ScriptHost) -> None:
-    """Assert that its ROS ports are closed to a neighbour, and that the result of an operator's check is shown."""
     rules = laptop.run("nft", "list", "table", "inet", "rosrv_protect").stdout
     assert OWN in rules
     assert row(site, "laptop")["ports"]["state"] == "unknown"
@@ -133,7 +131,6 @@ def closed(site: TunnelSite, laptop: ScriptHost) -> None:
 
 
 def forged(site: TunnelSite, laptop: ScriptHost) -> None:
-    """Assert that a datagram from the wire with the appliance's tunnel address is dropped."""
     before = dropped(laptop)
     unknown = site.attacker.namespace
     interfaces.add_address(unknown, "lo", f"{OWN}/32")
@@ -154,7 +151,6 @@ def dropped(laptop: ScriptHost) -> int:
 
 
 def again(site: TunnelSite, laptop: ScriptHost, script: Path) -> None:
-    """Assert that a second run needs no token, and that the kit's programs run instead of the earlier ones."""
     serial = row(site, "laptop")["serial"]
     mark = site.mark
     earlier = [laptop.run("cat", f"/run/rosrv/{what}.pid").stdout.strip() for what in ("keep", "renew")]
@@ -192,7 +188,6 @@ def renew(site: TunnelSite, laptop: ScriptHost) -> None:
 
 
 def leave(site: TunnelSite, laptop: ScriptHost, before: list[str]) -> None:
-    """Assert that leaving removes every file, rule and process of joining."""
     mark = site.mark
     laptop.run("/etc/rosrv/leave.sh")
     site.recorded(mark, event="tunnel down")
@@ -334,7 +329,6 @@ def test_two_hundred_hosts_beside_a_tunnel(site: TunnelSite, laptop: ScriptHost,
 
 
 def seconds_of(record: dict[str, Any]) -> float:
-    """Return the time of a record, in seconds since the epoch."""
     return datetime.datetime.fromisoformat(str(record["time"])[:26] + "+00:00").timestamp()
 
 

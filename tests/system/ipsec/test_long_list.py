@@ -1,5 +1,3 @@
-"""The longest possible list of revoked certificates, with real charons at both ends."""
-
 import sqlite3
 import subprocess
 import time
@@ -47,7 +45,7 @@ def test_tunnels_work_with_thousands_of_revoked_certificates(tmp_path: Path) -> 
 
 
 def revoke_many(state: Path) -> None:
-    """Revoke as if hosts had renewed their certificates for months."""
+    """As if hosts had renewed their certificates for months."""
     now = time.time()
     names = ["ocu-1"] * 2_000 + ["gone"] * 3_000
     rows = [

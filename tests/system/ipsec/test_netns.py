@@ -1,5 +1,3 @@
-"""A tunnel to an appliance in its own namespace on a bare host, which forwards IKE and ESP to it."""
-
 import json
 import subprocess
 import sys
@@ -71,7 +69,6 @@ def test_a_device_that_only_root_may_open_carries_the_tunnel() -> None:
 
 
 def authority_seen_from(joined: JoinedHost) -> str:
-    """Return REST's answer in the tunnel, where certificates are renewed, without extra settings."""
     asked = joined.popen(
         [
             "curl",

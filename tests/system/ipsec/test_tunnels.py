@@ -26,7 +26,7 @@ from tests.support.waiting import allowed
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
-    """Run one appliance for all tests here, without enrolled hosts at first."""
+    """Without enrolled hosts at first."""
     need_root()
     need_strongswan()
     with Lab("rosrv-ipsec") as lab, TunnelSite(lab, tmp_path_factory.mktemp("ipsec")) as one:
@@ -35,7 +35,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
 
 @pytest.fixture(scope="module")
 def kit(site: TunnelSite) -> Path:
-    """Return the kit of `ocu-1`, enrolled once."""
     return site.kit()
 
 
@@ -124,9 +123,6 @@ def test_a_forged_address_gets_nowhere(site: TunnelSite, kit: Path) -> None:
 
 
 def test_a_foreign_certificate_is_refused(site: TunnelSite, kit: Path) -> None:
-    """A certificate with the correct name from another authority opens no tunnel; the log has the sender and the
-    reason.
-    """
     site.home.joinpath("foreign").mkdir()
     foreign, key = CertificateAuthority(site.home / "foreign"), make_key()
     thief = site.join(kit, site.attacker)
@@ -143,7 +139,6 @@ def test_a_foreign_certificate_is_refused(site: TunnelSite, kit: Path) -> None:
 
 
 def test_an_interrupted_tunnel_recovers(site: TunnelSite, joined: JoinedHost) -> None:
-    """Unplugged, the tunnel is down within half a minute and the host has no rights; plugged in, it recovers."""
     with (
         RosSession(MASTER, site.home, site.robot) as on_robot,
         RosSession(joined.master, site.home, joined) as on_ocu,
@@ -186,7 +181,6 @@ def test_a_replaced_certificate_is_revoked(site: TunnelSite, kit: Path, joined: 
 
 
 def revoke_while_it_talks(site: TunnelSite, joined: JoinedHost) -> None:
-    """Assert that a revoked host loses registrations, connections and tunnel within a second, and gets none again."""
     with (
         RosSession(MASTER, site.home, site.robot) as on_robot,
         RosSession(joined.master, site.home, joined) as on_ocu,
@@ -210,7 +204,7 @@ def revoke_while_it_talks(site: TunnelSite, joined: JoinedHost) -> None:
 
 
 def _seconds(record: Event) -> float:
-    """Return the time of a record within its day; a test over midnight is a second off, which no assertion notices."""
+    """The time within its day; a test over midnight is a second off, which no assertion notices."""
     hours, minutes, seconds = str(record["time"]).split("T")[1].rstrip("Z").split(":")
     return int(hours) * 3600 + int(minutes) * 60 + float(seconds)
 

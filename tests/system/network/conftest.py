@@ -1,5 +1,3 @@
-"""A lab of network namespaces, and the hosts that tests of several files have."""
-
 from collections.abc import Iterator
 
 import pytest
@@ -28,5 +26,4 @@ def robot(lab: Lab) -> Host:
 
 @pytest.fixture
 def attacker(lab: Lab) -> Host:
-    """Return any other machine; it may forge the robot's address."""
     return lab.host("attacker", "10.77.0.66/24", "fd77::66/64")

@@ -54,7 +54,6 @@ def _machine() -> None:
 
 
 def connect(host: Host, uid: int, *targets: tuple[str, int]) -> list[str]:
-    """Try to connect from a host as a local user; return the result of each attempt."""
     process = host.popen(
         ["/usr/bin/python3", "-I", "-S", "-c", CLIENT, *(f"{address}/{port}" for address, port in targets)],
         user=uid,
@@ -70,7 +69,7 @@ def connect(host: Host, uid: int, *targets: tuple[str, int]) -> list[str]:
 
 @contextlib.contextmanager
 def listening(host: Host, address: str = "::", port: int = 0) -> Iterator[int]:
-    """Listen on a host, on all its addresses of both families by default; yield the port."""
+    """Listens on all addresses of both families by default; yields the port."""
     with host.entered():
         family = socket.AF_INET6 if ":" in address else socket.AF_INET
         server = socket.create_server(
@@ -90,7 +89,7 @@ def settings(port: int, **others: Any) -> FirewallSettings:
 
 
 def ruleset(host: Host) -> str:
-    """Return every rule of a host, of both kinds and both families, without counters."""
+    """Without counters."""
     commands = ("nft -s list ruleset", "iptables-legacy-save -t filter", "ip6tables-legacy-save -t filter")
     outputs = []
     for command in commands:
@@ -220,7 +219,6 @@ def test_only_management_networks_reach_the_rest_port(
 def test_clear_text_packets_of_a_tunnelled_host_are_dropped(
     lab: Lab, protected: Host, backend: BackendChoice
 ) -> None:
-    """Packets from and to the virtual address of a host that must use its tunnel are dropped outside it."""
     spoofer = lab.host("spoofer", "10.77.0.9/24", "fd77::9/64")
     honest = lab.host("honest", "10.77.0.10/24")
     firewall = Firewall(protected.namespace, backend)
@@ -275,7 +273,7 @@ def test_hosts_without_a_bucket_have_one_common_limit(
 
 
 def flood(host: Host, address: str, servers: tuple[socket.socket, ...], rounds: int) -> int:
-    """Open connections to all servers at once; return how many succeeded at the first attempt (a second takes 1 s)."""
+    """Returns how many succeeded at the first attempt; a second takes 1 s."""
     with contextlib.ExitStack() as stack, host.entered():
         for server in servers * rounds:
             target = (address, server.getsockname()[1])
@@ -284,7 +282,7 @@ def flood(host: Host, address: str, servers: tuple[socket.socket, ...], rounds: 
 
 
 def waiting(server: socket.socket, host: Host) -> int:
-    """Accept and close waiting connections of a server; return the number of the host's."""
+    """Closes the connections; returns the number of the host's."""
     server.settimeout(0.3)
     found = 0
     with contextlib.suppress(TimeoutError):
@@ -419,7 +417,6 @@ def test_without_any_back_end_there_is_no_firewall(protected: Host, monkeypatch:
 
 @pytest.mark.parametrize("kind", [NftBackend, IptablesBackend])
 def test_the_proof_leaves_nothing(protected: Host, kind: type[NftBackend] | type[IptablesBackend]) -> None:
-    """The test of a back end leaves the rules of the namespace unchanged."""
     before = ruleset(protected)
     prove(kind(protected.namespace), protected.namespace)
     assert ruleset(protected) == before

@@ -1,5 +1,3 @@
-"""Thousands of forged SYNs a second under the address of a named host do not affect that host."""
-
 import socket
 import subprocess
 import sys
@@ -34,7 +32,7 @@ def _machine() -> None:
 
 
 def calls_during(flood: "subprocess.Popen[str]", robot: Host, server: socket.socket) -> list[bool]:
-    """Return whether the flood delayed each call of the robot; an unanswered call raises.
+    """Returns whether the flood delayed each call; an unanswered call raises.
 
     A delayed call has sent a packet again; without that, the machine was busy.
     """
@@ -54,14 +52,14 @@ def calls_during(flood: "subprocess.Popen[str]", robot: Host, server: socket.soc
 
 
 def repeated_packets(connection: socket.socket) -> int:
-    """Return how many packets the kernel sent again: `tcpi_total_retrans` of `struct tcp_info` (linux/tcp.h)."""
+    """`tcpi_total_retrans` of `struct tcp_info` (linux/tcp.h)."""
     return int.from_bytes(
         connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 104)[100:], sys.byteorder
     )
 
 
 def accepted(server: socket.socket, port: int) -> socket.socket:
-    """Return the connection from this port; a repeated SYN cookie makes a second one, which is closed."""
+    """A repeated SYN cookie makes a second connection, which is closed."""
     for _ in range(100):
         peer, (_, seen, *_) = server.accept()
         if seen == port:
@@ -96,7 +94,7 @@ def unharmed(robot: Host, attacker: Host, protected: Host, ports: tuple[int, ...
 
 @pytest.fixture(params=[False, True], ids=["resets", "silent"])
 def silent(request: pytest.FixtureRequest, robot: Host) -> bool:
-    """Return whether the robot's own firewall drops unexpected answers: forged connections then stay half-open."""
+    """If the robot's own firewall drops unexpected answers, forged connections stay half-open."""
     if request.param:
         load(robot.namespace, "nft", _SILENT)
     return bool(request.param)

@@ -63,7 +63,7 @@ def master(host: Host, tmp_path: Path) -> "Iterator[subprocess.Popen[str]]":
 
 
 def wait_until_listening(host: Host, process: "subprocess.Popen[str]") -> None:
-    """Wait for the process to accept connections on PORT, at most half a minute."""
+    """At most half a minute."""
     for _ in range(300):
         with host.entered(), socket.socket() as client:
             if client.connect_ex(("127.0.0.1", PORT)) == 0:
@@ -74,7 +74,6 @@ def wait_until_listening(host: Host, process: "subprocess.Popen[str]") -> None:
 
 
 def ask(host: Host, uid: int, uri: str) -> str:
-    """Query the master's pid as a local user."""
     process = host.popen(
         ["/usr/bin/python3", "-I", "-c", ASK, uri],
         user=uid,

@@ -33,7 +33,6 @@ def node(lab: Lab) -> Host:
 
 
 def settings(tmp_path: Path, name: str | None = None) -> IsolationSettings:
-    """Return settings with a name for this test only."""
     return IsolationSettings(
         ports=(PortRange.one(MASTER), PortRange(FIRST, LAST)),
         name=name or f"riso{os.getpid()}",
@@ -61,7 +60,6 @@ def serving(namespace: Namespace, port: int) -> Iterator[socket.socket]:
 
 
 def source_seen(server: socket.socket, host: Host, address: str, port: int) -> str:
-    """Connect from a host; return the peer address that the server sees."""
     with host.entered(), socket.create_connection((address, port), timeout=10) as client:
         peer, (seen, *_) = server.accept()
         with peer:
@@ -199,7 +197,6 @@ def test_the_appliance_does_not_reach_the_hosts_loopback(bare: Host, tmp_path: P
 
 
 def test_the_end_restores_everything(bare: Host, tmp_path: Path) -> None:
-    """Rules, settings, interfaces and routes of the host are as before, foreign ones included."""
     bare.popen(["nft", "add", "table", "inet", "foreign"]).wait(timeout=20)
     bare.namespace.sysctl("net/ipv4/conf/eth0/forwarding", "1")
     before = state(bare)

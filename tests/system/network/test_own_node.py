@@ -67,7 +67,7 @@ def connect(host: Host, uid: int, *targets: tuple[str, int]) -> list[str]:
 
 @contextlib.contextmanager
 def rosout(host: Host, port: int) -> Iterator[int]:
-    """Run a listener like rosout, under its user: messages at `port`; yield the port of its API."""
+    """Runs under rosout's user; yields the port of its API."""
     process = host.popen(
         [sys.executable, "-I", "-S", "-c", SERVE, str(port)],
         user=ROSOUT, group=ROSOUT, extra_groups=[], cwd="/",
@@ -142,7 +142,6 @@ def test_a_compromised_rosout_or_rosmaster_reaches_nothing() -> None:
 
 @contextlib.contextmanager
 def listening(host: Host) -> Iterator[int]:
-    """Listen on another machine and accept every connection; yield the port."""
     with host.entered():
         server = socket.create_server((host.address, 0))
     with server:

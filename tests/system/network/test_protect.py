@@ -29,7 +29,7 @@ def gateway(lab: Lab) -> Host:
 
 
 def protect(host: Host, *arguments: str, status: int = 0, **environment: str) -> str:
-    """Run `rosrv protect` on a host; return its standard output, or the error output when it is to fail."""
+    """Returns the error output if the command is to fail."""
     process = host.popen(
         [sys.executable, "-c", COMMAND, *arguments],
         stdout=subprocess.PIPE,
@@ -60,7 +60,7 @@ def listening(host: Host, *ports: int) -> Iterator[None]:
 
 
 def reaches(host: Host, address: str, port: int) -> bool:
-    """Return whether a TCP connection can be opened; a refusal must be explicit, not silence."""
+    """A refusal must be explicit, not silence."""
     with host.entered():
         try:
             socket.create_connection((address, port), timeout=10).close()

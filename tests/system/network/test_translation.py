@@ -1,5 +1,3 @@
-"""Identity behind other programs' NAT: guests of Docker, libvirt, podman, a hotspot, on the same machine."""
-
 import os
 import socket
 from collections.abc import Iterator
@@ -26,7 +24,7 @@ DOCKER = TRANSLATORS[0]
 
 @pytest.fixture
 def lab() -> Iterator[Lab]:
-    """Make a lab with the machine that the appliance is started on, and a possible guest behind it."""
+    """The appliance runs on the machine; the guest is behind it."""
     need_root()
     for program, package in (("nft", "nftables"), ("iptables-legacy", "iptables")):
         need_program(program, package)
@@ -131,7 +129,6 @@ def test_without_rules_the_machines_own_packets_are_recognized(
 
 
 def test_forged_source_addresses_do_not_arrive(machine: Host, behind: Namespace, tmp_path: Path) -> None:
-    """A guest cannot send forged packets to the appliance under an address of the machine's link."""
     guest = guest_behind(machine.namespace, behind, DOCKER)
     with isolated(machine, tmp_path) as isolation, serving(isolation.namespace, MASTER) as server:
         with isolation.namespace.entered():

@@ -1,5 +1,3 @@
-"""Run in the virtual machine: tunnels with the kernel's own ESP, and attacks on them."""
-
 import re
 import subprocess
 from collections.abc import Iterator
@@ -48,7 +46,6 @@ def told(host: Host, *command: str) -> str:
 
 
 def test_esp_is_the_kernels(site: TunnelSite, joined: JoinedHost) -> None:
-    """The appliance has chosen the kernel's ESP: there are states with the cipher, and no interface of charon."""
     status = site.appliance.status()
     assert status["ipsec"]["esp"] == "kernel"
     assert status["ipsec"]["up"] == 1
@@ -62,9 +59,6 @@ def test_esp_is_the_kernels(site: TunnelSite, joined: JoinedHost) -> None:
 
 
 def test_a_node_publishes_through_the_kernel(site: TunnelSite, joined: JoinedHost) -> None:
-    """The robot hears a node of the host that the policy knows as `host:ocu-1`, from its virtual address, through the
-    kernel's states.
-    """
     with site.talking(joined, rate=20) as (_talker, listener):
         listener.wait_for_count(20, event="received", timeout=LONG)
     registered = site.trail.wait_for(event="registered", caller_id="/boss", timeout=LONG)

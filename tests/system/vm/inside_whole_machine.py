@@ -1,4 +1,4 @@
-"""Run in the virtual machine: the appliance, and the machine of a trusted host, as on real machines.
+"""The appliance, and the machine of a trusted host, in the virtual machine.
 
 The tests change the network of the machine itself, so they never run anywhere else.
 """
@@ -36,7 +36,6 @@ def told(*command: str) -> str:
 
 
 def state_of_the_machine() -> dict[str, object]:
-    """Return the settings of a machine that an appliance changes, and must restore."""
     return {
         "rules": told("nft", "list", "ruleset"),
         "iptables": "ROSRV" in told("iptables-legacy-save") + told("ip6tables-legacy-save"),
@@ -57,9 +56,6 @@ def state_of_the_machine() -> dict[str, object]:
     ids=["container", "netns"],
 )
 def test_the_appliance_on_a_machine(lab: Lab, tmp_path: Path, isolation: str, backend: str) -> None:
-    """rosmaster is hidden, nodes in clear text and behind a kernel tunnel hear each other, forged packets are dropped,
-    and a clean stop leaves the machine as it was.
-    """
     robot, ocu = lab.host("robot", f"{ROBOT}/24"), lab.host("ocu", f"{OCU}/24")
     attacker = lab.host("attacker", f"{ATTACKER}/24")
     config, kit = tmp_path / "appliance.yaml", tmp_path / "kit.tar.gz"
@@ -90,9 +86,6 @@ def test_the_appliance_on_a_machine(lab: Lab, tmp_path: Path, isolation: str, ba
 
 
 def test_a_host_joins_and_leaves_by_its_kit(lab: Lab, tmp_path: Path) -> None:
-    """After join.sh on a Debian with systemd the tunnel is up, ROS works through it, and the ports are closed;
-    leave.sh undoes everything.
-    """
     with (
         TunnelSite(lab, tmp_path, options=("--api", "off")) as site,
         root_host(lab, "10.88.0.50/24") as machine,
@@ -138,15 +131,13 @@ def test_a_host_joins_and_leaves_by_its_kit(lab: Lab, tmp_path: Path) -> None:
 
 
 def listening() -> set[int]:
-    """Return the TCP ports of nodes on this machine: those in the local port range that accept connections."""
+    """Nodes listen in the local port range."""
     first = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text(encoding="ascii").split()[0])
     rows = map(str.split, told("ss", "-Hltn").splitlines())
     return {port for row in rows if (port := int(row[3].rpartition(":")[2])) >= first}
 
 
 class _Joined:
-    """The machine under its virtual address, as nodes on it see it."""
-
     def __init__(self, address: str, machine: Host) -> None:
         self.address = address
         self.popen = machine.popen

@@ -1,7 +1,6 @@
 """The appliance in a virtual machine with Debian's own kernel: promises that no namespace can show.
 
-Each test here runs tests *in* the machine: those of `inside_*.py`, which are written for it, and those of other
-folders that depend on the kernel. The report of a failure contains their output.
+Each test here runs tests *in* the machine: `inside_*.py`, and those of other folders that depend on the kernel.
 """
 
 from collections.abc import Iterator
@@ -27,7 +26,6 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
 
 
 def passes(machine: Machine, *what: str) -> None:
-    """Assert that all these tests pass in the machine, without skips."""
     done = machine.run(
         *(*PLUGINS, f"{ROOT}/.venv/bin/pytest", "-p", "pytest_timeout", "-p", "no:cacheprovider", "--quiet"),
         *("--durations=5", "-o", f"timeout={SECONDS:.0f}", *what),
@@ -41,7 +39,6 @@ def passes(machine: Machine, *what: str) -> None:
 
 
 def test_the_kernels_esp(machine: Machine) -> None:
-    """With tunnels in the kernel and both back ends, nodes communicate, forged addresses fail, and nothing remains."""
     passes(machine, f"{HERE}/inside_kernel_esp.py")
 
 

@@ -1,5 +1,3 @@
-"""Fixtures for the tests of the REST contract."""
-
 import pytest
 from fastapi import FastAPI
 

@@ -28,7 +28,6 @@ class Machine:
         self.age()
 
     def run(self, duration: int) -> int:
-        """Let the machine run and read the clock of ages eight times; return the last reading."""
         for _ in range(8):
             self.true += duration // 8
             self.age()
@@ -139,7 +138,6 @@ def test_a_damaged_file_starts_from_known_time(tmp_path: Path, left: bytes) -> N
 
 
 def test_a_full_disk_does_not_stop_it(tmp_path: Path) -> None:
-    """If its file cannot be written, the clock continues in memory."""
     machine = Machine(tmp_path / "gone" / "age")
     machine.begin()
     assert machine.run(DAY) == machine.true

@@ -12,7 +12,7 @@ _LIMIT = 60
 
 
 class Engine:
-    """Counts its turns, and ends with the first turn after `close`."""
+    """It ends with the first turn after `close`."""
 
     def __init__(self, *dues: float) -> None:
         self.turns: queue.Queue[float] = queue.Queue()

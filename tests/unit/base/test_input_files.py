@@ -128,7 +128,6 @@ def test_a_pipe_of_the_shell_is_read(tmp_path: Path) -> None:
 
 
 def test_files_are_bounded(tmp_path: Path) -> None:
-    """A file longer than the reader's limit is an error that names the limit."""
     file = tmp_path / "file"
     file.write_bytes(b"abc\r\nd\n")
     assert read_given(file, 7) == b"abc\r\nd\n"

@@ -1,5 +1,3 @@
-"""Invalid values get our own messages, never a library's: on the command line, in REST and in the configuration."""
-
 import asyncio
 import dataclasses
 import json
@@ -47,7 +45,6 @@ def test_the_command_line_explains_valid_values() -> None:
 
 
 def test_rest_explains_valid_parameters(app: FastAPI) -> None:  # noqa: F811  the fixture
-    """Covers each parameter of every path and query, and each header."""
     told = set()
     for dependant in _dependants(app):
         for field in [*dependant.query_params, *dependant.path_params, *dependant.header_params]:

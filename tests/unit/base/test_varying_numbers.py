@@ -1,5 +1,3 @@
-"""Texts that differ only in measured values."""
-
 import pytest
 
 from appliance.base.varying_numbers import without_numbers

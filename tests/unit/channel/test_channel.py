@@ -18,7 +18,7 @@ Pair = tuple[Channel, Channel]
 
 @pytest.fixture
 def pair() -> Iterator[Pair]:
-    """Return the two ends of a channel; the second accepts messages of at most 1,000 bytes."""
+    """The second end accepts messages of at most 1,000 bytes."""
     one, other = socket.socketpair()
     ends = Channel(one, Lifeline, limit=300_000), Channel(other, Lifeline, longest=1000)
     yield ends

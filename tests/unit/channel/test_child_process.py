@@ -45,7 +45,7 @@ class Bench:
         self.links += 1
 
     def link(self, role: str = "control") -> tuple[Channel, asyncio.Queue[Any]]:
-        """Give the child a link; return control's end and the list of received messages (None: closed)."""
+        """A closed link is received as None."""
         ours, theirs = socket.socketpair()
         self.lifeline.send(LinkOpened(role=role, index=0), (theirs.fileno(),))
         theirs.close()

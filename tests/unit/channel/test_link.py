@@ -13,8 +13,6 @@ pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 class World:
-    """A link, its received messages and lost peers, and the processes at its other end."""
-
     def __init__(self) -> None:
         self.heard: list[object] = []
         self.lost: list[str] = []

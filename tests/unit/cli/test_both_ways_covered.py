@@ -1,5 +1,3 @@
-"""Each verb of a running appliance has a row in the nightly comparison of `--state` and `--api`."""
-
 from pathlib import Path
 
 from tests.support.command import commands

@@ -8,7 +8,6 @@ from rosmop.tool.terminal import counted, printable, say
 
 
 def test_control_characters_never_reach_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    """A name of an unknown host that would clear the screen or start a new line is printed escaped."""
     say("/evil\x1b[2J\nallow \u202e[red]")
     assert capsys.readouterr().out == "/evil\\x1b[2J\\nallow \\u202e[red]\n"
 

@@ -1,5 +1,3 @@
-"""Tests of `rosmop.tool.progress_bar`: programs read only the output."""
-
 import subprocess
 import sys
 

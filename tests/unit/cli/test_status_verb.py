@@ -1,5 +1,3 @@
-"""How `rosrv status` shows ages and long lists; `status.txt` has the rest."""
-
 from appliance.base.ages import age
 from appliance.cli.status_verb import shortened
 

@@ -56,7 +56,7 @@ def serving(tmp_path: Path) -> Iterator[Callable[..., FakeAppliance]]:
 
 
 class Terminal:
-    """A terminal of this size, and a command in it; `shown` has all that was written to it."""
+    """`shown` has all that was written to it."""
 
     def __init__(self, columns: int, lines: int, state: Path, seconds: str) -> None:
         self._ours, theirs = pty.openpty()
@@ -81,7 +81,6 @@ class Terminal:
         self.process.send_signal(signal.SIGWINCH)
 
     def until(self, text: str, after: int = 0) -> int:
-        """Wait for a text after a position; return the position of its end."""
         eventually(lambda: text in self.shown[after:], lambda: f"{text!r} in {self.shown[after:]!r}")
         return self.shown.index(text, after) + len(text)
 

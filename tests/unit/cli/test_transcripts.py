@@ -77,5 +77,4 @@ _FILES = [*_HERE.rglob("*.txt"), *_HERE.parent.glob("features/*/*.txt")]
 
 @pytest.mark.parametrize("section", sections(*sorted(_FILES)))
 def test_transcript(transcript: Transcript, section: Section) -> None:
-    """Each command makes the requests listed below it, and has the output and the exit status listed there."""
     assert section.played(transcript) == section.text

@@ -39,7 +39,7 @@ pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 async def conversation(*wanted: messages.Message) -> list[Any]:
-    """Return the compiler's answers to these questions; then the supervisor has stopped the process."""
+    """The supervisor has stopped the process at the end."""
     lifeline, its_lifeline = socket.socketpair()
     ours, theirs = socket.socketpair()
     supervisor, control = Channel(lifeline, messages.Lifeline), Channel(ours, messages.CompilerLink)
@@ -114,7 +114,7 @@ async def test_large_specifications_are_rejected(monkeypatch: pytest.MonkeyPatch
 
 
 def nested_repetitions(count: int) -> str:
-    """Return short specifications whose automata take about a second of processor time each."""
+    """Each takes about a second of processor time."""
     formula = "(a | b)* a"
     for _ in range(12):
         formula = f"({formula} (a|b))"
@@ -213,7 +213,7 @@ async def test_a_compiler_without_its_link_ends(used: float) -> None:
 
 
 def _until_used(pid: int, seconds: float) -> None:
-    """Wait until the process has used this much processor time; a start takes less than 3 s."""
+    """A start takes less than 3 s."""
 
     def used() -> float:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()

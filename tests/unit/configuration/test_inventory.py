@@ -25,7 +25,6 @@ Version: 9.0
 
 @pytest.fixture(autouse=True)
 def anew() -> Iterator[None]:
-    """Gather the inventory again for each test; a process does it once."""
     inventory.inventory.cache_clear()
     yield
     inventory.inventory.cache_clear()

@@ -84,7 +84,6 @@ def test_rest_in_clear_text_stays_on_this_machine(api: str) -> None:
 
 
 def test_rest_can_be_disabled() -> None:
-    """`off`, also as YAML reads it, means no address."""
     assert read({"api": "off"}).api_address is None
     assert read({"api": False}).api_address is None
     assert Settings().api_address == ("127.0.0.1", 8443)

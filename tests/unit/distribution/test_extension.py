@@ -27,7 +27,7 @@ def answer(unsigned char[::1] place):
 
 
 class Checkout:
-    """A small checkout with the program that builds, and a source of its own."""
+    """It has the program that builds, and its own source."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -52,13 +52,11 @@ class Checkout:
         )
 
     def build(self, path: str = "/usr/bin:/bin") -> tuple[int, str]:
-        """Run the program; return its exit status and its output."""
         process = self.start(PATH=path)
         output, errors = process.communicate(timeout=120)
         return process.returncode, output + errors
 
     def answer(self) -> int:
-        """Return the result of the module's function in another interpreter."""
         code = "import pump; print(pump.answer(bytearray(b'abcd')) - ord('d'))"
         command = [sys.executable, "-c", code]
         done = subprocess.run(command, cwd=self.made.parent, capture_output=True, text=True, check=True)
@@ -72,7 +70,6 @@ def checkout(tmp_path: Path) -> Checkout:
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Checkout:
-    """Provide a checkout in which the module is built; no test changes it."""
     made = Checkout(tmp_path_factory.mktemp("original") / "with a longer name")
     assert made.build() == BUILT
     return made
@@ -129,7 +126,6 @@ def test_a_missing_compiler_is_named(checkout: Checkout, tmp_path: Path) -> None
 
 
 def test_many_builds_at_once(checkout: Checkout) -> None:
-    """Programs that start at once do not disturb each other: one builds, the others find the result."""
     several = [checkout.start(PATH="/usr/bin:/bin") for _ in range(6)]
     said = {process.communicate(timeout=120)[1] for process in several}
     assert said <= {BUILT[1], ""}

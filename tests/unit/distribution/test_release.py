@@ -12,7 +12,7 @@ pytestmark = pytest.mark.nightly
 
 @pytest.fixture
 def released(tmp_path: Path) -> Path:
-    """Return a folder with two signed files, with key.pem and public.pem beside it."""
+    """Two signed files; key.pem and public.pem are beside the folder."""
     folder = tmp_path / "dist"
     folder.mkdir()
     (folder / "rosrv_0.2.0_amd64.deb").write_bytes(b"a package")
@@ -28,7 +28,7 @@ def released(tmp_path: Path) -> Path:
 
 
 def checks(folder: Path) -> bool:
-    """Return whether the two commands of docs/install.md (openssl and coreutils) accept the release."""
+    """The two commands of docs/install.md, openssl and coreutils."""
     signature = folder.parent / "signature"
     decoded = subprocess.run(
         ["base64", "--decode", "SHA256SUMS.sig"], cwd=folder, capture_output=True, check=False
@@ -53,13 +53,11 @@ def checks(folder: Path) -> bool:
 
 
 def test_standard_tools_check_it(released: Path) -> None:
-    """An unchanged release is accepted; a second release of the same files has the same sums."""
     assert checks(released)
 
 
 @pytest.mark.parametrize("name", ["rosrv_0.2.0_amd64.deb", "provenance.json", "SHA256SUMS", "SHA256SUMS.sig"])
 def test_changes_are_found(released: Path, name: str) -> None:
-    """Covers a file, its provenance, the sums and the signature."""
     changed = bytearray((released / name).read_bytes())
     changed[5] ^= 1
     (released / name).write_bytes(changed)

@@ -15,7 +15,6 @@ KNOWN = {metric.name: metric for metric in METRICS}
 
 
 def expressions() -> Iterator[tuple[str, str, str]]:
-    """Yield panel, query and legend of each series, including annotations."""
     for panel in PANELS:
         yield from ((panel["title"], target["expr"], target["legendFormat"]) for target in panel["targets"])
     yield from ((one["name"], one["expr"], "") for one in DASHBOARD["annotations"]["list"])
@@ -23,7 +22,6 @@ def expressions() -> Iterator[tuple[str, str, str]]:
 
 @pytest.mark.parametrize(("panel", "query", "legend"), list(expressions()), ids=lambda text: text[:40])
 def test_queried_metrics_exist(panel: str, query: str, legend: str) -> None:
-    """Every metric exists, with every label that selects, groups or names a series."""
     names = re.findall(r"\brosrv_\w+", query)
     assert names or query.startswith("up{"), panel
     grouped = {
@@ -42,7 +40,6 @@ def test_queried_metrics_exist(panel: str, query: str, legend: str) -> None:
 
 
 def test_panels_do_not_overlap() -> None:
-    """On Grafana's grid of 24 columns each panel has its own space, number, unit and description."""
     taken: set[tuple[int, int]] = set()
     for panel in DASHBOARD["panels"]:
         place = panel["gridPos"]

@@ -1,5 +1,3 @@
-"""The simulated LandShark moves and measures according to its geometry."""
-
 import importlib.util
 import math
 import sys
@@ -30,20 +28,17 @@ seconds = st.floats(0.001, 5)
 
 
 def test_straight_ahead() -> None:
-    """One metre a second for two seconds is two metres forward."""
     pose = physics.drive(physics.Pose(0, 0, math.pi / 2), physics.Velocity(1.0, 0.0), 2.0)
     assert (pose.x, pose.y) == (pytest.approx(0), pytest.approx(2))
 
 
 def test_full_circle() -> None:
-    """A full circle ends at its start, with the same heading."""
     pose = physics.drive(physics.Pose(3, 4, 0.5), physics.Velocity(1.0, 0.5), math.tau / 0.5)
     assert (pose.x, pose.y, pose.heading) == (pytest.approx(3), pytest.approx(4), pytest.approx(0.5))
 
 
 @given(heading=angles, forward=speeds, turn=speeds, first=seconds, second=seconds)
 def test_steps_add_up(heading: float, forward: float, turn: float, first: float, second: float) -> None:
-    """Two steps at one velocity equal one long step, for any turn rate."""
     velocity = physics.Velocity(forward, turn)
     start = physics.Pose(0, 0, heading)
     whole = physics.drive(start, velocity, first + second)
@@ -54,7 +49,6 @@ def test_steps_add_up(heading: float, forward: float, turn: float, first: float,
 
 @given(forward=st.floats(), turn=st.floats())
 def test_motors_have_limits(forward: float, turn: float) -> None:
-    """No command, infinite or not a number, exceeds the robot's top speed."""
     velocity = physics.possible(physics.Velocity(forward, turn))
     assert abs(velocity.forward) <= physics.TOP_SPEED
     assert abs(velocity.turn) <= physics.TOP_TURN_RATE
@@ -62,7 +56,6 @@ def test_motors_have_limits(forward: float, turn: float) -> None:
 
 @given(pan=st.floats(), tilt=st.floats(), step=seconds)
 def test_turret_has_limits(pan: float, tilt: float, step: float) -> None:
-    """The gun moves no faster than its motors, and never past its stops."""
     turret = physics.aim(physics.Turret(), physics.Turret(pan, tilt), step)
     assert physics.TILT_LIMITS[0] <= turret.tilt <= physics.TILT_LIMITS[1]
     assert physics.PAN_LIMITS[0] <= turret.pan <= physics.PAN_LIMITS[1]
@@ -70,7 +63,6 @@ def test_turret_has_limits(pan: float, tilt: float, step: float) -> None:
 
 
 def test_turret_arrives() -> None:
-    """With repeated commands the gun reaches its target."""
     turret = physics.Turret()
     for _ in range(100):
         turret = physics.aim(turret, physics.Turret(1.0, -0.5), 0.05)
@@ -78,7 +70,6 @@ def test_turret_arrives() -> None:
 
 
 def test_laser_sees_the_obstacle() -> None:
-    """A wall two metres ahead is measured at two metres, nothing to the left or behind."""
     thing = physics.Obstacle(x=3, y=0, radius=1)
     ahead, left, behind = physics.scan(physics.Pose(), [0.0, math.pi / 2, math.pi], (thing,))
     assert ahead == pytest.approx(2)
@@ -91,13 +82,11 @@ def test_laser_has_a_maximum_range() -> None:
 
 
 def test_position_on_earth() -> None:
-    """A degree of latitude is about 111 km; the origin has the configured position."""
     assert physics.position_on_earth(physics.Pose()) == physics.ORIGIN
     north, east = physics.position_on_earth(physics.Pose(x=0, y=111_195))
     assert (north - physics.ORIGIN[0], east) == (pytest.approx(1, abs=1e-4), physics.ORIGIN[1])
 
 
 def test_battery_is_never_negative() -> None:
-    """Driving uses more charge than standing still; the charge never falls below zero."""
     assert physics.drained(1.0, 1.0, 10) < physics.drained(1.0, 0.0, 10) < 1.0
     assert physics.drained(0.001, 2.0, 1000) == 0.0

@@ -18,7 +18,7 @@ RIGHT = FIRST.replace("positions:angles", "position:angles")
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return the reader's folder: `my-monitors` with the LandShark's message beside it."""
+    """`my-monitors` has the LandShark's message."""
     shutil.copytree(MONITORS / "msg", tmp_path / "my-monitors" / "msg")
     monkeypatch.chdir(tmp_path)
     return tmp_path / "my-monitors"
@@ -44,7 +44,6 @@ def test_the_page_quotes_check(folder: Path) -> None:
 
 
 def test_the_page_quotes_run(folder: Path) -> None:
-    """The output of the simulated mission equals the page's, to the millisecond."""
     (folder / "gun.rv").write_text(RIGHT)
     record(Simulation().run(), Path("mission.bag"))
     found = said("run", "my-monitors/gun.rv", "--bag", "mission.bag")

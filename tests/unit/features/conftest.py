@@ -1,5 +1,3 @@
-"""Fixtures of forwarding: an audit log, and a receiver's certificates."""
-
 from pathlib import Path
 
 import pytest

@@ -13,8 +13,6 @@ pytestmark = pytest.mark.anyio
 
 
 class Control:
-    """A control that records the reported gaps in `gaps`."""
-
     def __init__(self) -> None:
         self.gaps: list[int] = []
         self.forwarded = ForwarderLink("udp://127.0.0.1:514", "all", cast(AuditTrail, self))
@@ -27,8 +25,7 @@ class Control:
     def attach(self, _loop: object, received: Any, *_ends: object) -> None:
         self.hears = received
 
-    def close(self) -> None:
-        """Close, as a channel does."""
+    def close(self) -> None: ...
 
 
 def missed(count: int) -> messages.ForwardingReported:
@@ -37,7 +34,7 @@ def missed(count: int) -> messages.ForwardingReported:
 
 @pytest.fixture
 def controls() -> list[Control]:
-    """Return the list of controls, the current one last; the list is empty at first."""
+    """The current one is last; the list is empty at first."""
     return []
 
 

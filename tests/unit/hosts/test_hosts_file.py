@@ -51,7 +51,6 @@ def test_a_missing_or_empty_file_declares_no_host(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_mistakes_are_named(tmp_path: Path, text: str | bytes, said: str) -> None:
-    """Every one, with its line and column and what to write instead; no word is the library's."""
     path = tmp_path / "hosts.yaml"
     path.write_bytes(text.encode() if isinstance(text, str) else text)
     with pytest.raises(DeclaredHostsError, match=r"hosts\.yaml") as error:

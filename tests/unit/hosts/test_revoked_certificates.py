@@ -1,5 +1,3 @@
-"""Tests of the revoked certificates: which are on the list, and that the list is never too long for charon."""
-
 import contextlib
 import itertools
 import sqlite3

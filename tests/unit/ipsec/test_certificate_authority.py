@@ -82,7 +82,7 @@ def test_an_invalid_request_is_refused(tmp_path: Path, request_text: bytes) -> N
 
 
 def with_another_version(request: bytes) -> bytes:
-    """Return the same request with version 3 (PKCS #10 has only the first, written as 0)."""
+    """PKCS #10 has only the first version, written as 0; this is 3."""
     der = x509.load_pem_x509_csr(request).public_bytes(Encoding.DER)
     start = der.index(b"\x02\x01\x00")
     text = base64.encodebytes(der[:start] + b"\x02\x01\x02" + der[start + 3 :])
@@ -97,7 +97,6 @@ def test_a_request_of_another_version_is_refused(tmp_path: Path) -> None:
 
 
 def test_limits_of_a_request(tmp_path: Path) -> None:
-    """A request that is too long, an invalid name, and a validity beyond the limit are refused."""
     authority = CertificateAuthority(tmp_path)
     good = request_of(ec.generate_private_key(ec.SECP384R1()))
     for name in ("", "-x", "a b", "x" * 64, "../x", "a\n", 'a"b'):

@@ -67,8 +67,6 @@ def test_a_remaining_state_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_a_kernel_that_lists_nothing(monkeypatch: pytest.MonkeyPatch, complaint: str, known: bool) -> None:
-    """A list that cannot be read is an error, unless the kernel has no IPsec."""
-
     def run(*_arguments: object, **_options: object) -> subprocess.CompletedProcess[str]:
         return subprocess.CompletedProcess([], 1, "", complaint)
 

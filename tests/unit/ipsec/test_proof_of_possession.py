@@ -1,5 +1,3 @@
-"""Tests of renewal by signature: only the holder of the present key of the same name gets the next certificate."""
-
 from pathlib import Path
 
 import pytest
@@ -13,7 +11,7 @@ from appliance.ipsec.requests import make_key, signing_request
 
 
 def sign(key: bytes, request: bytes) -> bytes:
-    """Sign as `openssl pkeyutl -sign -rawin -digest sha384` does."""
+    """As `openssl pkeyutl -sign -rawin -digest sha384` does."""
     private = load_pem_private_key(key, None)
     assert isinstance(private, ec.EllipticCurvePrivateKey)
     return private.sign(request, ec.ECDSA(hashes.SHA384()))

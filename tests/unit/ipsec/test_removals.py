@@ -1,5 +1,3 @@
-"""Tests of what the signer lets go from a log: only what follows from the settings, by what it signed itself."""
-
 import hashlib
 from pathlib import Path
 
@@ -14,7 +12,7 @@ _STEP = 100  # records of a checkpoint
 
 
 class Desk:
-    """A signer with its memory and a clock that the test moves; ten checkpoints, signed a day after each other."""
+    """Ten checkpoints were signed a day after each other."""
 
     def __init__(self, directory: Path, kept: RetentionLimits) -> None:
         self.now = 1000 * _DAY
@@ -26,7 +24,7 @@ class Desk:
             self.now += _DAY
 
     def text(self, *, removed: int | None, time: int = 1, number: int | None = None) -> bytes:
-        """Return the text of the next checkpoint, with a wrong time that control chose: 1970."""
+        """The time is wrong, as control chose it: 1970."""
         number = number or len(self.texts) + 1
         previous = hashlib.sha256(self.texts[-1]).hexdigest() if self.texts else "0" * 64
         version, line = (1, "") if removed is None else (2, f"removed {removed}\n")
@@ -112,7 +110,6 @@ def test_a_log_older_than_signed_removals_goes_on(tmp_path: Path) -> None:
 
 
 def test_a_new_log_has_nothing_removed(tmp_path: Path) -> None:
-    """The first checkpoint of a log cannot say that something was removed before it."""
     desk = Desk.__new__(Desk)
     desk.texts = []
     desk.signed = CheckpointMemory(tmp_path, lambda: _DAY)

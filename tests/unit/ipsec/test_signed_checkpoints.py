@@ -1,5 +1,3 @@
-"""Tests of what the signer remembers: only one past can be signed."""
-
 import hashlib
 from pathlib import Path
 
@@ -19,7 +17,7 @@ def checkpoint(number: int, previous: str = _NONE, log: str = "a" * 32, digest: 
 
 
 def digest(text: bytes) -> str:
-    """Return the digest that the next checkpoint carries as `previous`."""
+    """The next checkpoint carries it as `previous`."""
     return hashlib.sha256(text).hexdigest()
 
 
@@ -59,7 +57,6 @@ def test_asked_again(tmp_path: Path) -> None:
     ],
 )
 def test_refused(tmp_path: Path, text: bytes, reason: str) -> None:
-    """A second history, a gap, and other texts are refused with the reason, and change nothing."""
     signed = CheckpointMemory(tmp_path, wall_ns)
     signed.approve(checkpoint(1))
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}

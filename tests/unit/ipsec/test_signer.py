@@ -60,8 +60,6 @@ _TEXT = (
 
 
 class SignerProcess:
-    """A running signer; `say` and `hear` are the supervisor's side of the lifeline."""
-
     def __init__(self, directory: Path) -> None:
         ours, theirs = socket.socketpair()
         command = (
@@ -76,7 +74,6 @@ class SignerProcess:
         self.links: list[Channel] = []
 
     def open_link(self) -> Channel:
-        """Give the signer a link to control; control's end of it."""
         ours, theirs = socket.socketpair()
         self.lifeline.send(LinkOpened(role="control", index=0), (theirs.fileno(),))
         theirs.close()
@@ -123,7 +120,6 @@ def test_key_is_made_once_and_private(tmp_path: Path) -> None:
 
 
 def test_signs_a_checkpoint(signer: SignerProcess) -> None:
-    """A checkpoint comes back with a valid signature of the signer's key."""
     link = signer.open_link()
     link.send(SignatureWanted(1, _TEXT))
     made = hear(link)
@@ -135,7 +131,6 @@ def test_signs_a_checkpoint(signer: SignerProcess) -> None:
 
 
 def test_signs_nothing_else(signer: SignerProcess) -> None:
-    """Another text, or a second history, is refused with the reason, and the signer continues."""
     link = signer.open_link()
     link.send(SignatureWanted(1, b"a certificate for me, please"))
     assert hear(link) == SignatureRefused(1, "the data to sign is not an audit checkpoint")
@@ -184,7 +179,6 @@ def test_damaged_key(tmp_path: Path, damage: Any, reason: str) -> None:
 
 
 def test_supervisor_gone(tmp_path: Path) -> None:
-    """A signer whose supervisor vanished ends."""
     running = SignerProcess(tmp_path)
     hear(running.lifeline)
     running.lifeline.close()
@@ -192,7 +186,6 @@ def test_supervisor_gone(tmp_path: Path) -> None:
 
 
 def test_log_and_signer_together(signer: SignerProcess, tmp_path: Path) -> None:
-    """Checkpoints made while the signer was away are signed when it is back, and the log is verifiable."""
     path = tmp_path / "audit.db"
     link: list[Channel] = []
     log = open_log(
@@ -225,7 +218,7 @@ async def test_an_unexpected_parser_error_is_a_refusal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class OddError(Exception):
-        """An error of an unexpected kind."""
+        pass
 
     def fail(*_arguments: object, **_named: object) -> None:
         raise OddError("something is odd")
@@ -261,7 +254,6 @@ async def test_an_unexpected_parser_error_is_a_refusal(
 
 
 def test_certificates_over_the_link(tmp_path: Path) -> None:
-    """Control gets the authority's certificate, certificates for requests, and the list of revoked ones."""
     signer = SignerProcess(tmp_path)
     key = ec.generate_private_key(ec.SECP384R1())
     request = (

@@ -72,7 +72,6 @@ def test_a_device_that_cannot_be_lent_is_reported(monkeypatch: pytest.MonkeyPatc
 
 
 def _opens(uid: int, path: Path) -> bool:
-    """Return whether a process of this user can open a file to read and write it."""
     child = os.fork()
     if child == 0:
         status = 1

@@ -41,11 +41,9 @@ class Stuck(socket.socket):
     number = errno.ENETUNREACH
 
     def connect_ex(self, _address: object) -> int:
-        """Return the kernel's error; the socket does not report it again later."""
         return self.number
 
     def connect(self, address: object) -> None:
-        """Raise the same error."""
         raise OSError(self.connect_ex(address), "stuck")
 
 

@@ -1,5 +1,3 @@
-"""`ask` in a value: the hosts after it need an operator's approval, and every reader of a policy says so."""
-
 from dataclasses import replace
 from typing import cast
 

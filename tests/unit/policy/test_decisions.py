@@ -38,7 +38,6 @@ def decided(policy: Policy, line: re.Match[str], category: str, name: str) -> De
 
 @pytest.mark.parametrize("title", _CASES)
 def test_decisions(title: str) -> None:
-    """Each request has the verdict beside it, from the rule that the line names."""
     lines = _CASES[title].splitlines()
     first = next(number for number, line in enumerate(lines) if line.startswith("> "))
     policy = compile_policy("\n".join(lines[:first]), file="p.ini")

@@ -1,5 +1,3 @@
-"""Find the subscriptions and connections that a new policy would deny."""
-
 import ipaddress
 
 import pytest

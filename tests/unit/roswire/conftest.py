@@ -1,5 +1,3 @@
-"""Messages encoded by Debian's ROS, as the reference for the tests of definitions and layouts."""
-
 import json
 import subprocess
 from pathlib import Path
@@ -18,7 +16,7 @@ PACKAGES = (
 
 @pytest.fixture(scope="session")
 def genpy_types() -> dict[str, dict[str, Any]]:
-    """Return every installed message and service class: md5sum, full text, a serialised example and its values."""
+    """Each class has md5sum, full text, a serialised example and its values."""
     script = Path(__file__).with_name("genpy_messages.py")
     ran = subprocess.run(["/usr/bin/python3", str(script), *PACKAGES], check=True, capture_output=True)
     types: dict[str, dict[str, Any]] = json.loads(ran.stdout)

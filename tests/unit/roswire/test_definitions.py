@@ -1,5 +1,3 @@
-"""Definitions: md5sums and full texts equal those of ROS; an unusable definition is refused with the reason."""
-
 from typing import Any
 
 import pytest

@@ -12,7 +12,7 @@ Values = dict[str, Any]
 
 
 def read(layout: MessageLayout, data: bytes, position: int) -> tuple[Values, int]:
-    """Read a whole message by its layout alone; return the values by path, and the end position."""
+    """By the layout alone; returns the values by path, and the end position."""
     values: Values = {}
     for part in layout.parts:
         match part:
@@ -62,13 +62,13 @@ def read_string(data: bytes, position: int) -> tuple[str, int]:
 
 
 def primitive(type_name: str, data: bytes, position: int) -> Any:
-    """Read a primitive; a time is a list of seconds and nanoseconds."""
+    """A time is a list of seconds and nanoseconds."""
     values = struct.unpack_from("<" + PRIMITIVES[type_name][0], data, position)
     return list(values) if len(values) > 1 else values[0]
 
 
 def nested(values: Values) -> Values:
-    """Convert values by path into values by name, in genpy's structure."""
+    """In genpy's structure."""
     result: Values = {}
     for path, value in values.items():
         *outer, last = path.split(".")
@@ -84,7 +84,7 @@ def nested(values: Values) -> Values:
 
 
 def without_empty(value: Any) -> Any:
-    """Drop nested messages that have no fields: they have no bytes."""
+    """Nested messages without fields have no bytes."""
     if isinstance(value, dict):
         return {name: without_empty(item) for name, item in value.items() if item != {}}
     if isinstance(value, list):

@@ -57,7 +57,6 @@ def test_resolve_agrees_with_rosmaster(rosmaster: Oracle, name: str, caller_id: 
 @settings(max_examples=examples(1000))
 @given(name=NAME_LIKE, caller_id=CALLER_IDS)
 def test_resolve_parameter_agrees_with_rosmaster(rosmaster: Oracle, name: str, caller_id: str) -> None:
-    """Parameter keys and namespaces that are not refused resolve as rosmaster resolves them."""
     for resolve in (names.resolve_parameter, names.resolve_namespace):
         try:
             resolved = resolve(name, caller_id)

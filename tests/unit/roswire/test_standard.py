@@ -15,7 +15,6 @@ def test_md5sums_are_those_of_the_installed_packages(
 
 
 def test_every_type_is_whole(standard: Definitions) -> None:
-    """Every type has an md5sum, a full text and a layout."""
     for name in standard.message_types:
         assert len(standard.md5sum(name)) == 32
         text = standard.full_text(name)

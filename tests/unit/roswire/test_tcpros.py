@@ -1,5 +1,3 @@
-"""TCPROS: headers and frames from rospy and roscpp are read in any pieces; false lengths are refused."""
-
 import struct
 
 import pytest
@@ -92,7 +90,6 @@ def test_message_definitions_keep_their_bytes() -> None:
     ],
 )
 def test_headers_that_are_refused(data: bytes, error: type[ProtocolError], text: str) -> None:
-    """False lengths, missing or duplicate names and broken text are refused with the position."""
     with pytest.raises(error, match=text):
         HeaderParser().feed(data)
 

@@ -1,5 +1,3 @@
-"""XML-RPC: exactly the documents of ROS clients are read, and ROS clients read our documents."""
-
 import datetime
 import math
 import time
@@ -47,7 +45,6 @@ VALUES: st.SearchStrategy[Value] = st.recursive(
 
 
 def call(value: str) -> bytes:
-    """Return a call whose only parameter is the element `value`."""
     return (
         f"<methodCall><methodName>m</methodName><params><param>{value}</param></params></methodCall>".encode()
     )
@@ -101,7 +98,6 @@ def test_answers_are_read_as_python_reads_them(value: Value) -> None:
 
 @given(code=st.integers(-(2**31), 2**31 - 1), text=XML_TEXT)
 def test_faults_come_back(code: int, text: str) -> None:
-    """A fault is an error with its code and text, both here and in Python."""
     body = build_fault(code, text)
     with pytest.raises(FaultReceived) as fault:
         parse_response(body)
@@ -113,7 +109,6 @@ def test_faults_come_back(code: int, text: str) -> None:
 
 @pytest.mark.parametrize("number", [math.inf, -math.inf, 1e308, 5e-324, -0.0, 1e16, 0.1])
 def test_doubles_keep_every_bit(number: float) -> None:
-    """Doubles, including infinities, are written so that exactly the same double is read back."""
     result = parse_response(build_response(number))
     assert isinstance(result, float)
     assert math.copysign(1, result) == math.copysign(1, number)
@@ -208,7 +203,6 @@ def test_rosjava_calls_are_read() -> None:
 
 
 def test_calls_without_parameters() -> None:
-    """A call may have no parameters, with or without an empty <params>."""
     assert parse_call(b"<methodCall><methodName>m</methodName></methodCall>") == MethodCall("m", ())
     assert parse_call(b"<methodCall><methodName>m</methodName><params/></methodCall>") == MethodCall("m", ())
 
@@ -339,7 +333,6 @@ def test_large_documents_are_refused_where_they_go_wrong(body: bytes, text: str)
 
 
 def test_large_values_in_pieces() -> None:
-    """A document in many pieces is read like a small one, including text that crosses pieces."""
     value: Value = [{"a": "x\u00e9<&" * 30_000, "b": list(range(20_000))}, "\U0001f916" * 60_000]
     assert parse_call(build_call("m", [value])).params == (value,)
 

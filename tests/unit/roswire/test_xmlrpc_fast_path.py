@@ -1,5 +1,3 @@
-"""A pattern reads plain documents as the general parser does, or leaves them to that parser."""
-
 import time
 import xmlrpc.client
 
@@ -26,7 +24,7 @@ ROSCPP = (
 
 
 def walked(body: bytes, root: str, limits: XmlRpcLimits) -> tuple[str, list[Value]] | None:
-    """Return the result of the general parser; None if it rejects the document."""
+    """None if the general parser rejects the document."""
     try:
         document = XmlRpcDocument(body, limits, root)
     except PeerError:
@@ -35,7 +33,6 @@ def walked(body: bytes, root: str, limits: XmlRpcLimits) -> tuple[str, list[Valu
 
 
 def dumped(values: list[Value], method: str | None) -> bytes:
-    """Return a call or an answer as Python's clients write it."""
     if method is not None:
         return xmlrpc.client.dumps(tuple(values), method).encode("utf-8", "surrogatepass")
     return xmlrpc.client.dumps((values,), methodresponse=True).encode("utf-8", "surrogatepass")
@@ -175,7 +172,7 @@ def test_an_invalid_document_takes_linear_time(piece: bytes, before: bytes) -> N
 
 
 def spoilt(before: bytes, piece: bytes, size: int) -> list[bytes]:
-    """Return an answer, a call and multicalls that match until their last byte."""
+    """The documents match until their last byte."""
     some = piece * (size // 32 // len(piece))
     whole = dumped(["a"], None).partition(b"<value>")[0] + before + some + b"<"
     texts = [whole, whole.replace(b"<methodResponse>", b"<methodCall><methodName>m</methodName>")]
@@ -189,7 +186,6 @@ def spoilt(before: bytes, piece: bytes, size: int) -> list[bytes]:
 
 
 def seconds_to_leave(texts: list[bytes]) -> float:
-    """Return the processor time until the pattern has rejected each document."""
     begun = time.thread_time()
     answer, *calls = texts
     assert read_common_answer(answer, XmlRpcLimits()) is None

@@ -1,5 +1,3 @@
-"""XML-RPC with roscpp's own library: it reads our documents, and we read its documents."""
-
 import datetime
 import math
 import shutil
@@ -70,7 +68,6 @@ VALUES: list[Value] = [
 
 @pytest.mark.parametrize("value", VALUES, ids=repr)
 def test_values_survive_roscpp(roscpp: Peer, value: Value) -> None:
-    """roscpp reads our answer, and the value in its call equals ours."""
     call = roscpp(build_response(value))
     assert call == MethodCall("echo", (value,))
     assert [type(param) for param in call.params] == [type(value)]

@@ -1,5 +1,3 @@
-"""Fixtures of the tests of RVMaster's server."""
-
 from collections.abc import AsyncIterator
 from typing import Any
 

@@ -1,5 +1,3 @@
-"""Large requests: one of a host and two in all at a time, released in every case."""
-
 import asyncio
 import datetime
 import ipaddress

@@ -18,8 +18,6 @@ def guest(number: int) -> Address:
 
 @dataclass
 class QuotaClasses:
-    """The classes of hosts, and the clock."""
-
     of: dict[Address, QuotaClass] = field(default_factory=dict)
     now: float = 0.0
 
@@ -38,8 +36,7 @@ class Guest:
     holding: int = 0
     cut: bool = False
 
-    def expire(self) -> None:
-        """Ignore the end of its time; no test uses it."""
+    def expire(self) -> None: ...
 
     def abort(self) -> None:
         self.cut = True
@@ -69,7 +66,6 @@ def books(
 def come(
     connection_table: ConnectionTable[Address], host: Address, stage: Stage = Stage.IDLE
 ) -> Guest | None:
-    """A connection of this host, at this stage; None when it is turned away."""
     connection = Guest(connection_table, host)
     if connection_table.enter(connection, host):
         return None

@@ -55,7 +55,6 @@ async def test_one_host_never_has_all_slots() -> None:
 
 
 async def test_turns_balance() -> None:
-    """Whatever requests enter, leave or give up, no slot is lost and none is added."""
     turns = slots(3, 2)
 
     async def request(host: Any, number: int) -> None:
@@ -137,7 +136,6 @@ async def test_a_host_that_begins_waits_for_no_guest() -> None:
 
 
 async def test_own_slots_balance() -> None:
-    """Whatever requests of two hosts of one group enter and leave, no slot is lost and none is added."""
     turns: Turns[Address] = Turns(
         Bounds(4, 2, 0, 0), lambda _host: QuotaClass.NAMED, lambda _host: "group", own_slots=True
     )

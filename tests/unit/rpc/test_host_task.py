@@ -1,5 +1,3 @@
-"""A host's task: its first step runs at once, it can be cancelled, limited in time and found like any other task."""
-
 import asyncio
 import ipaddress
 from functools import partial
@@ -69,7 +67,6 @@ async def test_a_limit_of_time_ends_a_wait(time: ProcessorTime) -> None:
 
 @pytest.mark.parametrize("busy", [False, True], ids=["waiting", "its step is due"])
 async def test_a_cancelled_task_ends(busy: bool, time: ProcessorTime) -> None:
-    """A cancellation reaches the coroutine, whether it waits or its next step waits for a turn."""
     ready, ended = asyncio.Event(), list[str]()
 
     async def work() -> None:

@@ -1,5 +1,3 @@
-"""Hosts share the processor time of the loop: charged by a clock, bounded by turn, none waits for a flood."""
-
 import asyncio
 import ipaddress
 from collections.abc import Callable
@@ -18,7 +16,7 @@ PIECE = TURN_SECONDS / 4
 
 
 class Loop:
-    """Processor time with a clock that only `spend` moves, the work that ran, in order, and the time of each turn."""
+    """Only `spend` moves the clock."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -34,7 +32,7 @@ class Loop:
         return run
 
     async def all(self) -> None:
-        """Let the loop turn until nothing waits; note what each turn took."""
+        """Notes what each turn took."""
         while self.time.waiting:
             before = self.now
             await asyncio.sleep(0)

@@ -38,7 +38,6 @@ pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 async def test_malformed(
     request_bytes: bytes, status: int, reason: str, server: Server, client: Client
 ) -> None:
-    """A request that is not an HTTP POST within the limits is answered with its status, reported, and never served."""
     await client.send(request_bytes)
     code, _headers, body = await client.response()
     assert code == status
@@ -122,7 +121,6 @@ async def test_more_framing_than_body(framing: bytes) -> None:
 
 
 async def test_endless_trailer() -> None:
-    """A trailer counts towards the limit of data beside the body."""
     async with serving(limits=replace(LIMITS, head_bytes=4096, body_bytes=1 << 16)) as server:
         client = await server.connect()
         client.writer.write(

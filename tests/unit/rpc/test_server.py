@@ -1,5 +1,3 @@
-"""HTTP of RVMaster over loopback: requests that are served, and the order of connections."""
-
 import asyncio
 import ipaddress
 import math
@@ -25,7 +23,6 @@ async def test_requests_on_one_connection(client: Client) -> None:
 
 
 async def test_peer_path_and_body(server: Server, client: Client) -> None:
-    """The handler sees the peer's address, the address that it connected to, the path and the whole body."""
     await client.send(post(b"x" * 100_000, path="/key/"))
     await client.response()
     request = server.requests[0]
@@ -35,7 +32,6 @@ async def test_peer_path_and_body(server: Server, client: Client) -> None:
 
 @pytest.mark.parametrize("size", [1 << 16, 1 << 20, 3 << 20, 16 << 20])
 async def test_large_bodies(size: int, server: Server, client: Client) -> None:
-    """Bodies up to the limit are served, one after the other, by length and in chunks."""
     for _ in range(2):
         await client.send(post(b"x" * size))
         assert (await client.response())[0] == 200
@@ -47,7 +43,6 @@ async def test_large_bodies(size: int, server: Server, client: Client) -> None:
 
 
 async def test_pipelined_requests(server: Server, client: Client) -> None:
-    """Requests sent without waiting are answered one after the other, in order, none twice."""
     await client.send(b"".join(post(b"%d" % number) for number in range(500)))
     for number in range(500):
         assert (await client.response())[2] == b"answer to %d" % number
@@ -197,7 +192,6 @@ async def test_a_program_that_the_kernel_refuses(later: bool) -> None:
 
 
 async def test_connections_that_ended_before_they_are_opened() -> None:
-    """They take no place, so none of them is one too many."""
     one = Bounds(whole=1, host=1, unknown=0, kept=0)
     async with serving(shares=Shares(connections=one)) as server:
         for _ in range(50):
@@ -209,7 +203,6 @@ async def test_connections_that_ended_before_they_are_opened() -> None:
 
 
 async def test_byte_by_byte(client: Client) -> None:
-    """A request may arrive in pieces of any size."""
     for byte in post(b"slow", "X-Header: value"):
         await client.send(bytes([byte]))
     assert (await client.response())[2] == b"answer to slow"

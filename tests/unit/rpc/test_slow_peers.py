@@ -1,5 +1,3 @@
-"""HTTP of RVMaster over loopback: no peer can block it or fill its memory."""
-
 import asyncio
 import contextlib
 import socket
@@ -50,7 +48,6 @@ async def test_slowloris(beginning: bytes) -> None:
 
 
 async def test_stalled_body() -> None:
-    """A body that stops coming ends the connection after `stall_seconds`."""
     async with serving(limits=replace(LIMITS, stall_seconds=0.2)) as server:
         client = await server.connect()
         await client.send(post(b"half", length=100))
@@ -59,7 +56,6 @@ async def test_stalled_body() -> None:
 
 
 async def test_idle_connection() -> None:
-    """A kept connection that asks nothing for `idle_seconds` is closed, without a complaint."""
     async with serving(limits=replace(LIMITS, idle_seconds=0.2)) as server:
         client = await server.connect()
         await client.send(post(b"x"))
@@ -82,8 +78,6 @@ async def test_answers_that_are_not_taken() -> None:
 
 
 async def test_slow_reader_that_moves() -> None:
-    """An answer that is taken slowly but steadily is delivered whole."""
-
     async def handler(_request: HttpRequest) -> bytes:
         return b"x" * (8 << 20)
 
@@ -119,7 +113,6 @@ async def test_next_request_after_a_slow_answer() -> None:
 
 
 async def test_connections_per_host() -> None:
-    """A host has a limited number of connections; others are not affected, and a closed one no longer counts."""
     async with serving(shares=Shares(connections=two_hosts(3))) as server:
         clients = [await server.connect() for _ in range(3)]
         for client in clients:
@@ -154,7 +147,6 @@ async def test_connections_that_are_too_many_do_not_stay() -> None:
 
 
 async def test_bytes_per_host() -> None:
-    """Bodies that wait to be answered are bounded per host; one too many is refused, the others are served."""
     release = asyncio.Event()
 
     async def handler(_request: HttpRequest) -> bytes:

@@ -55,8 +55,6 @@ def test_more_networks_than_a_program_has_room_for() -> None:
 
 
 class Port:
-    """A port with two queues; `known` is sorted into the first."""
-
     def __init__(self, host: str, *known: str) -> None:
         self.program = first_for(networks(*known))
         self.first = listen(host, 0)
@@ -65,7 +63,7 @@ class Port:
         self.queues.second.settimeout(WAIT)
 
     def accepts(self, source: str, by: socket.socket) -> None:
-        """Connect from a source; the connection must come out of this socket."""
+        """The connection must come out of this socket."""
         target = (source if ":" in source else "127.0.0.1", self.first.getsockname()[1])
         other = self.queues.second if by is self.first else self.first
         with socket.create_connection(target, WAIT, source_address=(source, 0)):
@@ -93,7 +91,6 @@ def port() -> Iterator[Callable[..., Port]]:
 @pytest.mark.nightly
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0", "::"])
 def test_the_kernel_sorts_connections(port: Callable[..., Port], host: str) -> None:
-    """Also those that come over IPv4 to a socket of IPv6."""
     both = port(host, "127.0.0.2/32", "127.0.1.0/24")
     for source in ("127.0.0.2", "127.0.1.9"):
         both.accepts(source, both.first)

@@ -47,7 +47,7 @@ async def test_a_kept_connection_that_does_not_answer_is_given_up_in_time() -> N
 
 @pytest.mark.nightly
 async def test_a_large_call_has_more_time() -> None:
-    """Otherwise a new ROS master, which reads all parameters in one long call, would never have them."""
+    """A new ROS master reads all parameters in one long call."""
     small_failed = asyncio.Event()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

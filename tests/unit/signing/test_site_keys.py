@@ -1,5 +1,3 @@
-"""Signatures of the site: OpenSSH's own signatures are accepted, and only for text that a key of the site signed."""
-
 from pathlib import Path
 
 import pytest

@@ -70,8 +70,6 @@ async def here_at_start(sources: Sources, site_keys: Sequence[str]) -> CheckedSp
 
 
 class Desk:
-    """The monitors of one control over its life times, with a relay that takes everything."""
-
     def __init__(self, home: Path) -> None:
         self.home, self.folder = home, home / "monitors"
         self.folder.mkdir()
@@ -132,8 +130,6 @@ class Desk:
 
 
 class WaitingManager(SpecificationManager):
-    """Monitors that roll back an unconfirmed change only when the desk lets the time limit end."""
-
     desk: Desk
 
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
@@ -155,7 +151,7 @@ class Taking:
         self.desk = desk
 
     def send(self, message: messages.Message, relay: int) -> bool:
-        """Accept a statement; the answer comes in the next turn of the loop."""
+        """The answer comes in the next turn of the loop."""
         if self.desk.away:
             return False
         self.desk.sent.append(message)
@@ -176,11 +172,9 @@ class Taking:
     def live_resources(self) -> set[Resource]:
         return set()
 
-    def withdraw(self, moves: Sequence[Move]) -> None:
-        """Do nothing: nothing is carried."""
+    def withdraw(self, moves: Sequence[Move]) -> None: ...
 
-    def place(self, moves: Sequence[Move]) -> None:
-        """Do nothing: nothing is carried."""
+    def place(self, moves: Sequence[Move]) -> None: ...
 
 
 _ORDERS: dict[str, tuple[str, type[Any], dict[str, Any]]] = {
@@ -201,8 +195,6 @@ def _file(word: str) -> tuple[str, str]:
 
 
 class Dialogue:
-    """Orders to the monitors of a desk, and their effects."""
-
     def __init__(self, desk: Desk) -> None:
         self.desk = desk
         desk.limit_ends.clear()

@@ -1,5 +1,3 @@
-"""Topics, services and specifications are spread over relay processes; connected ones stay together."""
-
 import json
 
 import pytest

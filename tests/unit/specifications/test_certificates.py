@@ -1,5 +1,3 @@
-"""Specifications are refused whose automaton, or whose module, the certifier finds wrong."""
-
 import pytest
 
 from appliance.channel.messages import PartNames

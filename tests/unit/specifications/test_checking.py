@@ -1,5 +1,3 @@
-"""Files with errors do not keep an appliance from starting; what `check` accepts can be loaded."""
-
 from collections.abc import Callable
 
 import pytest

@@ -108,7 +108,7 @@ async def test_a_silent_or_missing_compiler_is_not_waited_for(
 
 
 class Told:
-    """A compiler that works without end on a dry run, and answers everything else."""
+    """Works without end on a dry run, and answers everything else."""
 
     def __init__(self) -> None:
         self.heard: asyncio.Queue[Any] = asyncio.Queue()

@@ -1,5 +1,3 @@
-"""Operators set given constants within their ranges; values and topics survive a restart of control."""
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,3 @@
-"""The relays take specifications all together or not at all, and nothing goes past its monitors on the way."""
-
 import asyncio
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -62,7 +60,6 @@ class Fleet:
         )
 
     def send(self, message: messages.Message, relay: int) -> bool:
-        """Note the statement; the relay answers in the next turn of the loop."""
         if relay in self.away:
             return False
         assert isinstance(message, messages.SpecificationsStated)
@@ -73,8 +70,7 @@ class Fleet:
             asyncio.get_running_loop().call_soon(self.rollout.received, answer, relay)
         return True
 
-    async def carried_out(self) -> None:
-        """As `Relays`."""
+    async def carried_out(self) -> None: ...
 
     def live_resources(self) -> set[Resource]:
         return self.carried

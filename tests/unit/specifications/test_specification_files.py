@@ -1,5 +1,3 @@
-"""Files of specifications: reading the folder, and the findings of checks."""
-
 import os
 from pathlib import Path
 

@@ -38,7 +38,6 @@ ORDERS = transcripts(Path(__file__).with_name("orders.txt"))
 
 @pytest.mark.parametrize("title", ORDERS, ids=ORDERS)
 async def test_orders(desk: Desk, title: str) -> None:
-    """Each order has exactly the effects below it, in that order (`monitor_desk.py` describes the form)."""
     assert await played(ORDERS[title], Dialogue(desk).say) == ORDERS[title]
 
 

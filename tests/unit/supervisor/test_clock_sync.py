@@ -34,7 +34,6 @@ def test_the_structure_is_the_kernels() -> None:
 
 
 def test_this_kernel_is_asked() -> None:
-    """The real call fills the structure: the maximum error is positive."""
     timex = clock_sync.Timex()
     answer = ctypes.CDLL(None).adjtimex(ctypes.pointer(timex))
     assert answer == -1 or timex.maxerror > 0

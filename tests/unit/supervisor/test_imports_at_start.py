@@ -1,5 +1,3 @@
-"""Before they are ready, processes import no library that they may never need."""
-
 import subprocess
 import sys
 from typing import Final

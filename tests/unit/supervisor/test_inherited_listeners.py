@@ -47,7 +47,6 @@ def test_a_name_stands_for_one_socket(kept: InheritedListeners) -> None:
 
 
 def test_there_is_a_bound(kept: InheritedListeners) -> None:
-    """One socket too many is refused and closed; the others stay."""
     kept.keep("one", _listening())
     kept.keep("two", _listening())
     third = _listening()

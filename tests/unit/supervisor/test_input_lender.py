@@ -1,5 +1,3 @@
-"""Tests of `appliance.supervisor.input_lender` and `base.owner_access`: files that only their owner may reach."""
-
 import os
 import socket
 import subprocess
@@ -46,7 +44,7 @@ assert context.get_ca_certs()
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """Return the home of a user, of mode 0700, with a policy, a folder of specifications, and another file."""
+    """Mode 0700; a policy, a folder of specifications, and another file."""
     need_root()
     (tmp_path / "monitors/msg/p").mkdir(parents=True)
     for name in ("robot.ini", "robot.ini.sig", "monitors/m.rv", "monitors/msg/p/T.msg", ".ssh_key"):
@@ -59,7 +57,6 @@ def home(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def borrower(home: Path) -> Iterator[Borrower]:
-    """Return a role's end of the link, for the policy and the specifications."""
     link = lend_inputs((home / "robot.ini", home / "monitors"))
     assert link is not None
     with link:

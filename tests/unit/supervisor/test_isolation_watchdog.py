@@ -82,7 +82,6 @@ async def test_a_new_control_receives_the_last_finding(surroundings: Surrounding
 
 @pytest.mark.nightly
 async def test_the_master_side_port_is_closed_and_then_probed(surroundings: Surroundings) -> None:
-    """The port is closed to others and then probed; if it cannot be closed, that is a finding."""
     surroundings.found = [None]
     watchdog = IsolationWatchdog(surroundings, lambda _message: None)
     assert await watchdog.control_ready(4711, 4712) is None
@@ -136,7 +135,6 @@ def test_tunnels_that_cannot_be_opened_are_answered(surroundings: Surroundings) 
 
 @pytest.mark.nightly
 async def test_probes_are_repeated(surroundings: Surroundings) -> None:
-    """While the appliance runs, the enclosure is probed repeatedly, also after a finding."""
     told: list[Message] = []
     surroundings.found = [None, "reached", None]
     surroundings.found += [None] * 100_000

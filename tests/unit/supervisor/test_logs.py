@@ -1,5 +1,3 @@
-"""Tests of `appliance.supervisor.logs` in a separate process, because logging is set up once for each process."""
-
 import json
 import subprocess
 import sys

@@ -55,7 +55,7 @@ print(json.dumps({
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """Return a home with a program, a state with the folders of two users, and files that are closed to others."""
+    """A program, a state with the folders of two users, and files that are closed to others."""
     need_root()
     home = tmp_path / "home"
     for folder in ("x y/appliance", "state/relay", "state/control"):

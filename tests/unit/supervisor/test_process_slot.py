@@ -10,7 +10,6 @@ from appliance.supervisor.role import Facts, Role
 
 
 def process(*, lived: float) -> Any:
-    """Return a process that started this number of seconds ago."""
     return SimpleNamespace(started=now() - lived, since="2026-01-01T00:00:00.000Z")
 
 

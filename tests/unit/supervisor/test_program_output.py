@@ -8,8 +8,6 @@ from appliance.supervisor.process_handle import ProgramOutput
 
 
 class Loop:
-    """An event loop that only keeps the reader."""
-
     read: Callable[[], None] | None = None
 
     def add_reader(self, _descriptor: int, read: Callable[[], None]) -> None:

@@ -19,5 +19,5 @@ def test_a_marked_directory_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_missing_directory_is_not_marked(tmp_path: Path) -> None:
-    """A missing directory counts as new, so an appliance may start on it."""
+    """It counts as new, so an appliance may start on it."""
     refuse_half_restored(tmp_path / "new")

@@ -50,7 +50,6 @@ def test_rosmaster_logs_warnings_and_no_calls(tmp_path: Path) -> None:
 
 
 def test_rosout_writes_no_files() -> None:
-    """Log messages of nodes cannot fill the disk."""
     role = BY_NAME["rosout"]
     assert role.program is not None
     assert role.program(FACTS).environment["ROSOUT_DISABLE_FILE_LOGGING"] == "1"

@@ -1,5 +1,3 @@
-"""Tests of `appliance.supervisor.sandbox`, each in a separate process: a sandbox cannot be left."""
-
 import json
 import subprocess
 import sys

@@ -14,15 +14,13 @@ pytestmark = pytest.mark.anyio
 
 
 class Crowd:
-    """Processes, and the actions that end them, in order."""
-
     def __init__(self) -> None:
         self.slots: list[ProcessSlot] = []
         self.died = asyncio.Event()
         self.done: list[tuple[str, str]] = []
 
     def add(self, name: str, ends_by: str, *, is_program: bool = False, last: bool = False) -> None:
-        """Add a process that ends on `Stop`, on a signal of this name, or never."""
+        """The process ends on `Stop`, on a signal of this name, or never."""
         role = Role(name=name, user="rosrv", part=name, outlives_control=last)
         slot = ProcessSlot(role, 0)
         slot.process = cast(ProcessHandle, Process(self, slot, ends_by, is_program=is_program))
@@ -54,7 +52,6 @@ class Process:
 
 @pytest.fixture
 def crowd(monkeypatch: pytest.MonkeyPatch) -> Crowd:
-    """Return a crowd without processes and with short time limits."""
     for name in ("_STOP_SECONDS", "_TERMINATE_SECONDS", "_LAST_SECONDS"):
         monkeypatch.setattr(shutdown, name, 0.05)
     return Crowd()

@@ -107,7 +107,6 @@ def test_a_part_that_a_group_may_traverse(tmp_path: Path) -> None:
 
 
 def folder(path: Path, *files: str) -> Path:
-    """Return a directory of mode 0755 with these files."""
     path.mkdir()
     path.chmod(0o755)
     for name in files:

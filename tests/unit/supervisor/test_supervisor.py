@@ -24,8 +24,6 @@ ROSMASTER = Role(name="rosmaster", user="rosmaster", part="rosmaster", entry="m:
 
 
 class StandIn:
-    """A process that only counts its messages."""
-
     alive = True
     role = "control"
 
@@ -48,8 +46,7 @@ class StandIn:
         self.killed = number is signal.SIGKILL
         self.signals.append(number)
 
-    def discount_pause(self, _seconds: float) -> None:
-        """Do nothing."""
+    def discount_pause(self, _seconds: float) -> None: ...
 
     def send(self, message: object, _descriptors: tuple[int, ...] = ()) -> None:
         self.told.append(type(message).__name__)

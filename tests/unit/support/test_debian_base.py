@@ -35,7 +35,6 @@ def test_apt_fetches_through_the_machines_proxy() -> None:
 
 
 def test_pip_gets_only_indexes_that_the_tree_can_reach() -> None:
-    """Indexes on the network are kept; folders of this machine are left out because the tree lacks them."""
     listed = (
         "global.extra-index-url='file:///srv/simple https://pypi.example/simple'\n"
         "global.find-links='/srv/wheels'\n:env:.index-url='https://mirror.example/simple'\n"

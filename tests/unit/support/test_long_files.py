@@ -1,5 +1,3 @@
-"""Tests of tests/long.txt, the list of files that run first because they take longest."""
-
 import subprocess
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Tests use only public names of the product; stand-ins are typed and reject unknown calls."""
-
 import ast
 import re
 from collections.abc import Iterator
@@ -46,7 +44,6 @@ def test_the_rule_finds_what_it_forbids() -> None:
 
 
 def trees(words: str) -> Iterator[tuple[str, ast.Module]]:
-    """Yield each test file that contains the text, by its name in tests/, with its syntax tree."""
     for path in files_of_tests():
         text = path.read_text(encoding="utf-8")
         if re.search(words, text):
@@ -63,7 +60,7 @@ def private(tree: ast.Module) -> Iterator[str]:
 
 
 def answers_anything(tree: ast.Module) -> Iterator[str]:
-    """Yield classes that invent attributes, and mocks of the standard library."""
+    """Yields classes that invent attributes, and mocks of the standard library."""
     for node in ast.walk(tree):
         match node:
             case ast.FunctionDef(name="__getattr__" | "__getattribute__"):

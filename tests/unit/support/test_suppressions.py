@@ -1,5 +1,3 @@
-"""Each suppression of a checker has its reason on its line, in every language of the tree."""
-
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -44,7 +42,6 @@ def test_the_reason_is_what_follows(line: str, reason: str) -> None:
 
 
 def reasons_in(text: str) -> Iterator[str]:
-    """Yield the reason of each suppression; empty if there is none."""
     for line in text.splitlines():
         _code, *after = SUPPRESSION.split(line)
         if after:
@@ -52,7 +49,7 @@ def reasons_in(text: str) -> Iterator[str]:
 
 
 def sources() -> Iterator[Path]:
-    """Yield each checked file except this one, which is full of examples."""
+    """This file is excluded because it is full of examples."""
     for folder in FOLDERS:
         for path in (ROOT / folder).rglob("*"):
             ours = path != Path(__file__) and not {"vendor", "__pycache__"} & set(path.parts)

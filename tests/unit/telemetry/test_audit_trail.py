@@ -15,8 +15,6 @@ GUEST, UNKNOWN = "10.0.0.66", "10.9.9.9"
 
 
 class Log:
-    """An audit log that cannot be written."""
-
     def __init__(self) -> None:
         self.ids = IdSource(clock=clock.wall_ns)
         self.failed: str | None = "/var/lib/rosrv/control/audit.db: database or disk is full"
@@ -29,7 +27,6 @@ class Log:
         return str(record.id)
 
     async def wait_durable(self) -> str | None:
-        """Return why the log cannot be written."""
         return self.failed
 
 

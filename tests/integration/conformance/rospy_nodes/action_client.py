@@ -1,5 +1,3 @@
-"""Use actionlib/Test as a client: one goal that is reached, one that is cancelled."""
-
 import sys
 import threading
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Serve actionlib/Test: count to the goal with feedback; a goal can be cancelled."""
-
 import sys
 from pathlib import Path
 
@@ -12,7 +10,7 @@ from report import init_node, report
 
 
 def main():
-    """Serve until terminated; a goal over 100 continues until it is cancelled."""
+    """A goal over 100 continues until it is cancelled."""
     init_node("action_server")
 
     def work(goal):

@@ -1,5 +1,3 @@
-"""An agent is held, approved, and held again; a lease on a motion ends by silence, with the guard's stop."""
-
 import json
 import re
 from collections.abc import Iterator
@@ -51,8 +49,6 @@ def appliance(lab: Lab) -> Iterator[Appliance]:
 
 
 def agent(robot: Host, *frames: dict[str, Any], answer: str) -> dict[str, Any]:
-    """Send frames on a connection of their own, as ros-mcp does; return the first frame of this operation."""
-
     def work() -> dict[str, Any]:
         with connect(AGENT) as client:
             for one in frames:
@@ -139,12 +135,11 @@ def test_a_publication_lasts_for_its_lease(appliance: Appliance, robot: Host, tm
 
 
 def published(publish: dict[str, Any]) -> bool:
-    """Advertise and publish on a connection; return whether nothing was refused."""
     return not refused(publish)
 
 
 def refused(publish: dict[str, Any]) -> str:
-    """Advertise and publish on a connection for two seconds; return the last refusal."""
+    """Return the last refusal in two seconds."""
     text = ""
     with connect(AGENT) as client:
         client.send(json.dumps({"op": "advertise", "topic": "/cmd_vel", "type": "geometry_msgs/Twist"}))
@@ -174,7 +169,6 @@ MOTION = POLICY + "[Authority]\nbase = /cmd_vel\ntake base = site agent\nlease b
 def test_a_lease_on_a_motion_ends_by_silence_and_the_guard_stops_the_robot(
     appliance: Appliance, robot: Host, tmp_path: Path
 ) -> None:
-    """Without a guard, a record says that nothing stops the robot. A restart of control ends a lease too."""
     appliance.reload(MOTION)
     publish = {"op": "publish", "topic": "/cmd_vel", "msg": TWIST, "id": "p"}
     advertise = {"op": "advertise", "topic": "/cmd_vel", "type": "geometry_msgs/Twist", "id": "a"}

@@ -1,5 +1,3 @@
-"""Two real publishers on two hosts share a topic of [Authority]: one at a time is heard."""
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -34,8 +32,6 @@ lease base = 3s
 
 
 class Site(NamedTuple):
-    """A listener on the robot, and a talker on each of two hosts."""
-
     appliance: Appliance
     listener: Process
     pilot: Process
@@ -62,7 +58,6 @@ class Site(NamedTuple):
 
 @pytest.fixture
 def site(lab: Lab, robot: Host, tmp_path: Path) -> Iterator[Site]:
-    """A site whose policy gives the pilot and the boss claims to the topic."""
     with (
         Appliance(lab.host("appliance", "10.77.0.2/24"), policy=POLICY, settings=SETTINGS) as appliance,
         RosSession(appliance.master_uri, tmp_path, robot) as ros,

@@ -1,5 +1,3 @@
-"""A running appliance is backed up and restored in another place, where it continues."""
-
 import contextlib
 import json
 import subprocess
@@ -39,10 +37,6 @@ def busy(uri: str) -> Iterator[None]:
 
 
 def test_backed_up_while_running_and_restored_elsewhere(tmp_path: Path) -> None:
-    """After backup under load and restore, the log verifies and grows; policy, parameters and tokens are there.
-
-    The original appliance is not affected, and its own log stays complete.
-    """
     settings = "audit: {checkpoint_records: 20, checkpoint_seconds: 1}\n"
     file = tmp_path / "backup.tar.gz"
     with Appliance(settings=settings) as old:

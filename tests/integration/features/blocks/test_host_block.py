@@ -1,5 +1,3 @@
-"""A host is blocked while a robot works: its messages stop, others continue, and it returns without a restart."""
-
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -13,7 +11,6 @@ from tests.support.processes import Process
 
 TABLET = "10.77.0.66"
 SOME = 15
-"""The number of messages of the robot's own talker in which a blocked talker would have been heard."""
 
 
 @pytest.fixture(scope="module")
@@ -27,8 +24,6 @@ def tablet(common_lab: Lab) -> Host:
 
 
 class Robot(NamedTuple):
-    """A listener and a talker on the robot, and a talker on the tablet."""
-
     listener: Process
     tablet: RosSession
 
@@ -36,7 +31,6 @@ class Robot(NamedTuple):
         self.listener.wait_for(event="received", publisher=name, since=self.listener.mark())
 
     def heard(self) -> set[str]:
-        """Return the talkers of the messages that arrive with the next messages of the robot's own talker."""
         for _ in range(SOME):
             self.hears("/friend")  # messages that were already sent have arrived
         first = self.listener.mark()
@@ -46,7 +40,6 @@ class Robot(NamedTuple):
 
 @pytest.fixture
 def robot(appliance: Appliance, ros: RosSession, tablet: Host) -> Iterator[Robot]:
-    """A robot that hears its own talker and one on the tablet; the tablet is not blocked afterwards."""
     appliance.ignore_earlier_records()
     client: Client = "rospy"
     listener = ros.listener(client, "/chatter")

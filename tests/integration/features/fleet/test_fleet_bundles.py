@@ -1,5 +1,3 @@
-"""A real appliance takes bundles from a collector: end to end, all or nothing, with commit-confirm."""
-
 import json
 import shutil
 import tempfile
@@ -35,7 +33,6 @@ latch() {
 
 @pytest.fixture(scope="module")
 def site() -> Iterator[tuple[BundleSite, str]]:
-    """Serve a site with one group; its files are readable by the appliance's users."""
     folder = Path(tempfile.mkdtemp(prefix="rosrv-fleet-"))
     folder.chmod(0o755)
     made = BundleSite(folder / "site")
@@ -70,8 +67,6 @@ def bundles_of(appliance: Appliance) -> dict[str, Any]:
 
 
 def in_force(appliance: Appliance, path: object) -> dict[str, Any]:
-    """Wait until a bundle is in force."""
-
     def found() -> dict[str, Any] | None:
         state = bundles_of(appliance)
         return state if state["in_force"] == str(path) and not state["trying"] else None
@@ -90,8 +85,6 @@ def test_a_bundle_comes_into_force(site: tuple[BundleSite, str]) -> None:
 
 
 def refused(appliance: Appliance, path: object) -> str:
-    """Wait until a bundle is refused; return the reason."""
-
     def found() -> str | None:
         state = bundles_of(appliance)
         return str(state["reason"]) if state["refused"] == str(path) and not state["trying"] else None
@@ -100,8 +93,6 @@ def refused(appliance: Appliance, path: object) -> str:
 
 
 def refusal(appliance: Appliance, path: object) -> dict[str, Any]:
-    """Wait for the record of a refused bundle; return its detail."""
-
     def found() -> dict[str, Any] | None:
         details = [record["detail"] for record in appliance.audit(event="bundle refused")]
         return next((detail for detail in details if detail["bundle"] == str(path)), None)

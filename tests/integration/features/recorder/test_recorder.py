@@ -1,5 +1,3 @@
-"""The flight recorder beside real nodes: a drop by a monitor makes a recording that stock tools read."""
-
 import hashlib
 import json
 import os
@@ -44,7 +42,6 @@ audit: {reserve_bytes: 1MiB}
 
 @pytest.fixture(scope="module")
 def recording() -> Iterator[Appliance]:
-    """Run an appliance with a recorder, and a monitor that drops the messages on /rude."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     monitors, options = {"censor": MONITOR}, ("--api", "127.0.0.1:0")
     with Appliance(settings=CONFIGURATION, monitors=monitors, options=options) as appliance:
@@ -53,7 +50,6 @@ def recording() -> Iterator[Appliance]:
 
 @pytest.fixture
 def appliance(recording: Appliance) -> Iterator[Appliance]:
-    """Provide the appliance without recordings; its memory has messages of other tests, on other topics."""
     recording.ignore_earlier_records()
     yield recording
     for row in recording.rows("record", "list"):
@@ -76,7 +72,7 @@ def fetched(appliance: Appliance, recording: str, folder: Path) -> Path:
 
 
 def said(ros: RosSession, bag: Path, topic: str) -> list[str]:
-    """Return the strings of a topic, read by Debian's rosbag in sequence and, as rqt_bag does, by the index."""
+    """Debian's rosbag reads in sequence and, as rqt_bag does, by the index."""
     program = (
         "import rosbag, sys\n"
         "bag, topics = rosbag.Bag(sys.argv[1]), [sys.argv[2]]\n"
@@ -122,10 +118,6 @@ def viewers_see_no_contents(appliance: Appliance, dropped: str) -> None:
 def test_a_drop_makes_a_recording_that_stock_tools_read(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """The recording has the dropped message, earlier and later ones, and the decisions.
-
-    The log proves the recording and records its export.
-    """
     assert "no recordings; make one: rosrv record now" in appliance.rosrv("record", "list").stdout
     listener = ros.listener("roscpp", "/chatter", name="ear")
     for topic in ("/rude", "/secret/key"):
@@ -231,7 +223,6 @@ def test_messages_of_a_killed_relay_are_in_the_recording(
 
 
 def test_a_killed_recorder_resumes(appliance: Appliance, ros: RosSession, tmp_path: Path) -> None:
-    """The next recorder completes the recording under the same name, with every message once."""
     listener = ros.listener("roscpp", "/speech", name="ear")
     ros.talker("roscpp", "/speech", name="voice")
     heard = [event["data"] for event in listener.wait_for_count(10, event="received")]

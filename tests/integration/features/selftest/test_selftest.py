@@ -1,5 +1,3 @@
-"""`rosrv selftest` tests each part of a running appliance for real, and finds faults."""
-
 import json
 import os
 import signal
@@ -19,7 +17,6 @@ Rows = dict[str, dict[str, str]]
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """Run an appliance with REST over TLS; the last test stops it."""
     with Appliance(options=("--api", "127.0.0.1:0")) as running:
         running.rest()
         yield running

@@ -38,7 +38,6 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Certificates:
 
 @pytest.fixture(scope="module")
 def provider(certificates: Certificates) -> Iterator[int]:
-    """Provide the port of a provider that speaks TLS."""
     users = [oidc_provider_mock.User(sub=name, claims=claims) for name, claims in USERS.items()]
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificates.certificate, certificates.key)
@@ -49,8 +48,6 @@ def provider(certificates: Certificates) -> Iterator[int]:
 
 
 class Proxy(socketserver.ThreadingTCPServer):
-    """A proxy that knows one method, CONNECT, and resolves every name to the loopback."""
-
     daemon_threads = True
 
     def __init__(self) -> None:
@@ -89,7 +86,6 @@ def proxy() -> Iterator[Proxy]:
 
 @pytest.fixture
 def way(provider: int) -> str:
-    """Provide the setting that leads to the provider."""
     return f"address: 127.0.0.1:{provider}"
 
 
@@ -113,8 +109,6 @@ sso:
 
 
 class Browser:
-    """A browser: it makes a token, goes to the provider and returns with a code."""
-
     def __init__(self, appliance: Appliance) -> None:
         self.token = f"rosrv_{secrets.token_hex(6)}_{secrets.token_urlsafe(32)}"
         self.rest = httpx.Client(base_url=str(appliance.ready["api"]), verify=False, timeout=60)  # noqa: S501  of the test
@@ -126,7 +120,6 @@ class Browser:
         return str(self.rest.post("/v1/sso/begin", json=body).raise_for_status().json()["url"])
 
     def return_from(self, url: str, person: str) -> dict[str, str]:
-        """Sign in at the provider; return the parameters of the way back."""
         parts = urlsplit(url)
         assert parts.hostname == NAME
         answer = httpx.post(
@@ -150,7 +143,6 @@ class Browser:
 
 @pytest.fixture
 def opened(running: Appliance) -> Iterator[Callable[[], Browser]]:
-    """Provide a function that opens a browser; all are closed after the test."""
     with contextlib.ExitStack() as stack:
 
         def open_browser() -> Browser:
@@ -179,8 +171,6 @@ def test_a_person_signs_in_and_a_restart_ends_the_session(
 
 
 class TestProxy:
-    """A provider that only a proxy reaches."""
-
     @pytest.fixture
     def way(self, proxy: Proxy) -> str:
         return f"proxy: http://127.0.0.1:{proxy.server_address[1]}"
@@ -193,7 +183,6 @@ class TestProxy:
         tmp_path: Path,
         certificates: Certificates,
     ) -> None:
-        """The proxy sees no content. A certificate of another authority is refused, until the file is replaced."""
         (tmp_path / "ca.pem").write_bytes(make_certificates(tmp_path / "other").ca.read_bytes())
         keys = [base64.urlsafe_b64encode(bytes(32)).decode().rstrip("=")] * 2
         body = {"id": "0" * 12, "reading": keys[0], "verifying": keys[1]}

@@ -1,5 +1,3 @@
-"""The audit log of a real appliance is forwarded to a syslog receiver that is sometimes unavailable."""
-
 import json
 import os
 import time
@@ -23,7 +21,6 @@ def collector() -> Iterator[StreamCollector]:
 
 @pytest.fixture(scope="module")
 def appliance(collector: StreamCollector) -> Iterator[Appliance]:
-    """Run an appliance that forwards all records to the receiver, and seals its log every second."""
     audit = {"syslog": {"to": f"tcp://127.0.0.1:{collector.port}"}, "checkpoint_seconds": 1}
     with Appliance(settings=json.dumps({"audit": audit})) as appliance:
         yield appliance

@@ -30,8 +30,6 @@ NAMESPACES = re.compile(
 
 
 class Client:
-    """Sends requests to the console's routes only."""
-
     def __init__(self, settings: Settings) -> None:
         async def problem(_request: Request, error: Any) -> Any:
             return error.response()

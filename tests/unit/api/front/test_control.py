@@ -54,7 +54,6 @@ def link(tokens: list[TokenKept]) -> ControlLink:
 
 @pytest.fixture
 def control(link: ControlLink) -> Iterator[Callable[[], Control]]:
-    """Return a function that connects a control; each call replaces the previous control."""
     ends: list[Channel] = []
     yield lambda: Control(link, ends)
     for end in ends:

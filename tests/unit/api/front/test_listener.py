@@ -33,7 +33,6 @@ async def application(scope: Scope, receive: Receive, send: Send) -> None:
 
 @contextlib.asynccontextmanager
 async def listening(limits: ApiLimits) -> AsyncIterator[Connect]:
-    """Serve on a free port; yield a function that connects."""
     sock = socket.create_server(("127.0.0.1", 0))
     listener = Listener(application, limits, lambda _peer: QuotaClass.REGISTERED)
     await listener.start(sock, None)
@@ -56,7 +55,6 @@ async def listening(limits: ApiLimits) -> AsyncIterator[Connect]:
 
 
 async def served(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
-    """Return whether a request is answered; False when the connection is closed instead."""
     try:
         writer.write(REQUEST)
         await writer.drain()

@@ -1,5 +1,3 @@
-"""Tests of `appliance.api.front.moments`: times in answers get RFC 3339 texts; other fields are unchanged."""
-
 from typing import Annotated, Any
 
 import jsonschema_rs

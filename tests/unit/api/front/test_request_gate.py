@@ -1,5 +1,3 @@
-"""The gate in front of all routes: tokens, host names, origins, and the headers of each answer."""
-
 import re
 
 import httpx

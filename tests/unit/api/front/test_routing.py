@@ -1,5 +1,3 @@
-"""Request bodies of REST: one answer lists all errors of an invalid body, each with its field."""
-
 import json
 from typing import Annotated, Any
 
@@ -44,7 +42,7 @@ def app(monkeypatch: pytest.MonkeyPatch) -> FastAPI:
 
 
 def posted(app: FastAPI, sent: Any) -> httpx.Response:
-    """Return the answer to a body; text is sent unchanged."""
+    """Text is sent unchanged."""
     content = sent if isinstance(sent, str) else json.dumps(sent)
     return requested(app, "POST", "/", content=content, headers={"content-type": "application/json"})
 

@@ -17,7 +17,7 @@ def bearer(name: str, role: TokenRole = "viewer") -> Bearer:
 
 
 def taken(streams: Streams, who: Bearer, peer: str, most: int = 100) -> list[Callable[[], None]]:
-    """Take as many slots as possible; return the functions that release them."""
+    """Returns the functions that release the slots."""
     places: list[Callable[[], None]] = []
     try:
         while len(places) < most:

@@ -1,5 +1,3 @@
-"""`/v1/audit` on a log: searches, pages, one record, export and verification."""
-
 import json
 from collections.abc import Iterator
 

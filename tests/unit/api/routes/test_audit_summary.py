@@ -23,8 +23,6 @@ _VIEWER = Bearer("v", "v", "viewer", 1e12, "shown")
 
 
 class _Log:
-    """The only part of `Services` that the route reads."""
-
     def __init__(self, log: Path) -> None:
         self.audit_log = log
 

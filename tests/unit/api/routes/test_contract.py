@@ -1,5 +1,3 @@
-"""The OpenAPI document: units of times and durations, ETags, examples and descriptions."""
-
 import re
 from pathlib import Path
 from typing import Any

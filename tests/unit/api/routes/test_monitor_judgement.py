@@ -1,5 +1,3 @@
-"""Tests of `appliance.api.routes.monitor_judgement`: describing specifications without an appliance."""
-
 import pytest
 
 from appliance.api.routes.monitor_judgement import Compiler, findings_of, refusal

@@ -1,5 +1,3 @@
-"""Each operation over REST, from the gate to the part of control that carries it out: order, roles, dry run, ETag."""
-
 import asyncio
 import functools
 import json
@@ -168,7 +166,7 @@ def world() -> RestWorld:
 
 
 def sample(operation: Operation) -> tuple[str, str, Any]:
-    """Return the first request in `REQUESTS` for an operation, or the command line's request if there is none."""
+    """A request that is not in `REQUESTS` is the command line's."""
     parts = operation.path.split("/")
     for method, target, body in REQUESTS:
         given = target.partition("?")[0].split("/")
@@ -185,7 +183,6 @@ def sample(operation: Operation) -> tuple[str, str, Any]:
 
 
 def fields_of(operation: Operation) -> set[str]:
-    """Return the names of the fields that an order must have."""
     return {field.name for field in operation.fields().values() if field.required}
 
 
@@ -414,7 +411,6 @@ def test_the_matrix_has_every_operation() -> None:
 
 
 def test_rows_name_fields_of_their_requests() -> None:
-    """A misspelt field in a row would be sent elsewhere, or not be protected."""
     for one in OPERATIONS:
         known = {field.name for field in one.fields().values()}
         assert {*one.query, *one.fixed, *one.admin_with, *one.filled} <= known, one.request
@@ -498,7 +494,7 @@ def test_every_order_has_its_way() -> None:
 
 @pytest.mark.parametrize(("method", "target", "body"), REQUESTS, ids=IDS)
 def test_no_field_of_an_order_can_be_another(method: str, target: str, body: Any) -> None:
-    """A compromised api cannot change a field of an order, except those that the appliance fills in."""
+    """The appliance itself fills in some fields."""
     made = ordered(method, target, body, '"7"')
     assert made.asked is not None
     body = body if isinstance(body, dict) else {}
@@ -511,7 +507,6 @@ def test_no_field_of_an_order_can_be_another(method: str, target: str, body: Any
 
 
 def _other(value: Any) -> Any:
-    """Return a different value of the same type; for None, a number."""
     match value:
         case bool():
             return not value
@@ -545,8 +540,7 @@ def test_control_hears_of_a_client_that_disconnects() -> None:
         seen.append(type(request))
         return AdminAnswer(False, error="withdrawn", trouble="busy")
 
-    async def send(_message: Any) -> None:
-        """Drop the message."""
+    async def send(_message: Any) -> None: ...
 
     scope = {
         "type": "http", "http_version": "1.1", "method": "POST", "path": "/v1/policy/confirm", "query_string": b"",

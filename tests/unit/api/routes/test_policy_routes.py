@@ -1,5 +1,3 @@
-"""`/v1/policy` and `/v1/monitors`: what the api adds to the answers of control."""
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""`rosrv audit` on terminals and full disks, and in follow mode; `audit.txt` and `signed.txt` have the rest."""
+"""The files `audit.txt` and `signed.txt` have the rest."""
 
 import contextlib
 import json
@@ -81,7 +81,6 @@ def test_an_export_to_a_full_disk_leaves_no_file(state: Path, tmp_path: Path, wh
 
 @pytest.mark.nightly
 def test_tail_follows(state: Path) -> None:
-    """`tail` shows the last records and new ones, and ends quietly when interrupted."""
     command = [sys.executable, "-m", "appliance.cli.main", "audit", "tail", "-n", "1", "--deny", "--json"]
     environment = os.environ | {"ROSRV_STATE": str(state)}
     with subprocess.Popen(

@@ -1,5 +1,3 @@
-"""Tests of `appliance.cli.connection.admin_client`: its timeout, and words that cannot be encoded."""
-
 from pathlib import Path
 
 import pytest

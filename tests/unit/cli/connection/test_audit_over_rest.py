@@ -17,7 +17,7 @@ END = 'data: {"reason": "the token has expired"}'
 
 
 class Answer:
-    """An answer with these lines; unless `ends` is set, the connection breaks after the last line."""
+    """The connection breaks after the last line unless `ends` is set."""
 
     def __init__(self, lines: list[str], *, breaks: bool) -> None:
         self._lines = lines
@@ -30,7 +30,7 @@ class Answer:
 
 
 class Rest:
-    """REST that gives these answers to streams in turn, and an empty log to other requests."""
+    """Other requests get an empty log."""
 
     url = "https://robot"
 

@@ -1,5 +1,3 @@
-"""`--api` only sends to a server with a trusted certificate; `rest.txt` has the rest of `rest_session`."""
-
 import datetime
 import ssl
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Hostile bags: reading one takes time linear in its size, and bounded memory."""
-
 import bz2
 import shutil
 import struct
@@ -34,7 +32,7 @@ def record(fields: dict[str, bytes], data: bytes) -> bytes:
 
 
 def bag(place: Path, chunks: list[tuple[str, bytes, list[tuple[int, int]]]]) -> Path:
-    """Write a bag with these chunks, each given by compression, packed bytes, and its messages' seconds and offsets."""
+    """Each chunk: compression, packed bytes, and its messages' seconds and offsets."""
     out = bytearray(b"#ROSBAG V2.0\n" + bytes(4096))
     infos = b""
     for compression, packed, entries in chunks:

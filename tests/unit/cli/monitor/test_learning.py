@@ -1,5 +1,3 @@
-"""`rosrv monitor learn` and `coverage` on a drive of the simulated robot; `learn.txt` has the errors."""
-
 import json
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""`rosrv monitor check` and `run` where a transcript does not reach; `check.txt` and `run.txt` have the rest."""
-
 from pathlib import Path
 
 import pytest

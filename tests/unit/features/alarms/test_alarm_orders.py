@@ -21,7 +21,7 @@ BAD = {**GOOD, "rosmaster": "being rebuilt"}
 
 
 class Robot:
-    """The alarms of a robot, whose ROS master is being rebuilt at first; its state survives `restart`."""
+    """The ROS master is being rebuilt at first; the state survives `restart`."""
 
     def __init__(self, state: Path) -> None:
         self.state = state
@@ -38,7 +38,6 @@ class Robot:
         return ""
 
     def alarm(self) -> Alarm | None:
-        """Return the only alarm."""
         alarms = asyncio.run(self.orders.listed(AlarmsWanted())).alarms
         return alarms[0] if alarms else None
 

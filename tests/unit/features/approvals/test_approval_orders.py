@@ -41,8 +41,6 @@ NUMBER = re.compile(r"held for approval ([0-9]+); ask the operator, then repeat;
 
 
 class Site:
-    """Control without nodes: what is approved passes at once."""
-
     def __init__(self, time: VirtualClock) -> None:
         self.time = time
         self.text = compile_policy(TEXT, file="site.ini")
@@ -78,7 +76,7 @@ class Site:
             await self.replaced.wait()
 
     async def stop(self, host: str, topics: set[str], _why: str) -> None:
-        """The guards stop what a host published; its messages already no longer pass."""
+        """Its messages already no longer pass."""
         assert not any(
             (address_of(host), Category.PUBLISH, topic) in self.orders.approved() for topic in topics
         )
@@ -114,7 +112,7 @@ class Site:
         return (await self.orders.approve_call(wanted)).refused
 
     def publish(self, topic: str, category: Category = Category.PUBLISH) -> str:
-        """Publish a topic, or write a parameter; return the refusal."""
+        """Returns the refusal."""
         decision = self.policy.decide(Request(AGENT, "/it", category, topic))
         return (
             ""
@@ -168,7 +166,7 @@ async def test_a_lease_of_a_service_is_for_any_arguments_until_its_time(site: Si
 
 
 async def leased_call(site: Site) -> int:
-    """Return the number of a lease on a service, which cannot become an approval of one call with any arguments."""
+    """A lease on a service cannot become an approval of one call with any arguments."""
     number = number_in(await site.call(b"1"))
     await site.orders.approve(ApproveCall(number, 10.0), "ann")
     return number

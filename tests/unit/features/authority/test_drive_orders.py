@@ -1,5 +1,3 @@
-"""Hand-overs of a group: random histories of hosts, operators and relays, and the answers of each order."""
-
 import asyncio
 import random
 from collections.abc import Iterable, Iterator
@@ -65,7 +63,7 @@ class Site:
         self.records.append({"event": event, "reason": reason, **detail})
 
     async def after(self, host: str, topics: frozenset[str], why: str) -> None:
-        """The guards stop what a host commanded: no relay lets it through any longer, and no other holds the group."""
+        """No relay lets the host through any longer, and no other holds the group."""
         assert address_of(host) not in self.applied
         assert self.orders.holders() == {}
         self.records.append({"event": "motion stopped", "reason": why, "topics": sorted(topics)})
@@ -76,7 +74,7 @@ class Site:
         return 0
 
     async def carried_out(self, topics: Iterable[str] | None) -> None:
-        """Let the relays apply their orders in any order, and check after each that at most one host is let through."""
+        """Checks after each order that at most one host is let through."""
         while self.hanging and (topics is None or self.hanging.intersection(topics)):
             await asyncio.sleep(0)
         while any(self.ordered):

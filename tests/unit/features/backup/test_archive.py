@@ -14,7 +14,7 @@ NOTHING = "nothing is restored"
 
 
 def refused(file: Path, state: Path, words: str) -> None:
-    """Check that the restore fails with these words and leaves nothing behind."""
+    """The restore leaves nothing behind."""
     with pytest.raises(BackupError, match=words):
         restore(file, state)
     assert not state.exists()
@@ -68,7 +68,6 @@ def test_extended_headers_are_rejected(tmp_path: Path, kind: bytes) -> None:
 
 @pytest.mark.parametrize("size", [-1, 1 << 40])
 def test_impossible_sizes_are_rejected(tmp_path: Path, size: int) -> None:
-    """Negative sizes are rejected, and sizes above the limit for files that are not databases."""
     refused(archive(tmp_path / "evil", header("api/x", size)), tmp_path / "state", NOTHING)
 
 

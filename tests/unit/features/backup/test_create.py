@@ -29,7 +29,7 @@ from tests.support.small_disk import small_disk
 
 @pytest.fixture
 def state(tmp_path: Path) -> Path:
-    """Return a state directory with signed checkpoints, whose signer has signed one more since."""
+    """The signer has signed one checkpoint more than the state has."""
     state = tmp_path / "state"
     for part in ("control", "signer", "api", "ipsec", "run", "rosmaster/log"):
         (state / part).mkdir(parents=True)
@@ -62,7 +62,7 @@ def state(tmp_path: Path) -> Path:
 
 
 def test_a_backup_is_restored(state: Path, tmp_path: Path) -> None:
-    """Permanent state is restored unchanged; run-time state is left out; the restored log verifies."""
+    """Run-time state is left out; the restored log verifies."""
     file, other = tmp_path / "backup.tar.gz", tmp_path / "other"
     assert not verify(state / "control" / "audit.db", signer=state / "signer").ok
     names = back_up(state, file)
@@ -109,7 +109,6 @@ def test_a_backup_needs_no_ros(state: Path, tmp_path: Path, monkeypatch: pytest.
 
 
 def test_nothing_is_overwritten(state: Path, tmp_path: Path) -> None:
-    """An existing file, and a state directory that is not empty, stay unchanged."""
     file = tmp_path / "backup.tar.gz"
     file.write_text("mine")
     with pytest.raises(BackupError, match="already exists"):
@@ -221,7 +220,6 @@ def test_a_sparse_file_is_refused(state: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["\x1b[2J", "x" * 97])
 def test_a_name_that_cannot_be_restored_is_refused(state: Path, tmp_path: Path, name: str) -> None:
-    """The error names the file that would make the backup impossible to restore."""
     (state / "api" / name).touch()
     with pytest.raises(BackupError, match="find out its origin"):
         back_up(state, tmp_path / "backup.tar.gz")
@@ -229,7 +227,6 @@ def test_a_name_that_cannot_be_restored_is_refused(state: Path, tmp_path: Path, 
 
 
 def test_a_file_that_grows_is_refused(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A process that writes during the backup cannot fill the disk with it."""
     content = state / "api" / "growing"
     content.write_bytes(bytes(1000))
     opened = backup.opened
@@ -276,7 +273,6 @@ def test_a_half_restored_state_is_not_backed_up(state: Path, tmp_path: Path) -> 
 
 @pytest.fixture
 def owned(state: Path) -> Iterator[Path]:
-    """Return the state owned by `control`'s user and reachable for its users; root makes the backup."""
     need_root()
     place = Path(tempfile.mkdtemp(prefix="rosrv-backup-test-"))
     place.chmod(0o711)

@@ -14,7 +14,6 @@ KEY = b"-----BEGIN PRIVATE KEY-----"
 
 @pytest.fixture
 def state(tmp_path: Path) -> Path:
-    """Return a state directory with a key, a log, a link to another file, and a hard link to that file."""
     place = tmp_path / "state"
     StateDirectory(place).close()
     (place / "signer").mkdir()

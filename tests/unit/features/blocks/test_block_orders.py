@@ -1,5 +1,3 @@
-"""Blocked hosts: the decision, what ends and returns, the end of a block, restarts, and what cannot be blocked."""
-
 import asyncio
 import contextlib
 import ipaddress
@@ -46,13 +44,10 @@ async def until(condition: Callable[[], object]) -> None:
             await asyncio.sleep(0.005)
 
 
-async def at_once() -> None:
-    """Return as if the relays had applied the change."""
+async def at_once() -> None: ...
 
 
 class Clock:
-    """An age clock that a test sets."""
-
     def __init__(self) -> None:
         self.now = 1_700_000_000 * SECOND
         self.reads = 0
@@ -70,7 +65,7 @@ class Clock:
 
 
 class Control(ControlParts):
-    """Control with a store, a policy file and the orders about blocks; a test may start it again on the same state."""
+    """A test may start it again on the same state."""
 
     def __init__(self, state: Path, clock: Clock, connected: list[set[str]], text: str = OPEN) -> None:
         super().__init__()
@@ -111,7 +106,7 @@ class Control(ControlParts):
         return [row.address for row in (await self.orders.listed(HostBlocks())).blocks]
 
     def denial(self, host: str, text: str = "") -> str | None:
-        """Return the reason why a host may not publish, by the policy in force; None if it may."""
+        """None if the host may publish."""
         decision = self.current.decide(Request(address_of(host), "/node", Category.PUBLISH, "/scan"))
         return None if decision.allowed else decision.reason
 
@@ -312,7 +307,6 @@ async def test_a_note_is_short_and_printable(tmp_path: Path, note: str) -> None:
 
 
 async def test_the_robot_is_blocked_only_by_force(tmp_path: Path) -> None:
-    """The refusal has the numbers of what would end."""
     async with control(tmp_path, Clock(), [{ROBOT, OTHER}, {OTHER}]) as made:
         with pytest.raises(HostRefusedError, match=r"robot's own host: .* 0 registrations and 1 connections"):
             await made.block(ROBOT)

@@ -1,5 +1,3 @@
-"""A site of bundles with the robots' real client."""
-
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -10,8 +8,6 @@ from tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite
 
 
 class RobotSite(BundleSite):
-    """A site that also makes the clients of its robots."""
-
     def connection(self, url: str, robot: str = ROBOT) -> CollectorConnection:
         certificate, key = self.authority.issue(robot)
         made = robot_connection(url, self.authority.ca, certificate, key)

@@ -1,5 +1,3 @@
-"""Collectors that misbehave: no client hangs, grows or follows, and each reports why."""
-
 import asyncio
 import json
 import re
@@ -34,7 +32,7 @@ __all__ = ["MakeLog", "Notary", "key", "make_log", "notary", "path"]  # fixtures
 
 _SECONDS = 0.4
 Client = Callable[[str], str]
-"""A client: it gets the URL of a collector, makes one step, and returns the reported trouble."""
+"""Gets the URL of a collector, makes one step, and returns the reported trouble."""
 
 
 def drips_the_handshake(visitor: Visitor) -> None:
@@ -52,7 +50,6 @@ def drips_the_head(visitor: Visitor) -> None:
 
 
 def sends_interim_answers(visitor: Visitor) -> None:
-    """Send interim answers, and never the real one."""
     visitor.repeat(b"HTTP/1.1 100 Continue\r\n\r\n", 0.001)
 
 
@@ -89,7 +86,6 @@ def is_not_http(visitor: Visitor) -> None:
 
 
 def demands_a_login(visitor: Visitor) -> None:
-    """Answer with a status that the protocol does not have, and text that would move a terminal's cursor."""
     visitor.give(b"\x1b[2Jno", "401 Unauthorized", "Retry-After: 99999999999999999999")
 
 

@@ -34,8 +34,7 @@ def test_a_join_needs_no_checkpoint(
         def post(self, _path: str, body: bytes) -> None:
             posted.append(msgspec.json.decode(body, type=JoinRequest))
 
-        def close(self) -> None:
-            """Do nothing."""
+        def close(self) -> None: ...
 
     def prepared(folder: Path, _invitation: Any) -> str:
         folder.mkdir()

@@ -1,5 +1,3 @@
-"""A robot's client of bundles that is killed, or whose disk is full, loses nothing that it knew, and goes on."""
-
 import os
 import resource
 import sys
@@ -18,7 +16,7 @@ _KILLED, _DONE, _FULL = 9, 0, 7
 
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[tuple[RobotSite, str]]:
-    """Serve a site with two bundles; the robot knows the first one."""
+    """The robot knows the first of two bundles."""
     site = RobotSite(tmp_path / "site")
     site.add()
     with site.served() as url:
@@ -27,7 +25,7 @@ def site(tmp_path: Path) -> Iterator[tuple[RobotSite, str]]:
 
 
 def poll(robot: VerifiedBundles) -> str:
-    """Do what a robot does at each poll; return the bundle that it would take."""
+    """Returns the bundle that a robot would take at this poll."""
     robot.refresh()
     selected = robot.selected()
     assert selected is not None
@@ -35,7 +33,6 @@ def poll(robot: VerifiedBundles) -> str:
 
 
 def in_child(work: Callable[[], None]) -> int:
-    """Run work in a child process; return its exit status."""
     child = os.fork()
     if not child:
         try:
@@ -49,7 +46,7 @@ def in_child(work: Callable[[], None]) -> int:
 
 
 def killed_at(step: int, folder: Path) -> None:
-    """End this process without any cleanup at the given access to a file of a folder."""
+    """Ends this process without cleanup."""
     left = [step]
 
     def hook(event: str, arguments: tuple[object, ...]) -> None:
@@ -90,7 +87,6 @@ def test_a_kill_at_any_step_loses_nothing(site: tuple[RobotSite, str], tmp_path:
 
 
 def test_a_full_disk_is_reported_and_passes(site: tuple[RobotSite, str], tmp_path: Path) -> None:
-    """While files cannot be written, the client reports that; afterwards it takes the bundle."""
     served, url = site
     path = served.add()
     robot = served.robot(url, tmp_path / "robot")

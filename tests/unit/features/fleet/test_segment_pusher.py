@@ -1,5 +1,3 @@
-"""A collector that lies about segments and receipts: nothing counts without its signature, nothing ends the pusher."""
-
 import asyncio
 import json
 import sqlite3
@@ -25,7 +23,7 @@ from tests.unit.features.conftest import MakeLog
 
 
 class Collector(CollectorConnection):
-    """A collector without a network, which keeps the pushed numbers; the test replaces its answers."""
+    """Keeps the pushed numbers; the test replaces its answers."""
 
     is_open = True
 
@@ -65,8 +63,7 @@ class Collector(CollectorConnection):
         fields |= {"first": before + 1, "last": end, "time": 1}
         return msgspec.json.encode(SegmentReceipt(**fields | self.changes).signed(self.key))
 
-    def close(self) -> None:
-        """Do nothing: no connection is open."""
+    def close(self) -> None: ...
 
 
 @pytest.fixture
@@ -143,7 +140,7 @@ def test_a_kill_between_receipt_and_position(
     collector: Collector, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class KilledError(BaseException):
-        """The end of the process."""
+        pass
 
     def killed(*_values: object) -> None:
         raise KilledError
@@ -169,8 +166,6 @@ def test_a_kill_between_receipt_and_position(
 def test_a_full_disk_is_reported_and_passes(
     collector: Collector, make: Make, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """While the position cannot be stored, the pusher reports that; afterwards no record is missed."""
-
     def full(path: Path, *_rest: object) -> None:
         raise OSError(28, "No space left on device", str(path))
 

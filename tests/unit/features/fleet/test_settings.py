@@ -1,5 +1,3 @@
-"""Tests of `appliance.features.fleet.settings`: the section `fleet`, from the file and from a join."""
-
 import json
 from pathlib import Path
 from typing import Any
@@ -23,7 +21,6 @@ def mistakes(file: Path | None, flags: dict[str, Any]) -> list[str]:
 
 
 def joined(state: Path) -> Path:
-    """Write the settings that `rosrv fleet join` leaves in a state directory; return their folder."""
     folder = state / "joined"
     folder.mkdir(parents=True)
     section = {
@@ -75,7 +72,6 @@ _FLEET = {"collector": "https://10.0.0.9:8444", "ca": "a", "certificate": "b", "
 
 
 def test_a_collector() -> None:
-    """A collector has an address and a port; an appliance may push segments, take bundles, or both."""
     assert read({"fleet": _FLEET}).of(Fleet).destination == ("10.0.0.9", 8444)
     bundles = {"robot": "arm1", "bundles": {"root": "r", "site": "s", "group": "g"}}
     only_bundles = {name: value for name, value in _FLEET.items() if name != "receipt_key"} | bundles

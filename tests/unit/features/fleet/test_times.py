@@ -1,5 +1,3 @@
-"""A wrong clock is named: when a robot joins, and before it connects with its certificate."""
-
 import os
 from pathlib import Path
 from types import SimpleNamespace
@@ -35,7 +33,6 @@ def test_a_join_with_a_wrong_clock_is_refused(years: float, tmp_path: Path) -> N
 
 
 def test_a_join_after_the_clock_was_corrected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A new try with the same invitation makes a new certificate, unless the present one is valid."""
     monkeypatch.setattr(
         fleet_verbs, "account_of", lambda _user: SimpleNamespace(uid=os.getuid(), gid=os.getgid())
     )

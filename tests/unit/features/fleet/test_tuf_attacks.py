@@ -1,5 +1,3 @@
-"""Every attack of TUF's list is refused by the real client, over a real TLS connection to a collector that lies."""
-
 import datetime
 import http.server
 import shutil
@@ -34,21 +32,18 @@ METADATA = "/v1/bundles/metadata"
 
 
 class Field:
-    """A site with one served bundle, and one robot that has taken it."""
-
     def __init__(self, folder: Path, url: str, site: RobotSite) -> None:
         self.site, self.url, self.folder = site, url, folder
         self.robot = site.robot(url, folder / "robot")
 
     def poll(self, robot: VerifiedBundles | None = None) -> VerifiedBundle | None:
-        """Do what a robot does at each poll; return the bundle that it would take."""
+        """Returns the bundle that a robot would take at this poll."""
         asker = robot or self.robot
         asker.refresh()
         selected = asker.selected()
         return None if selected is None else asker.get(selected)
 
     def give(self, path: str, body: bytes | None) -> None:
-        """Make the collector answer a path with other bytes."""
         self.site.lies[path] = lambda handler: give(handler, body)
 
     def timestamp(self, snapshot: int, version: int | None = None, days: float = 1.0) -> bytes:
@@ -111,7 +106,6 @@ def test_rollback_by_a_stolen_timestamp_key_is_rejected(field: Field) -> None:
 
 
 def test_a_withdrawn_bundle_is_rejected(field: Field) -> None:
-    """The collector cannot select a bundle that the group's key has withdrawn since."""
     first = field.site.selection
     field.site.add(keep=1)
     field.site.selection = first
@@ -166,8 +160,6 @@ def test_mix_and_match_is_rejected(field: Field) -> None:
 
 
 def test_endless_data_is_cut(field: Field) -> None:
-    """Metadata or a bundle without an end is cut at its limit; the process does not grow."""
-
     def endless(handler: http.server.BaseHTTPRequestHandler) -> None:
         handler.send_response(200)
         handler.end_headers()
@@ -213,7 +205,6 @@ def test_the_wrong_target_is_rejected(field: Field) -> None:
 
 
 def test_arbitrary_software_is_rejected(field: Field) -> None:
-    """Metadata that a foreign key has signed, and unsigned metadata, are rejected."""
     expires = datetime.datetime.now(datetime.UTC).replace(microsecond=0) + datetime.timedelta(days=1)
     forged = Metadata(Timestamp(int(time.time()) + 9, expires=expires, snapshot_meta=MetaFile(9)))
     field.give(f"{METADATA}/timestamp.json", forged.to_bytes())
@@ -269,7 +260,7 @@ def test_an_invalid_selection_is_rejected(field: Field, selection: str) -> None:
 
 
 def test_a_later_ring_does_not_take_a_bundle_early(field: Field) -> None:
-    """The collector cannot give the bundle to a robot before the time that the operator signed for its ring."""
+    """The operator has signed a time for each ring."""
     rings = (Ring("canary", ["canary-1"]), Ring("rest", [], 100, 3600))
     path = field.site.add(terms=everywhere(None, *rings))
     with pytest.raises(BundleTooEarlyError):

@@ -73,7 +73,6 @@ def test_every_metric_is_exported_as_listed() -> None:
 
 
 def test_values_are_exported() -> None:
-    """Covers counters, gauges and cumulative histogram buckets; the parser restores the escaped name of a topic."""
     samples = {
         (one.name, tuple(sorted(one.labels.items()))): one.value
         for family in text_string_to_metric_families(rendered(body(), CALLS).decode())

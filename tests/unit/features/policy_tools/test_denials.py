@@ -1,5 +1,3 @@
-"""Every denial names the smallest change of the policy that would allow it, or why no change would."""
-
 import ipaddress
 from dataclasses import replace
 from types import SimpleNamespace

@@ -49,7 +49,7 @@ def test_only_observed_requests_are_granted() -> None:
 
 
 def test_a_search_for_a_parameter_may_find_it_the_next_time() -> None:
-    """Every parameter that `searchParam` tries is granted, so that the search under the policy is not denied."""
+    """Every parameter that `searchParam` tries is granted."""
     learned = learn([
         seen("10.0.0.1", Category.COMMAND, "searchParam", node="/arm/driver", call="searchParam", key="tf_prefix")
     ])  # fmt: skip

@@ -1,5 +1,3 @@
-"""Other programs can read the bags, even if the writer was killed in the middle."""
-
 from pathlib import Path
 
 import pytest
@@ -104,6 +102,5 @@ def test_stock_tools_find_beginning_and_end(tmp_path: Path) -> None:
 
 
 def test_empty_bag(tmp_path: Path) -> None:
-    """A bag without a message is valid."""
     BagWriter(tmp_path / "a.bag", {}).close()
     assert read(tmp_path / "a.bag") == []

@@ -1,5 +1,3 @@
-"""Topics that are never recorded because of the configuration or of a publisher's type."""
-
 import pytest
 
 from appliance.features.recorder.excluded_topics import NAMED, known_sums, left_out_because

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.nightly
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 4 MiB and a few files, in the folder of recordings."""
+    """4 MiB and a few files."""
     with small_disk(tmp_path / "recordings", "4m", "nr_inodes=64") as place:
         yield place
 

@@ -1,5 +1,3 @@
-"""Another library reads the MCAP file, with types, senders, their hosts, and times."""
-
 from pathlib import Path
 
 import pytest
@@ -31,7 +29,6 @@ def read(path: Path, bag: Path) -> tuple[list[tuple[str, str, int]], list[tuple[
 
 @pytest.mark.parametrize("size", [5, 600_000])
 def test_another_library_reads_it(tmp_path: Path, size: int) -> None:
-    """Messages of all chunks are in time order; two publishers of a topic are two channels."""
     bag = BagWriter(tmp_path / "a.bag", {})
     first, second = bag.connect(HEADER), bag.connect(HEADER | {"callerid": "/other"})
     third = bag.connect(HEADER | {"topic": "/quiet", "type": "std_msgs/Empty", "message_definition": "\n"})

@@ -1,5 +1,3 @@
-"""The recorder on a real log and a real ring: how recordings begin, grow, end and are limited."""
-
 import hashlib
 import json
 import mmap
@@ -32,8 +30,6 @@ TEXT = (5).to_bytes(4, "little") + b"hello"
 
 
 class Scene:
-    """A relay's ring, an audit log and the recorder, with a clock that the test sets."""
-
     def __init__(self, folder: Path, *, disk: int = 64 << 20, **rules: Any) -> None:
         self.clock = Clock(BEGAN)
         self.disk = disk
@@ -71,7 +67,7 @@ class Scene:
         self.stream.write(memoryview(frame(body)), 1, self.said)
 
     def happen(self, event: str = "message dropped", **fields: Any) -> str:
-        """Write an audit record now; return its id."""
+        """Returns the record's id."""
         record = decision(self.log, event=event, decision=None, time=self.clock.now, **fields)
         self.log.record(record)
         settle(self.log)
@@ -101,7 +97,6 @@ def scene(tmp_path: Path) -> Iterator[Scene]:
 
 
 def test_before_and_after(scene: Scene) -> None:
-    """The recording has the seconds before and after its record, the record as a message, and a description."""
     scene.later(20)
     scene.say(TEXT.replace(b"hello", b"alarm"))
     scene.later(1)
@@ -367,7 +362,7 @@ def test_the_next_recorder_continues_after_a_crash(scene: Scene) -> None:
 
 
 def test_a_restart_of_the_appliance_ends_a_recording(scene: Scene) -> None:
-    """The memory is new, so the written part is kept and marked as incomplete; an empty part is removed."""
+    """The memory is new, so the written part is marked as incomplete; an empty part is removed."""
     scene.happen()
     scene.later(0.1)
     (scene.folder / f".{'a' * 20}.part").mkdir()

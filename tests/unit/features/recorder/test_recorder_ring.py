@@ -1,5 +1,3 @@
-"""A relay gives the flight recorder all messages of publishers, before monitors change or drop them."""
-
 import mmap
 import os
 from collections.abc import Callable, Iterator

@@ -28,7 +28,7 @@ KEPT = Recording(
 
 
 class Trail:
-    """The audit trail: its records, and whether they can be written."""
+    """`written` records, and whether they can be written."""
 
     def __init__(self) -> None:
         self.events: list[tuple[str, dict[str, Any]]] = []

@@ -20,7 +20,7 @@ NAMES = {"127.0.0.1": ROBOT, GUEST: GUEST, "10.0.0.7": "10.0.0.7", "10.0.0.8": "
 
 
 def made(**rules: object) -> RecordingPlan:
-    """Return a plan in which hosts without a name are unknown."""
+    """Hosts without a name are unknown."""
     ids = count(1)
     every: dict[str, Any] = {"enabled": True, "per_hour": 6, "before": 60, "after": 10} | rules
     return RecordingPlan(

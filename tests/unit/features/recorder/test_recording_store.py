@@ -1,5 +1,3 @@
-"""The store has complete recordings only; the hosts and kinds with the most bytes make room."""
-
 from pathlib import Path
 
 import msgspec
@@ -52,7 +50,7 @@ def cleared(store: RecordingStore, now: int = 0, *, room: bool = False) -> list[
 
 
 def room_for(store: RecordingStore, charged_to: str) -> tuple[list[tuple[Recording, str]], str]:
-    """Return the recordings that are removed for this host, and the reason if there is still not enough room."""
+    """Returns what is removed for this host, and the reason if there is still not enough room."""
     gone: list[tuple[Recording, str]] = []
     while True:
         kept, why = store.in_the_way(charged_to)
@@ -160,7 +158,7 @@ def test_descriptions_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_old_recordings_are_removed(tmp_path: Path) -> None:
-    """A recording is removed when the configured time since its saving has passed, by the age clock."""
+    """The age clock decides."""
     age = 1000 * SECOND
 
     def make() -> RecordingStore:

@@ -1,5 +1,3 @@
-"""The ring: messages can be read even after the writer was killed, and a flood displaces only its own messages."""
-
 import mmap
 import os
 import random
@@ -39,8 +37,6 @@ def frame(body: bytes) -> bytes:
 
 
 class Clock:
-    """A clock with nanoseconds that a test sets."""
-
     def __init__(self, now: int = 1) -> None:
         self.now = now
 
@@ -288,7 +284,6 @@ _WRITER = textwrap.dedent("""
 
 @pytest.mark.nightly
 def test_killed_at_random(tmp_path: Path) -> None:
-    """A writer killed thirty times at random on the same memory leaves whole messages without a gap."""
     chance = random.Random(7)  # noqa: S311 - to find the same again
     descriptor = os.memfd_create("ring")
     os.ftruncate(descriptor, SMALLEST)

@@ -1,5 +1,3 @@
-"""The memory of the flight recorder: each process gets its part, and cannot damage the parts of others."""
-
 import mmap
 import os
 

@@ -1,5 +1,3 @@
-"""A recording's time line, and its messages around a point in time, read from one of the recorder's bags."""
-
 import json
 from datetime import UTC, datetime
 from pathlib import Path
@@ -33,7 +31,7 @@ def record(number: int, **fields: Any) -> bytes:
 
 @pytest.fixture
 def bag(tmp_path: Path) -> Path:
-    """Write two publishers of /chatter, ten messages a second each, in overlapping chunks, and events."""
+    """Two publishers of /chatter, ten messages a second each, in overlapping chunks, and events."""
     path = tmp_path / "a.bag"
     writer = BagWriter(path, {})
     first = writer.connect(HEADER)

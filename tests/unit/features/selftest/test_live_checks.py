@@ -17,7 +17,7 @@ NOT_OURS = SimpleNamespace(sequence=6, record=SimpleNamespace(caller_id="/joy", 
 
 
 class Log:
-    """An audit log that answers searches in turn as the test says."""
+    """It answers searches in turn as the test says."""
 
     def __init__(self) -> None:
         self.answers: list[Any] = []

@@ -1,5 +1,3 @@
-"""`rosrv selftest` on the kernel, ports and certificates; `selftest.txt` has the defects of files."""
-
 import datetime
 import json
 import os
@@ -21,8 +19,6 @@ RIGHT = "[Nodes]\ndefault = 10.0.0.1\n[Publishers]\ndefault = 10.0.0.1\n[Command
 
 
 class Place:
-    """A folder with a configuration, a policy and a state directory."""
-
     def __init__(self, home: Path) -> None:
         self.home = home
         self.policy, self.state = home / "policy.ini", home / "state"
@@ -103,7 +99,7 @@ def test_a_crashing_check_is_a_finding() -> None:
 
 
 def certificate(state: Path, days: int) -> None:
-    """Write a certificate for REST that ends in this number of days, and an hour."""
+    """`days` and an hour."""
     now = datetime.datetime.now(datetime.UTC)
     (state / "api").mkdir(parents=True, exist_ok=True)
     (state / "lock").write_text("")

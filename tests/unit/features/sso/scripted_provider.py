@@ -1,5 +1,3 @@
-"""A provider whose answers a test scripts, and the settings of its appliance."""
-
 import functools
 import hashlib
 import json
@@ -74,7 +72,7 @@ def part(value: Any) -> str:
 
 
 class ScriptedProvider:
-    """The provider: `payload` and `key` make the next ID token; `down` names the endpoints that do not answer."""
+    """`payload` and `key` make the next ID token; `down` names the endpoints that do not answer."""
 
     def __init__(self, wanted: Sso | None = None, secret: str | None = "s3:cret") -> None:  # noqa: S107  of a test
         self.wanted = wanted or sso()

@@ -1,5 +1,3 @@
-"""Sessions of people: rights, ends, quotas, records; and the same checks as for tokens."""
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -43,7 +41,7 @@ def _person(
 
 
 class World:
-    """Control's tokens and sessions, with a process of single sign-on that answers what the test says."""
+    """The process of single sign-on answers what the test says."""
 
     def __init__(self, home: Path) -> None:
         self.records: list[tuple[str, dict[str, Any]]] = []

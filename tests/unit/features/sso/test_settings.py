@@ -1,5 +1,3 @@
-"""Errors in the section `sso` say what is wrong, and what to do."""
-
 from typing import Any
 
 import pytest

@@ -1,5 +1,3 @@
-"""Sign-ons against a scripted provider: hostile responses, key rotation, failures, identities, and quotas."""
-
 import base64
 from typing import Any
 

@@ -17,7 +17,6 @@ from appliance.supervisor.roles import ROLES, roles_of
     ],
 )
 def test_a_syslog_receiver(text: str, destination: tuple[str, str, int]) -> None:
-    """A receiver of the audit log has a protocol, an address and a port."""
     settings = read({"audit": {"syslog": {"to": text}}})
     assert settings.of(Syslog).destination == destination
 

@@ -30,7 +30,7 @@ _DAY = 86_400_000_000_000
 
 
 class Kept:
-    """A receiver that stores messages, and fails when the test says so."""
+    """Fails when the test says so."""
 
     def __init__(self) -> None:
         self.lines: list[bytes] = []
@@ -38,7 +38,7 @@ class Kept:
         self.torn = False
 
     def send(self, messages: Sequence[bytes]) -> None:
-        """Store the messages; with `torn`, store only the first half and fail."""
+        """With `torn`, stores only the first half and fails."""
         if self.torn:
             self.lines += messages[: len(messages) // 2]
             raise ConnectionResetError("cut in the middle")
@@ -47,8 +47,7 @@ class Kept:
             raise ConnectionRefusedError("nobody there")
         self.lines += messages
 
-    def close(self) -> None:
-        """Do nothing: no resource is open."""
+    def close(self) -> None: ...
 
     @property
     def messages(self) -> list[Message]:
@@ -76,7 +75,6 @@ def run(one: LogForwarder, steps: int = 100) -> None:
 
 
 def record(log: AuditLog, count: int, **fields: object) -> None:
-    """Record some events and wait until they are on disk."""
     for number in range(count):
         log.record(decision(log, number, **fields))
     assert settle(log) is None

@@ -1,5 +1,3 @@
-"""Tests of records as RFC 5424 messages, parsed by the grammar of the RFC."""
-
 import json
 from typing import Any
 
@@ -17,7 +15,6 @@ _TIME = 1_700_000_000_123_456_789
 
 
 def entry(**fields: Any) -> LogEntry:
-    """Return a record with sequence 7."""
     all_fields: dict[str, Any] = {"id": "0" * 20, "time": _TIME, "event": "decision"} | fields
     return LogEntry(7, AuditRecord(**all_fields))
 
@@ -94,7 +91,6 @@ def test_a_name_cannot_inject_fields() -> None:
 
 @pytest.mark.parametrize("longest", [2048, 8192])
 def test_a_message_is_bounded(longest: int) -> None:
-    """A long message is cut to the limit and names what was omitted."""
     huge = "\\]" * 4096
     data = formatter(longest).record(
         entry(
@@ -121,7 +117,6 @@ def test_a_message_fits_a_datagram() -> None:
 
 @pytest.mark.parametrize("time", [-1, 0, 2**62, -(2**62)])
 def test_any_time_is_valid(time: int) -> None:
-    """Even with a wrong clock, the receiver accepts the message."""
     parse(formatter().record(entry(time=time)))
 
 

@@ -14,13 +14,10 @@ def entry(sequence: int, event: str, **fields: Any) -> LogEntry:
 
 
 def unknown(log: list[LogEntry], at: int) -> tuple[str, ...]:
-    """Return the reported gaps for /a at this second."""
     return found(log, at).unknown
 
 
 def found(log: list[LogEntry], at: int) -> PastPublishers:
-    """Return the publishers of /a at this second."""
-
     def export(wanted: Filter) -> list[LogEntry]:
         return [one for one in log if one.record.event == wanted.event]
 
@@ -41,7 +38,7 @@ def test_gaps_of_the_log_are_reported() -> None:
 
 
 def counted(sequence: int, scope: str, event: str, **fields: Any) -> LogEntry:
-    """Return the summary of a record that was repeated two seconds earlier."""
+    """The record was repeated two seconds earlier."""
     first = entry(sequence - 2, event, host="10.0.0.9", caller_id="/n", **fields).record
     state = new_state(structs.replace(first, folds=True), scope)
     state.count_in(first)

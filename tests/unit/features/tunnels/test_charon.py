@@ -18,7 +18,7 @@ pytestmark = pytest.mark.nightly
 
 
 class Standing(NamedTuple):
-    """An open tunnel: the name of its connection, the number of its IKE SA, and that of its child SA (0: none)."""
+    """The name of the connection, the number of its IKE SA, and that of its child SA (0: none)."""
 
     tunnel: str
     ike: int
@@ -34,7 +34,7 @@ class Standing(NamedTuple):
 
 
 class StandIn:
-    """A charon that accepts every command; `standing` are its tunnels, `asked` its commands, `events` its notices."""
+    """Accepts every command; `standing` are its tunnels, `asked` its commands, `events` its notices."""
 
     def __init__(self, path: Path) -> None:
         self.events = bytes([Packet.EVENT_CONFIRM])
@@ -64,7 +64,7 @@ class StandIn:
                     connection.sendall(struct.pack("!I", len(answer)) + answer)
 
     def ended(self, by: str) -> list[str]:
-        """Return the connections that charon had to end since the last call, by their `ike` (name) or `ike-id`."""
+        """Since the last call, by their `ike` (name) or `ike-id`."""
         asked, self.asked = self.asked, []
         return [body[by].decode() for name, body in asked if name == "terminate" and by in body]
 
@@ -79,7 +79,7 @@ def pem_of(count: int) -> bytes:
 
 
 def stated(count: int) -> TunnelsStated:
-    """Return a state without hosts and with a list of this size."""
+    """`count` is the size of the list."""
     return TunnelsStated(1, "kernel", "10.113.11.1", b"authority", b"certificate", pem_of(count), [])
 
 

@@ -75,8 +75,6 @@ pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 class Bench:
-    """Hosts with a store and a log of their own, and a supervisor that answers `answer`."""
-
     def __init__(
         self,
         directory: Path,
@@ -183,7 +181,6 @@ class Bench:
 
 
 def sign(key: bytes, request: str) -> bytes:
-    """Return the proof of a renewal, as `openssl pkeyutl` makes it."""
     private = load_pem_private_key(key, None)
     assert isinstance(private, ec.EllipticCurvePrivateKey)
     return private.sign(request.encode(), ec.ECDSA(hashes.SHA384()))
@@ -552,8 +549,6 @@ async def test_odd_names_that_are_names(bench: Bench, name: str) -> None:
 
 
 def test_two_hundred_hosts(tmp_path: Path) -> None:
-    """Each has its own address, and all exist after a restart."""
-
     async def work(bench: Bench) -> None:
         request = request_of("x")
         for number in range(200):
@@ -702,14 +697,14 @@ def test_a_full_disk_during_enrolment_names_the_way_out(
 
 
 class Waiting(StoredAuthority):
-    """The authority of the second of two appliances: the other one has its key."""
+    """The other of two appliances has the key."""
 
     async def obstacle(self) -> str:
         return "new certificates wait"
 
 
 class Two(Appliances):
-    """Two appliances; the other one is `row` once it has introduced itself."""
+    """`row` is the other appliance once it has introduced itself."""
 
     paired = True
     row: ApplianceRow | None = None

@@ -62,7 +62,6 @@ def test_a_host_that_made_its_key_gets_none() -> None:
 @pytest.mark.nightly
 @pytest.mark.parametrize("script", ["join.sh", "leave.sh", "keep.sh", "renew.sh"])
 def test_scripts_are_complete_shell(script: str) -> None:
-    """The shell reads them without an error, and every placeholder was replaced."""
     text = unpack(KIT)[f"rosrv-ocu-1/{script}"][0]
     done = subprocess.run(["/bin/sh", "-n"], input=text, text=True, capture_output=True, check=False)
     assert done.stderr == ""

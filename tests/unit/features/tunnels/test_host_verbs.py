@@ -1,5 +1,3 @@
-"""The kits of `rosrv host`; `host.txt` has the rest, and tests/system/ipsec runs it with an appliance."""
-
 import io
 import tarfile
 from pathlib import Path

@@ -22,8 +22,6 @@ SPELLINGS = {"before 3.2": "s/CN *= */CN = /; s/O *= */O = /", "3.2": "s/CN *= *
 
 
 class Machine:
-    """A host with a kit, and the certificate of a renewal in place."""
-
     def __init__(self, folder: Path, spelling: str) -> None:
         self._folder, self._authority = folder, CertificateAuthority(folder)
         self._kit, self._etc, programs = folder / "kit/swanctl", folder / "etc", folder / "bin"

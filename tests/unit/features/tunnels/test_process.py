@@ -31,8 +31,6 @@ _LIMIT_SECONDS = 30
 
 
 class Conversation:
-    """A stand-in for the connection to charon; notes whether a query interrupts the configuration."""
-
     def __init__(self) -> None:
         self._busy = threading.Event()
         self.interrupted = threading.Event()
@@ -44,15 +42,13 @@ class Conversation:
         self._busy.clear()
 
     def seen(self) -> list[TunnelSeen]:
-        """Return no tunnels; note whether the configuration is in progress."""
+        """Notes whether the configuration is in progress."""
         if self._busy.is_set():
             self.interrupted.set()
         return []
 
 
 class Bench(process.TunnelProcess):
-    """The process with the stand-in in place of charon."""
-
     conversation: Conversation = Conversation()
 
     async def _start(self, _wanted: TunnelsStated) -> ViciClient:
@@ -112,8 +108,6 @@ class Opening(Conversation):
 
 
 class ListeningBench(Bench):
-    """The process with `Opening` in place of charon; the process listens to its events."""
-
     async def _start(self, _wanted: TunnelsStated) -> ViciClient:
         vici = cast(ViciClient, self.conversation)
         self._loop.run_in_executor(None, self._listen, vici)
@@ -194,7 +188,6 @@ def test_the_last_output_of_charon_is_kept(tmp_path: Path, monkeypatch: pytest.M
 
 @pytest.mark.nightly
 def test_charon_is_not_started_without_its_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If ESP runs in user space and the TUN device cannot be opened, the error gives advice."""
     monkeypatch.setattr(process, "PROGRAM", tmp_path / "none")
     monkeypatch.setattr(process, "TUN", tmp_path / "tun")
     said = failure_of(tmp_path, "user space")

@@ -45,7 +45,6 @@ def test_unknown_lines_of_the_log_are_skipped() -> None:
 
 
 def test_packets_that_esp_dropped() -> None:
-    """A replayed packet, and one with a source address outside its tunnel, are each reported with the address."""
     found = refusals("""\
 16[ESP] ESP sequence number verification failed:
 16[ESP]   src 10.88.0.20, dst 10.88.0.2, SPI 7ce6406b [seq 2]

@@ -29,8 +29,6 @@ printf '%s' "${code-}"
 
 
 class Host:
-    """A host with a certificate, and the appliance's answers to it."""
-
     def __init__(self, folder: Path) -> None:
         self.swanctl, self.answers, self._programs = folder / "swanctl", folder / "answers", folder / "bin"
         for path in (self.swanctl / "x509ca", self.swanctl / "x509", self.swanctl / "private", self.answers,

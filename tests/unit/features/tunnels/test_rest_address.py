@@ -27,7 +27,6 @@ NET = ["192.168.1.0/24"]
     ],
 )
 def test_an_unreachable_rest_says_which_setting_helps(settings: dict[str, Any], trouble: str) -> None:
-    """Hosts cannot enrol themselves, and the reason names a setting."""
     place = rest_address(read(settings))
     assert place.port is None
     assert trouble in place.trouble

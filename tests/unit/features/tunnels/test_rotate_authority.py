@@ -36,7 +36,6 @@ def test_the_next_start_has_another_authority(state: Path) -> None:
 
 
 def test_it_needs_a_stopped_single_appliance_with_an_authority(state: Path, tmp_path: Path) -> None:
-    """Otherwise nothing changes, and the error says what to do."""
     before = CertificateAuthority(state / "signer").certificate
     with closing(StateDirectory(state)), pytest.raises(BackupError, match="stop the appliance first"):
         rotate_authority(state)

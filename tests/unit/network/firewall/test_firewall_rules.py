@@ -193,7 +193,6 @@ def test_a_kernel_without_a_family_lacks_no_rule_of_it() -> None:
 
 
 def test_a_rule_describes_itself() -> None:
-    """The description has the matches and the verdict in words of netfilter."""
     _, owner, _ = inner_port("ROS master port", 11312, "control", 61011)
     assert owner.describe() == "out lo, tcp 11312, uid 61011, syn -> RETURN"
 

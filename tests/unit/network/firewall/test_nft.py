@@ -98,7 +98,7 @@ def test_a_rate_limit_has_one_set_for_each_family() -> None:
 
 
 def listed(rules: tuple[PacketRule, ...], *, without: int | None = None) -> str:
-    """Return the output of `nft list table` when all of these rules except one are in force."""
+    """Leave out the rule `without`."""
     bodies = [one["add"]["rule"] for one in render(rules) if "rule" in one["add"]]
     jumps = [body for body in bodies if "comment" not in body]
     kept = [
@@ -148,14 +148,11 @@ def test_ipsec_is_matched_as_each_hook_knows_it() -> None:
 
 
 class Machine(Namespace):
-    """A namespace where a test chooses the output of `nft`, or the error of starting it."""
-
     def __init__(self, nft: OSError | str) -> None:
         super().__init__("machine")
         self.nft = nft
 
     def popen(self, args: Any, **options: Any) -> "subprocess.Popen[Any]":
-        """Return the output, or raise the error."""
         if isinstance(self.nft, OSError):
             raise self.nft
         return subprocess.Popen([sys.executable, "-c", f"print({self.nft!r})"], **options)
@@ -179,6 +176,5 @@ def test_an_nft_that_does_not_run_is_an_error_of_the_firewall(nft: OSError | str
 
 
 def test_a_missing_nft_selects_another_back_end() -> None:
-    """The machine has no nft, so another back end may be used."""
     with pytest.raises(BackendMissingError, match="apt install nftables"):
         NftBackend(Machine(FileNotFoundError(errno.ENOENT, "no such file"))).remove()

@@ -1,5 +1,3 @@
-"""A node in virtual time: two nodes, a scripted master and peers that break the rules, on a network in memory."""
-
 import asyncio
 import tracemalloc
 from collections.abc import AsyncIterator
@@ -38,8 +36,6 @@ SET_BOOL = ServiceType(
 
 
 class Nodes:
-    """The network, the master and the nodes of a test."""
-
     def __init__(self) -> None:
         self.network = MemoryNetwork()
         self.master = ScriptedMaster(self.network)
@@ -62,7 +58,6 @@ class Nodes:
 
 @asynccontextmanager
 async def nodes() -> AsyncIterator[Nodes]:
-    """Yield the world of a test; at its end every node is closed, and no task of a node remains."""
     before = asyncio.all_tasks()
     made = Nodes()
     try:

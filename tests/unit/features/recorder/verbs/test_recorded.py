@@ -1,5 +1,3 @@
-"""`rosrv monitor replay --since`: the transcript `recorded.txt`; its form: `tests/support/transcript.py`."""
-
 import functools
 import shutil
 from collections.abc import Iterator
@@ -19,7 +17,7 @@ from tests.support.transcript import Section, Transcript, sections
 pytestmark = pytest.mark.nightly
 
 BASE = 1_767_225_600
-"""2026-01-01T00:00:00Z, the beginning of all recordings."""
+"""2026-01-01T00:00:00Z."""
 
 
 def keep_recordings(fake: FakeAppliance, before: str, how: str = "", *, below: list[str]) -> None:
