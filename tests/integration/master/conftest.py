@@ -1,5 +1,3 @@
-"""A robot under attack, shared by the tests of a file."""
-
 from collections.abc import Iterator
 
 import pytest
@@ -12,7 +10,6 @@ from tests.support.requirements import need_root, needs
 
 @pytest.fixture(scope="module")
 def battlefield(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Field]:
-    """Run the appliance with the policy (and the configuration) of the test file, and its hosts."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     home, settings = tmp_path_factory.mktemp("field"), getattr(request.module, "CONFIGURATION", "")

@@ -1,5 +1,3 @@
-"""Unknown hosts fill their queue of new connections; hosts that the policy names still connect as before."""
-
 import contextlib
 import os
 import signal

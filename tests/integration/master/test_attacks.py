@@ -1,7 +1,6 @@
-"""Attacks that only the wire shows: addresses, relay ports, hidden listeners, dishonest peers.
+"""Attacks that only the wire shows; `tests/unit/master/conversations/attacks.txt` has the attacks by calls.
 
-`tests/unit/master/conversations/attacks.txt` has the attacks by calls. After each attack the robot's talker and its
-operator's listener still run (the fixture checks this).
+After each attack the robot's talker and its operator's listener still run (the fixture checks this).
 """
 
 import contextlib
@@ -155,7 +154,7 @@ def header(**fields: str) -> bytes:
 
 
 def relay_port(field: Field) -> int:
-    """Return the relay port of `/shared_voice`, with a permission for `/taker`."""
+    """The port has a permission for `/taker`."""
     code, _text, protocol = field.rogue(
         "requestTopic", "/taker", "/shared/talk", TCPROS, uri=outer(field, "/shared_voice")
     )
@@ -164,7 +163,6 @@ def relay_port(field: Field) -> int:
 
 
 def knock(field: Field, port: int, data: bytes) -> bytes:
-    """Return the relay's first bytes after a connection header, or nothing if it closes."""
     with field.connect(port=port) as sock:
         sock.sendall(data)
         with contextlib.suppress(ConnectionResetError):
@@ -176,7 +174,7 @@ STRING = {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1
 
 
 def test_granted_topic_arrives(field: Field) -> None:
-    """With the permission the connection is served, so the denials in the tests below have the intended reason."""
+    """The denials in the tests below have the intended reason."""
     answer = knock(field, relay_port(field), header(callerid="/taker", topic="/shared/talk", **STRING))
     assert b"callerid=/shared_voice" in answer
 
@@ -235,7 +233,6 @@ def test_host_that_no_rule_names(field: Field) -> None:
 
 
 def test_port_scan(field: Field) -> None:
-    """From other hosts only RVMaster, the nodes' endpoints and the relay's ports answer."""
     hidden = {port for address, port in field.middle.run(_listening) if address == LOOPBACK}
     assert hidden, "rosmaster and the master-side endpoints listen somewhere"
     scanned = field.attacker.run(lambda: scan("10.77.0.2", range(1, 65536), 0.3))
@@ -246,7 +243,6 @@ def test_port_scan(field: Field) -> None:
 
 
 def _listening() -> set[tuple[str, int]]:
-    """Return (address, port) of all listening sockets of this namespace, as in /proc."""
     table = Path("/proc/thread-self/net/tcp").read_text(encoding="ascii")
     rows = [line.split() for line in table.splitlines()[1:]]
     return {(row[1].split(":")[0], int(row[1].split(":")[1], 16)) for row in rows if row[3] == "0A"}
@@ -277,7 +273,6 @@ def twice(connection: socket.socket, _request: bytes) -> None:
 
 
 def rubbish(connection: socket.socket, _request: bytes) -> None:
-    """Send bytes that are not HTTP."""
     connection.sendall(b"\x00\xff" * 1000)
 
 

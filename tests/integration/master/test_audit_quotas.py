@@ -1,5 +1,3 @@
-"""Guests and unknown hosts flood the log while the robot works: it stays small, and keeps the important records."""
-
 import time
 import xmlrpc.client
 from collections.abc import Iterator
@@ -58,10 +56,6 @@ def test_reads_with_long_keys_do_not_fill_the_disk(siege: Siege) -> None:
 
 
 def test_unknown_hosts_do_not_displace_denials_of_named_hosts(siege: Siege) -> None:
-    """A hundred unknown hosts with varying requests cause few records.
-
-    Each denial of a named host is recorded in full.
-    """
     unknown_hosts, guest = siege.crowd.unknown_hosts, siege.crowd.guests[2]
     began = time.monotonic()
     for turn in range(4):

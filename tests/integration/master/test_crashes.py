@@ -1,5 +1,3 @@
-"""Processes are killed or stopped, and policies reloaded under load: every confirmed call takes full effect."""
-
 import contextlib
 import os
 import signal
@@ -19,8 +17,6 @@ BURST = 60
 
 
 class Burst:
-    """Register one node after another from the robot, each with a topic and a parameter, as fast as possible."""
-
     def __init__(self, field: Field, name: str, count: int = BURST) -> None:
         self._field, self._name, self._count = field, name, count
         self.node = Impostor(field.robot, answering([1, "", 4711]))
@@ -74,13 +70,11 @@ class Burst:
             assert [answer[0] for answer in calls()] == [1] * len(self.registered)
 
     def finish(self) -> None:
-        """Wait until all registrations are done."""
         for thread in self._threads:
             thread.join(LIMIT)
             assert not thread.is_alive()
 
     def all_there(self) -> None:
-        """Assert that every confirmed node is registered with its parameter, and that no call was refused."""
         assert not self.failed, self.failed[:3]
         assert len(self.registered) == self._count
         state = self._field.call(self._field.robot, "getSystemState", "/looker")[2]
@@ -93,7 +87,6 @@ class Burst:
 
 @pytest.fixture
 def working(battlefield: Field) -> Iterator[Field]:
-    """Provide the field; afterwards messages arrive again (some may be lost), and a new node can join."""
     yield battlefield
     battlefield.listener.wait_for(event="received", since=battlefield.listener.mark())
     late = battlefield.ros.on(battlefield.ocu).listener("rospy", "/chatter")

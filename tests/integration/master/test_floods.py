@@ -1,7 +1,4 @@
-"""Floods of connections, calls, registrations, names, permissions and values; other hosts hardly notice them.
-
-The policy grants the rogue everything, so limits, and not rules, protect the other hosts.
-"""
+"""The policy grants the rogue everything, so only limits protect the other hosts."""
 
 import contextlib
 import threading
@@ -27,14 +24,11 @@ GROWTH = 160 << 20  # bytes that control may grow by under attack: buffers withi
 
 
 def request(method: str, *parameters: Any) -> bytes:
-    """Return a call as bytes."""
     body = xmlrpc.client.dumps(parameters, method).encode()
     return b"POST / HTTP/1.1\r\nHost: m\r\nContent-Length: %d\r\n\r\n" % len(body) + body
 
 
 class Flood:
-    """Threads that repeat an action until the block ends."""
-
     def __init__(self, field: Field, threads: int, act: Callable[[int, int], None]) -> None:
         self._over = threading.Event()
         self.count = 0
@@ -64,7 +58,6 @@ class Flood:
 
 
 def bystander(field: Field, calls: int = 30) -> float:
-    """Return the slowest of the victim's calls: to RVMaster, each on its own connection, and to a node's endpoint."""
     slowest = 0.0
     face = field.call(field.robot, "lookupNode", "/looker", "/voice")[2]
     for number in range(calls):
@@ -96,7 +89,6 @@ def calm(field: Field) -> Iterator[Field]:
 
 
 def test_calls(calm: Field) -> None:
-    """Flood with calls as fast as a host can make them, on persistent connections."""
     data = request("getSystemState", "/flooder")
 
     def act(_number: int, _turn: int) -> None:

@@ -32,10 +32,6 @@ def test_a_malformed_request_is_refused_and_recorded(field: Field, node: str) ->
 
 @pytest.mark.parametrize("method", ["setParam", "getPid"])
 def test_the_limit_of_values_in_one_request(field: Field, method: str) -> None:
-    """A million values in one request are parsed outside the event loop; larger requests are rejected.
-
-    Other callers do not notice.
-    """
     values = "<value/>" * 1_000_010
     body = CALL.format(method, f"<param><value><array><data>{values}</data></array></value></param>")
     assert b"more than 1000000 values" in field.raw(post(body))

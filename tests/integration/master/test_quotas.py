@@ -34,7 +34,6 @@ SLOW = 1.0  # seconds for a call of the robot during a flood, on an idle machine
 
 
 def http_request(method: str, *parameters: str) -> bytes:
-    """Return a call as bytes."""
     body = xmlrpc.client.dumps(parameters, method).encode()
     return b"POST / HTTP/1.1\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body)
 
@@ -79,7 +78,6 @@ def test_requests_of_two_hundred_addresses(siege: Siege) -> None:
 
 
 def test_connections_to_the_relay(siege: Siege) -> None:
-    """Guests take every slot of the relay, and unknown hosts send half a header: permitted hosts still connect."""
     crowd = siege.crowd
     port = max(crowd.subscribe(guest, "/guest/ear", "/voice", "/chatter") for guest in crowd.guests[:12])
     header = encode_header({
@@ -96,7 +94,6 @@ def test_connections_to_the_relay(siege: Siege) -> None:
 
 
 def test_handshakes_with_rest(siege: Siege) -> None:
-    """Despite five thousand silent connections, a client with a token is served, and the process does not grow."""
     crowd, rest = siege.crowd, siege.ocu.run(siege.appliance.rest)
     before = siege.memory("api")
 
@@ -162,7 +159,6 @@ def test_parameters_of_two_hundred_addresses(siege: Siege) -> None:
 
 
 def test_ports_and_names(siege: Siege) -> None:
-    """Guests register as many nodes as they may, then unregister them all: the robot's nodes can still register."""
     crowd = siege.crowd
     with Impostor(crowd.host, answering([1, "", 4711]), address="0.0.0.0") as nodes:
 

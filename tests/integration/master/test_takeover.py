@@ -23,8 +23,6 @@ _NUMBERS = itertools.count(40, 3)  # for the machines of a test
 
 @dataclass
 class Pair:
-    """Two machines whose nodes may both be /voice, and a third that listens."""
-
     lab: Lab
     appliance: Appliance
     first: Host
@@ -41,7 +39,7 @@ class Pair:
 
 @pytest.fixture
 def pair(masters: Masters, tmp_path: Path) -> Iterator[Pair]:
-    """Provide an appliance with default times and a listener; machines, voice and topic belong to this test alone."""
+    """The machines, the voice and the topic belong to this test alone."""
     number = next(_NUMBERS)
     voice, topic = f"/voice{number}", f"/chatter{number}"
     with masters.lend("appliance", "lab") as site:

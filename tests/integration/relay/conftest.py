@@ -1,5 +1,3 @@
-"""Run a real relay between real nodes."""
-
 from collections.abc import Iterator
 from pathlib import Path
 

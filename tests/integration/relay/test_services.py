@@ -1,5 +1,3 @@
-"""Services through the relay, between unmodified rospy and roscpp nodes and the stock tools."""
-
 import socket
 from functools import partial
 
@@ -36,7 +34,6 @@ def _refused(message: object, resource: str) -> bool:
 def test_calls_are_answered(
     driver: RelayDriver, ros: RosSession, server: Client, caller: Client, options: tuple[str, ...]
 ) -> None:
-    """Every pair of client libraries is tested, with a connection for each call and with one for all calls."""
     service = ros.service_server(server, "/mode", name="server")
     client = ros.service_client(caller, "/mode", *options, name="client")
     for count, value in enumerate(("true", "false", "true"), start=1):

@@ -1,5 +1,3 @@
-"""Topics through the relay, between unmodified rospy and roscpp nodes and the stock tools."""
-
 import resource
 import signal
 import socket
@@ -29,12 +27,10 @@ STRING = {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1
 
 
 def rss(pid: int) -> int:
-    """Return the resident bytes of a process."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * resource.getpagesize()
 
 
 def subscribe(face: Face, fields: dict[str, str]) -> tuple[socket.socket, dict[str, str]]:
-    """Connect to a relay port with a raw socket, and read the header of the answer."""
     sock = socket.create_connection((LOOPBACK, face.port), timeout=20)
     sock.sendall(encode_header(fields))
     parser = HeaderParser()
@@ -95,10 +91,6 @@ def test_a_latched_message_reaches_early_and_late_subscribers_once(
 def test_a_stopped_subscriber_neither_delays_others_nor_grows_memory(
     driver: RelayDriver, ros: RosSession
 ) -> None:
-    """Messages to the stopped subscriber are dropped and counted; the other subscriber gets all, in order.
-
-    The relay's memory does not grow.
-    """
     ros.talker("roscpp", "/chatter", "--rate", "100", "--text", "x" * 60_000)
     stuck = ros.listener("roscpp", "/chatter", name="stuck")
     stuck.wait_for(event="received")

@@ -1,5 +1,3 @@
-"""Fixtures of the collector's tests: a real PostgreSQL 15, and a database for each test."""
-
 import secrets
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,7 +10,6 @@ from tests.system.fleet.postgres import PostgresCluster, postgres
 
 @pytest.fixture(scope="session")
 def cluster() -> Iterator[PostgresCluster]:
-    """Return a running PostgreSQL 15 that the tests of a worker share."""
     with postgres() as running:
         yield running
 
@@ -30,7 +27,6 @@ def site(database: str, tmp_path: Path) -> Iterator[FleetSite]:
 
 @pytest.fixture
 def make_robot(site: FleetSite) -> Iterator[Callable[..., FleetRobot]]:
-    """Return a function that makes robots of the collector; they are closed after the test."""
     made: list[FleetRobot] = []
 
     def make(name: str, **settings: object) -> FleetRobot:
@@ -44,7 +40,7 @@ def make_robot(site: FleetSite) -> Iterator[Callable[..., FleetRobot]]:
 
 @pytest.fixture(scope="module")
 def shared(cluster: PostgresCluster, tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetSite]:
-    """Return a running collector with a hundred decisions of one robot, for tests that only read."""
+    """A hundred decisions of one robot, for tests that only read."""
     database = cluster.create(f"test_{secrets.token_hex(6)}")
     with running(FleetSite(tmp_path_factory.mktemp("shared") / "site", database)) as found:
         robot = FleetRobot(found, "arm1")

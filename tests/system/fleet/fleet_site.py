@@ -1,5 +1,3 @@
-"""A collector as a process of its own, and robots that push real logs with the appliance's client."""
-
 import asyncio
 import os
 import signal
@@ -73,7 +71,6 @@ class FleetSite:
         return done
 
     def start(self) -> None:
-        """Start the collector and wait until it answers."""
         environment = os.environ | {"PYTHONPATH": str(ROOT / "fleet")}
         with (self.folder / "log").open("ab") as log:
             self._process = self.popen(self.command("serve"), stderr=log, env=environment)
@@ -105,20 +102,19 @@ class FleetSite:
         self.stop(signal.SIGKILL)
 
     def get(self, path: str, token: str | None = "", **parameters: Any) -> httpx.Response:
-        """Ask the collector; `token` "" is that of a viewer, None is none."""
+        """The default token is a viewer's."""
         headers = {} if token is None else {"Authorization": f"Bearer {token or self.token}"}
         with self.client() as client:
             return client.get(path, headers=headers, params=parameters)
 
     def client(self, robot: Certificates | None = None) -> httpx.Client:
-        """Return an HTTP client, with a robot's certificate or without one."""
         context = ssl.create_default_context(cafile=self.server.ca)
         if robot is not None:
             context.load_cert_chain(robot.certificate, robot.key)
         return httpx.Client(base_url=f"https://127.0.0.1:{self.port}", verify=context, timeout=60)
 
     def answer(self, path: str, **parameters: Any) -> dict[str, Any]:
-        """Return an answer. Raises `NoAnswerError` if the collector asks to come back later."""
+        """Raises `NoAnswerError` if the collector asks to come back later."""
         found = self.get(path, **parameters)
         if found.status_code in (429, 503):
             raise NoAnswerError(found.text)
@@ -147,7 +143,6 @@ class FleetSite:
         return self.answer("/v1/health")
 
     def indexed(self) -> None:
-        """Wait until every stored segment is indexed."""
         eventually(
             lambda: self.health()["waiting"] == 0 and self.health()["trouble"] is None, "all is indexed"
         )
@@ -159,7 +154,7 @@ class FleetSite:
 
 
 class FleetRobot:
-    """A robot: a real audit log with a signer's key, a certificate, and the appliance's pusher."""
+    """It has a real audit log with a signer's key, a certificate, and the appliance's pusher."""
 
     def __init__(
         self, site: FleetSite, name: str, *, enrolled: bool = True, every: int = 10, group: str = ""
@@ -188,7 +183,7 @@ class FleetRobot:
         self.log.request_signatures()
 
     def rewind(self, number: int) -> None:
-        """Cut the closed log off after checkpoint `number`, as an old copy would be, and open it again."""
+        """As an old copy of the log would be."""
         with sqlite3.connect(self.log_file) as log:
             (sequence,) = log.execute(
                 "SELECT sequence FROM checkpoint WHERE number = ?", (number,)
@@ -239,7 +234,6 @@ class FleetRobot:
 
 
 def push_joined(robot: FleetRobot, state: Path) -> None:
-    """Push the log of a robot with the settings that `rosrv fleet join` left in a state directory."""
     fleet = resolve(None, {}, {"state": state}).of(Fleet)
     assert fleet.receipt_key
     link = robot_connection(*fleet.connection)

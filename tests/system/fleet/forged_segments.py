@@ -17,8 +17,6 @@ from tests.system.fleet.fleet_site import FleetRobot
 
 
 class _Placed(NamedTuple):
-    """A record in the chain, and its line if it is not the last of its segment."""
-
     columns: StoredColumns
     before: bytes
     hash: bytes
@@ -47,9 +45,9 @@ def _line(columns: StoredColumns, before: bytes, digest: bytes, end: SignedCheck
 def forged(
     robot: FleetRobot, records: int, *, log: str = "", number: int = 1, **fields: Any
 ) -> tuple[SegmentSummary, bytes]:
-    """Return a valid segment with this number of records, uncompressed; `fields` are those of the records.
+    """Uncompressed; `fields` are those of the records.
 
-    A segment with a number above 1 begins after records that retention removed, as it claims.
+    A segment with a number above 1 claims to begin after records that retention removed.
     """
     log = log or secrets.token_hex(16)
     start = 0 if number == 1 else number

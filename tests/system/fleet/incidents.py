@@ -1,5 +1,3 @@
-"""Evidence bundles of the robots of a fleet, made by the appliance's own export."""
-
 import time
 from pathlib import Path
 
@@ -8,7 +6,7 @@ from tests.unit.features.evidence.conftest import Control
 
 
 def incident(robot: FleetRobot, place: Path, bag: bytes = b"") -> Path:
-    """Let a robot work, and export this time; with the messages of a recording if a `bag` is given."""
+    """The messages of a recording are `bag`."""
     control = Control(robot.log)
     control.load_policy(7, "[Nodes]\ndefault = *\n")
     control.load_specifications(2, {"a.rv": "a() { }"})

@@ -20,8 +20,6 @@ _PROGRAMS = Path("/usr/lib/postgresql/15/bin")
 
 
 class PostgresCluster:
-    """A cluster of its own, which a test can stop, kill and start again."""
-
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._process: subprocess.Popen[bytes] | None = None
@@ -37,7 +35,7 @@ class PostgresCluster:
         return f"host={self.folder} user=postgres dbname={name}"
 
     def make(self) -> None:
-        """Create the cluster; quick, as its files need not survive a power cut."""
+        """Its files need not survive a power cut."""
         command = [
             _PROGRAMS / "initdb",
             "--auth=trust",
@@ -50,7 +48,6 @@ class PostgresCluster:
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd="/", **self._as_postgres)  # type: ignore[call-overload]  # user, group
 
     def start(self, **settings: object) -> None:
-        """Start the server and wait until it accepts connections."""
         options = {"listen_addresses": "", "unix_socket_directories": self.folder, "fsync": "off", **settings}
         given = [part for name, value in options.items() for part in ("-c", f"{name}={value}")]
         with (self.folder / "log").open("ab") as log:
@@ -82,7 +79,6 @@ class PostgresCluster:
             self._process = None
 
     def kill(self) -> None:
-        """Kill the server and all its processes, as a power cut would end them."""
         if self._process is not None:
             # Its processes have groups of their own; one that outlived the server would keep it from starting again.
             server = self._process.pid

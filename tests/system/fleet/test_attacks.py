@@ -1,5 +1,3 @@
-"""Attacks on the collector: forged, replayed, swapped, huge and slow segments, and stolen certificates."""
-
 import gzip
 import json
 import os
@@ -33,7 +31,7 @@ def segment(robot: FleetRobot, number: int) -> tuple[SegmentSummary, bytes]:
 def put(
     site: FleetSite, certificates: Certificates, summary: SegmentSummary, body: bytes, **headers: str
 ) -> httpx.Response:
-    """Push a body as a segment, when the robot need not pause any more because others were refused."""
+    """Waits while the robot must pause because others were refused."""
     end = summary.header.end
     path = f"/v1/logs/{end.log}/segments/{end.number}/{summary.name}"
 
@@ -179,7 +177,7 @@ def strict(database: str, tmp_path: Path) -> Iterator[FleetSite]:
 
 @pytest.fixture
 def hasty(database: str, tmp_path: Path) -> Iterator[FleetSite]:
-    """Return a collector with short limits of time, which suffice for honest clients."""
+    """Its short limits of time suffice for honest clients."""
     limits = {"upload_seconds": 10.0, "header_seconds": 10.0}
     with running(FleetSite(tmp_path / "site", database, limits)) as found:
         yield found
@@ -283,7 +281,7 @@ def test_a_collector_with_another_key_is_not_believed(site: FleetSite, make_robo
 
 
 class _Busy(CollectorConnection):
-    """A collector that asks every robot to wait for ten minutes."""
+    """It asks every robot to wait for ten minutes."""
 
     def get(self, path: str, longest: int = 0) -> bytes:
         raise CollectorError(f"not now: {path} {longest}", 503, 600.0)

@@ -1,5 +1,3 @@
-"""A real appliance pushes its log to a real collector, and takes a signed bundle from it."""
-
 import json
 import os
 import re
@@ -27,7 +25,7 @@ POLICY = (
 
 
 class Operator:
-    """An operator with a repository of bundles and a token, who uses the command `rosrv-fleet` only."""
+    """Uses the command `rosrv-fleet` only."""
 
     def __init__(self, site: FleetSite, folder: Path) -> None:
         self._site = site
@@ -44,7 +42,6 @@ class Operator:
         self.viewer.write_text(site.token)
 
     def run(self, *arguments: str, status: int = 0) -> str:
-        """Run a verb and check its exit status; return its output."""
         done = subprocess.run(
             [sys.executable, "-m", "rosrv_fleet", *arguments], capture_output=True, text=True, check=False,
             env=os.environ | {"PYTHONPATH": str(ROOT / "fleet")},
@@ -69,13 +66,11 @@ class Operator:
         return self.run(*arguments, *access, status=status)
 
     def group(self) -> dict[str, Any]:
-        """Return the only group's last rollout, from `rosrv-fleet rollout status`."""
         (group,) = json.loads(self.rollout("status", "--json", token=self.viewer))["groups"]
         return dict(group["rollout"] or {})
 
 
 def serve_bundles(site: FleetSite, operator: Operator) -> None:
-    """Publish a bundle, and restart the collector with the section `bundles`."""
     folder = site.folder / "bundles"
     operator.publish(folder)
     key = operator.repository / "timestamp.pem"
@@ -85,7 +80,6 @@ def serve_bundles(site: FleetSite, operator: Operator) -> None:
 
 
 def make_appliance(site: FleetSite, operator: Operator) -> Appliance:
-    """Return an appliance that pushes its log and takes bundles, with the files of its users readable."""
     appliance = Appliance()
     fleet = pushing(site, appliance.directory)
     root = appliance.directory / "fleet" / "root.json"

@@ -1,5 +1,3 @@
-"""Segments of real logs are pushed, stored, proven and found."""
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,5 +1,3 @@
-"""Limits of connections and searches: of a robot, of an address without a certificate, of a token."""
-
 import socket
 import ssl
 from collections.abc import Callable, Iterator
@@ -20,7 +18,7 @@ MakeRobot = Callable[..., FleetRobot]
 
 @pytest.fixture
 def narrow(database: str, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[FleetSite]:
-    """Return a collector that permits few connections, each for this time (seconds) without a request."""
+    """It permits few connections, each for a time (seconds) without a request."""
     limits = {"robot_connections": 3, "address_connections": 6, "header_seconds": request.param}
     with running(FleetSite(tmp_path / "site", database, limits)) as found:
         yield found
@@ -31,7 +29,7 @@ def _connect(site: FleetSite, source: str = "127.0.0.1") -> socket.socket:
 
 
 def _is_closed(connection: socket.socket) -> bool:
-    """Return whether the collector has closed a connection; wait up to a second."""
+    """Waits up to a second."""
     connection.settimeout(1.0)
     try:
         return connection.recv(1) == b""
@@ -42,7 +40,6 @@ def _is_closed(connection: socket.socket) -> bool:
 
 
 def _is_held(connection: ssl.SSLSocket) -> bool:
-    """Return whether the collector answers a request, and waits for the end of a second one."""
     connection.settimeout(LIMIT)
     try:
         connection.sendall(b"GET /v1/bundles/x HTTP/1.1\r\nHost: x\r\n\r\nGET ")

@@ -1,5 +1,3 @@
-"""The collector's console in a real browser: log in, robots, search; no script, no text of a robot as markup."""
-
 import datetime
 import time
 from collections.abc import Callable, Iterator
@@ -31,7 +29,7 @@ _MARKUP = "<script>document.title='owned'</script><b id=owned>"
 
 @contextmanager
 def opened_page(width: int = 1280, theme: Literal["light", "dark"] = "light") -> Iterator[Page]:
-    """Return a page of headless Chromium; an error in its console fails the test."""
+    """An error in the page's console fails the test."""
     program = need_program("chromium", "chromium")
     with sync_playwright() as playwright:
         browser: Browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
@@ -61,7 +59,6 @@ def log_in(page: Page, site: FleetSite, token: str) -> None:
 
 
 def test_the_console(site: FleetSite, make_robot: MakeRobot) -> None:
-    """An operator logs in, sees the robots and a gap, and finds a record; texts of robots stay texts."""
     robot = make_robot("arm1")
     robot.record(10, reason=_MARKUP, caller_id="/x\u202e")
     robot.record(5)
@@ -111,7 +108,7 @@ def test_a_wrong_token_is_refused(site: FleetSite) -> None:
 
 
 class RolloutSite:
-    """A collector with two rollouts of a group whose robots only report, an operator and a viewer."""
+    """Two rollouts of a group whose robots only report."""
 
     def __init__(self, site: FleetSite, folder: Path, make_robot: MakeRobot) -> None:
         self.site = site
@@ -127,7 +124,7 @@ class RolloutSite:
         return self.operator.token.read_text().strip()
 
     def start(self) -> None:
-        """Begin a rollout as the operator; robots are not silent while a slow browser works."""
+        """Robots are not silent while a slow browser works."""
         wanted = {"bundle": BUNDLE, "gates": {"healthy_seconds": 600, "silent_seconds": 3600}}
         with self.site.client() as client:
             header = {"Authorization": f"Bearer {self.token}"}
@@ -135,7 +132,7 @@ class RolloutSite:
             assert answer.status_code == 200, answer.text
 
     def report(self, **changes: Any) -> None:
-        """Report for all robots but the last one, which was never seen."""
+        """The last robot was never seen and does not report."""
         report: dict[str, Any] = dict.fromkeys(("in_force", "trying", "refused", "reason", "trouble"), "")
         report |= {"site": "site-a", "group": "arms", "changed": False, "denials": 0, "failing": 0} | changes
         for robot in self.robots[:-1]:
@@ -157,7 +154,6 @@ def rollouts(site: FleetSite, tmp_path: Path, make_robot: MakeRobot) -> RolloutS
 
 
 def _follow(page: Page, name: str) -> None:
-    """Press Tab until the link or button with this name has the focus, then Enter, and wait for the next page."""
     focused = "document.activeElement.textContent.trim()"
     for _ in range(60):
         if page.evaluate(focused) == name:
@@ -256,7 +252,6 @@ def _violations(page: Page, rollouts: RolloutSite) -> Iterator[tuple[str, list[s
 
 
 def _axe(page: Page) -> list[str]:
-    """Return the violations of WCAG 2.2 AA and best practices that axe-core finds."""
     kinds = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
     found = Axe().run(page, options={"resultTypes": ["violations"], "runOnly": kinds})
     return [

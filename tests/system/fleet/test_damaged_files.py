@@ -1,4 +1,4 @@
-"""One damaged file in the collector's folder affects its robot only, and is reported."""
+"""The damage affects its robot only, and is reported."""
 
 import gzip
 from collections.abc import Callable

@@ -1,5 +1,3 @@
-"""Operators carry evidence bundles to a collector: it verifies, stores, lists and returns them."""
-
 import json
 import secrets
 import shutil
@@ -25,8 +23,6 @@ MakeRobot = Callable[..., FleetRobot]
 
 
 class Carrier:
-    """An operator who adds bundles to a collector over REST."""
-
     def __init__(self, site: FleetSite) -> None:
         self.site = site
         self.token = site.run("token", "add", "olga", "--role", "operator").stdout.strip()
@@ -37,7 +33,7 @@ class Carrier:
             return client.post("/v1/evidence", params={"robot": robot}, content=bundle, headers=headers)
 
     def stored(self) -> list[dict[str, Any]]:
-        """Return the stored bundles; fail if an unfinished upload is on the disk."""
+        """Fails if an unfinished upload is on the disk."""
         assert list(self.incoming.iterdir()) == []
         return list(self.site.get("/v1/evidence").json())
 
@@ -269,7 +265,6 @@ def test_sizes_have_limits(site: FleetSite, make_robot: MakeRobot, tmp_path: Pat
 
 
 def _begin_upload(carrier: Carrier) -> ssl.SSLSocket:
-    """Send the first half of an upload, and wait until the collector has it."""
     context = ssl.create_default_context(cafile=carrier.site.server.ca)
     plain = socket.create_connection(("127.0.0.1", carrier.site.port), 30)
     secured = context.wrap_socket(plain, server_hostname="127.0.0.1")

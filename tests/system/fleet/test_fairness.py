@@ -1,5 +1,3 @@
-"""Compromised robots, clients and viewers take only their own part of the collector, which still serves others."""
-
 import contextlib
 import gzip
 import secrets
@@ -56,7 +54,6 @@ def _seen(site: FleetSite, uploads: set[str]) -> set[str]:
 
 @contextmanager
 def _attack(site: FleetSite, attackers: list[FleetRobot], *, valid: bool) -> Iterator[None]:
-    """Let robots push large segments, valid or with a wrong last line, during a block."""
     ended, log = threading.Event(), secrets.token_hex(16)
     made = [(robot, *forged(robot, _RECORDS, log=log)) for robot in attackers]
     pushed = [

@@ -1,5 +1,3 @@
-"""Robots join a collector with invitations: once, each for its own name, and nothing secret leaves them."""
-
 import contextlib
 import hashlib
 import json
@@ -46,7 +44,6 @@ def invite(site: FleetSite, name: str, file: Path, *options: str) -> Path:
 
 
 def state_of(robot: FleetRobot) -> Path:
-    """Return a state directory with the public key of the robot's log."""
     control = robot.folder / "appliance" / "control"
     control.mkdir(parents=True, exist_ok=True)
     shutil.copy(robot.folder / "audit.pub.pem", control / "audit.pub")
@@ -54,21 +51,19 @@ def state_of(robot: FleetRobot) -> Path:
 
 
 def join(robot: FleetRobot, file: Path, status: int = 0) -> str:
-    """Run `rosrv fleet join` for a robot; return its output, standard error last."""
+    """Standard error comes last in the output."""
     done = rosrv("fleet", "join", str(file), "--state", str(state_of(robot)))
     assert done.returncode == status, done.stdout + done.stderr
     return done.stdout + done.stderr
 
 
 def pusher_of(robot: FleetRobot) -> SegmentPusher:
-    """Return the appliance's client with the settings that a join left."""
     fleet = resolve(None, {}, {"state": state_of(robot), "isolation": "none"}).of(Fleet)
     link = robot_connection(*fleet.connection)
     return SegmentPusher(robot.log_file, robot.folder / "state", link, robot.site.receipt_key)
 
 
 def pushes_all(robot: FleetRobot) -> bool:
-    """Push the sealed segments with the settings that a join left; return whether the collector took all."""
     pusher = pusher_of(robot)
     while pusher.step() == 0:
         pass
@@ -341,7 +336,6 @@ def _fingerprint(pem: str) -> str:
 
 
 def test_the_health_check_asks_this_collector_only(inviting: FleetSite, tmp_path: Path) -> None:
-    """It passes while the collector answers with its own certificate, and prints the reason otherwise."""
     environment = {
         "PYTHONPATH": str(ROOT / "fleet"),
         "ROSRV_FLEET_CONFIG": str(inviting.folder / "fleet.yaml"),

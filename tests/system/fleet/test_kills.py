@@ -1,5 +1,3 @@
-"""Collector and PostgreSQL are killed while many robots push: no record is missing, by chain proof."""
-
 import json
 import secrets
 import threading

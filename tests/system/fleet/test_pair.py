@@ -20,8 +20,6 @@ NAMES = ("a", "b")
 
 
 class Fleet(FleetSite):
-    """A collector on a host of its own, which is asked with commands only."""
-
     def _answers(self) -> bool:
         try:
             with socket.create_connection((self.address, self.port), 1):
@@ -107,7 +105,7 @@ def _configure(site: StandbySite, operator: Operator) -> None:
 
 
 def _bundles(site: StandbySite, name: str) -> tuple[str, bool] | None:
-    """Return the bundle in force, and whether it was changed, once an appliance has verified the metadata."""
+    """None until an appliance has verified the metadata."""
     state = site.appliances[name].status()["bundles"]
     return None if state["checked"] is None else (state["in_force"], state["changed"])
 
@@ -121,7 +119,7 @@ def _restart(site: StandbySite, name: str) -> None:
 
 
 def _all_pushed(site: StandbySite, fleet: Fleet, name: str) -> bool:
-    """Return whether the collector has all records of an appliance that a checkpoint seals."""
+    """Only records that a checkpoint seals count."""
     log = site.appliances[name].state / "control" / "audit.db"
     last = signed_checkpoints(log, 0, 1_000_000)[-1]
     found = {proof["log"]: proof["last"] for proof in fleet.proven()}

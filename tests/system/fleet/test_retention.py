@@ -37,7 +37,6 @@ def _segments(site: FleetSite, robot: str) -> list[Path]:
 
 
 def _aged(site: FleetSite, robot: FleetRobot, ages: list[int]) -> None:
-    """Push a segment for each age in days, and pretend that it arrived so long ago."""
     for _age in ages:
         robot.record(5)
     robot.push()

@@ -1,5 +1,3 @@
-"""Rollouts with robots that use the real client, a real collector and PostgreSQL."""
-
 import asyncio
 import json
 import shutil
@@ -35,7 +33,7 @@ RINGS = (Ring("canary", ["r-0", "r-1"]), Ring("half", [], 50), Ring("rest", [], 
 
 @dataclass
 class Robot:
-    """A robot with the real poller; instead of control it has a function that judges bundles."""
+    """A function judges bundles instead of control."""
 
     name: str
     poller: Poller
@@ -57,7 +55,7 @@ class Robot:
 
 
 class Fleet:
-    """A site, its collector and robots; `poll` lets all robots poll once, several at a time."""
+    """`poll` lets several robots poll at a time."""
 
     def __init__(self, site: RobotSite, running: RolloutCollector, folder: Path) -> None:
         self.site, self.collector, self.folder = site, running, folder
@@ -112,7 +110,7 @@ class Fleet:
         return dict(answer.json())
 
     def state(self) -> dict[str, Any]:
-        """Return the rollout of the group. Raises `NoAnswerError` until the collector returns one."""
+        """Raises `NoAnswerError` until the collector returns a rollout."""
         answer = self.operator.get(f"/v1/rollouts/{SITE}/{GROUP}")
         found = answer.json()["rollout"] if answer.status_code == 200 else None
         if found is None:
@@ -120,8 +118,6 @@ class Fleet:
         return dict(found)
 
     def until(self, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-        """Let all robots poll until the rollout is as wanted."""
-
         def found() -> dict[str, Any] | None:
             self.poll()
             state = self.state()
@@ -268,7 +264,7 @@ def test_half_of_a_publication_is_not_served(fleet: Fleet) -> None:
 
 
 def _put(fleet: Fleet, name: str, **changes: Any) -> httpx.Response:
-    """Send a robot's report, as a compromised robot could write it."""
+    """The report may be one of a compromised robot."""
     report: dict[str, Any] = dict.fromkeys(("in_force", "trying", "refused", "reason", "trouble"), "")
     report |= {"site": SITE, "group": GROUP, "changed": False, "denials": 0, "failing": 0} | changes
     certificate, key = fleet.site.authority.issue(name)
@@ -338,7 +334,6 @@ async def _seen(fleet: Fleet, name: str) -> bool:
 
 
 def test_a_reason_with_a_null_character_stops_only_its_rollout(fleet: Fleet) -> None:
-    """A reason that PostgreSQL cannot store stops the rollout like any other, and no other work of the collector."""
     fleet.add(2)
     path = fleet.publish(*RINGS)
     fleet.poll()

@@ -1,5 +1,3 @@
-"""Fixtures of the audit log: a path, a key, a signer in the test's process, and logs."""
-
 import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,7 +17,7 @@ MakeLog = Callable[..., AuditLog]
 
 
 class Notary:
-    """The signer's memory, settings and clock; the clock is `ago` nanoseconds behind."""
+    """The clock is `ago` nanoseconds behind."""
 
     def __init__(self, directory: Path) -> None:
         directory.mkdir()
@@ -33,18 +31,16 @@ class Notary:
         return clock.wall_ns() - self.ago
 
     def sign(self, text: bytes) -> None:
-        """Remember a checkpoint, unless it is from another history: some tests make such checkpoints."""
         with contextlib.suppress(CheckpointRefusedError):
             self._signed.approve(text)
 
     def approve(self, checkpoint: bytes, newest: bytes) -> bytes:
-        """Return the signed text of a removal. Raises `RemovalRefusedError`."""
+        """Raises `RemovalRefusedError`."""
         return RemovalApprover(self._signed, self.kept, clock=self._now).approve(checkpoint, newest)
 
 
 @pytest.fixture(autouse=True)
 def time() -> Iterator[VirtualClock]:
-    """Return the clock of the test, which moves only when the test moves it."""
     time = VirtualClock(wall=1_800_000_000)
     with clock.using(time):
         yield time

@@ -1,5 +1,3 @@
-"""The service calls of monitors are decided by the policy like those of a client on the loopback."""
-
 import asyncio
 from typing import Any, cast
 
@@ -16,7 +14,7 @@ ALLOWED = "[Commands]\nlookupService = 127.0.0.1\n[Clients]\n/arm = 127.0.0.1\n"
 
 
 class Control:
-    """The parts of control that the gate uses: the records, and the grants as `host caller service`."""
+    """`granted` has the grants as `host caller service`."""
 
     strict = False
 

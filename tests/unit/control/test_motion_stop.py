@@ -1,5 +1,3 @@
-"""The stop of what hosts commanded by rights that a new control does not keep."""
-
 import asyncio
 from types import SimpleNamespace
 from typing import Any, cast

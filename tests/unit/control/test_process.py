@@ -22,12 +22,11 @@ URI = "http://10.0.0.5:4000/"
 
 
 def fail(reason: str) -> None:
-    """Fail if the store could not write."""
     raise AssertionError(reason)
 
 
 class Ports(idle_class(ProxyEndpoints)):  # type: ignore[misc]  # it is made
-    """Ports that can all be bound again after a restart."""
+    """All ports can be bound again after a restart."""
 
     async def reopen(self, _incarnation: Incarnation) -> None:
         """Act as `ProxyEndpoints`."""

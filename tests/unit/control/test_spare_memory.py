@@ -1,5 +1,3 @@
-"""Large amounts of free memory that the allocator keeps are returned to the system."""
-
 import subprocess
 import sys
 

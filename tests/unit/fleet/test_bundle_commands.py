@@ -1,5 +1,3 @@
-"""`rosrv-fleet bundle` from the first key to the collector's folder, as an operator types it."""
-
 from pathlib import Path
 
 import pytest
@@ -94,7 +92,6 @@ def test_a_bundle_with_errors_is_not_signed(desk: Desk) -> None:
     ],
 )
 def test_mistakes_are_explained(desk: Desk, words: tuple[str, ...], reason: str) -> None:
-    """A mistake ends with status 1 and a reason; nothing changes."""
     given = [str(desk.robot) if word == "arms" else word for word in words]
     done = desk.run(*given)
     assert done.exit_code == 1

@@ -19,8 +19,6 @@ _NUMBERS = count(100)
 
 
 class _Socket(CountedSocket):
-    """A connection without a socket; `cut` once it made room."""
-
     def __init__(self) -> None:
         self.number, self.cut = next(_NUMBERS), False
 
@@ -30,19 +28,17 @@ class _Socket(CountedSocket):
     def shutdown(self, _how: int) -> None:
         self.cut = True
 
-    def close(self) -> None:
-        """Nothing is open."""
+    def close(self) -> None: ...
 
 
 @pytest.fixture
 def table(monkeypatch: pytest.MonkeyPatch) -> ClientConnections:
-    """Return a table for 400 connections, 64 of an address."""
     monkeypatch.setattr(connections, "permitted_connections", lambda wanted: wanted)
     return ClientConnections(Limits(connections=400, address_connections=64))
 
 
 def _opened(table: ClientConnections, address: str, number: int = 1) -> list[_Socket]:
-    """Return the accepted ones of new connections of an address, opened slowly enough for its share."""
+    """Opened slowly enough for the share of the address; only the accepted ones are returned."""
     accepted = []
     for _ in range(number):
         let_time_pass(10.0)

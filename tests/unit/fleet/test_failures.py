@@ -29,7 +29,7 @@ _DEFECT = "a defect of rosrv-fleet, please report it: RuntimeError: unforeseen"
 
 
 class _Defect:
-    """A function that always raises an unexpected error; before the second one, it calls `second`."""
+    """Before the second error, it calls `second`."""
 
     def __init__(self, second: Callable[[], object]) -> None:
         self._second = second
@@ -50,7 +50,6 @@ class _WithoutMemory(Workers):
 
 
 def test_the_indexer_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The defect is reported as the reason why segments are not indexed."""
     work = Indexer(
         SegmentStore(tmp_path, 0),
         enrolled_robots(tmp_path, "arm1"),
@@ -87,7 +86,6 @@ def test_a_segment_that_causes_a_defect_is_set_aside(tmp_path: Path) -> None:
 
 
 def test_retention_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The defect is reported, and old data is removed later."""
     database = IndexDatabase("", connections=1, statement_seconds=1.0)
     work = Pruner(
         SegmentStore(tmp_path, 0), enrolled_robots(tmp_path, "arm1"), database, RetentionConfig(index_days=1)
@@ -101,7 +99,6 @@ def test_retention_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.nightly
 def test_rollouts_continue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After the defect, the next tick reads the robots again."""
     monkeypatch.setattr(service, "_PAUSE_SECONDS", 0.0)
     monkeypatch.setattr(service, "_TICK_SECONDS", 0.0)
     database = IndexDatabase("", connections=1, statement_seconds=1.0)

@@ -17,15 +17,11 @@ _PLACE = SegmentPlace("arm1", "0" * 32, 1, "a" * 64)
 
 
 class _NoProcesses(Workers):
-    """Workers on a machine that starts no more processes."""
-
     def submit(self, *_work: Any, **_named: Any) -> NoReturn:
         raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
 
 
 class _Damage(Workers):
-    """Workers that find damage in the bytes of each segment; `before` is called while they work."""
-
     def __init__(self, before: Callable[[], object]) -> None:
         super().__init__(1)
         self._before = before
@@ -39,7 +35,6 @@ class _Damage(Workers):
 
 @pytest.fixture
 def store(tmp_path: Path) -> SegmentStore:
-    """Return a store with a segment of arm1 that waits for the index."""
     store = SegmentStore(tmp_path, 0)
     (tmp_path / "pending" / "arm1").mkdir()
     (tmp_path / "pending" / "arm1" / _PLACE.mark).touch()

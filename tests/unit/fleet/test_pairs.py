@@ -1,5 +1,3 @@
-"""A robot with a standby is one robot of the collector; both appliances have logs, keys and certificates."""
-
 from pathlib import Path
 
 import pytest
@@ -35,7 +33,6 @@ def test_a_standby_joins_as_the_same_robot(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("gone", ["a", "b"])
 def test_an_appliance_is_replaced(gone: str, tmp_path: Path) -> None:
-    """The removed machine may not connect or join, its log is still verified, and a new one takes its place."""
     robots, machines, new = (
         Robots(tmp_path / "robots"),
         {"a": JoiningAppliance(), "b": JoiningAppliance()},

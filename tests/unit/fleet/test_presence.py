@@ -16,7 +16,6 @@ from tests.support.virtual_clock import let_time_pass
 
 
 def state_of(data: Path, presence: RobotPresence) -> RobotState:
-    """Return the state of the only robot; the index is up."""
     up = SimpleNamespace(trouble=None)
     parts = SimpleNamespace(
         store=SegmentStore(data, 0), robots=Robots(data / "robots"), presence=presence, indexer=up, pruner=up,

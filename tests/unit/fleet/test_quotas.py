@@ -12,8 +12,6 @@ _DAY = 86_400.0
 
 
 class _Clock:
-    """A clock that a test sets."""
-
     def __init__(self) -> None:
         self.now = 1e9
 

@@ -25,7 +25,6 @@ async def _gone() -> Message:
 def test_a_body_has_limits(
     receive: Callable[[], object], status: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A body that is too long, a silent client and a closed connection end the request with an answer."""
     monkeypatch.setattr(request_body, "_SECONDS", 0.01)
     request = Request({"type": "http", "method": "POST", "headers": []}, receive)  # type: ignore[arg-type]  # of ASGI
     with pytest.raises(HTTPException) as refused:

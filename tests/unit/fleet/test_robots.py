@@ -167,7 +167,6 @@ def test_two_robots_cannot_join_with_one_key(data: Path, tmp_path: Path) -> None
 
 
 def test_acts_are_recorded(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each act is a line with time, user, act and subject; a token's text is not in it."""
     monkeypatch.setenv("SUDO_USER", "olga")
     monkeypatch.setattr("os.getuid", lambda: 0)
     key, certificate = map(str, _files(tmp_path, "arm7"))
@@ -195,7 +194,6 @@ def _acts(data: Path) -> list[dict[str, str]]:
 
 
 def test_no_act_takes_effect_unrecorded(data: Path, tmp_path: Path) -> None:
-    """While acts cannot be recorded, no command changes anything; each command that changes something has a case."""
     (tmp_path / "c").write_bytes(make_own_certificate("rosrv-fleet", 1, "127.0.0.1")[1])
     key, certificate = map(str, _files(tmp_path, "arm7"))
     other_key, other = map(str, _files(tmp_path, "arm8"))
@@ -399,7 +397,6 @@ def test_whatever_certificate_is_accepted_can_be_shown(tmp_path: Path) -> None:
 
 
 def _health(data: Path) -> FleetHealth:
-    """Return the health of a collector with the robots of a data folder, whose index is up."""
     up = SimpleNamespace(trouble=None)
     parts = SimpleNamespace(
         store=SegmentStore(data, 0), robots=Robots(data / "robots"), presence=RobotPresence(data / "heard"),

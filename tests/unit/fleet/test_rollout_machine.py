@@ -43,7 +43,6 @@ looks = st.lists(
 
 
 def begun(terms: Terms | None = None, gates: HealthGates = GATES) -> BundleRollout:
-    """Return a new rollout at time 0."""
     return BundleRollout(NEW, OLD, terms or Terms(0, RINGS), gates, 0.0)
 
 

@@ -28,7 +28,7 @@ _ROLLOUT = BundleRollout(
 
 
 class _Memory(RolloutStore):
-    """A store with one rollout, in memory. `meddle` is called before the rollout is replaced."""
+    """`meddle` is called before the rollout is replaced."""
 
     def __init__(self) -> None:
         super().__init__(IndexDatabase("", connections=1, statement_seconds=1.0))
@@ -81,7 +81,7 @@ class _Calls:
         return work(*arguments)
 
     async def during(self, tick: Coroutine[Any, Any, None], other: Coroutine[Any, Any, object]) -> None:
-        """Begin a tick, let `other` do all that it can while the call waits, and end both."""
+        """`other` does all that it can while the call waits."""
         ticking = asyncio.create_task(tick)
         await self.began.wait()
         beside = asyncio.create_task(other)
@@ -93,7 +93,7 @@ class _Calls:
 
 @pytest.fixture
 def store() -> _Memory:
-    """Return a store with a healthy rollout, whose first ring is open since 1000 s."""
+    """Healthy; the first ring is open since 1000 s."""
     return _Memory()
 
 

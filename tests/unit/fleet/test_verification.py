@@ -40,7 +40,7 @@ class _Store(SegmentStore):
 
 @pytest.fixture
 def store(make_log: MakeLog, path: Path, tmp_path: Path) -> _Store:
-    """Return a store with an indexed log, of which all but the last segment are old."""
+    """All but the last segment are old."""
     log, found = make_log(checkpoint_every=10), _Store(tmp_path / "data", 0)
     for number in range(50):
         log.record(decision(log, number))

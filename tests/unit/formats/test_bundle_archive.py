@@ -95,7 +95,6 @@ def test_any_bytes_are_an_archive_or_rejected(noise: bytes) -> None:
     ],
 )
 def test_wrong_contents_are_rejected(files: dict[str, bytes], word: str) -> None:
-    """A missing, foreign, binary or too large file is named."""
     with pytest.raises(BundleArchiveError, match=word):
         pack(files)
 
@@ -125,7 +124,6 @@ def test_each_robot_is_in_one_ring(robot: str, version: int) -> None:
     ],
 )
 def test_wrong_rings_are_rejected(rings: list[Ring]) -> None:
-    """Rings that do not cover all robots in order are rejected, by the operator's command and by robots."""
     with pytest.raises(TermsError):
         checked_terms(Terms(1, rings))
 

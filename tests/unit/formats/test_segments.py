@@ -33,7 +33,7 @@ def public(key: Ed25519PrivateKey) -> bytes:
 
 @pytest.fixture
 def segments(make_log: MakeLog, path: Path) -> list[bytes]:
-    """Return the first three segments of a real log; its last checkpoint, that of its end, is not signed."""
+    """The last checkpoint, of the log's end, is not signed."""
     log = make_log(checkpoint_every=5)
     fill(log, 21)
     assert len(signed_checkpoints(path)) == 4
@@ -50,7 +50,6 @@ def fill(log: AuditLog, count: int) -> None:
 
 
 def written(path: Path, number: int) -> bytes:
-    """Return the bytes of a segment."""
     file = io.BytesIO()
     assert write_segment(path, number, file.write) is not None
     return file.getvalue()

@@ -20,7 +20,6 @@ _CASES = [(name, title) for name, read in _READ.items() for title in read.conver
 
 @pytest.mark.parametrize(("name", "title"), _CASES)
 async def test_conversation(name: str, title: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each action has exactly the effects below it, in that order."""
     # Checks of lost nodes would begin on their own during a later action.
     monkeypatch.setattr(liveness, "RECENTLY_LOST_SECONDS", 3600.0)
     written = _READ[name].conversations[title]

@@ -31,8 +31,6 @@ LOAD = ClientRequest("10.0.0.1", "POST", "/v1/policy", '"3"', "text/plain", "", 
 
 
 class World:
-    """The parts of control that note orders and records."""
-
     def __init__(self, directory: Path) -> None:
         self.store = StateStore(directory, failed=lambda _text: None, kind=InlineDatabase)
         self.done: list[tuple[AnyRequest, str]] = []
@@ -49,8 +47,7 @@ class World:
             parts, self.tokens, parts, served=print, certified=print, require_proof=require_proof
         )
 
-    def token_changed(self) -> None:
-        """Send no notification."""
+    def token_changed(self) -> None: ...
 
     async def carry_out(self, request: AnyRequest, *, who: str) -> AdminAnswer[Any]:
         self.done.append((request, who))
@@ -66,8 +63,6 @@ class World:
 
 
 class Api:
-    """The api's end of the link, which sends any message."""
-
     def __init__(self, world: World) -> None:
         self.channel, self.control = memory_link(ApiLink)
         world.link.attach(self.control)
@@ -106,7 +101,6 @@ class Api:
 
 @pytest.fixture
 def world(tmp_path: Path) -> Iterator[World]:
-    """Return control's parts; its links and its store are closed at the end."""
     world = World(tmp_path)
     yield world
     for api in world.apis:

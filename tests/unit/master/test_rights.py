@@ -180,7 +180,6 @@ NAMED = st.sampled_from(["default", "/**", "/arm/**", *RESOURCES])
 
 
 def rules_of(keys: st.SearchStrategy[str]) -> st.SearchStrategy[dict[str, str] | None]:
-    """Draw the rules of a section, which may be missing."""
     return st.none() | st.dictionaries(keys, WHO, max_size=4)
 
 

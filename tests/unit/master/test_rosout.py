@@ -1,5 +1,3 @@
-"""Messages of monitors on /rosout: correct bytes, correct level, and no flood."""
-
 import msgspec
 import pytest
 

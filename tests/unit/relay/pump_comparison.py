@@ -76,8 +76,6 @@ _WORDS = ("bad", "one", "long", "count", "", "x", "hello", "a message of usual l
 
 
 class ComparedRelay(Monitored):
-    """A relay with two topics; `pumped`: it may arm connections."""
-
     def __init__(self, *, pumped: bool) -> None:
         super().__init__(_MANY)
         self.pumped = pumped
@@ -95,7 +93,7 @@ class ComparedRelay(Monitored):
                 self.engine.topics["k", topic][0].tap(_nothing, latched=False)
 
     def until(self, condition: Callable[[], Any], seconds: float = LIMIT) -> Any:
-        """Like the method of `World`, which waits for events in each turn."""
+        """The method of `World` waits for events in each turn."""
         for _ in range(20):
             self.loop.turn(0)
             found = condition()
@@ -127,7 +125,6 @@ class ComparedRelay(Monitored):
         self.until(lambda: all(map(self.arrived, _TOPICS)))
 
     def answered(self, revision: int) -> None:
-        """Wait until these specifications are in force."""
         self.until(lambda: self.taken(SpecificationsTaken, revision))
 
     def collect(self) -> None:
@@ -163,7 +160,7 @@ class ComparedRelay(Monitored):
         return {"counted": dict(self.counted), "rows": rows}
 
     def recovered(self, statement: SpecificationsStated) -> list[bytes]:
-        """Return the state with which the next process would start, except times."""
+        """Without times."""
         left = StateKeeper(self.given, self.memory).recovered()
         monitors = Loader.load(statement, str)
         if left is None or isinstance(monitors, list):
@@ -173,7 +170,7 @@ class ComparedRelay(Monitored):
 
 
 def _nothing(_batch: Batch) -> None:
-    """Do nothing with a batch: a tap keeps the pump from a topic."""
+    """A tap keeps the pump from a topic."""
 
 
 class PumpComparison:
@@ -208,7 +205,6 @@ class PumpComparison:
         self.done[chosen.__name__.strip("_")] += 1
 
     def run(self, batches: int) -> None:
-        """Perform steps until this number of batches was sent, then compare everything."""
         while self.done["batch"] < batches:
             self.step()
         self._compare()
@@ -234,7 +230,7 @@ class PumpComparison:
         self._settle()
 
     def _both_at_once(self) -> None:
-        """Make both publishers ready before the next turn, unless a monitor depends on the order of their messages."""
+        """Unless a monitor depends on the order of their messages."""
         if self._ordered:
             return
         messages = [self._message() for _ in _TOPICS]
@@ -279,7 +275,7 @@ class PumpComparison:
                 self._served(side, topic)
 
     def _served(self, side: ComparedRelay, topic: str) -> None:
-        """Wait until the relay has noticed which subscribers have left."""
+        """Subscribers may have left."""
         there = [*self._slow.values(), *self._fast.values()].count(topic)
         side.until(lambda: len(side.engine.topics["k", topic][0].members) == there)
 
@@ -325,7 +321,6 @@ class PumpComparison:
     # --- comparison ---
 
     def _settle(self) -> None:
-        """Let both relays turn until they have received all messages and their fast subscribers have the same bytes."""
         for side in self.both:
             side.take_all()
         for name in self._fast:
@@ -334,8 +329,6 @@ class PumpComparison:
             side.collect()
 
     def _catch_up(self, name: str) -> None:
-        """Read until both relays have sent this subscriber the same number of bytes."""
-
         def same() -> bool:
             for side in self.both:
                 side.loop.turn(0)
@@ -357,7 +350,6 @@ class PumpComparison:
         del one[:common], other[:common]
 
     def _compare(self) -> None:
-        """Compare everything, once all bytes were read."""
         for name in (*self._slow, *self._fast):
             self._catch_up(name)
         for side in self.both:
@@ -406,7 +398,6 @@ class PumpComparison:
 
 
 def main(arguments: list[str]) -> None:
-    """Run the command line that the head of this file describes."""
     comparison = PumpComparison(int(arguments[0]))
     comparison.run(int(float(arguments[1])))
     comparison.close()

@@ -67,7 +67,6 @@ DIALOGUES = transcripts(Path(__file__).with_name("dialogues.txt"))
 
 @pytest.mark.parametrize("title", DIALOGUES, ids=DIALOGUES)
 def test_dialogue(title: str) -> None:
-    """Each step happens, in this order (`dialogue.py` has the steps)."""
     limits = {"(impatient)": IMPATIENT, "(unhurried)": UNHURRIED}.get(title.rpartition(" ")[2], LIMITS)
     world = World(limits)
     try:
@@ -80,7 +79,7 @@ def test_dialogue(title: str) -> None:
 
 @pytest.fixture
 def world(request: pytest.FixtureRequest) -> Iterator[World]:
-    """Yield a relay with one node; tests marked `impatient` get short limits."""
+    """Tests marked `impatient` get short limits."""
     world = World(getattr(request, "param", LIMITS))
     yield world
     world.close()
@@ -457,7 +456,6 @@ def test_a_slow_subscriber_drops_the_oldest_and_delays_no_other(world: World) ->
 
 
 def test_memory_is_given_back(world: World) -> None:
-    """After slow subscribers, large messages and broken publishers, no memory is counted as used."""
     publisher, slow = world.subscribed()
     rest = encode_frame(bytes(3 * MIB)) * 6 + encode_frame(bytes(3 * MIB))[:MIB]
     world.push(publisher, rest)

@@ -57,7 +57,7 @@ def test_stop_ends_run_after_the_turn(loop: EventLoop) -> None:
 
 
 class Costs:
-    """A loop with handlers of known cost; `order` lists the payers in the order they were served."""
+    """Handlers have known costs; `order` lists the payers in the order they were served."""
 
     def __init__(self) -> None:
         self.used = 0
@@ -83,7 +83,7 @@ class Costs:
         return ours
 
     def turns_until(self, condition: Callable[[], object]) -> int:
-        """Turn until the condition holds, at most a thousand times; return the number of turns."""
+        """At most a thousand turns; returns their number."""
         for turns in range(1000):
             if condition():
                 return turns

@@ -25,8 +25,6 @@ ROW = TopicTraffic("k", "/chatter", 1, 2, 0, 1)
 
 
 class Control:
-    """The other end of a reporter's link."""
-
     def __init__(self) -> None:
         ours, theirs = socket.socketpair()
         self.loop = EventLoop()
@@ -52,7 +50,7 @@ def control() -> Iterator[Control]:
 
 @pytest.fixture
 def reporter(control: Control) -> Reporter:
-    """Return a reporter that sends at most three refusals one by one."""
+    """It sends at most three refusals one by one."""
     reporter = Reporter(replace(RelayLimits(), refusals=3))
     reporter.attach(control.link)
     return reporter

@@ -1,5 +1,3 @@
-"""Guests that use up the relay's memory stop no other host, and no stop is permanent."""
-
 import socket
 from collections.abc import Iterator
 from dataclasses import replace
@@ -48,7 +46,7 @@ def world() -> Iterator[World]:
 
 
 def publish(world: World, number: int, host: str, header: dict[str, str] = HEADER) -> tuple[Peer, Peer]:
-    """Publish /chatter from a node on its own host to a subscriber; return publisher and subscriber."""
+    """The publisher is on its own host. Returns publisher and subscriber."""
     key, listening = f"guest{number}", world.listen()
     world.state(NodePlaced(key, f"/guest{number}", host), listening)
     world.state(PublicationPlaced(key, "/chatter", "*"))

@@ -1,5 +1,3 @@
-"""Taps show the messages that subscribers of a topic get, a few at a time, for any bytes."""
-
 import struct
 from collections.abc import Iterator
 
@@ -30,14 +28,12 @@ def seen(world: World, word: str) -> MessageSeen:
 
 @pytest.fixture
 def world() -> Iterator[World]:
-    """Yield a publisher of /chatter, and a subscriber with a grant."""
     world = World()
     yield world
     world.close()
 
 
 def subscribed(world: World) -> tuple[Peer, Peer]:
-    """Act as `World.subscribed`, with a publisher whose header has its definition."""
     subscriber = world.connect(encode_header(ASK))
     publisher = world.upstream(TOLD)
     world.gets_header(subscriber)

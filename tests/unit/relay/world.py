@@ -59,7 +59,7 @@ CALL = {"callerid": "/client", "service": "/mode", "md5sum": "*"}
 
 
 class Peer:
-    """A test's socket that never blocks and collects received bytes."""
+    """It never blocks."""
 
     def __init__(self, sock: socket.socket) -> None:
         sock.setblocking(False)
@@ -68,11 +68,10 @@ class Peer:
         self.ended = False
 
     def send(self, data: bytes) -> None:
-        """Send without waiting until all bytes are sent."""
+        """Does not wait until all bytes are sent."""
         self.sock.send(data)
 
     def read(self) -> None:
-        """Read the bytes that have arrived."""
         while not self.ended:
             try:
                 data = self.sock.recv(1 << 20)
@@ -84,7 +83,7 @@ class Peer:
             self.ended = not data
 
     def header(self) -> dict[str, str] | None:
-        """Return the header at the start of the received bytes, and remove it once it is complete."""
+        """Removes the header from the received bytes once it is complete."""
         parser = HeaderParser()
         fields = parser.feed(bytes(self.data))
         if fields is not None:
@@ -97,8 +96,6 @@ class Peer:
 
 
 class HeldWork:
-    """Work beside the loop that is not done yet."""
-
     def __init__(self, do: Callable[[], None]) -> None:
         self.do: Callable[[], None] | None = do
 
@@ -159,16 +156,13 @@ class World:
 
     @property
     def held(self) -> int:
-        """Return the bytes of messages that the relay holds for all hosts."""
         return sum(size for what, size in self.engine.memory.held().items() if what != "headers")
 
     def state(self, message: Message, *sockets: socket.socket) -> None:
-        """Send a message from control, and wait until it is carried out."""
         self.control.send(message, tuple(sock.fileno() for sock in sockets))
         self.link.catch_up()
 
     def until(self, condition: Callable[[], Any], seconds: float = LIMIT) -> Any:
-        """Let the loop turn until the condition returns a value; fail after a time limit."""
         deadline = time.monotonic() + seconds
         while True:
             self.loop.turn(0.01)
@@ -210,8 +204,6 @@ class World:
             self.loop.turn(0)
 
     def accept(self, listening: socket.socket) -> Peer:
-        """Return the relay's connection to the publisher or the service."""
-
         def take() -> Peer | None:
             try:
                 return Peer(listening.accept()[0])
@@ -223,8 +215,6 @@ class World:
         return peer
 
     def gets_header(self, peer: Peer) -> dict[str, str]:
-        """Wait until the peer has received a header, and return it."""
-
         def find() -> dict[str, str] | None:
             peer.read()
             return peer.header()
@@ -233,7 +223,7 @@ class World:
         return fields
 
     def gets(self, peer: Peer, data: bytes) -> None:
-        """Wait until the peer has received exactly these bytes."""
+        """Exactly these bytes."""
 
         def whole() -> bool:
             peer.read()
@@ -244,8 +234,6 @@ class World:
         peer.data.clear()
 
     def ends(self, peer: Peer) -> bytes:
-        """Wait until the relay closes the peer's connection; return the bytes before the end."""
-
         def ended() -> bool:
             peer.read()
             return peer.ended
@@ -254,7 +242,7 @@ class World:
         return bytes(peer.data)
 
     def upstream(self, header: dict[str, str] = HEADER, md5sum: str = "*") -> Peer:
-        """Answer the relay's request for the publisher with this header; return the connection."""
+        """Answers the relay's request with this header."""
         self.hears(UpstreamWanted, key="k", topic="/chatter")
         self.state(UpstreamFound("k", "/chatter", LOOPBACK, self.publisher.getsockname()[1]))
         peer = self.accept(self.publisher)

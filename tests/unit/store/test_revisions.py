@@ -1,5 +1,3 @@
-"""Which kept revision a rollback takes, and what a time limit leaves in the store."""
-
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,11 +14,11 @@ pytestmark = pytest.mark.anyio
 
 
 class RefusedError(Exception):
-    """A revision cannot come into force."""
+    pass
 
 
 class ChangedError(Exception):
-    """Another revision is in force."""
+    pass
 
 
 def row(revision: int, who: str = "eve") -> MonitorRevisionRow:

@@ -42,7 +42,7 @@ def leave_behind(directory: Path, changes: Sequence[Encoded]) -> None:
 
 
 def killed_after(work: Callable[[StateStore], None], directory: Path) -> None:
-    """Let a process open the store, work, and be killed: its writer thread writes nothing after that."""
+    """The writer thread writes nothing after the kill."""
     child = os.fork()
     if not child:
         try:
@@ -125,7 +125,6 @@ def test_forgetting_an_incarnation_removes_its_rows(tmp_path: Path) -> None:
 
 
 def test_parameters_keep_their_types(tmp_path: Path) -> None:
-    """A tree with every kind of value comes back equal; without one it is empty."""
     store = reopened(tmp_path)
     assert store.load_parameters() == {}
     tree = {"a": {"b": [1, 2.5, True, "x", b"\x00\xff"]}, "empty": {}, "nan_free": -(2**31)}

@@ -130,7 +130,6 @@ async def test_changes_that_cannot_be_written_at_the_end_are_reported(
 
 @pytest.mark.nightly
 async def test_a_thread_writes_changes(tmp_path: Path) -> None:
-    """A change is written soon, and when a caller waits at once."""
     database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
     database.put("thing", "a", 1)
     await database.settled()
@@ -351,7 +350,7 @@ def leave_behind(path: Path, *changes: Encoded) -> None:
 
 
 def names_after_start(tmp_path: Path) -> list[str]:
-    """Start and stop; return the rows then. The file of changes under way must be empty."""
+    """The file of changes under way must be empty."""
     database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
     names = [name for (name,) in database.query("SELECT name FROM thing ORDER BY name")]
     database.close()

@@ -1,5 +1,3 @@
-"""A door on real sockets: WebSocket clients with rospy and roscpp nodes behind both masters."""
-
 import asyncio
 import json
 import struct

@@ -1,5 +1,3 @@
-"""Doors of a running appliance: agents and viewers with rights of their own, a real robot behind them."""
-
 import json
 import ssl
 from collections.abc import Callable, Iterator
@@ -168,7 +166,6 @@ def test_doors_survive_a_restart_and_a_removed_one_ends(appliance: Appliance, co
 
 
 def test_doors_of_an_appliance_in_its_own_namespace(lab: Lab, robot: Host) -> None:
-    """The machine forwards the port of an agent and the port of tickets, until the door is removed."""
     machine = lab.host("appliance", "10.77.0.2/24")
     settings, rest = "api_networks: [10.77.0.0/24]\n", ("--api", "0.0.0.0:8443")
     call = json.dumps({"op": "call_service", "service": "/rosapi/get_time", "id": 1})

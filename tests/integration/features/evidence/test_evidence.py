@@ -1,5 +1,3 @@
-"""Evidence bundles of a running appliance: by command and REST, for each role, recorded, and verified elsewhere."""
-
 import json
 import subprocess
 import xmlrpc.client
@@ -24,7 +22,6 @@ MONITOR = "a() { event said() /chatter std_msgs/String '{}' { } }"
 
 @pytest.fixture(scope="module")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
-    """Run an appliance with REST and some activity; checkpoints are an hour apart."""
     specification = tmp_path_factory.mktemp("specification") / "a.rv"
     specification.write_text(MONITOR)
     with Appliance(settings=CONFIGURATION) as running:
@@ -61,7 +58,6 @@ def records_of(bundle: Path) -> list[dict[str, Any]]:
 
 
 def test_over_the_command_line(appliance: Appliance, tmp_path: Path) -> None:
-    """The bundle has all records up to now with proof, although no checkpoint was due; the export is recorded."""
     bundle = tmp_path / "incident.zip"
     appliance.rosrv("evidence", "export", "--since", "1h", "-o", str(bundle))
     assert bundle.stat().st_mode & 0o777 == 0o600
@@ -138,7 +134,6 @@ def test_a_recording_exports_as_evidence(appliance: Appliance, tmp_path: Path) -
 
 
 def test_a_time_without_records(appliance: Appliance, tmp_path: Path) -> None:
-    """The export is refused with a reason, and leaves no file."""
     place = tmp_path / "x.zip"
     span = ("--since", "1970-01-01", "--until", "1970-01-02")
     done = appliance.rosrv("evidence", "export", *span, "-o", str(place), check=False)

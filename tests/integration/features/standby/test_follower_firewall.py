@@ -34,8 +34,6 @@ from tests.support.waiting import eventually
 
 
 class Renewing:
-    """An appliance that renews its lease until it is released."""
-
     def __init__(self, peer: Peer, epoch: int) -> None:
         self._peer = peer
         self.epoch = epoch
@@ -49,14 +47,13 @@ class Renewing:
             self.renewed += self._peer.ask("renew", self.epoch).ok
 
     def end(self) -> None:
-        """End without a release, as an appliance that lost its power."""
+        """An appliance without power makes no release."""
         self._ended.set()
         self._thread.join()
 
 
 @pytest.fixture(params=BACKENDS)
 def site(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Site]:
-    """Yield a site with a running witness, whose lease has epoch 1."""
     need_root()
     with Lab("rosrv-follower") as lab, contextlib.ExitStack() as sockets:
         made = Site(lab, tmp_path, request.param, sockets)
@@ -77,7 +74,6 @@ def held(site: Site, name: str, epoch: int) -> Iterator[Renewing]:
 
 
 def connected(site: Site) -> socket.socket | None:
-    """Return a connection from the follower to the fixed address; None while it is shut out."""
     try:
         return site.connect(site.follower, FIXED, MASTER)
     except OSError:

@@ -35,8 +35,6 @@ MEMBERSHIP = Membership(
 
 
 class Site:
-    """The process in a thread, and the ends of its links in the test."""
-
     def __init__(self, lab: Lab, folder: Path) -> None:
         self.hosts: dict[str, Host] = {
             address: lab.host(name, f"{address}/24")
@@ -100,8 +98,6 @@ class Site:
                     self.witness.sendto(answer, address)
 
     def until(self, condition: Callable[[], bool], *, serving: bool = True) -> None:
-        """Wait for a condition; the witness answers in the meantime if `serving`."""
-
         def met() -> bool:
             if serving:
                 self.serve()
@@ -156,7 +152,7 @@ def test_a_grant_is_reported_with_its_end_and_its_epoch_is_on_the_disk(site: Sit
 def test_without_answers_no_extension_follows(site: Site) -> None:
     """The last report ends in less than an expiry, so the supervisor stops the service without any message.
 
-    A renewal in the same epoch may still follow, but not after the other appliance has had the time to claim.
+    A renewal in the same epoch may follow, but not after the other appliance has had the time to claim.
     """
     site.start()
     site.until(site.held)

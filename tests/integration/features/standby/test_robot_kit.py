@@ -70,8 +70,6 @@ done
 
 
 class RobotSite:
-    """Two appliances, the robot and a follower, which have the kits; an attacker without one."""
-
     def __init__(self, lab: Lab, folder: Path, stack: contextlib.ExitStack) -> None:
         self._stack = stack
         self.hosts = {name: lab.host(name, f"{address}/24") for name, address in ADDRESSES.items()}
@@ -205,7 +203,6 @@ def test_a_follower_and_the_robot_are_installed_in_any_order(site: RobotSite) ->
 
 
 def test_a_new_kit_begins_a_new_lease_with_the_first_appliance_alone_in_sync(site: RobotSite) -> None:
-    """A new standby, which has no data yet, cannot claim as the old one could."""
     robot = site.robot
     site.script(robot, site.kit / "witness" / "install.sh")
     a = site.peer("a")
@@ -241,7 +238,6 @@ def test_a_python_that_cannot_run_the_program_changes_nothing(site: RobotSite) -
 
 
 def test_damaged_settings_can_be_removed(site: RobotSite) -> None:
-    """The rules go, although the program cannot read its settings."""
     robot = site.robot
     site.script(robot, site.kit / "witness" / "install.sh")
     robot.run("sh", "-c", "echo damaged > /etc/rosrv/witness.json")

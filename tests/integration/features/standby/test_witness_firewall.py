@@ -1,5 +1,3 @@
-"""The witness with the kernel's firewall and real connections: a robot, two appliances, an attacker on one network."""
-
 import asyncio
 import contextlib
 import errno
@@ -38,7 +36,6 @@ from tests.support.waiting import eventually
 
 @pytest.fixture(params=BACKENDS)
 def site(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Site]:
-    """Yield a site whose lease has epoch 1, without a running witness."""
     need_root()
     with Lab("rosrv-witness") as lab, contextlib.ExitStack() as sockets:
         made = Site(lab, tmp_path, request.param, sockets)
@@ -164,7 +161,6 @@ def test_rules_that_another_program_removes_are_written_again(site: Site) -> Non
 
 
 def test_an_attacker_on_the_network_gets_no_lease_and_delays_none(site: Site) -> None:
-    """Forged, recorded and many datagrams, under the appliance's own address: nothing changes, renewals continue."""
     site.serve()
     a, b = site.peer("a"), site.peer("b")
     epoch = a.granted(1)

@@ -1,5 +1,3 @@
-"""A door in virtual time: its node, a scripted master, other nodes, and WebSocket clients, on a network in memory."""
-
 import asyncio
 import json
 from collections.abc import AsyncIterator, Sequence
@@ -37,8 +35,6 @@ DOOR = ("10.0.0.2", 9090)
 
 
 class WebSocketClient:
-    """A client of the door, made of the protocol of `websockets`."""
-
     def __init__(self, reader: asyncio.StreamReader, writer: MemoryWriter, **options: Any) -> None:
         self.reader, self.writer = reader, writer
         self.socket = ClientProtocol(parse_uri("ws://10.0.0.2:9090"), max_size=None, **options)
@@ -79,7 +75,6 @@ class WebSocketClient:
             return await self.frames.get()
 
     async def closed(self) -> str:
-        """Wait for the end of the connection; return its reason."""
         await asyncio.wait([self._reading], timeout=1000)
         assert self._reading.done()
         return str(self.socket.close_reason or "")
@@ -93,8 +88,6 @@ class WebSocketClient:
 
 
 class DoorWorld:
-    """The door at 10.0.0.2, and its surroundings."""
-
     def __init__(self) -> None:
         self.network = MemoryNetwork()
         self.master = ScriptedMaster(self.network)

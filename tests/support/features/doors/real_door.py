@@ -40,7 +40,6 @@ def protocol_of(subprotocol: str | None) -> ClientProtocol:
 async def real_door(
     master_uri: str, source: str, port: int = 0, definitions: Definitions | None = None
 ) -> AsyncIterator[int]:
-    """Serve a door for a block; yields the port of its WebSocket at the source address."""
     node = RosNode(
         NAME, master_uri, SourceNetwork(source), limits=NodeLimits(), shut_down=lambda _reason: None
     )
@@ -82,7 +81,6 @@ async def _accept(listener: socket.socket, connections: DoorConnections, serve: 
 
 
 async def main(master_uri: str, source: str, port: str, *files: str) -> None:
-    """Serve until killed; the last two parts of each file's path name its type."""
     texts = {"/".join(Path(file).parts[-2:]): Path(file).read_text(encoding="utf-8") for file in files}
     async with real_door(master_uri, source, int(port), Definitions.from_files(texts)):
         await asyncio.get_running_loop().create_future()

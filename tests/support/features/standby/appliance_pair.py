@@ -1,5 +1,3 @@
-"""Two appliances with an audit log, a key and a state each, which take over from each other."""
-
 import asyncio
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -37,7 +35,7 @@ class World:
 
 
 class Member:
-    """One appliance of a pair; its clock is `ahead` seconds. Call `open` in an event loop."""
+    """Its clock is `ahead` seconds. Call `open` in an event loop."""
 
     def __init__(self, state: Path, name: str, other: str, world: World, *, ahead: float = 0) -> None:
         self.state, self.name, self.other = state, name, other
@@ -51,7 +49,6 @@ class Member:
         return self._world.now + int(self.ahead * SECOND)
 
     def open(self) -> None:
-        """Start control's log, state and recorder."""
         requests = SignerRequests(lambda: self.log)
         self.signed, self._signs = requests.signed, True
         self.log = open_log(
@@ -82,7 +79,6 @@ class Member:
         self._signs = False
 
     def close(self) -> None:
-        """End control; the last checkpoint gets no signature, as after a crash."""
         self.silence()
         assert self.log.close() is None
         self.store.close()
@@ -107,14 +103,12 @@ class Member:
         return using(VirtualClock(wall=self.clock() / SECOND, now=now()))
 
     async def decide(self, count: int, seconds: float) -> None:
-        """Record decisions over some seconds."""
         for number in range(count):
             self._world.passes(seconds / count)
             self.log.record(decision(self.log, number, time=self.clock()))
         assert await self.log.wait_durable() is None
 
     async def sealed(self) -> None:
-        """Wait until the state has a checkpoint of everything recorded so far."""
         assert await self.log.wait_signed() is None
         newest = newest_checkpoint(self.path)
         await asyncio.to_thread(
@@ -138,7 +132,6 @@ Story = Callable[[Member, Member, World], Awaitable[None]]
 
 
 def play(folder: Path, story: Story) -> tuple[Member, Member]:
-    """Return two appliances, `a` and `b`, after a story; their clocks differ by an hour."""
     world = World()
     a = Member(folder / "a", "a", "b", world)
     b = Member(folder / "b", "b", "a", world, ahead=3600)
@@ -157,7 +150,6 @@ def play(folder: Path, story: Story) -> tuple[Member, Member]:
 
 
 async def four_takeovers(a: Member, b: Member, world: World) -> None:
-    """Let a and b take over in turn: a dies, b hands over, epoch 3 is lost, a dies again."""
     async with a.active(1):
         await a.decide(10, 100)
         await a.sealed()

@@ -1,5 +1,3 @@
-"""Two appliances' databases and the replication between them, over TLS on the loopback."""
-
 import asyncio
 import contextlib
 import random
@@ -43,7 +41,6 @@ def tables_of(path: Path) -> Tables:
 
 
 def change_randomly(database: Database, chosen: random.Random) -> None:
-    """Make one random change, of one to 100 rows, or of a large value."""
     kind = chosen.randrange(7)
     name = f"row {chosen.randrange(50)}"
     if kind < 3:
@@ -63,7 +60,6 @@ def change_randomly(database: Database, chosen: random.Random) -> None:
 
 
 def certificates(directory: Path) -> tuple[ssl.SSLContext, ssl.SSLContext]:
-    """Return the TLS contexts of the active appliance and of the standby; the same ones for a directory."""
     homes = [directory / "certificates-active", directory / "certificates-standby"]
     active, standby = map(_kept_certificate, homes)
     return (
@@ -89,8 +85,6 @@ def listening_socket() -> socket.socket:
 
 
 class ActiveSide:
-    """The database of the active appliance, which listens for its standby."""
-
     def __init__(
         self,
         path: Path,
@@ -117,7 +111,7 @@ class ActiveSide:
 
 
 class StandbySide:
-    """A standby, which connects again and again; `ends` has the reasons why links ended."""
+    """It connects again and again; `ends` has the reasons why links ended."""
 
     def __init__(
         self, path: Path, context: ssl.SSLContext, port: Callable[[], int], *, largest: int = 1 << 30

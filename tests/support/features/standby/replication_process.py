@@ -19,7 +19,6 @@ from tests.support.features.standby.replication import ActiveSide, StandbySide, 
 
 
 async def main() -> None:
-    """Run until killed."""
     structlog.configure(logger_factory=structlog.PrintLoggerFactory(sys.stderr))
     side, directory, port = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
     server, client = certificates(directory)

@@ -28,8 +28,6 @@ _FULL = "the audit log cannot be written"  # refused: the disk of the active app
 
 
 class Transport(xmlrpc.client.Transport):
-    """Connections that do not wait forever."""
-
     def make_connection(self, host: Any) -> http.client.HTTPConnection:
         connection = super().make_connection(host)
         connection.timeout = _SECONDS
@@ -37,8 +35,6 @@ class Transport(xmlrpc.client.Transport):
 
 
 class Registrar:
-    """The calls, and the state that the master must have."""
-
     def __init__(self, master: str, own: str) -> None:
         self.master, self.own = master, own
         self.parameters: dict[str, int] = {}
@@ -48,7 +44,6 @@ class Registrar:
         self._proxy = xmlrpc.client.ServerProxy(master, Transport())
 
     def call(self, method: str, *arguments: Any) -> Any:
-        """Call until there is an answer; return its value."""
         began = time.monotonic()
         while True:
             try:
@@ -96,7 +91,6 @@ def report(event: str, **fields: Any) -> None:
 
 
 def serve(address: str) -> str:
-    """Serve the node's interface in a thread; return its URI."""
     server = xmlrpc.server.SimpleXMLRPCServer((address, 0), logRequests=False)
     server.register_instance(_Node())
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -109,7 +103,6 @@ class _Node:
 
 
 def main() -> None:
-    """Make changes until the input ends."""
     registrar = Registrar(sys.argv[1], serve(sys.argv[2]))
     each = False
     for number in itertools.count(1):

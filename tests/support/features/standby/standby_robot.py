@@ -1,5 +1,3 @@
-"""The nodes of a robot with two appliances, which notice a takeover only as a short pause."""
-
 import hashlib
 import json
 import subprocess
@@ -20,7 +18,6 @@ CLIENTS: tuple[Client, Client] = ("rospy", "roscpp")
 
 class StandbyRobot:
     def __init__(self, site: StandbySite, *, rate: float = 10) -> None:
-        """Prepare the nodes; `rate` is the number of messages a second of each talker."""
         self.site, self.rate = site, rate
         self.ros: RosSession = site.ros()
         self.listeners: list[Process] = []
@@ -47,13 +44,11 @@ class StandbyRobot:
         self.ros.__exit__(*exc)
 
     def cut(self) -> None:
-        """Cut the robot's power: its nodes and the witness end at once."""
         for process in self.ros.processes:
             process.kill()
         self.site.stop_witness()
 
     def boot(self) -> None:
-        """Start the witness as at a boot of the robot, then its nodes; they find the parameters of before."""
         self.site.boot_robot()
         eventually(
             lambda: self.site.holder() and self.admitted() == {ADDRESSES[self.site.holder()]}, self.site.story
@@ -64,7 +59,6 @@ class StandbyRobot:
         self.__enter__()
 
     def works(self) -> None:
-        """Wait until topics, services and calls of the Master API work from now on."""
         marks = [(one, one.mark()) for one in self.listeners]
         for caller in self.callers:
             self.call(caller)
@@ -73,7 +67,6 @@ class StandbyRobot:
             listener.wait_for_count(3, since=mark, event="received")
 
     def call(self, caller: Process) -> int:
-        """Call a service until it answers, as a node would; return the number of failures before."""
         failures = 0
         while True:
             mark = caller.mark()
@@ -85,7 +78,6 @@ class StandbyRobot:
             failures += 1
 
     def lost_nothing(self) -> None:
-        """Check that no node ended, and that the master has all that was answered, by calls and by stock tools."""
         self.works()
         ended = [process.story() for process in self.ros.processes if not process.running]
         assert not ended, "\n".join(ended)
@@ -100,14 +92,13 @@ class StandbyRobot:
         assert hashlib.sha256(got.encode()).hexdigest() == _DIGEST
 
     def serves_newcomers(self) -> None:
-        """Check that a new subscriber gets a latched message, and that the stock tools list and call everything."""
         with self.site.ros() as ros:
             ros.listener("rospy", "/map").wait_for(event="received", data="map 1")
             assert {"/map", "/from_rospy", "/from_roscpp"} <= set(ros.run("rostopic", "list").stdout.split())
             assert "False" in ros.run("rosservice", "call", "/negate_roscpp", "true").stdout
 
     def admitted(self) -> set[str]:
-        """Return the addresses to which the robot's firewall translates the fixed address."""
+        """The robot's firewall translates the fixed address to them."""
         rules = self.site.robot.run(
             lambda: (
                 subprocess.run(

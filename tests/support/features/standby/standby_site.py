@@ -1,9 +1,3 @@
-"""Two appliances, and a robot with the witness, on one Ethernet.
-
-`active` and `passive` are the appliances by their role. `cut` ends all processes of an appliance at once and takes its
-link down, as a power cut does.
-"""
-
 import contextlib
 import json
 import os
@@ -59,8 +53,6 @@ def memberships(folder: Path) -> tuple[dict[str, Membership], dict[str, Any], di
 
 
 class StandbySite:
-    """The site; a context manager. `a` is in sync at first."""
-
     def __init__(
         self,
         lab: Lab,
@@ -71,7 +63,7 @@ class StandbySite:
         options: tuple[str, ...] = (),
         **more: Any,
     ) -> None:
-        """Make the machines. `lease_folder`: where the witness keeps the lease (default: `home`)."""
+        """`lease_folder` is where the witness keeps the lease (default: `home`)."""
         self.lab, self.home = lab, home
         self.robot = lab.host("robot", f"{ROBOT}/24")
         members, settings, follower = memberships(lease_folder or home)
@@ -97,7 +89,7 @@ class StandbySite:
             self.appliances[name] = one
 
     def command(self, *words: str, settings: Path | None = None) -> list[str]:
-        """Return a command of the witness, as on a robot without the product."""
+        """As on a robot without the product."""
         program = (
             f"import sys; sys.path.insert(0, {str(self.home)!r}); import witness;"
             f" witness.BOOT_ID = {str(self.home / 'boot')!r}; sys.exit(witness.main(sys.argv[1:]))"
@@ -114,7 +106,6 @@ class StandbySite:
         ]
 
     def start_follower(self) -> Host:
-        """Start the follower on a further computer of the robot; return that computer."""
         arm = self.lab.host("arm", f"{ARM}/24")
         command = ["nice", "-n", "-10", *self.command("follow", settings=self._follower_settings)]
         self._follower = Process(arm, command, env=dict(os.environ), label="follower")
@@ -133,7 +124,6 @@ class StandbySite:
         self.witness.stop(with_signal=signal.SIGKILL)
 
     def boot_robot(self) -> None:
-        """Start the witness as after a boot of the robot: without its rules at first, then shut, with a new boot."""
         for words in (["remove"], ["shut"]):
             with Process(self.robot, self.command(*words), env=dict(os.environ), label=words[0]) as done:
                 assert done.wait() == 0, done.story()
@@ -154,14 +144,12 @@ class StandbySite:
         ]  # fmt: skip
 
     def holder(self) -> str:
-        """Return the holder of the lease; empty if there is none yet."""
         return self.lease.read().holder
 
     def in_sync(self) -> set[str]:
         return set(self.lease.read().in_sync)
 
     def until_both_in_sync(self) -> None:
-        """Wait until both appliances are in sync."""
         eventually(lambda: self.in_sync() == {"a", "b"}, self.story)
 
     def cut(self, name: str) -> None:
@@ -180,7 +168,6 @@ class StandbySite:
         return holder, {"a": "b", "b": "a"}[holder]
 
     def until_active(self, name: str) -> None:
-        """Wait until nodes may connect to this appliance."""
         one = self.appliances[name].process
         assert one is not None
         one.wait_for(event="ready", timeout=2 * LIMIT)
@@ -191,11 +178,10 @@ class StandbySite:
         )
 
     def until_taken_over(self, name: str) -> None:
-        """Wait until this appliance has the lease."""
         eventually(lambda: self.holder() == name, self.story)
 
     def pids(self, name: str, role: str = "") -> list[int]:
-        """Return the processes of an appliance; with a role, only those of that role."""
+        """With a role, only those of that role."""
         one = self.appliances[name].process
         assert one is not None
         title = b"/usr/bin/rosmaster\0" if role == "rosmaster" else f"rosrv: {role}".encode()
@@ -215,7 +201,6 @@ class StandbySite:
 
     @contextlib.contextmanager
     def without_link(self, *pairs: tuple[str, str]) -> Iterator[None]:
-        """Lose all packets between the two addresses of each pair while the block runs."""
         ways = [way for here, there in pairs for way in ((here, there), (there, here))]
         self._switch(
             "add table bridge lost",

@@ -1,5 +1,3 @@
-"""A robot with the witness, two appliances that ask it, an attacker and a follower, on one network."""
-
 import contextlib
 import json
 import os
@@ -31,8 +29,6 @@ BACKENDS = ("nft", "iptables-nft", "iptables-legacy")
 
 
 class Peer:
-    """An appliance that asks the witness."""
-
     def __init__(self, host: Host, name: str, key: bytes) -> None:
         self.name = name
         self.channel = WitnessChannel(name, key, os.urandom(8).hex())
@@ -42,7 +38,7 @@ class Peer:
         self.sent = b""
 
     def ask(self, operation: Operation, epoch: int) -> WitnessAnswer:
-        """Return the witness's answer; a lost one is asked for again, and a late one to an earlier question ignored."""
+        """A lost answer is asked for again, and a late one to an earlier question ignored."""
         asked: list[WitnessRequest] = []
 
         def is_of_this(request: WitnessRequest) -> bool:
@@ -62,8 +58,6 @@ class Peer:
         return eventually(answer, "the witness answers")
 
     def granted(self, epoch: int) -> int:
-        """Claim until the claim is granted; return the epoch."""
-
         def grant() -> int | None:
             answer = self.ask("claim", epoch)
             return answer.epoch if answer.ok else None
@@ -72,8 +66,6 @@ class Peer:
 
 
 class Site:
-    """The machines, the witness's files, and its process."""
-
     def __init__(self, lab: Lab, folder: Path, backend: str, sockets: contextlib.ExitStack) -> None:
         self.lab, self.sockets = lab, sockets
         self.robot = lab.host("robot", f"{ROBOT}/24")
@@ -113,7 +105,6 @@ class Site:
         self.following: Process | None = None
 
     def command(self, *words: str, settings: Path | None = None) -> list[str]:
-        """Return a command of the witness's program, as on a robot without the product."""
         program = str(self.folder / "witness.py")
         options = ["--settings", str(settings or self.settings), "--backend", self.backend]
         return [sys.executable, "-I", "-S", program, *words, *options]
@@ -167,7 +158,7 @@ class Site:
         return self.sockets.enter_context(host.run(lambda: socket.create_server((host.address, port))))
 
     def refused(self, host: Host, address: str, port: int) -> bool:
-        """Return whether a connection is refused at once. While the rules change, an attempt may get no answer."""
+        """While the rules change, an attempt may get no answer."""
         begun = time.monotonic()
         try:
             self.connect(host, address, port, LIMIT / 3).close()
@@ -179,13 +170,12 @@ class Site:
 
 
 def write_settings(path: Path, settings: dict[str, object]) -> None:
-    """Write settings that only their owner can read."""
+    """Only the owner can read the file."""
     path.write_text(json.dumps(settings))
     path.chmod(0o600)
 
 
 def forged(source: str, payload: bytes) -> bytes:
-    """Return an IPv4 packet with a UDP datagram to the witness, from any address."""
     udp = struct.pack("!HHHH", 5555, WITNESS, 8 + len(payload), 0) + payload
     ends = socket.inet_aton(source) + socket.inet_aton(ROBOT)
     return struct.pack("!BBHHHBBH", 0x45, 0, 20 + len(udp), 0, 0, 64, socket.IPPROTO_UDP, 0) + ends + udp

@@ -1,5 +1,3 @@
-"""Two appliances and a robot with real nodes, which the tests of a file share."""
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""A power cut of the active appliance while a person watches, a host drives, and guards are at work."""
-
 import json
 import ssl
 from collections.abc import Iterator

@@ -15,7 +15,7 @@ from tests.support.waiting import eventually
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
-    """Run both appliances; the states of `a` and of the witness are on small disks."""
+    """The states of `a` and of the witness are on small disks."""
     need_root()
     need_program("nft", "nftables")
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
@@ -39,7 +39,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
 
 
 def until_able(site: StandbySite) -> None:
-    """Wait until both appliances report that the standby could take over."""
     for one in site.appliances.values():
         eventually(lambda one=one: one.rosrv("standby", "status"), site.story)  # type: ignore[misc]  # mypy infers no type for a lambda's default
 

@@ -1,5 +1,3 @@
-"""A full disk, a standby that lies, and attackers on the robot's network: the robot's nodes notice nothing."""
-
 import asyncio
 import contextlib
 import os
@@ -74,7 +72,6 @@ def test_a_full_disk_of_the_standby(site: StandbySite, robot: StandbyRobot) -> N
 
 
 def grow(robot: StandbyRobot, site: StandbySite, until: Callable[[], bool]) -> None:
-    """Let the registrar make changes until the condition holds."""
     robot.registrar.send("time")
     eventually(until, site.story)
     robot.registrar.send("rest")
@@ -120,7 +117,7 @@ class Liar:
 
 @contextlib.contextmanager
 def standby_replaced(site: StandbySite, folder: Path) -> Iterator[Liar]:
-    """Stop the standby and yield a liar in its place; start the standby again afterwards."""
+    """The real standby starts again afterwards."""
     active, passive = site.pair()
     site.signal(passive, signal.SIGKILL)
     eventually(lambda: site.in_sync() == {active}, site.story)
@@ -149,7 +146,7 @@ def test_a_standby_that_lies(site: StandbySite, robot: StandbyRobot, tmp_path: P
 
 
 async def lied(link: ReplicationLink[Any], lie: Callable[[str], Any]) -> bool:
-    """Take the snapshot, then lie; return whether the link ended."""
+    """Returns whether the link ended."""
     await link.send(Stored(0, "", 0))
     begin = await link.receive(10)
     while not isinstance(await link.receive(10), SnapshotEnd):
@@ -181,7 +178,6 @@ def test_a_client_without_the_certificate(site: StandbySite, tmp_path: Path) -> 
 
 
 def test_floods_and_replayed_datagrams(site: StandbySite, robot: StandbyRobot) -> None:
-    """Garbage and recorded datagrams from any address, at the rate that a host can send, change nothing."""
     attacker = site.lab.host("attacker", "10.79.0.66/24")
     recorded = record(site, 40)
     assert {port_of(one) for one in recorded} >= {PORT, WITNESS_PORT}
@@ -208,7 +204,7 @@ def connects(address: str) -> bool:
 
 
 def record(site: StandbySite, number: int) -> list[bytes]:
-    """Return datagrams of the lease, with their Ethernet headers, as the network's switch sees them."""
+    """The datagrams have their Ethernet headers."""
 
     def listen() -> list[bytes]:
         found: list[bytes] = []
@@ -234,7 +230,7 @@ def port_of(frame: bytes) -> int:
 
 
 def send_always(recorded: list[bytes], ended: threading.Event) -> None:
-    """Send recorded frames, damaged ones and garbage, each from the attacker's Ethernet address."""
+    """Damaged frames and garbage are sent too, each from the attacker's Ethernet address."""
     own = bytes.fromhex(Path(f"/sys/class/net/{INTERFACE}/address").read_text().replace(":", ""))
     frames = [frame[:6] + own + frame[12:] for frame in recorded]
     frames += [frame[:-1] + bytes([frame[-1] ^ 1]) for frame in frames]

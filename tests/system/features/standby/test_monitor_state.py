@@ -1,5 +1,3 @@
-"""A latched emergency stop survives a switchover and a power cut."""
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,6 @@ from tests.support.waiting import eventually
 
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[StandbySite]:
-    """Yield two appliances in sync, `a` active, with the stop loaded."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with Lab("rosrv-monitors") as lab, StandbySite(lab, tmp_path) as made:
@@ -32,7 +29,6 @@ def site(tmp_path: Path) -> Iterator[StandbySite]:
 
 
 def monitor(site: StandbySite, name: str) -> dict[str, Any]:
-    """Return the monitor's row in `rosrv monitor list` of an active appliance. Raises `NoAnswerError`."""
     return site.appliances[name].row("monitor", "list")
 
 
@@ -42,7 +38,6 @@ def dropped(site: StandbySite, name: str, least: int) -> bool:
 
 @pytest.mark.parametrize("takeover", ["switchover", "power cut", "cut from the robot"])
 def test_a_latched_stop_stays(site: StandbySite, takeover: str) -> None:
-    """The monitor of the other appliance goes on with the state, or with its copy, and holds no topic."""
     with site.ros() as ros:
         listener = ros.listener("rospy", "/chatter")
         ros.talker("roscpp", "/chatter")

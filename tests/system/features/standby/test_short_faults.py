@@ -1,5 +1,3 @@
-"""Faults of a few seconds on every edge of a pair, with nodes on two computers of the robot: no subscription ends."""
-
 import pytest
 
 from benchmarks.standby_faults import FAULTS, faults

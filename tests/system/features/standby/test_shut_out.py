@@ -1,5 +1,3 @@
-"""The robot shuts out both appliances for a moment, and no appliance takes over: nodes connect again within seconds."""
-
 import os
 import threading
 import time

@@ -1,5 +1,3 @@
-"""A block of a host keeps its length over switchovers between appliances whose clocks of ages differ."""
-
 import json
 import time
 from functools import partial
@@ -13,7 +11,6 @@ HOUR = 3600.0
 
 
 def blocked_for(site: StandbySite, name: str) -> float:
-    """Return the seconds that the block has left at an appliance."""
     block = json.loads(site.appliances[name].rosrv("host", "blocks", "--json").stdout)
     return float(block["until"]) - time.time()
 

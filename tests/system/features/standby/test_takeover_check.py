@@ -46,7 +46,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
 
 
 def until_obstacle(site: StandbySite, words: str, *names: str) -> None:
-    """Wait until these appliances report why `b` cannot take over; no words: that it can."""
+    """Without words: until `b` can take over."""
 
     def reported(name: str) -> bool:
         done = site.appliances[name].rosrv("standby", "status", "--json", check=False)
@@ -66,7 +66,6 @@ def load(site: StandbySite, text: str, signature: str) -> None:
 
 
 def make_ready(site: StandbySite) -> None:
-    """Bring a signed policy into force, and wait until nothing prevents a takeover."""
     load(site, OPEN_POLICY, signed(OPEN_POLICY))
     until_obstacle(site, "", "a", "b")
 

@@ -1,9 +1,3 @@
-"""Failures of the active appliance, the witness and the network, with real nodes: they notice a short pause only.
-
-All tests of the file use the same nodes. After each failure no node has ended, no answered change is lost, the robot
-admits one appliance, and the orders of operators are in force.
-"""
-
 import os
 import select
 import signal
@@ -116,7 +110,7 @@ def request(site: StandbySite, name: str, method: str) -> socket.socket:
 
 
 def answer_to(sock: socket.socket) -> bytes:
-    """Return the bytes of the answer; none if the connection ends without."""
+    """Empty if the connection ends without an answer."""
     with sock:
         try:
             return sock.recv(4096)
@@ -157,7 +151,7 @@ def test_a_lapse_of_the_lease(site: StandbySite, robot: StandbyRobot) -> None:
 
 
 def rest_of(one: Appliance, token: str) -> Callable[[str], Answer]:
-    """Return a function that gets a path of REST; the api has served once, which loads its routes."""
+    """The api has served once, which loads its routes."""
     assert isinstance(one.host, Host)
     host = one.host
     rest = Rest(REST, token, one.state / "api" / "certificate.pem")
@@ -224,7 +218,6 @@ def test_the_death_of_the_witness(site: StandbySite, robot: StandbyRobot) -> Non
 
 
 def test_flapping_links(site: StandbySite, robot: StandbyRobot) -> None:
-    """However often links come and go, the nodes lose nothing."""
     for pause in (0.1, 0.4, 0.7, 1.3, 0.2, 1.0):
         active, _ = site.pair()
         for ends in ((ADDRESSES["a"], ADDRESSES["b"]), (ADDRESSES[active], ROBOT)):

@@ -51,7 +51,7 @@ WAITS = "new certificates wait, because the key of the hosts' authority is on th
 
 
 class TunnelledStandbySite:
-    """Both appliances with the witness, `a` active; a host that joins behind a tunnel, and an attacker."""
+    """`a` is active."""
 
     def __init__(self, lab: Lab, home: Path, **more: Any) -> None:
         self.home = home
@@ -68,7 +68,6 @@ class TunnelledStandbySite:
         self.site.until_both_in_sync()
 
     def kit(self, verb: str, name: str) -> Path:
-        """Enrol a host at the active appliance, or renew its certificate; return its kit."""
         self.kits += 1
         path = self.home / f"kit-{self.kits}.tar.gz"
         one, address = self.serving(), ADDRESSES[self.site.holder()]
@@ -85,13 +84,11 @@ class TunnelledStandbySite:
         return JoinedHost(host or self.ocu, kit, folder, programs=programs)
 
     def cut(self) -> str:
-        """Cut the active appliance's power; return its name."""
         active = self.site.holder()
         self.site.cut(active)
         return active
 
     def restore(self, name: str) -> None:
-        """Start an appliance again after its power was cut; it becomes the standby."""
         one = self.site.appliances[name]
         assert isinstance(one.host, Host)
         interfaces.set_link(one.host.namespace, INTERFACE, up=True)
@@ -327,7 +324,6 @@ def open_tunnel_parts(host: Host) -> list[str]:
 
 
 def read(path: str) -> list[str]:
-    """Return the lines of a file; none if its process has ended."""
     with contextlib.suppress(OSError):
         return Path(path).read_text().splitlines()
     return []

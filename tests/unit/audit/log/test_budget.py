@@ -1,5 +1,3 @@
-"""Tests of the quota of record bytes for each host, with a clock that the test moves."""
-
 from appliance.audit.log.budget import RATE, Budget, weight
 from appliance.audit.log.record import AuditRecord
 from appliance.quotas.pool import Bounds, QuotaClass
@@ -10,8 +8,6 @@ RESERVE = Bounds(whole=1 << 20, host=1 << 16, unknown=0, kept=1 << 18)
 
 
 class Desk:
-    """A budget, its clock, and the known hosts."""
-
     def __init__(self) -> None:
         self.now = 100.0
         self.registered = {ROBOT}
@@ -24,7 +20,6 @@ class Desk:
         )
 
     def quota_class(self, host: str) -> QuotaClass:
-        """Return the class of a host: registered with a registration, otherwise named."""
         return QuotaClass.REGISTERED if host in self.registered else QuotaClass.NAMED
 
     def spend(self, host: str, size: int = 1 << 21) -> AuditRecord:

@@ -13,7 +13,6 @@ def make(**fields: Any) -> AuditRecord:
 
 
 def test_round_trip() -> None:
-    """The stored record equals the original, to the last field and character."""
     record = make(
         severity=Severity.ALARM, decision="deny", host="10.0.0.1", caller_id="/\x1b[2J\u202e\0é",
         category="call", resource="/a", rule=RuleReference("Clients", "/a", "p.ini", 7), revision=2,
@@ -59,7 +58,6 @@ def test_any_detail_can_be_stored(value: Any) -> None:
 
 @pytest.mark.parametrize("field", ["host", "caller_id", "category", "resource", "reason", "event"])
 def test_texts_are_bounded_and_storable(field: str) -> None:
-    """Texts that cannot be stored are escaped; long ones are cut and state their length."""
     assert getattr(from_columns(to_columns(make(**{field: "a\udcffb"}), 1)), field) == "a\\udcffb"
     cut = getattr(from_columns(to_columns(make(**{field: "z" * 100_000}), 1)), field)
     assert len(cut) <= LONGEST_TEXT
@@ -84,9 +82,8 @@ def test_fields_of_a_wrong_type(fields: dict[str, Any]) -> None:
 
 
 def test_small_details_survive_large_ones() -> None:
-    """A load of many files keeps its revision and hash.
-
-    Names that do not fit are omitted, and the record names the field.
+    """Names that do not fit are omitted, and the record names the field; a load of many files keeps its revision and
+    hash.
     """
     names = [f"monitor_{number}" * 20 for number in range(1000)]
     detail = {

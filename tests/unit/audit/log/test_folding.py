@@ -201,7 +201,6 @@ def test_the_loudest_callers_are_named() -> None:
 
 
 def test_long_names_are_bounded() -> None:
-    """Long names of unknown hosts use bounded space in a summary."""
     folder = make_folder(keys_per_host=1)
     offer(folder, *(denial("/" + "x" * 100_000 + str(number)) for number in range(50)))
     (host,) = [one for one in folder.finish() if one.detail["scope"] == "host"]

@@ -50,7 +50,6 @@ def test_durable_records_are_on_disk(make_log: MakeLog, path: Path, durability: 
 
 
 def tried_again(log: AuditLog) -> str | None:
-    """Let a second pass, in which the log tries to write; return why it cannot."""
     let_pass(log, 1)
     return log.failed
 
@@ -192,7 +191,6 @@ def test_counted_denials_survive_a_kill(path: Path) -> None:
 
 
 def test_flood_of_denials(make_log: MakeLog, path: Path) -> None:
-    """A hundred thousand identical denials leave a handful of records that count every one of them."""
     log = make_log(fold=FoldSettings(seconds=10))
     before = decision(log, decision="deny", resource="/evidence")
     log.record(before)
@@ -232,7 +230,6 @@ def test_a_repeated_denial_gets_the_id_of_a_stored_record(
 
 
 def fill(path: Path) -> None:
-    """Write a file until the disk is full."""
     with path.open("wb", buffering=0) as file, pytest.raises(OSError, match="No space"):
         while True:
             file.write(b"x" * 512)
@@ -240,14 +237,12 @@ def fill(path: Path) -> None:
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
-    """Mount a file system of 2 MiB."""
     with small_disk(tmp_path / "disk", "2m") as place:
         yield place
 
 
 @pytest.mark.nightly
 def test_full_disk(disk: Path) -> None:
-    """With a full disk the log reports the failure, keeps its queue, and writes the queue once there is space."""
     path = disk / "audit.db"
     filler = disk / "filler"
     log = AuditLog(path, drive=ByHand)
@@ -446,7 +441,6 @@ def test_recovery_counts_denials_once(make_log: MakeLog, path: Path) -> None:
 
 
 def signed_now(log: AuditLog) -> str | None:
-    """Wait until all records are sealed and signed; return the reason if not."""
     return asyncio.run(asyncio.wait_for(log.wait_signed(), _LIMIT_SECONDS))
 
 

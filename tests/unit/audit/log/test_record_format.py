@@ -62,7 +62,6 @@ def test_json_is_one_line_of_ascii() -> None:
     ],
 )
 def test_printable(text: str, shown: str) -> None:
-    """Control characters, escape sequences and invisible or bidirectional marks are escaped; letters are not."""
     assert printable(text) == shown
 
 
@@ -75,7 +74,6 @@ def test_printable(text: str, shown: str) -> None:
     ],
 )
 def test_time(time: int, text: str) -> None:
-    """Times are UTC with nanoseconds over the whole range that can be stored."""
     assert rfc3339(time) == text
 
 

@@ -1,5 +1,3 @@
-"""Retention removes only records that its rules allow, records each removal, and leaves a log that can be verified."""
-
 import itertools
 import sqlite3
 from contextlib import closing
@@ -33,7 +31,6 @@ def retain(log: AuditLog) -> None:
 
 
 def make_old(make_log: MakeLog, notary: Notary) -> None:
-    """Make a log of 2000 records that were made and signed a week ago."""
     notary.ago = 7 * _DAY
     old = itertools.count(clock.wall_ns() - 7 * _DAY, 1000)
     log = make_log(checkpoint_every=100, clock=lambda: next(old))
@@ -98,7 +95,6 @@ def test_removal_by_size_does_not_wait_for_receipts(make_log: MakeLog, path: Pat
 
 
 def test_young_records_stay(make_log: MakeLog, path: Path) -> None:
-    """No record within the limits is removed."""
     log = make_log(checkpoint_every=10, retention=Retention(days=1, size=1 << 30))
     for number in range(500):
         log.record(decision(log, number))
@@ -210,7 +206,6 @@ def test_a_flood_of_denials_leaves_those_of_other_hosts(time: VirtualClock) -> N
 
 @pytest.mark.nightly
 def test_unsigned_records_stay(make_log: MakeLog, path: Path) -> None:
-    """Records that the signer has not signed yet stay, however old."""
     old = itertools.count(clock.wall_ns() - 7 * _DAY, 1000)
     log = make_log(checkpoint_every=100, clock=lambda: next(old), signer=lambda number, text: None)
     for number in range(1000):
@@ -242,6 +237,5 @@ def test_removal_beyond_retention_is_found(make_log: MakeLog, path: Path, notary
 
 @pytest.mark.parametrize("wrong", [{"days": 0}, {"days": -1}, {"size": 100}])
 def test_invalid_limits_are_rejected(wrong: dict[str, Any]) -> None:
-    """Limits that would remove everything are rejected."""
     with pytest.raises(ValueError, match="retention needs"):
         Retention(**wrong)

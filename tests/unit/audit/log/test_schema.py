@@ -16,7 +16,6 @@ def test_the_page_matches_the_code() -> None:
 
 
 def test_every_field_is_documented() -> None:
-    """A record's JSON has the fields of the schema, in its order, and no others."""
     rule = RuleReference("Publishers", "/**", "a.ini", 1)
     full = as_object(
         LogEntry(1, AuditRecord(id="0" * 20, time=1, event="decision", decision="deny", rule=rule))
@@ -33,7 +32,6 @@ def test_a_line_of_an_export_is_a_record_and_its_position() -> None:
 
 
 def test_events_are_described() -> None:
-    """Every event has a name in lower-case words and a sentence."""
     for name, text in EVENTS.items():
         assert name == name.lower().strip()
         assert text.endswith(".")

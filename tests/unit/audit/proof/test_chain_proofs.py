@@ -1,5 +1,3 @@
-"""An export can be verified on another machine with only the public key, whatever its filter was."""
-
 import json
 import lzma
 from pathlib import Path
@@ -32,7 +30,7 @@ OLD_LOG = Path(__file__).with_name("log-0.1.0.db.xz")
 
 @pytest.fixture
 def log(make_log: MakeLog, path: Path) -> Path:
-    """Return a log of over two hundred records with a seal every fifty and a denial every ten."""
+    """A seal every fifty records, a denial every ten."""
     log = make_log(checkpoint_every=50, checkpoint_seconds=3600)
     for number in range(200):
         verdict = "deny" if number % 10 == 3 else "allow"
@@ -51,7 +49,6 @@ def public(key: Ed25519PrivateKey) -> bytes:
 def checked(
     log: Path, folder: Path, key: bytes, wanted: Filter = ALL, page: int = 1000
 ) -> tuple[int, list[str]]:
-    """Return the number of records that the bundle verifier proves, and its findings."""
     write_public_key(folder / "audit.pub", key)
     lines, sealed, logs = [], 0, {""}
     for entry, chain in evidence(log, wanted, page):
@@ -68,7 +65,6 @@ def checked(
 @pytest.mark.parametrize("wanted", [Filter(), Filter(decision=("deny",)), Filter(resource="/r77")])
 @pytest.mark.parametrize("page", [1000, 7])
 def test_it_verifies_elsewhere(log: Path, public: bytes, tmp_path: Path, wanted: Filter, page: int) -> None:
-    """With and without a filter, each record leads to a signed checkpoint, in pages of any size."""
     proven, findings = checked(log, tmp_path, public, wanted, page)
     assert not findings
     assert proven > 0.8 * sum(1 for _ in export(log, wanted))

@@ -25,7 +25,6 @@ from tests.unit.audit.log.test_retention import retain
 
 @pytest.fixture
 def log(make_log: MakeLog, path: Path) -> Path:
-    """Return a closed log of two hundred records with signed checkpoints."""
     log = make_log(checkpoint_every=50, checkpoint_seconds=3600)
     for number in range(200):
         log.record(decision(log, number))
@@ -42,7 +41,6 @@ def kinds(result: Verification) -> set[FindingKind]:
 
 
 def test_an_unchanged_log_agrees(log: Path) -> None:
-    """An unchanged log agrees with every copied checkpoint, and the result names the last one."""
     copies = signed_checkpoints(log)
     assert len(copies) >= 4
     result = verify(log, copies=copies)
@@ -93,7 +91,6 @@ def test_an_end_removed_by_root_is_found(log: Path, key: Ed25519PrivateKey, tmp_
 
 
 def test_another_log_is_found(log: Path, make_log: MakeLog, path: Path) -> None:
-    """A new log, however well signed, does not match the copied checkpoints."""
     copies = signed_checkpoints(log)
     for one in path.parent.glob("audit.db*"):
         one.unlink()
@@ -146,7 +143,6 @@ def test_checkpoints_of_removed_records_contradict_nothing(
 
 
 def test_formats_of_a_copy(log: Path, tmp_path: Path) -> None:
-    """NDJSON and lines of a syslog receiver are read alike; other lines and a cut line are skipped."""
     copies = signed_checkpoints(log)
     fields = json.loads(copies[1].as_json())
     element = " ".join(f'{name}="{value}"' for name, value in fields.items())
@@ -171,7 +167,6 @@ def test_a_file_without_checkpoints_is_an_error(tmp_path: Path, text: str) -> No
 
 
 def test_json_and_back(log: Path) -> None:
-    """A checkpoint as JSON is read back unchanged, and its signature covers exactly these fields."""
     one = signed_checkpoints(log, limit=1)[0]
     assert msgspec.json.decode(one.as_json(), type=SignedCheckpoint) == one
     assert signed_checkpoints(log, after=one.number)[0].number == one.number + 1

@@ -1,5 +1,3 @@
-"""An attacker who can write the log removes recent records as if they were old: verification finds it."""
-
 import lzma
 import sqlite3
 from contextlib import closing
@@ -34,7 +32,7 @@ def kinds(result: Verification) -> set[FindingKind]:
 
 
 def forge(path: Path, proof: dict[str, object] | None = None) -> RemovedRange:
-    """Remove as many records as possible in the program's way, with age as the recorded reason."""
+    """Removes as many records as possible, with age as the recorded reason."""
     writer = ChainWriter(path, 0)
     gone = writer.removable(1 << 30, signed=True)
     assert gone is not None
@@ -52,7 +50,7 @@ def forge(path: Path, proof: dict[str, object] | None = None) -> RemovedRange:
 
 @pytest.fixture
 def fresh(make_log: MakeLog, path: Path) -> Path:
-    """Return a log that is seconds old, with a denial at its beginning and retention off."""
+    """Seconds old, with a denial at its beginning and retention off."""
     log = make_log(checkpoint_every=20)
     log.record(decision(log, decision="deny", host="10.0.0.66"))
     for number in range(100):
@@ -138,7 +136,7 @@ def test_the_signer_refuses_removals_beyond_its_settings(
 
 @pytest.fixture
 def old(path: Path) -> Path:
-    """Return a log written by version 0.1.0 and opened by 0.2.0, with a removal by retention."""
+    """Written by version 0.1.0, opened by 0.2.0, with a removal by retention."""
     path.write_bytes(lzma.decompress(OLD_LOG.read_bytes()))
     path.with_name("audit.pub").write_bytes(OLD_LOG.with_name("log-0.1.0.pub").read_bytes())
     return path

@@ -35,7 +35,6 @@ _UNCOVERED = 5
 
 @pytest.fixture
 def log(make_log: MakeLog, path: Path) -> Path:
-    """Return a closed log of some hundred records with four signed checkpoints, and records after the last."""
     log = make_log(checkpoint_every=50, checkpoint_seconds=3600)
     for number in range(_RECORDS):
         log.record(decision(log, number))
@@ -102,7 +101,6 @@ def test_an_unchanged_log_is_complete(log: Path, key: Ed25519PrivateKey) -> None
 
 @pytest.mark.parametrize("column", COLUMNS.split(", ")[1:])
 def test_any_changed_field(log: Path, column: str) -> None:
-    """A change of any field is found and its record named."""
     kind = "INTEGER" if column in ("time", "version", "rule_line", "revision", "duration_us") else "TEXT"
     value = "4711" if kind == "INTEGER" else ("x'7b7d'" if column == "detail" else "'other'")
     attack(log, f"UPDATE record SET {column} = {value} WHERE sequence = 60")
@@ -162,7 +160,7 @@ def test_a_removed_end_is_found(log: Path) -> None:
 
 
 def rewrite(path: Path, start: int) -> None:
-    """Change a record and recompute all hashes after it, as an attacker who knows the program would."""
+    """An attacker who knows the program would recompute all later hashes."""
     with closing(sqlite3.connect(path)) as connection:
         connection.execute("UPDATE record SET decision = 'deny' WHERE sequence = ?", (start,))
         (log_id,) = connection.execute("SELECT id FROM log").fetchone()
@@ -174,7 +172,6 @@ def rewrite(path: Path, start: int) -> None:
 
 
 def test_rewritten_chain(log: Path) -> None:
-    """A rewritten history with valid hashes does not match the checkpoints."""
     rewrite(log, 60)
     result = verify(log)
     assert not result.ok
@@ -246,7 +243,6 @@ def test_the_signers_memory_finds_a_removed_end(
 
 @pytest.mark.parametrize("sequence", [3, 100, 190])
 def test_overwritten_page(log: Path, sequence: int) -> None:
-    """A garbled part of the file is found, and verification ends without a crash."""
     with closing(sqlite3.connect(log)) as connection:
         (target,) = connection.execute("SELECT hash FROM record WHERE sequence = ?", (sequence,)).fetchone()
     with log.open("r+b") as file:
@@ -283,7 +279,6 @@ def test_a_missing_log_is_an_error(tmp_path: Path) -> None:
 
 
 def content(path: Path) -> list[tuple[object, ...]]:
-    """Return all records and checkpoints that a reviewer can read."""
     with closing(sqlite3.connect(path)) as connection:
         records = connection.execute(f"SELECT {COLUMNS}, hash FROM record ORDER BY sequence").fetchall()
         return records + connection.execute("SELECT * FROM checkpoint ORDER BY number").fetchall()
@@ -448,7 +443,6 @@ def test_a_checkpoint_made_during_verification_is_not_a_finding(
 
 
 def test_findings_are_limited(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first findings are listed, with the number of the rest and the last record."""
     monkeypatch.setattr("appliance.audit.proof.verification._MOST_FINDINGS", 10)
     attack(log, "DELETE FROM record WHERE sequence % 5 = 0 AND sequence <= 150")
     result = verify(log)

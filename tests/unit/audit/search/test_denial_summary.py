@@ -32,7 +32,6 @@ def denial(
 
 
 def folded(scope: str, host: str | None, count: int, **more: object) -> AuditRecord:
-    """Return the summary of `count` repetitions, from second 10 to 20."""
     detail = {
         "scope": scope,
         "count": count,
@@ -127,7 +126,6 @@ def test_a_denial_without_a_host_is_listed() -> None:
 
 
 def test_everything_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hosts, reasons and callers beyond the limits are counted together; too many records are cut at the oldest."""
     for name, most in (("_MOST_HOSTS", 5), ("_MOST_NAMES", 3), ("MOST_RECORDS", 40)):
         monkeypatch.setattr(denial_summary, name, most)
     many = [denial(second, f"10.0.0.{second % 8}") for second in range(40)]

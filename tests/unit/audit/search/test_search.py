@@ -18,7 +18,7 @@ _BEGIN = 1_700_000_000 * _SECOND
 
 @pytest.fixture
 def log(make_log: MakeLog) -> AuditLog:
-    """Return an open log with a hundred ordinary decisions a second apart, and some that differ."""
+    """Ordinary decisions a second apart, and some that differ."""
     log = make_log(checkpoint_seconds=3600)
     for number in range(100):
         log.record(decision(log, number, time=_BEGIN + number * _SECOND))
@@ -41,7 +41,7 @@ def log(make_log: MakeLog) -> AuditLog:
 
 
 def sequences(path: Path, wanted: Filter, **arguments: Any) -> list[int]:
-    """Return the sequences of the records found, less two (the log's own first record is 1)."""
+    """Less two: the log's own first record is 1."""
     return [entry.sequence - 2 for entry in search(path, wanted, **arguments).entries]
 
 
@@ -82,7 +82,6 @@ def sequences(path: Path, wanted: Filter, **arguments: Any) -> list[int]:
     ids=str,
 )
 def test_filters(log: AuditLog, path: Path, wanted: Filter, expected: list[int]) -> None:
-    """Each filter, alone or combined, finds exactly its records, newest first, in a running and a closed log."""
     assert sequences(path, wanted) == expected
     log.close()
     assert sequences(path, wanted) == expected
@@ -157,7 +156,6 @@ def test_a_follower_gets_new_records(log: AuditLog, path: Path) -> None:
     ],
 )
 def test_invalid_filters_are_errors(log: AuditLog, path: Path, wanted: Filter, message: str) -> None:
-    """A filter past its limits is an error that names the part and the reason."""
     with pytest.raises(FilterError, match=message):
         search(path, wanted)
 

@@ -3,7 +3,6 @@ from appliance.audit.search.why import _ACTIONS, lines_of
 
 
 def test_a_verdict_is_explained() -> None:
-    """The lines name the message, the place, the values, the events, and how far they explain the verdict."""
     event = {
         "event": "go",
         "time": "12:00",
@@ -32,7 +31,6 @@ def test_a_verdict_is_explained() -> None:
 
 
 def test_missing_explanations_are_reported() -> None:
-    """Covers a verdict without an explanation, one without events, and one with too many events."""
     bare = AuditRecord(id="1", time=1, event="monitor verdict", reason="bad")
     assert list(lines_of(bare))[-1].startswith("because: the causing events are no longer known")
     silent = AuditRecord(
@@ -47,7 +45,6 @@ def test_missing_explanations_are_reported() -> None:
 
 
 def test_a_denial_names_its_rule() -> None:
-    """The change that would allow it is computed from the policy in force."""
     rule = RuleReference("Publishers", "/t", "robot.ini", 4)
     record = AuditRecord(
         id="1", time=1, event="decision", decision="deny", severity=Severity.WARNING, reason="no", host="10.0.0.1",

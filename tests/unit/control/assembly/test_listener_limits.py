@@ -72,7 +72,7 @@ def test_hosts_of_a_wildcard_share_processor_time() -> None:
 
 @pytest.fixture
 def everybodys(tmp_path: Path) -> Iterator[ListenerLimits]:
-    """Return limits under a policy that names `ROBOT` and admits all others by `*`; one of the others is registered."""
+    """The policy names `ROBOT` and admits all others by `*`; one of the others is registered."""
     policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
     log = open_log(tmp_path / "audit.db")
     trail = AuditTrail(log, strict=False, deny_when_failed=False, details=lambda *_: {})
@@ -112,8 +112,6 @@ def test_registered_hosts_of_a_wildcard_leave_the_robot_its_slots(tmp_path: Path
 
 
 class Opened:
-    """A connection in the middle of a request."""
-
     deadline = 0.0
     holding = 0
     cut = False
@@ -125,8 +123,7 @@ class Opened:
         self.refused = connection_table.enter(self, host)
         connection_table.file(self, stage)
 
-    def expire(self) -> None:
-        """Do nothing: no connection expires in this test."""
+    def expire(self) -> None: ...
 
     def abort(self) -> None:
         self.cut = True

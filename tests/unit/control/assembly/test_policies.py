@@ -35,12 +35,10 @@ OTHER = OPEN.replace("default=*", "default=10.0.0.5", 1)
 
 
 def fail(reason: str) -> None:
-    """Fail if the store could not write."""
     raise AssertionError(reason)
 
 
-async def at_once() -> None:
-    """Return as if the relays had applied the change."""
+async def at_once() -> None: ...
 
 
 class Appliance:
@@ -63,7 +61,6 @@ class Appliance:
         changed: Callable[[Policy, Policy], int] = lambda _before, _policy: 0,
         site_keys: Sequence[str] = (),
     ) -> Iterator[Policies]:
-        """Run control until the block ends; yield its policies."""
         store = StateStore(self.state, failed=fail, kind=InlineDatabase)
         self.records = Records()
         policies = Policies(
@@ -173,8 +170,6 @@ async def test_a_change_stays_confirmed_over_a_crash(tmp_path: Path) -> None:
 
 
 class Slow:
-    """Tests of the policy that finish when the test allows it."""
-
     def __init__(self, monkeypatch: pytest.MonkeyPatch, appliance: Appliance) -> None:
         self.rounds = 0
         self.begun, self.over = threading.Event(), threading.Event()
@@ -303,7 +298,7 @@ async def test_the_first_start_has_nothing_to_keep(tmp_path: Path) -> None:
 
 
 class DiedError(Exception):
-    """Control crashes."""
+    pass
 
 
 @pytest.mark.nightly
@@ -347,7 +342,7 @@ async def test_the_loop_does_not_wait_for_the_disk(tmp_path: Path, monkeypatch: 
 
 
 async def unsigned(policies: Policies, change: Callable[[], Awaitable[object]]) -> str:
-    """Return the message of a refused change; the policy in force stays."""
+    """The policy in force stays."""
     before = policies.revision, policies.current.text
     with pytest.raises(PolicyRefusedError) as refused:
         await change()

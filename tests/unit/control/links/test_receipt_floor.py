@@ -1,5 +1,3 @@
-"""`ReceiptFloor` of `signer_requests`: retention by age waits for receipts, within limits."""
-
 from pathlib import Path
 
 from appliance.control.links.signer_requests import ReceiptFloor

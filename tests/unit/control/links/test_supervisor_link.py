@@ -25,7 +25,7 @@ _LIMIT_SECONDS = 30
 
 
 class Supervisor:
-    """The supervisor's end; `asked` lists the hosts whose routes control requested."""
+    """`asked` lists the hosts whose routes control requested."""
 
     def __init__(self, sock: socket.socket) -> None:
         self.asked: list[str] = []

@@ -20,8 +20,6 @@ pytestmark = pytest.mark.anyio
 
 
 class Slow:
-    """Orders with a slow one, which takes effect when `goes_on` is set."""
-
     def __init__(self) -> None:
         self.begun, self.goes_on = asyncio.Event(), asyncio.Event()
         self.ended: asyncio.Queue[str] = asyncio.Queue()
@@ -40,8 +38,7 @@ class Slow:
 
 @contextlib.asynccontextmanager
 async def served(state: Path) -> AsyncIterator[Slow]:
-    async def durable() -> None:
-        """Do nothing: the test's state needs no disk."""
+    async def durable() -> None: ...
 
     slow = Slow()
     methods = [RequestMethod(PolicyConfirm, slow.confirm, who=True)]
@@ -108,7 +105,7 @@ async def test_the_order_of_a_killed_tool_is_withdrawn(tmp_path: Path) -> None:
 
 
 def _once(event: asyncio.Event, method: Any) -> Any:
-    """Wrap a method so that other threads can call it: the call waits for the event first."""
+    """The call waits for the event, so that other threads can call the method."""
     loop = asyncio.get_running_loop()
 
     def later(*arguments: Any) -> Any:

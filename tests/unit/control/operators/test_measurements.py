@@ -17,7 +17,6 @@ API = parse_node_uri("http://10.0.0.5:4000/")
 
 
 def test_sums_by_name() -> None:
-    """Several incarnations of one topic are summed."""
     rows = [("/a", (1, 10)), ("/b", (2, 20)), ("/a", (3, 30))]
     assert by_resource(rows) == {"/a": [4, 40], "/b": [2, 20]}
 

@@ -11,8 +11,6 @@ from tests.support.engines import InlineDatabase
 
 
 class Scene:
-    """Monitors and a policy for the watch; `recorded` are the alarms."""
-
     def __init__(self, store: StateStore) -> None:
         self.store = store
         self.off: dict[str, Any] = {}

@@ -28,8 +28,6 @@ pytestmark = pytest.mark.anyio
 
 
 class Lives:
-    """Several runs of control on one state."""
-
     def __init__(self, home: Path) -> None:
         self.home = home
         self.log = open_log(home / "audit.db")

@@ -4,7 +4,6 @@ from appliance.control.rest.rest_proof import SECONDS, ChallengeRefusedError, Ch
 
 
 def refusal(challenges: Challenges, challenge: str, now: float) -> str:
-    """Return the reason for rejecting a challenge; empty if the challenge is accepted."""
     try:
         challenges.take(challenge, now)
     except ChallengeRefusedError as error:

@@ -48,8 +48,6 @@ def loading(number: int, text: str, shown: str = TOKEN) -> RequestMade:
 
 
 class Everything:
-    """Stands in for administration, tokens and trail."""
-
     def __init__(self) -> None:
         self.asked: list[tuple[AnyRequest, str]] = []
         self.recorded: list[dict[str, Any]] = []
@@ -87,8 +85,6 @@ class Everything:
 
 
 class Api:
-    """The api's end of the link."""
-
     def __init__(self, world: Everything, link: RestLink) -> None:
         control, self.channel = memory_link(ApiLink)
         self.closed = asyncio.Event()

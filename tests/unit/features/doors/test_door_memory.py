@@ -1,5 +1,3 @@
-"""The memory of one door, under clients that take as much as they can."""
-
 import pytest
 
 from appliance.features.doors.door_memory import ClientMemory, DoorMemory
@@ -12,7 +10,7 @@ _MIB = 1 << 20
 
 
 def fill(memory: ClientMemory) -> tuple[ViewerQueue[str], FragmentStore]:
-    """Send a client that reads nothing messages, replies and fragments until each is refused."""
+    """A client that reads nothing gets messages, replies and fragments until each is refused."""
     queue, fragments = ViewerQueue[str](memory=memory), FragmentStore(8 * _MIB, memory)
     queue.configure("/image", depth=1000, interval=0.0)
     with pytest.raises(OperationError):

@@ -19,8 +19,6 @@ NEW = door_link.DoorStarted("", 0.0, False)
 
 
 class Bench:
-    """The processes, with the messages that they get and the records that they cause."""
-
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.sent: list[Any] = []
         self.asked: list[Any] = []

@@ -1,5 +1,3 @@
-"""Foxglove's protocol: channels of what the door sees, messages as their own bytes, refusals in words."""
-
 import asyncio
 import json
 import struct
@@ -30,7 +28,7 @@ async def next_op(client: WebSocketClient, op: str) -> Any:
 def sees(
     world: DoorWorld, *, topics: dict[str, tuple[str, str]], services: dict[str, str] | None = None
 ) -> None:
-    """State the graph that the master shows: type and publisher of topics, providers of services."""
+    """The types and publishers of topics, the providers of services."""
     world.master.answers["getSystemState"] = [
         [[topic, [node]] for topic, (_kind, node) in topics.items()],
         [["/cmd_vel", ["/base"]]],
@@ -205,7 +203,7 @@ async def test_a_denied_look_is_one_status_in_words() -> None:
 
 
 def viewer(**limits: int) -> tuple[Foxglove, ViewerQueue[int | str]]:
-    """Return a connection that has announced the channel 1."""
+    """The connection has announced the channel 1."""
     queue: ViewerQueue[int | str] = ViewerQueue()
     foxglove = Foxglove("/door_alice", FoxgloveLimits(**limits), queue)
     graph = VisibleGraph({"/t": ["/n"]}, {}, {}, {"/t": "a/B"})

@@ -1,5 +1,3 @@
-"""The types of a door: known from ROS's own packages or from publishers, within a limit of memory."""
-
 import pytest
 
 from appliance.features.doors.known_types import KnownTypes

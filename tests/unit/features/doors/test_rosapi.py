@@ -1,5 +1,3 @@
-"""The services of rosapi: the answers have rosapi's fields, and show only what the sight shows."""
-
 import asyncio
 import json
 from collections.abc import Mapping

@@ -1,5 +1,3 @@
-"""The rosbridge protocol as a conversation: frames of the client, then the requests and frames that come out."""
-
 import base64
 import json
 import struct
@@ -35,8 +33,6 @@ STRING = MessageCodec(
 
 
 class Client:
-    """One connection, without a network; `now` is its clock."""
-
     def __init__(self, **limits: Any) -> None:
         self.queue: ViewerQueue[str] = ViewerQueue(message_bytes=100_000, reply_bytes=100_000)
         self.rosbridge = Rosbridge("/door_alice", RosbridgeLimits(**limits), self.queue)

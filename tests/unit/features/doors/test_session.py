@@ -1,4 +1,4 @@
-"""A door in virtual time: WebSocket clients on one side, a master and other nodes on the other."""
+"""A door in virtual time."""
 
 import asyncio
 import struct

@@ -1,5 +1,3 @@
-"""Values of messages: each standard type survives JSON and CBOR, and hostile input is an error with its path."""
-
 import functools
 import math
 import struct

@@ -1,5 +1,3 @@
-"""Fixtures of evidence: a signed log with loads, denials and unusual texts, and the appliance of an export."""
-
 import asyncio
 import hashlib
 from pathlib import Path
@@ -58,8 +56,6 @@ NUMBERS = (
 
 
 class Trigger(msgspec.Struct):
-    """A trigger of a recording, as the recorder answers."""
-
     time: int
     what: str
     record: str
@@ -67,8 +63,6 @@ class Trigger(msgspec.Struct):
 
 
 class Topic(msgspec.Struct):
-    """A topic of a recording, as the recorder answers."""
-
     topic: str
     type: str
     messages: int
@@ -87,8 +81,6 @@ class Recording(msgspec.Struct):
 
 
 class Control:
-    """A running appliance, as an export finds it."""
-
     def __init__(self, log: AuditLog) -> None:
         self.log = log
         self.trail = AuditTrail(log, strict=False, deny_when_failed=False, details=lambda *_: {})
@@ -111,7 +103,6 @@ class Control:
         self.trail.happened("specifications loaded", "they are in force", category="monitor", more=detail)
 
     def work(self, count: int = 20) -> None:
-        """Make requests of nodes; every third is denied."""
         self.worked += count
         for number in range(self.worked - count, self.worked):
             length, whole = LENGTHS[number % len(LENGTHS)], NUMBERS[number % len(NUMBERS)]
@@ -123,7 +114,7 @@ class Control:
         assert settle(self.log) is None
 
     def record(self, folder: Path, bag: bytes, **about: Any) -> RecordingSelection:
-        """Record the time until now and close the recording, in its own folder."""
+        """The recording ends now, and has its own folder."""
         digest = hashlib.sha256(bag).hexdigest()
         recording = example(
             Recording, id="ab" * 10, began=self.begun, ended=wall_ns(), sha256=digest, **about
@@ -174,7 +165,7 @@ class Control:
 
 @pytest.fixture
 def control(make_log: MakeLog) -> Control:
-    """Return an appliance whose policy and specifications were loaded before the exported time."""
+    """Its policy and specifications were loaded before the exported time."""
     running = Control(make_log(checkpoint_every=12, checkpoint_seconds=3600))
     running.load_policy(6, "[Nodes]\nold = *\n")
     running.load_policy(7, "[Nodes]\ndefault = *\né = *\n")

@@ -1,5 +1,3 @@
-"""A bundle has the events and the rules in force, and is verified with only Python and openssl."""
-
 import ast
 import hashlib
 import itertools
@@ -69,8 +67,6 @@ def pem(key: Ed25519PrivateKey, tmp_path: Path) -> Path:
 
 
 class Reviewer:
-    """Runs the verifier in this process; `said` has its output."""
-
     def __init__(self, capsys: pytest.CaptureFixture[str], key: Path) -> None:
         self._capsys = capsys
         self._key = key
@@ -265,7 +261,7 @@ def test_a_cut_or_damaged_file_is_never_valid(bundle: Path, tmp_path: Path, revi
 
 
 def _longer(place: Path) -> bytes:
-    """Return a bundle whose last member's size is four bytes too large, which no tool unpacks."""
+    """The last member's size is four bytes too large; no tool unpacks such a bundle."""
     with zipfile.ZipFile(place) as archive:
         last, end, whole = archive.infolist()[-1], archive.start_dir, place.read_bytes()
     whole = whole[:end] + b"evil" + whole[end:]
@@ -298,7 +294,7 @@ def test_data_outside_members_is_named(bundle: Path, tmp_path: Path, reviewer: R
         return place
 
     def between(archive: zipfile.ZipFile) -> None:
-        """Remove a member only from the directory, as a tool does."""
+        """The member stays in the file, only the directory loses it."""
         archive.writestr("left", b"out")
         archive.filelist.pop()
 
@@ -431,7 +427,7 @@ def test_many_runs_take_few_steps() -> None:
 
 
 def resealed(members: Members) -> Members:
-    """Return a forger's bundle whose manifest has matching hashes."""
+    """A forger's bundle: its manifest has matching hashes."""
     manifest = json.loads(members["manifest.json"])
     for name, about in manifest["members"].items():
         data = members[name]
@@ -528,7 +524,6 @@ def test_copied_checkpoints_show_a_rewritten_history(
 
 @pytest.mark.nightly
 def test_a_recording_is_included(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
-    """The bag matches the hash in the log and has the recording's time and reason; a different bag is named."""
     bag = random.Random(7).randbytes(3 << 20)  # noqa: S311  the same each time
     trigger = Trigger(control.begun, "drop", "r", "<b>\x1b")
     kept = control.record(tmp_path, bag, triggers=[trigger], topics=[example(Topic, topic="/scan")])
@@ -553,7 +548,6 @@ def test_a_recording_is_included(control: Control, tmp_path: Path, reviewer: Rev
 
 @pytest.mark.nightly
 def test_unproven_facts_are_listed(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
-    """Covers a load without a hash, a text that the appliance lost, and time before the first load."""
     control.load_policy(8, "[Nodes]\n", sha256=None)
     control.work(3)
     control.load_policy(9, "[Nodes]\n# nine\n")
@@ -566,7 +560,7 @@ def test_unproven_facts_are_listed(control: Control, tmp_path: Path, reviewer: R
 
 
 def _as_before(previous: bytes, columns: tuple[object, ...]) -> bytes:
-    """Return the hash of a record as version 0.1.0 computed it."""
+    """As version 0.1.0 computed it."""
     return hashlib.sha256(previous + msgspec.msgpack.encode(columns)).digest()
 
 

@@ -1,5 +1,3 @@
-"""Verification of evidence bundles in a worker: limits that no content can avoid."""
-
 import json
 import zipfile
 from collections.abc import Iterator

@@ -1,5 +1,3 @@
-"""Run a preset on its module, and collect all that its command topic gets."""
-
 import functools
 import math
 import random
@@ -44,7 +42,7 @@ def _part(text: str) -> bytes:
 
 
 class Guarded:
-    """A guard, and the base behind it: each command that it gets, with its time in milliseconds."""
+    """`base` has each command that passes, with its time in milliseconds."""
 
     def __init__(self, preset: str, types: dict[str, str] | None = None, **values: object) -> None:
         wanted = {name: str(value).lower() for name, value in values.items()}
@@ -63,7 +61,7 @@ class Guarded:
             self._sent(one, (one.time - BEGIN) // MS)
 
     def tell(self, given: str, data: bytes, at: int, node: str = "/a", *, faults: bool = False) -> Outcome:
-        """Send a message on a topic that is given to the guard; `faults`: it is too much for the guard."""
+        """`faults`: the message is too much for the guard."""
         self.advance(at)
         topic = self.topics[given]
         outcome = self.monitors.judge(
@@ -76,7 +74,7 @@ class Guarded:
         return outcome
 
     def drive(self, data: bytes, at: int, node: str = "/a") -> tuple[float, ...]:
-        """Send a command; return the velocities that the base gets."""
+        """Returns the velocities that the base gets."""
         outcome = self.tell("command", data, at, node)
         return () if outcome.result == "dropped" else legs_of(bytes(outcome.buffer))
 

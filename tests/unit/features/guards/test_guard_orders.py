@@ -1,5 +1,3 @@
-"""Control answers requests about guards: their states and values, new guards, and proposals."""
-
 from collections import Counter
 from types import SimpleNamespace
 from typing import Any
@@ -21,7 +19,7 @@ FENCE = Guard("fence", PRESETS["fence"], types=TYPES, values={"polygon": "0,0 1,
 
 
 class Manager:
-    """Specifications with a fence and a monitor that is not a guard; it keeps the orders that it gets."""
+    """A fence and a monitor that is not a guard; it keeps the orders that it gets."""
 
     revision, tag, shadow = 2, "2.0", False
 
@@ -64,7 +62,6 @@ def orders(manager: Manager) -> GuardOrders:
 
 
 async def row(orders: GuardOrders) -> Any:
-    """Return the only guard."""
     [found] = (await orders.guards(guard_requests.GuardsWanted())).guards
     return found
 

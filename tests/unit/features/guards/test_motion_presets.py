@@ -1,5 +1,3 @@
-"""Presets that limit motions do what a naive account says, also with NaN, silence and several nodes."""
-
 import math
 from typing import Any
 
@@ -152,14 +150,14 @@ def odometry(x: float, y: float, yaw: float) -> bytes:
 
 
 def depth(x: float, y: float) -> float:
-    """Return the metres to the edge of the square of 4 m; negative outside."""
+    """In metres to the edge of the square of 4 m; negative outside."""
     if max(abs(x), abs(y)) <= 2:
         return 2 - max(abs(x), abs(y))
     return -math.hypot(max(abs(x) - 2, 0), max(abs(y) - 2, 0))
 
 
 def simulated(guard: Guarded, random: Any, x: float, y: float, turned: float) -> list[float]:
-    """Drive a base at random for 4 s, also with NaN; return its depth at each step of 10 ms."""
+    """4 s, also with NaN; returns the depth at each step of 10 ms."""
     depths, x_speed, y_speed, turning, at = [], 0.0, 0.0, 0.0, 0
     for step in range(400):
         at += 10
@@ -229,7 +227,7 @@ def test_a_fence_by_satellites_is_in_metres_from_its_origin() -> None:
 
 
 def scan(ranges: list[float], start: float = -math.pi) -> bytes:
-    """Return a scan around the sensor; 0.1 to 10 m are its range."""
+    """The range is 0.1 to 10 m."""
     step = 2 * math.pi / max(len(ranges), 1)
     return message("sensor_msgs/LaserScan", angle_min=start, angle_increment=step, range_min=0.1, range_max=10.0,
                    ranges=ranges)  # fmt: skip

@@ -1,5 +1,3 @@
-"""Ten robots are guarded by commands alone: each proposal is a valid guard for the topics of its graph."""
-
 from pathlib import Path
 from typing import Any
 

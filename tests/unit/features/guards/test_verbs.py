@@ -14,8 +14,6 @@ from tests.unit.features.guards.test_suggestions import graph_of
 
 
 class Robot:
-    """An appliance with some guards; it keeps the orders that it gets."""
-
     as_json = False
     said = True
 
@@ -71,7 +69,7 @@ FENCE = Guard("fence", PRESETS["fence"], types={"command": "geometry_msgs/Twist"
 
 
 def run(verb: Any, robot: Robot, *arguments: Any, **options: Any) -> Any:
-    """Run a verb; return its only order, or None."""
+    """Returns the verb's only order, or None."""
     verb.function(robot, *arguments, **options)
     return robot.orders[0] if robot.orders else None
 
@@ -88,7 +86,6 @@ def test_a_new_guard_is_loaded_and_written(tmp_path: Path, capsys: pytest.Captur
 def test_a_dry_run_prints_the_plan_and_changes_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], new: bool
 ) -> None:
-    """The exit status is 1 if the change would be refused."""
     robot = Robot(tmp_path, FENCE)
     with pytest.raises(typer.Exit):
         if new:

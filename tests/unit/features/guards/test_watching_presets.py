@@ -1,5 +1,3 @@
-"""Presets that watch sensors, buttons, goals and trajectories do what a naive account of the same messages says."""
-
 import math
 from typing import Any
 
@@ -62,7 +60,6 @@ def test_an_emergency_stop_stays_until_a_reset(hands: bool) -> None:
 
 
 def test_an_emergency_stop_is_sent_at_once_and_repeated() -> None:
-    """Without a further command; a stop that must be heard stops when it is silent."""
     guard = Guarded("estop")
     assert runs(guard, 1)
     stops(guard)
@@ -226,7 +223,7 @@ def test_an_interlock_needs_battery_position_and_check(
 
 
 def trajectory(names: list[str], *points: tuple[float, list[float]]) -> bytes:
-    """Return a trajectory: for each point its seconds and positions."""
+    """For each point its seconds and positions."""
     point = STORE.types["trajectory_msgs/msg/JointTrajectoryPoint"]
     duration = STORE.types["builtin_interfaces/msg/Duration"]
     empty = np.array([], dtype=np.float64)

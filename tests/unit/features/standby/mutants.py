@@ -18,7 +18,7 @@ from tests.unit.features.standby.simulation import History, Product, Violation
 
 
 class Mutant(NamedTuple):
-    """A change of the source, and the first seed whose history finds it, with these kinds of faults (or any)."""
+    """`seed` is the first seed whose history finds the change, with these kinds of faults (or any)."""
 
     module: ModuleType
     old: str
@@ -97,7 +97,7 @@ def first_seed(product: Product, faults: tuple[str, ...], histories: int) -> int
 
 
 def main(arguments: list[str]) -> int:
-    """Print the first seed of each mutant; return 1 if one is not found."""
+    """Returns 1 if a mutant is not found."""
     missing = 0
     for name, mutant in MUTANTS.items():
         with tempfile.TemporaryDirectory() as folder:

@@ -51,41 +51,33 @@ _INBOX = 64
 
 
 class Violation(AssertionError):  # noqa: N818  it is a finding
-    """A promise that a history broke."""
+    pass
 
 
 class _PowerLost(Exception):  # noqa: N818  it is an event
-    """The robot loses its power during a save."""
+    pass
 
 
 @dataclass(frozen=True)
 class Product:
-    """The modules under test; a mutant replaces one."""
-
     witness: ModuleType = witness
     lease: ModuleType = lease
 
 
 @dataclass(frozen=True)
 class LogCopy:
-    """The whole log of the active appliance, for the standby."""
-
     epoch: int
     entries: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class LogStored:
-    """The number of entries that the standby has stored."""
-
     epoch: int
     number: int
 
 
 @dataclass
 class Net:
-    """The state of one direction of a link."""
-
     cut: int = 0
     loss: float = 0.0
     duplicates: float = 0.0  # the second copy comes seconds later, as if an attacker had kept it
@@ -94,8 +86,6 @@ class Net:
 
 
 class Host:
-    """A process with its own clock, which can be down or paused."""
-
     def __init__(self, history: "History", name: str) -> None:
         self.history = history
         self.name = name
@@ -115,7 +105,6 @@ class Host:
         return self.up and self.history.now >= self.paused_until
 
     def start(self) -> None:
-        """Start the process, if it is down."""
         if not self.up:
             self.up = True
             self.life += 1
@@ -124,7 +113,7 @@ class Host:
             self._wake(self.life, self._timer)
 
     def crash(self) -> None:
-        """End the process at once; only its disk remains."""
+        """Only the disk remains."""
         if self.up:
             self.up = False
             self.inbox.clear()
@@ -133,11 +122,11 @@ class Host:
             self.history.trace(f"crashed {self.name}")
 
     def pause(self, seconds: float) -> None:
-        """Stop the process for some time; datagrams wait in its socket."""
+        """Datagrams wait in its socket."""
         self.paused_until = max(self.paused_until, self.history.now + seconds)
 
     def take(self, sender: str, message: Any) -> None:
-        """Receive a message, or keep it until the process runs."""
+        """The message is kept until the process runs."""
         if self.running:
             self.received(sender, message)
         elif self.up and len(self.inbox) < _INBOX:
@@ -162,21 +151,17 @@ class Host:
         due = max(TICK * self.history.random.uniform(0.5, 1), self.paused_until - self.history.now)
         self.history.at(due, lambda: self._wake(life, timer))
 
-    def started(self) -> None:
-        """Prepare the process."""
+    def started(self) -> None: ...
 
-    def crashed(self) -> None:
-        """Forget what is not on the disk."""
+    def crashed(self) -> None: ...
 
-    def tick(self) -> None:
-        """Do what is due."""
+    def tick(self) -> None: ...
 
-    def received(self, sender: str, message: Any) -> None:
-        """Take a message."""
+    def received(self, sender: str, message: Any) -> None: ...
 
 
 class SimulatedAppliance(Host):
-    """An appliance: the product's lease and datagrams, with an abstract replicated log on its disk."""
+    """The product's lease and datagrams, with an abstract replicated log on its disk."""
 
     def __init__(self, history: "History", name: str) -> None:
         super().__init__(history, name)
@@ -249,7 +234,6 @@ class SimulatedAppliance(Host):
         self._answer()
 
     def note_activity(self) -> None:
-        """Check and record a change between active and passive."""
         epoch = self.lease.held if self.active else 0
         if epoch != self.was_active:
             if epoch:
@@ -283,7 +267,7 @@ class SimulatedAppliance(Host):
 
 
 class SimulatedRobot(Host):
-    """The robot's computer: the product's witness, a disk, and `nft` as the kernel would act on its rules."""
+    """The product's witness, a disk, and `nft` as the kernel would act on its rules."""
 
     def __init__(self, history: "History") -> None:
         super().__init__(history, "witness")
@@ -297,7 +281,7 @@ class SimulatedRobot(Host):
         self.firewall = witness.LeaseFirewall(SETTINGS, "nft", self._nft)
 
     def started(self) -> None:
-        """Start the witness; after a boot, its boot rule ran before the network was up."""
+        """After a boot, the boot rule ran before the network was up."""
         product = self.history.product.witness
         if not self.network_up:
             self.boot += 1
@@ -324,7 +308,6 @@ class SimulatedRobot(Host):
         self.history.at(self.history.random.uniform(0.05, 1), self.start_if_booted)
 
     def start_if_booted(self) -> None:
-        """Start the witness, unless the robot is off."""
         if self.network_up:
             self.start()
 
@@ -398,8 +381,6 @@ class SimulatedRobot(Host):
 
 @dataclass
 class History:
-    """One history: a virtual clock, three hosts, the links between them."""
-
     seed: int
     product: Product = field(default_factory=Product)
     on_event: Callable[[str], None] | None = None
@@ -443,12 +424,10 @@ class History:
             self.on_event(event)
 
     def at(self, seconds: float, action: Callable[[], None]) -> None:
-        """Run an action after some seconds."""
         self._count += 1
         heapq.heappush(self._queue, (self.now + seconds, self._count, action))
 
     def require(self, condition: bool, text: str) -> None:
-        """Raise `Violation` unless the condition holds."""
         if not condition:
             raise Violation(f"seed {self.seed}, {self.now:.3f} s: {text}")
 
@@ -471,7 +450,6 @@ class History:
         self.require(not lost, f"{appliance.name} is active without the answered writes {sorted(lost)[:5]}")
 
     def send(self, sender: str, receiver: str, message: Any) -> None:
-        """Send a message over a link, which may lose, delay or duplicate it."""
         net = self.links[sender, receiver]
         if net.cut or self.random.random() < net.loss:
             return
@@ -483,7 +461,7 @@ class History:
             self.at(delay, lambda: None if net.cut else self.hosts[receiver].take(sender, message))
 
     def run(self) -> "History":
-        """Run the history to its end. Raises `Violation`."""
+        """Raises `Violation`."""
         for host in self.hosts.values():
             self.at(self.random.uniform(0, 0.5), host.start)
         self._client()
@@ -648,7 +626,7 @@ class History:
 
 
 def main(arguments: list[str]) -> int:
-    """Run histories; return the number of those that broke a promise, at most 1."""
+    """Returns the number of histories that broke a promise, at most 1."""
     parser = argparse.ArgumentParser(description="Simulate the lease of two appliances.")
     parser.add_argument("seed", type=int)
     parser.add_argument("histories", type=int)

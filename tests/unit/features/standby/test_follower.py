@@ -1,5 +1,3 @@
-"""A follower admits what the witness admits, never longer than the lease runs there, and never an older epoch."""
-
 import json
 import random
 from pathlib import Path
@@ -38,7 +36,7 @@ FOLLOWERS = {"arm": AppliancePeer("10.0.0.20", KEY)}
 
 
 class Robot:
-    """A witness and a follower with one clock; a test carries their datagrams."""
+    """Both have one clock; a test carries their datagrams."""
 
     def __init__(self, epoch: int = 0) -> None:
         self.now = 100.0
@@ -89,7 +87,7 @@ class Robot:
         return self.gate.answer(datagram or self.follower.request(), address)
 
     def look(self) -> str:
-        """Carry one request and its answer; return the appliance that the follower then admits."""
+        """Returns the appliance that the follower admits after one request and its answer."""
         answer = self.answer()
         assert answer is not None
         self.follower.receive(answer)
@@ -97,7 +95,7 @@ class Robot:
 
 
 def following(holder: str = "a") -> Robot:
-    """Return a robot whose follower admits the holder; the first answer has the witness's nonce only."""
+    """The first answer has the witness's nonce only."""
     robot = Robot()
     robot.claim(holder)
     assert robot.look() == ""
@@ -358,14 +356,13 @@ class RandomHistory:
         )
 
     def send(self, datagram: bytes, *, answer: bool) -> None:
-        """Lose, delay or repeat a datagram; most arrive at once."""
+        """Most datagrams arrive at once."""
         chosen = self.random.random()
         for _ in range(0 if chosen < 0.1 else 2 if chosen > 0.9 else 1):
             delay = self.random.uniform(0, 2) if self.random.random() < 0.2 else 0.01
             self.wire.append((self.seconds + delay, datagram, answer))
 
     def step(self) -> None:
-        """Let 20 ms pass; check what is admitted."""
         self.seconds += 0.02
         if self.random.random() < 0.03:
             self.up[self.random.choice(BOTH)] ^= True

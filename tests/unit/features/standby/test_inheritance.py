@@ -43,15 +43,16 @@ def members(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Pair
 
 
 class Pairs:
-    """The appliances, one of which is active in each epoch."""
-
     def __init__(self, members: dict[str, Pair], store: StateStore) -> None:
         self.members, self.store = members, store
         self.epoch = 1
         self.copy_age: float | None = 1.0
 
     def active(self, name: str, *, taken: bool = True) -> tuple[str, tuple[bytes, ...]]:
-        """Make an appliance active; return why the state is lost, and what was left. `taken`: its relays have it."""
+        """Returns why the state is lost, and what was left.
+
+        `taken`: its relays have it.
+        """
         self.epoch += 1
         state, settle = inherited_state(
             self.members[name]._replace(epoch=self.epoch, copy_age=self.copy_age), self.store
@@ -74,7 +75,7 @@ class Pairs:
 
 
 class Relays:
-    """The relays of an appliance, each with the state of its monitors; None: it does not answer."""
+    """None: the relay does not answer."""
 
     def __init__(self, *contents: bytes | None) -> None:
         self.contents = contents
@@ -95,8 +96,7 @@ class Relays:
             raise ConnectionError
         return [StateLeft(0, content, self.at) for content in self.contents]
 
-    def pass_again(self) -> None:
-        """Act as `Rollout`."""
+    def pass_again(self) -> None: ...
 
 
 @pytest.fixture

@@ -1,5 +1,3 @@
-"""The supervisor of one of two appliances stops what serves the robot while the lease has lapsed."""
-
 import signal
 import socket
 from pathlib import Path

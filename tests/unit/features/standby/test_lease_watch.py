@@ -1,8 +1,3 @@
-"""The supervisor's dead man's switch: it serves only up to the time that the lease reported last.
-
-A lapse suspends the service; only a renewal in the same epoch ends the lapse.
-"""
-
 import asyncio
 from collections.abc import Awaitable, Callable
 
@@ -16,8 +11,6 @@ from tests.support.virtual_clock import VirtualClock
 
 
 class Role:
-    """A watch, and what it ordered."""
-
     def __init__(self) -> None:
         self.orders: list[int | str] = []
         self.stopped = asyncio.Event()

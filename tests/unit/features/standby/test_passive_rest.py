@@ -33,8 +33,6 @@ pytestmark = pytest.mark.anyio
 
 
 class Standby:
-    """A standby that hands nothing over."""
-
     def state(self) -> StandbyState:
         return example(StandbyState, role="standby", other={"name": "a", "address": "10.0.0.1"})
 
@@ -58,7 +56,6 @@ def rest_of(folder: Path) -> PassiveRest:
 
 
 def attached(rest: PassiveRest) -> tuple[Channel, asyncio.Queue[Any]]:
-    """Attach a new api; return its end of the channel, and the messages that it receives."""
     ours, theirs = socket.socketpair()
     heard: asyncio.Queue[Any] = asyncio.Queue()
     api = Channel(theirs, ApiLink)

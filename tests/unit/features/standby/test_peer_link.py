@@ -1,5 +1,3 @@
-"""The datagrams between two appliances: only authentic and new ones are read."""
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

@@ -40,17 +40,12 @@ STEPS = (
 
 
 class Feed:
-    """The changes for the standby; the test ships them."""
-
     size = 0
 
-    def release(self, _number: int) -> None:
-        """Forget changes that the standby has."""
+    def release(self, _number: int) -> None: ...
 
 
 class Store:
-    """A database that writes at once."""
-
     history = "history"
 
     def __init__(self) -> None:
@@ -59,12 +54,11 @@ class Store:
     def follow(self, _notice: object, _room: int) -> Feed:
         return Feed()
 
-    async def settled(self) -> None:
-        """Return at once."""
+    async def settled(self) -> None: ...
 
 
 class Pair:
-    """The active appliance `a`, its standby `b`, and the witness, with every message in a queue of the test."""
+    """Every message waits in a queue of the test."""
 
     def __init__(self, folder: Path, patch: pytest.MonkeyPatch, machine: VirtualClock) -> None:
         self.machine = machine

@@ -1,5 +1,3 @@
-"""A standby's state file, and an active appliance that does not keep to the rules."""
-
 import contextlib
 import os
 import sqlite3
@@ -39,12 +37,12 @@ def thing(name: str) -> Put:
 
 
 def changes(*made: Change, epoch: int = 3, history: str = "h", first: int = 8) -> Changes:
-    """Return changes that follow the snapshot, unless they lie."""
+    """They follow the snapshot, unless they lie."""
     return Changes(epoch, history, first, list(made))
 
 
 def begun(tmp_path: Path) -> Replica:
-    """Return a replica with the row `old`, at epoch 3 and number 7 of the history `h`."""
+    """It has the row `old`, at epoch 3 and number 7 of the history `h`."""
     replica = Replica(tmp_path / "state.db", SCHEMA, failed=pytest.fail, largest=1 << 20)
     for message in (BEGIN, SnapshotRows([thing("old")]), SnapshotEnd(1)):
         replica.take(message)
@@ -157,7 +155,6 @@ def test_a_snapshot_that_ends_early_is_undone(tmp_path: Path) -> None:
 
 
 def large(number: int) -> Put:
-    """Return 10 rows of 10 kB."""
     return Put("thing", [(f"{number} {row}", 1, "x" * 10_000) for row in range(10)])
 
 

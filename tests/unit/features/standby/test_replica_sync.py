@@ -1,5 +1,3 @@
-"""A standby that a power cut may have robbed of its last changes does not take over with them missing."""
-
 import asyncio
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,7 +21,6 @@ def replica(tmp_path: Path) -> Iterator[Replica]:
 
 
 async def complete(replica: Replica, folder: Path, boot: str, *, followed: bool, seconds: float) -> bool:
-    """Return whether the appliance may take over within this time."""
     done = asyncio.Event()
     task = asyncio.create_task(ReplicaSync(replica, folder, boot).run(lambda: followed, done.set))
     try:

@@ -70,7 +70,7 @@ async def until(condition: Callable[[], Any]) -> None:
 
 
 async def require_equal(directory: Path, active: ActiveSide) -> None:
-    """Both databases have the same rows, once the active one is on its disk: the standby's may be there earlier."""
+    """The standby's rows may be there before the active one has them on its disk."""
     await active.database.settled()
     assert tables_of(directory / "standby.db") == tables_of(directory / "active.db")
 
@@ -176,7 +176,7 @@ async def connected(directory: Path, active: ActiveSide) -> AsyncIterator[Replic
 
 
 async def take_snapshot(link: ReplicationLink[FromActive]) -> SnapshotBegin:
-    """Take a snapshot without storing it; return its beginning. The stored state is of another history."""
+    """The stored state is of another history."""
     begin = await link.receive(10)
     assert isinstance(begin, SnapshotBegin)
     await link.send(Stored(0, "other", 1))
@@ -407,7 +407,7 @@ async def pair_of_streams() -> tuple[Streams, Streams]:
 
 
 async def pair_of_links() -> tuple[asyncio.StreamReader, asyncio.StreamWriter, asyncio.StreamWriter]:
-    """Return a reader, the writer whose bytes it reads, and the reader's own writer."""
+    """Returns a reader, the writer whose bytes it reads, and the reader's own writer."""
     (reader, writer), (_, other) = await pair_of_streams()
     return reader, other, writer
 

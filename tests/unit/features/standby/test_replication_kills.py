@@ -12,8 +12,6 @@ pytestmark = pytest.mark.nightly
 
 
 class Side:
-    """One process, which is killed and started again."""
-
     def __init__(self, name: str, directory: Path, descriptor: int, port: int) -> None:
         module = "tests.support.features.standby.replication_process"
         self._command = [sys.executable, "-m", module, name, str(directory), str(port), str(descriptor)]

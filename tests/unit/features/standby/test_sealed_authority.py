@@ -1,5 +1,3 @@
-"""Tests of an authority's key on the second appliance: only encrypted, and only used with the passphrase."""
-
 from pathlib import Path
 
 import pytest
@@ -17,13 +15,12 @@ SECRET = b"correct horse"
 
 @pytest.fixture
 def folders(tmp_path: Path) -> tuple[Path, Path]:
-    """Return the signers' directories of both appliances; the second one does not exist yet."""
+    """The second directory does not exist yet."""
     (tmp_path / "a").mkdir()
     return tmp_path / "a", tmp_path / "b"
 
 
 def joined(folders: tuple[Path, Path]) -> CertificateAuthority:
-    """Bring the first appliance's sealed authority to the second one; return the authority."""
     made = CertificateAuthority(folders[0], passphrase=SECRET)
     sealed = sealed_authority(folders[0])
     assert sealed is not None
@@ -41,7 +38,6 @@ def test_a_clear_key_never_leaves(folders: tuple[Path, Path]) -> None:
 
 
 def test_the_passphrase_opens_it(folders: tuple[Path, Path]) -> None:
-    """The second appliance then has the same authority, now and after the next start."""
     made = joined(folders)
     assert (folders[1] / FOLDER / KEY_FILE).stat().st_mode & 0o777 == 0o600
     for _start in range(2):

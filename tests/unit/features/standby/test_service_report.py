@@ -1,5 +1,3 @@
-"""Tests of `appliance.features.standby.service_begin`: what an active appliance reports to its lease."""
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,8 +11,6 @@ from tests.support.virtual_clock import VirtualClock
 
 
 class Control:
-    """A control that serves; a test changes its parts."""
-
     def __init__(self, state: Path) -> None:
         (state / "control").mkdir()
         self.state = state

@@ -11,7 +11,7 @@ from appliance.features.standby.service_watch import (
 
 
 def serving() -> ServiceWatch:
-    """Return the watch of an appliance that is active at 100 s, and serves from 102 s on."""
+    """Active at 100 s, serves from 102 s on."""
     watch = ServiceWatch()
     assert watch.fault(100.0, active=True) == ""
     watch.linked()

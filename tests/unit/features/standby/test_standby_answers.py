@@ -1,5 +1,3 @@
-"""REST on a standby: every request that needs control gets the address of the active appliance."""
-
 import asyncio
 import json
 from pathlib import Path
@@ -34,8 +32,6 @@ ROW, TOKEN = make_token("alice", "admin", now=0.0, seconds=1e10)
 
 
 class Standby(ControlLink):
-    """Control's end of the link, on a standby."""
-
     def __init__(self) -> None:
         super().__init__(lambda _tokens: None, lambda: None)
 

@@ -15,9 +15,11 @@ pytestmark = pytest.mark.anyio
 
 
 class Pair:
-    """Appliance `a` of two, and its audit trail.
+    """`a` is the active appliance.
 
-    `did` has what happened, in order. `refusal` is the reason against a switchover.
+    `did` has what happened, in order.
+
+    `refusal` is the reason against a switchover.
     """
 
     def __init__(self, role: str) -> None:

@@ -1,5 +1,3 @@
-"""Every stored duration keeps its length over a takeover, however the clocks of the two appliances differ."""
-
 import asyncio
 import contextlib
 import re
@@ -41,8 +39,6 @@ def members(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pair]:
 
 
 class Two:
-    """The replicated state, and the clocks and folders of both appliances; time passes on both."""
-
     def __init__(self, home: Path, members: dict[str, Pair], ahead: float) -> None:
         self.members, self.home = members, home
         self.clocks = {

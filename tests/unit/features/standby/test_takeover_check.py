@@ -33,7 +33,7 @@ SECONDS = 60
 
 
 class Standby:
-    """The files of a standby; `store` writes its state as the replication does."""
+    """`store` writes its state as the replication does."""
 
     def __init__(self, home: Path) -> None:
         self.home = home
@@ -64,7 +64,7 @@ class Standby:
         compiler: SpecificationCompiler | None = None,
         **settings: Any,
     ) -> AsyncIterator["Checked"]:
-        """Run the check; it repeats itself after `again` seconds."""
+        """The check repeats itself after `again` seconds."""
         await self.store.settled()
         given: dict[str, Any] = {
             "listen": "127.0.0.1:0",
@@ -86,8 +86,6 @@ class Standby:
 
 
 class Checked:
-    """A running check, and its results."""
-
     def __init__(self, check: TakeoverCheck, store: StateStore) -> None:
         self.check = check
         self.changed = asyncio.Event()
@@ -196,14 +194,13 @@ async def test_a_port_in_use(standby: Standby) -> None:
 
 
 async def test_a_damaged_certificate(standby: Standby) -> None:
-    """Without the certificate of the link, a takeover would fail."""
     damaged = msgspec.structs.replace(standby.membership, certificate="")
     async with standby.checked(membership=damaged) as checked:
         assert "the certificates of the two appliances cannot be used" in await checked.next_obstacle()
 
 
 class OwnCompiler(SpecificationCompiler):
-    """A compiler in this process, which counts the questions."""
+    """Counts the questions."""
 
     questions = 0
 

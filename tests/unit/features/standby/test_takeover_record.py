@@ -17,7 +17,7 @@ pytestmark = pytest.mark.nightly
 
 
 def records(member: Member, event: str) -> list[dict[str, Any]]:
-    """Return the details of the records of an event, the oldest first; `reason` is added."""
+    """`reason` is added to the details."""
     found = search(member.path, Filter(event=event), newest_first=False).entries
     return [{**one.record.detail, "reason": one.record.reason} for one in found]
 
@@ -30,7 +30,7 @@ def after(tmp_path: Path, story: Callable[[Member, Member], Awaitable[None]]) ->
 
 
 async def sealed_by_b(a: Member, b: Member) -> SignedCheckpoint:
-    """Let b be active and replicate to a; return b's checkpoint."""
+    """b is active and replicates to a."""
     async with b.active(1):
         await b.decide(3, 1)
         await b.sealed()

@@ -39,8 +39,6 @@ Kind = TakeoverFindingKind
 
 
 class Pair(NamedTuple):
-    """Copies of two closed logs, and their keys."""
-
     a: Path
     b: Path
     key_a: Ed25519PrivateKey
@@ -60,7 +58,7 @@ def build(folder: Path, story: Story) -> Pair:
 
 @pytest.fixture(scope="module")
 def honest(tmp_path_factory: pytest.TempPathFactory) -> Pair:
-    """Return the logs of an honest pair; tests change copies."""
+    """Tests change copies."""
     return build(tmp_path_factory.mktemp("honest"), four_takeovers)
 
 
@@ -78,7 +76,7 @@ def verified(a: Path, b: Path) -> PairVerification:
 
 
 def found(pair: Pair) -> list[tuple[Kind, int]]:
-    """Return the findings between two logs that are both valid on their own."""
+    """Both logs are valid on their own."""
     result = verified(pair.a, pair.b)
     assert [log.findings for log in result.logs] == [[], []]
     turned = verified(pair.b, pair.a)
@@ -265,19 +263,16 @@ def test_logs_without_a_takeover_have_no_link(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("change", ["decision = 'deny'", "time = time - 1", "host = '10.0.0.99'"])
 def test_a_rewritten_log(pair: Pair, change: str) -> None:
-    """A record changed before a named checkpoint, with everything signed again, contradicts the other log."""
     pair.forge_b(f"UPDATE record SET {change} WHERE sequence = 5")
     assert found(pair) == [(Kind.REWRITTEN, 4)]
 
 
 def test_a_removed_decision(pair: Pair) -> None:
-    """A decision removed before a named checkpoint, with everything signed again, contradicts the other log."""
     pair.forge_a("DELETE FROM record WHERE sequence = 6")
     assert found(pair) == [(Kind.REWRITTEN, 2), (Kind.REWRITTEN, 5)]
 
 
 def test_a_cut_log(pair: Pair) -> None:
-    """A log whose end was cut off with its checkpoints lacks the checkpoint that the other log names."""
     third = verified(pair.a, pair.b).takeovers[2]
     execute(
         pair.b,
@@ -288,7 +283,6 @@ def test_a_cut_log(pair: Pair) -> None:
 
 
 def test_a_missing_log(pair: Pair) -> None:
-    """A log that is not there is an error that names its path."""
     result = verify(pair.b)
     pair.b.unlink()
     with pytest.raises(LogUnreadableError, match=str(pair.b)):
@@ -296,7 +290,6 @@ def test_a_missing_log(pair: Pair) -> None:
 
 
 def test_a_removed_takeover(pair: Pair) -> None:
-    """A takeover removed from a log that was signed again is named: the takeover after it names it."""
     pair.forge_b(removing(2))
     assert (Kind.TAKEOVER_MISSING, 2) in found(pair)
 
@@ -386,7 +379,6 @@ def test_a_wrong_name(pair: Pair, field: str, name: str) -> None:
 
 @pytest.mark.parametrize("value", ["-1", "'five'", "9223372036854775808.5"])
 def test_an_unreadable_takeover(pair: Pair, value: str) -> None:
-    """A takeover without the fields of its event is a finding, not a crash."""
     pair.forge_b(setting("epoch", value, 5))
     assert (Kind.UNREADABLE, 0) in found(pair)
 
@@ -410,7 +402,6 @@ def test_a_hand_over_that_does_not_fit(pair: Pair, field: str, value: str) -> No
     ],
 )
 def test_a_replaced_table(pair: Pair, statement: str) -> None:
-    """Tables with values of other types are findings, not a crash."""
     execute(
         pair.a,
         "CREATE TABLE loose AS SELECT * FROM record",
@@ -446,7 +437,6 @@ def test_a_fault_of_either_log_is_one_of_the_pair(pair: Pair, side: str) -> None
 
 
 def test_an_older_copy(pair: Pair, tmp_path: Path) -> None:
-    """A copy of a log from before the last takeovers is named as too short."""
     shutil.copytree(pair.b.parent, tmp_path / "older")
     older = pair._replace(b=tmp_path / "older" / "audit.db")
     execute(older.b, "DELETE FROM record WHERE sequence > 3", "DELETE FROM checkpoint WHERE sequence > 3")
@@ -457,7 +447,7 @@ def test_an_older_copy(pair: Pair, tmp_path: Path) -> None:
 
 
 def overlapping(folder: Path, both: float, *, lasting: float = 60, clock_set: str = "") -> Pair:
-    """Return the logs of a pair in which a decides for `both` seconds while b is active for `lasting` seconds."""
+    """a decides for `both` seconds while b is active for `lasting` seconds."""
 
     async def story(a: Member, b: Member, world: World) -> None:
         async with a.active(1):

@@ -1,5 +1,3 @@
-"""The witness: it grants one lease at a time, keeps it on the disk, and answers only authenticated, fresh requests."""
-
 import ast
 import json
 import subprocess
@@ -39,8 +37,6 @@ FIRST = LeaseRecord(1, "", BOTH, "")
 
 
 class Robot:
-    """A witness with a clock, a disk and a firewall, each of which a test can make fail."""
-
     def __init__(self, record: LeaseRecord | None = FIRST, boot: str = "one") -> None:
         self.now = 100.0
         self.disk = record
@@ -52,13 +48,13 @@ class Robot:
         self.gate = WitnessGate(self.witness, PEERS, "nonce")
 
     def save(self, record: LeaseRecord) -> None:
-        """Save, unless the disk is full."""
+        """Fails if the disk is full."""
         if self.disk_full:
             raise WitnessError("the disk is full")
         self.disk = record
 
     def admit(self, name: str) -> None:
-        """Admit, unless the firewall fails."""
+        """Fails if the firewall does."""
         if self.firewall_fails:
             raise WitnessError("nft: no")
         self.admits.append(name)
@@ -72,7 +68,6 @@ class Robot:
 
 
 def granted() -> Robot:
-    """Return a robot whose lease `a` has, with epoch 2."""
     robot = Robot().expired()
     assert robot.asks("a", "claim") == ""
     return robot

@@ -22,7 +22,7 @@ API = "http://127.0.0.1:4000/"
 
 
 def held(name: str, host: str, *, own: bool) -> Registry:
-    """Return a registry in which a node of this host holds `name`; with `own`, it is the appliance's node."""
+    """With `own`, it is the appliance's node."""
     registry = Registry()
     address, uri = ipaddress.ip_address(host), parse_node_uri(API)
     node = Incarnation("key", name, address, uri, API, host, 19001, 19002, own=own)

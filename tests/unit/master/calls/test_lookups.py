@@ -1,5 +1,3 @@
-"""Look-ups are answered from the registry, whatever state the ROS master is in."""
-
 import ipaddress
 from types import SimpleNamespace
 from typing import Any, cast
@@ -19,8 +17,6 @@ pytestmark = pytest.mark.anyio
 
 
 class Site:
-    """A registry, and the look-ups on it, without a ROS master."""
-
     def __init__(self, unseen: str | None = None) -> None:
         self.registry = Registry()
         self.granted: list[Incarnation] = []

@@ -1,5 +1,3 @@
-"""Requests about connections take time in proportion to the connections, not to connections times topics."""
-
 import ipaddress
 from types import SimpleNamespace
 from typing import Any, cast
@@ -21,7 +19,7 @@ TOPICS, CONNECTIONS = 200, 300
 
 
 class Counted(dict[Any, Any]):
-    """A table of connections that counts how often a connection is read."""
+    """Counts how often a connection is read."""
 
     looks = 0
 

@@ -60,7 +60,7 @@ STEP = st.one_of(st.tuples(st.just("set"), KEY, VALUE), st.tuples(st.just("delet
 
 @pytest.fixture(scope="module")
 def oracle() -> Any:
-    """rosmaster's ParamDictionary, run by the interpreter that rosmaster is installed for."""
+    """Debian's Python runs rosmaster's own code."""
     with subprocess.Popen(
         [PYTHON, "-c", ORACLE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
@@ -105,7 +105,7 @@ def test_key_and_value_together_are_bounded_in_depth() -> None:
 
 
 class OrderedServer:
-    """The parameters of the ROS master, and the requests that reached it."""
+    """It has the requests that reached the ROS master."""
 
     def __init__(self, there: ParameterMirror) -> None:
         self.tree = mirror()
@@ -237,8 +237,6 @@ def test_a_value_that_rosmaster_keeps_despite_its_error(together: bool) -> None:
     assert codes[:2] == [-1, -1]
 
     class Failing(OrderedServer):
-        """A ROS master that gives the answers recorded from the real one."""
-
         async def call_in_order(self, calls: Any) -> list[Any]:
             keys = [key for key, _ in steps]
             return [[codes[keys.index(params[1])], method, 0] for method, params in calls]

@@ -52,7 +52,7 @@ write /arm/max = adm
 
 
 class Trail(Records):
-    """The trail: decisions as (call, key or resource, decision), events by name."""
+    """Decisions as (call, key or resource, decision)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -66,7 +66,7 @@ class Trail(Records):
 
 
 class Site:
-    """A running pipeline, its ROS master (whose calls wait for `go`), and the audit records."""
+    """Calls of the ROS master wait for `go`."""
 
     def __init__(self, rules: str = LIMITED, tree: Any = None, *, bytes_limit: int = 64 << 20) -> None:
         self.policy_text = POLICY + rules
@@ -94,12 +94,10 @@ class Site:
             offload=OFFLOAD,
         )
 
-    async def learn(self, _peer: Peer) -> None:
-        """Act as `AdvertisedAddresses`."""
+    async def learn(self, _peer: Peer) -> None: ...
 
     @property
     def reachable(self) -> bool:
-        """Report that the ROS master can be called, because it is not being rebuilt."""
         return False
 
     async def call(self, method: str, *params: Any) -> Any:
@@ -136,7 +134,6 @@ class Site:
 
 @pytest.fixture
 def site() -> Site:
-    """Return a pipeline under the limited policy, without parameters."""
     return Site()
 
 
@@ -145,7 +142,6 @@ def part(method: str, *params: Value) -> Value:
 
 
 async def others() -> None:
-    """Let every other task run until it waits."""
     for _ in range(20):
         await asyncio.sleep(0)
 
@@ -162,7 +158,7 @@ def told(answers: list[Any]) -> list[int]:
 
 
 async def held(site: Site, parts: list[Value]) -> "asyncio.Task[Any]":
-    """Start an operator's multicall; the ROS master answers its first run after `site.go`."""
+    """The ROS master answers the first run after `site.go`."""
     site.go.clear()
     asked = asyncio.create_task(site.ask(OPERATOR, "system.multicall", parts))
     await others()

@@ -1,5 +1,3 @@
-"""The record of a request that is refused after only the beginning of its body was read."""
-
 import ipaddress
 from typing import Any
 

@@ -9,7 +9,6 @@ pytestmark = pytest.mark.anyio
 
 
 async def write(turns: KeyTurns, keys: Sequence[str], order: list[str], go: asyncio.Event) -> None:
-    """One write, which lasts until `go`."""
     async with turns.alone(keys):
         order.append(f"{keys[0]} in")
         await go.wait()

@@ -17,7 +17,7 @@ LONG = [f"http://10.0.0.1:{19001 + number}/" for number in range(500)]
 
 
 class Node:
-    """The node that is called: it answers once `answers` is set, and fails while `fails`."""
+    """It answers once `answers` is set, and fails while `fails`."""
 
     def __init__(self) -> None:
         self.answers = asyncio.Event()
@@ -33,8 +33,6 @@ class Node:
 
 
 class Post:
-    """Deliveries to one node, and the calls that stayed undelivered."""
-
     def __init__(self, **bounds: Any) -> None:
         self.node, self.lost = Node(), list[tuple[str, Value]]()
         self.world = ControlParts()

@@ -1,5 +1,3 @@
-"""The master-side endpoint only acknowledges the calls that the ROS master makes to a node."""
-
 import ipaddress
 from typing import Any
 

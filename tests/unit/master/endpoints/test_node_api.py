@@ -13,8 +13,6 @@ pytestmark = pytest.mark.anyio
 
 
 class Street(ControlParts):
-    """Control, with queues of calls to nodes, and the processes that answer at their ports."""
-
     def surround(self) -> None:
         self.heard: list[tuple[int, str]] = []
         self.process = 1
@@ -28,7 +26,7 @@ class Street(ControlParts):
         self.deliveries = cast(Any, self.delivery)
 
     async def two_at_one_address(self) -> tuple[Incarnation, Incarnation]:
-        """Two live nodes with the same port; both have registered."""
+        """Both have registered."""
         await self.round()
         first, second = self.node("/first", 1), self.node("/second", 1)
         await self.register(first, Kind.SUBSCRIPTION, "/t")
@@ -41,8 +39,7 @@ class _Door:
     def __init__(self, street: Street, node: Incarnation) -> None:
         self._street, self._port = street, node.api.port
 
-    def close(self) -> None:
-        """Close nothing."""
+    def close(self) -> None: ...
 
     async def call(self, method: str, *_params: Value) -> Value:
         self._street.heard.append((self._port, method))

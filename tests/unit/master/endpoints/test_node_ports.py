@@ -19,16 +19,13 @@ FIRST = 20_000
 
 
 class Listening:
-    """A listening socket that takes no port from other programs."""
-
     def __init__(self, _host: str, port: int) -> None:
         self.port = port
 
     def getsockname(self) -> tuple[str, int]:
         return "127.0.0.1", self.port
 
-    def close(self) -> None:
-        """Do nothing: there is no file descriptor."""
+    def close(self) -> None: ...
 
 
 @pytest.fixture(autouse=True)

@@ -7,8 +7,6 @@ from roswire.uris import parse_node_uri
 
 
 class Told:
-    """Stands in for the parts that a proxy endpoint uses; records their calls."""
-
     def __init__(self) -> None:
         self.calls: list[tuple[str, Any]] = []
 

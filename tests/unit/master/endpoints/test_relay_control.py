@@ -33,19 +33,15 @@ _UNUSED = object()  # a part that is not used
 
 
 class Ports:
-    """`NodePorts` without sockets: the descriptor of a socket is its port."""
-
     def socket(self, port: int) -> Any:
         return SimpleNamespace(fileno=lambda: port)
 
 
 class NoDelivery:
-    """Deliveries that call no node."""
+    pass
 
 
 class Link:
-    """A relay's end of the link: the messages it received, in order."""
-
     def __init__(self) -> None:
         self.told: list[tuple[messages.Message, tuple[int, ...]]] = []
         self.end: Callable[[], None] = lambda: None
@@ -56,8 +52,7 @@ class Link:
     def send(self, message: messages.Message, descriptors: tuple[int, ...] = (), **_when: bool) -> None:
         self.told.append((message, descriptors))
 
-    def close(self) -> None:
-        """Act as `Channel`."""
+    def close(self) -> None: ...
 
     def heard(self) -> list[messages.Message]:
         told, self.told = [message for message, _descriptors in self.told], []
@@ -65,7 +60,6 @@ class Link:
 
 
 def policy(*limits: str, nodes: str = "default = 10.0.0.5") -> Policy:
-    """Return a policy with these limits, and rules for `nodes`."""
     return compile_policy("\n".join(["[Limits]", *limits, "[Nodes]", nodes]), file="p.ini")
 
 

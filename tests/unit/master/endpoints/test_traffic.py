@@ -1,5 +1,3 @@
-"""Audit records made from a relay's reports of refused connections."""
-
 import ipaddress
 from typing import Any, cast
 
@@ -13,8 +11,6 @@ from roswire.uris import parse_node_uri
 
 
 class Kept:
-    """A trail that keeps its records."""
-
     def __init__(self) -> None:
         self.records: list[dict[str, Any]] = []
 

@@ -1,5 +1,3 @@
-"""The appliance's own node may make the calls of an unmodified rosout, and no others."""
-
 import ipaddress
 
 import pytest

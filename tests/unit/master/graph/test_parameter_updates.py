@@ -1,5 +1,3 @@
-"""Updates of parameters go to the nodes that rosmaster computes, and never have a key that was not decided."""
-
 import asyncio
 import copy
 import json

@@ -1,5 +1,3 @@
-"""The registry's invariants after any sequence of changes, compared with a naive count."""
-
 import ipaddress
 
 import pytest

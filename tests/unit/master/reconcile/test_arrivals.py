@@ -28,7 +28,7 @@ class FewPorts:
 
 
 class SlowFaces:
-    """Proxy endpoints that open only after some turns of the event loop."""
+    """They open only after some turns of the event loop."""
 
     async def open(self, _incarnation: Incarnation) -> None:
         for _turn in range(3):
@@ -36,7 +36,7 @@ class SlowFaces:
 
 
 class NoFaces:
-    """Proxy endpoints of a control that has run out of file descriptors."""
+    """The control has run out of file descriptors."""
 
     async def open(self, incarnation: Incarnation) -> None:
         raise NoPortError(f"no proxy endpoint for {incarnation.name}: Too many open files")

@@ -1,5 +1,3 @@
-"""Registering calls are answered from the registry; the ROS master gets their changes afterwards, in order."""
-
 import asyncio
 from typing import Any, cast
 
@@ -18,7 +16,7 @@ def uri(number: int = 1) -> str:
 
 
 class Requests:
-    """A ROS master that notes its requests. `held` delays them, and `failure` replaces their answers."""
+    """`held` delays the requests, and `failure` replaces their answers."""
 
     def __init__(self, world: ControlParts) -> None:
         self._hidden = world.hidden

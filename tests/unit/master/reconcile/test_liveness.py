@@ -1,5 +1,3 @@
-"""Nodes that leave and return, while other nodes or the policy took over their registrations."""
-
 import asyncio
 import ipaddress
 from typing import Any, cast

@@ -1,5 +1,3 @@
-"""The reconcile loop brings the ROS master to the state of the registry, without revoked registrations."""
-
 from typing import Any, cast
 
 import pytest
@@ -42,8 +40,6 @@ async def test_a_new_master_is_complete_before_the_first_call() -> None:
 
 
 class _Requests:
-    """A ROS master that counts its requests."""
-
     def __init__(self, world: ControlParts) -> None:
         self._hidden = world.hidden
         self.number = 0

@@ -1,5 +1,3 @@
-"""Checks of a header: missing fields, and missing entries in the grant table."""
-
 import pytest
 
 from appliance.channel.messages import (

@@ -32,7 +32,6 @@ class Relay:
         self.later.append(work)
 
     def question(self, host: str, body: bytes = b"") -> int:
-        """Ask about a request of a client on its own."""
         return self.approvals.ask(("/home", host, "/it"), "std_srvs/SetBool", body, lambda _refused: None)
 
     def ask(self, body: bytes) -> bool:

@@ -8,8 +8,6 @@ from roswire.tcpros import encode_frame, encode_service_error, encode_service_re
 
 
 class Conversation:
-    """An exchange, the bytes that each side was sent, and the counts."""
-
     def __init__(self, *, persistent: bool = False, limit: int = 1 << 20) -> None:
         self.service: list[bytes] = []
         self.client: list[bytes] = []
@@ -97,7 +95,6 @@ def test_lengths_beyond_the_limit_are_refused(length: int) -> None:
 
 
 def test_an_ok_byte_that_is_neither_is_refused() -> None:
-    """A reply must begin with 0 or 1."""
     call = Conversation()
     call.ask(encode_frame(b""))
     with pytest.raises(ProtocolError):

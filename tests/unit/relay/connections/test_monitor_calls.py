@@ -100,7 +100,6 @@ def test_the_number_of_calls_under_way_is_bounded() -> None:
 
 @pytest.fixture(name="world")
 def served() -> Iterator[Monitored]:
-    """Yield a relay with a service /arm of the node /server, and a monitor that calls it."""
     world = Monitored()
     listening = world.listen()
     ports = world.listen()

@@ -34,8 +34,7 @@ def publisher() -> Iterator[socket.socket]:
         yield sock
 
 
-def _nothing(*_what: object) -> None:
-    """Do nothing: there are no publishers and no monitors."""
+def _nothing(*_what: object) -> None: ...
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ CALL = {"callerid": "/client", "service": "/rosrv/record_now", "md5sum": "*"}
 
 
 class Scene(World):
-    """A relay with the service of the appliance, which /client may call from two hosts; its port is `port`."""
+    """/client may call the appliance's service from two hosts."""
 
     def __init__(self, limits: RelayLimits = LIMITS) -> None:
         super().__init__(limits)
@@ -51,7 +51,6 @@ def scene(request: pytest.FixtureRequest) -> Iterator[Scene]:
 
 
 def reply(success: bool, text: str) -> bytes:
-    """Return a std_srvs/TriggerResponse as it is on the wire."""
     return encode_service_reply(bytes([success]) + encode_frame(text.encode()))
 
 
@@ -136,7 +135,6 @@ def test_a_call_is_answered_when_control_ends(scene: Scene) -> None:
 
 
 def test_a_client_with_another_type_gets_an_error(scene: Scene) -> None:
-    """The client gets the error that a node would send; control receives no call."""
     client = scene.connect(encode_header(CALL | {"md5sum": "0" * 32}))
     assert f"not {'0' * 32}" in scene.gets_header(client)["error"]
     assert scene.called() == []

@@ -5,8 +5,6 @@ from appliance.relay.transport.memory import MemoryPool
 
 
 class World:
-    """A table of pending connections, its clock, and the hosts with a grant."""
-
     def __init__(self) -> None:
         self.now = 0.0
         self.granted: set[str] = set()
@@ -14,7 +12,6 @@ class World:
         self.room = PendingConnections(lambda: self.now, self.quota_class, self.held)
 
     def quota_class(self, host: str) -> QuotaClass:
-        """Return `REGISTERED` for a host with a grant, `UNKNOWN` for others."""
         return QuotaClass.REGISTERED if host in self.granted else QuotaClass.UNKNOWN
 
     def guest(self, host: str) -> "Peer":

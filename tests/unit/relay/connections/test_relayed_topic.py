@@ -88,16 +88,13 @@ class RecordedMember:
         self.trimmed += 1
         return 3
 
-    def check_stall(self) -> None:
-        """Do nothing: this subscriber never stalls."""
+    def check_stall(self) -> None: ...
 
     def cut(self, reason: str) -> None:
         self.was_cut = reason
 
 
 class Story:
-    """A topic with a clock that a test sets."""
-
     def __init__(
         self,
         topic: str = "/chatter",

@@ -29,7 +29,6 @@ class NaiveOutbox:
         self.advance(sent)
 
     def advance(self, sent: int) -> None:
-        """Remove sent bytes from the front."""
         taken = min(sent, len(self.started))
         self.started, sent = self.started[taken:], sent - taken
         while sent:

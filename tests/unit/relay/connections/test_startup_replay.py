@@ -1,5 +1,3 @@
-"""The first messages of a publisher are kept within limits, and without a gap."""
-
 import pytest
 
 from appliance.relay.connections.startup_replay import APPEARED, SECONDS, SPEECH, StartupReplay

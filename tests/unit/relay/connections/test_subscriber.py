@@ -1,5 +1,3 @@
-"""Whether a subscriber's type fits a publisher's; test_data_plane.py has the other tests of subscribers."""
-
 import pytest
 
 from appliance.relay.connections.subscriber import describe_mismatch
@@ -22,7 +20,6 @@ def test_the_md5sum_decides_and_an_asterisk_fits_all(wanted: dict[str, str]) -> 
 
 
 def test_a_mismatch_names_both_sides() -> None:
-    """The error names the types if they differ, otherwise the md5sums."""
     assert describe_mismatch({"type": "std_msgs/Int32", "md5sum": "b"}, OFFERED) == (
         "topic types do not match: [std_msgs/Int32] vs. [std_msgs/String]"
     )

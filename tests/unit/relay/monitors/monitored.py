@@ -1,5 +1,3 @@
-"""A relay with monitors whose control sends specifications, and dialogues with this relay as text."""
-
 import struct
 from typing import Any, ClassVar
 from unittest import mock
@@ -53,10 +51,7 @@ COSTLY = """a() { int n; event e(std::string s) /chatter std_msgs/String '{data:
 
 
 class Monitored(World):
-    """A relay whose control sends specifications and records the actions of monitors."""
-
     def load(self, *texts: str, revision: int = 1, restarted: bool = False, **enabled: bool) -> Any:
-        """Send these files to the relay, and return its answer."""
         files = [(f"{number}.rv", text) for number, text in enumerate(texts)]
         self.state(stated(revision, files, {}, enabled, restarted))
         return self.until(
@@ -84,7 +79,6 @@ class Monitored(World):
         return found
 
     def typed(self) -> tuple[Peer, Peer]:
-        """Return a publisher of std_msgs/String and a subscriber that is served."""
         publisher = self.upstream(TYPED)
         subscriber = self.connect(encode_header(WANTED))
         assert self.gets_header(subscriber) == TYPED

@@ -1,4 +1,4 @@
-"""The monitors of a relay without its sockets, threads and clocks: statements and messages in, reports out."""
+"""Monitors without sockets, threads and clocks: statements and messages in, reports out."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,14 +12,11 @@ from tests.support.stated import stated
 
 
 class Timers:
-    """The part of the loop that monitors use; the test calls what is due."""
-
     def __init__(self) -> None:
         self.due: list[tuple[float, LoopTimer]] = []
         self._work: list[Callable[[], None]] = []
 
     def over(self) -> bool:
-        """Return whether the turn is over: never."""
         return False
 
     def beside(self, work: Callable[[], Any], done: Callable[[Any], None]) -> "Timers":
@@ -75,7 +72,6 @@ class QuietMonitors:
             self._send(message.topic, message.data)
 
     def load(self, *texts: str, **more: Any) -> SpecificationsTaken:
-        """Load these files, and return the relay's answer."""
         files = [(f"{number}.rv", text) for number, text in enumerate(texts)]
         self.interceptor.state(stated(1, files, {}, **more))
         self._finish()

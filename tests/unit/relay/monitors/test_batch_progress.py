@@ -1,5 +1,3 @@
-"""A batch through the monitors has the effect of its single messages: bytes, records, counters and state."""
-
 import struct
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -41,8 +39,6 @@ MONITORS = Path(__file__).parents[4] / "monitors"
 
 
 class Heard(Reporter):
-    """Keeps the messages that would be sent to control."""
-
     def __init__(self) -> None:
         super().__init__(RelayLimits())
         self.messages: list[Message] = []
@@ -56,8 +52,6 @@ class Heard(Reporter):
 
 
 class Monitored:
-    """Monitors with a clock that the test sets, with or without the module that handles batches."""
-
     def __init__(
         self,
         texts: dict[str, str],
@@ -112,7 +106,7 @@ class Monitored:
         return left.messages, bytes(left.view), bytes(left.keep_last().view)
 
     def _asked(self, traffic: Traffic, client: str) -> tuple[int, bytes, bytes]:
-        """Judge requests or replies one by one, and return the same as `through`, with errors for refused ones."""
+        """The same as `through`, one by one, with errors for refused ones."""
         service, part = traffic.topic.split()
         judged = [
             self.interceptor.judge(ObservationPoint("key", service, "10.0.0.7", client), part, body)
@@ -122,7 +116,6 @@ class Monitored:
         return sum(one.refused is None for one in judged), b"\0".join(left), left[-1]
 
     def told(self) -> list[str]:
-        """Return everything sent to control, sorted within each second."""
         self.interceptor.tick()
         self.interceptor.observations.flush()
         told = sorted(repr(one) for one in self.sent())
@@ -153,7 +146,7 @@ class Monitored:
 
 def agree(texts: dict[str, str], known: Definitions, all_traffic: Iterable[Traffic], on_fault: str = "drop",
           switched: tuple[int, str] | None = None) -> Monitored:  # fmt: skip
-    """Send the same traffic as batches and as single messages; fail at the first difference."""
+    """Fails at the first difference between batches and single messages."""
     ways = [Monitored(texts, known, together=together, on_fault=on_fault) for together in (False, True)]
     try:
         for number, traffic in enumerate(all_traffic):

@@ -41,7 +41,7 @@ class Given(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A specification, its messages, the kind of the reported event, and its expected details."""
+    """`kind` is that of the reported event."""
 
     text: str
     given: list[Given]
@@ -115,13 +115,13 @@ def told(row: Row, given: Iterable[Given], *, together: bool, shadow: bool = Fal
 
 
 def place(text: str, piece: str) -> str:
-    """Return the position of a piece of text; for a formula, the position of its property's head."""
+    """The position of a property's head if the piece is its formula."""
     before = text[: text.index(piece) + (len(piece) + 1) * piece.endswith(":")]
     return f"x.rv:{before.count(chr(10)) + 1}:{len(before) - before.rfind(chr(10))}"
 
 
 def check(row: Row, *, together: bool, shadow: bool = False) -> None:
-    """Check the event, its record and its lines against the row, and that the named events are enough."""
+    """The named events must be enough."""
     found = told(row, row.given, together=together, shadow=shadow)
     assert found is not None
     detail = found.detail
@@ -176,7 +176,7 @@ BOTH = [("a", ARM), ("b", STICK)]
 
 
 def given(text: str) -> list[Given]:
-    """Return messages `a5` (5 on /a, from the arm) and `b1` (1 on /b, from the stick), 10 ms apart.
+    """`a5`: 5 on /a, from the arm; `b1`: 1 on /b, from the stick; 10 ms apart.
 
     A `.` adds 10 ms, and `c0` lets the time pass.
     """
@@ -191,7 +191,6 @@ def given(text: str) -> list[Given]:
 
 
 def logic(formula: str, words: str, because: list[tuple[str, str]], by: str = STICK) -> Row:
-    """Return the row of a verdict of a formula over `a` and `b`."""
     text = f"m() {{ {A} {{ }} {B} {{ }} {CLOCK}\n {formula} {{ }} }}"
     return Row(text, given(words), "verdict", by, formula[: formula.index(":") + 1], because, {})
 
@@ -225,7 +224,6 @@ VERDICTS = {
 @pytest.mark.parametrize("shadow", [False, True], ids=["in force", "shadow"])
 @pytest.mark.parametrize("name", VERDICTS)
 def test_a_verdict(name: str, *, shadow: bool) -> None:
-    """For each logic, a verdict by a message or by time names the sufficient events and their senders."""
     check(VERDICTS[name], together=not shadow, shadow=shadow)
 
 

@@ -1,5 +1,3 @@
-"""Monitors that hold their topics: when, why, and until when."""
-
 from collections.abc import Iterator
 
 import pytest

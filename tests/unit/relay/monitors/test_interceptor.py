@@ -54,7 +54,6 @@ DIALOGUES = transcripts(Path(__file__).with_name("dialogues.txt"))
 
 @pytest.mark.parametrize("title", DIALOGUES, ids=DIALOGUES)
 def test_dialogue(world: Monitored, title: str) -> None:
-    """Each step happens, in this order (`tests/unit/relay/dialogue.py` has the steps)."""
     dialogue = MonitoredDialogue(world)
     for line in DIALOGUES[title]:
         dialogue.say(line)
@@ -306,7 +305,7 @@ def _called(world: Monitored, persistent: bool = True) -> tuple[Peer, Peer]:
 
 
 class Killed(BaseException):
-    """The relay was killed at a write."""
+    pass
 
 
 class Mortal(bytearray):

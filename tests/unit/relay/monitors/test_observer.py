@@ -1,5 +1,3 @@
-"""Reports of monitors to control: records and counters of drops, changes and publications."""
-
 import struct
 from collections.abc import Iterator
 from typing import Any
@@ -48,7 +46,6 @@ class Told:
 
 @pytest.fixture(params=[False, True], ids=["one by one", "together"])
 def told(request: pytest.FixtureRequest) -> Iterator[Told]:
-    """Yield the monitors twice: with single messages, and with batches."""
     told = Told(together=request.param)
     yield told
     told.monitored.close()

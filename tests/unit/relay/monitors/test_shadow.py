@@ -1,5 +1,3 @@
-"""Monitors in shadow mode in the whole relay: messages pass unchanged, and reports are marked."""
-
 import time
 from collections.abc import Iterator
 
@@ -23,10 +21,7 @@ pytestmark = pytest.mark.nightly
 
 
 class Trying(Monitored):
-    """A relay whose control sends specifications, some of them in shadow mode."""
-
     def state_shadows(self, *texts: str, shadowed: tuple[str, ...] = (), revision: int = 1) -> list[str]:
-        """Send these specifications, and return the names of the monitors that began."""
         files = [(f"{number}.rv", text) for number, text in enumerate(texts)]
         self.state(stated(revision, files, {}, {}, False, shadows=shadowed))
         taken: SpecificationsTaken = self.until(lambda: self.taken(SpecificationsTaken, revision))

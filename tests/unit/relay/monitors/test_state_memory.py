@@ -11,8 +11,6 @@ SIZE = 8192
 
 
 class Written:
-    """A memory that records each stored byte, in order."""
-
     def __init__(self, data: bytearray) -> None:
         self.data = data
         self.stores: list[tuple[int, int]] = []
@@ -32,7 +30,7 @@ class Written:
 
 
 def killed_anywhere(data: bytearray, act: Callable[[Any], object]) -> list[StoredState | None]:
-    """Return what can be read after each prefix of an action's writes."""
+    """Returns the readable state after each prefix of an action's writes."""
     torn, written = bytearray(data), Written(data)
     act(written)
     found = [read(torn)]

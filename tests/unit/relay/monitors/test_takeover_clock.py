@@ -1,5 +1,3 @@
-"""The clock of monitors over a switchover between two appliances whose clocks differ, and over the next crash."""
-
 import pytest
 
 from appliance.base import clock
@@ -20,8 +18,6 @@ HALT = """hold halted() {
 
 
 class Relay:
-    """A relay of an appliance, with a clock and a memory."""
-
     def __init__(self, machine: VirtualClock, memory: bytearray, boot: str, **stated: object) -> None:
         self.machine = machine
         with clock.using(machine):

@@ -6,7 +6,7 @@ _SECOND = 10**9
 
 
 def reductions(budget: TimeBudget, seconds: float) -> list[float]:
-    """Cut off 100 messages a second; return the seconds at which a message had the whole budget."""
+    """Cuts off 100 messages a second; returns the seconds at which a message had the whole budget."""
     times = [number / 100 for number in range(round(100 * seconds))]
     cut = []
     for time in times:

@@ -1,5 +1,3 @@
-"""Splitting a stream of bytes into whole frames, however the stream is cut."""
-
 import struct
 
 import pytest
@@ -34,7 +32,7 @@ def receiver(limit: int = LIMIT, memory: int = 1 << 30) -> tuple[FrameReceiver, 
 
 
 def feed(one: FrameReceiver, data: bytes, cuts: list[int]) -> list[tuple[bytes, int, int]]:
-    """Feed `data` in reads of the sizes `cuts` (the last one repeats); return the contents of the batches."""
+    """The last size repeats."""
     batches, position, turn = [], 0, 0
     while position < len(data):
         buffer = one.buffer()

@@ -1,17 +1,14 @@
-"""No host takes memory that others need, and no memory is held for data that never arrives."""
-
 from appliance.quotas.pool import Bounds, QuotaClass
 from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.transport.memory import MemoryPool, RelayMemory, StallDetector
 
 
 def shares(whole: int) -> MemoryPool:
-    """Return a pool of bytes; all hosts are registered, and each may take all."""
+    """All hosts are registered, and each may take all."""
     return MemoryPool("bytes", Bounds(whole, whole, 0, 0), lambda _host: QuotaClass.REGISTERED)
 
 
 def take_all(pool: MemoryPool, host: str, step: int = 1) -> int:
-    """Let a host take all that it can get; return the amount."""
     share = pool.of(host)
     while not share.refusal(step):
         share.add(step)

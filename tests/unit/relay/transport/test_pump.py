@@ -30,8 +30,6 @@ def frame(body: bytes) -> bytes:
 
 
 class PlainTopic:
-    """A topic that changes when a test says so."""
-
     def __init__(self) -> None:
         self.plain = Version()
         self.counters = Traffic()
@@ -39,8 +37,6 @@ class PlainTopic:
 
 
 class Pumped:
-    """A publisher, subscribers, and the armed connection between them."""
-
     def __init__(self, subscribers: int = 1) -> None:
         self.epoll = select.epoll()
         self.pump = Pump(self.epoll.fileno())
@@ -63,13 +59,12 @@ class Pumped:
         return self.pump.wait(longest, _ROOM, True)
 
     def left(self) -> Left | None:
-        """Wait for an event that is left to Python; return the work of its step."""
+        """Returns the work of an event's step that is left to Python."""
         found = self.wait(10)
         assert found == [(self.ours.fileno(), READ)]
         return self.connection.step()
 
     def received(self, number: int = 0) -> bytes:
-        """Return the bytes that a subscriber can read now."""
         try:
             return self.pairs[number + 1][1].recv(1 << 20)
         except BlockingIOError:

@@ -1,5 +1,3 @@
-"""The pump under mistreatment, with AddressSanitizer and UndefinedBehaviorSanitizer (docs/dev/assurance.md)."""
-
 import os
 import re
 import subprocess

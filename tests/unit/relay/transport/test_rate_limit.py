@@ -25,12 +25,11 @@ def frames(*sizes: int) -> Batch:
 
 
 def alone(limit: FlowLimit) -> RateAllowance:
-    """Return the quota of the only holder of a flow."""
     return SharedRateLimit(limit, 0.0).of("")
 
 
 def sent(flow: RateAllowance, *batches: tuple[float, Batch]) -> int:
-    """Return how many of these messages pass, each sent at its time."""
+    """Each message is sent at its time."""
     passed = 0
     for now, batch in batches:
         count = flow.room(batch, batch.messages, now)
@@ -117,7 +116,6 @@ def test_unused_flows_are_forgotten_once_they_are_paid() -> None:
 
 
 def flood(share: RateAllowance, until: float) -> list[tuple[float, RateAllowance, Batch]]:
-    """Return a holder that sends fifty messages every ten milliseconds."""
     return [(number / 100, share, frames(*[4] * 50)) for number in range(int(until * 100))]
 
 

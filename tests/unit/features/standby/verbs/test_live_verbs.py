@@ -1,5 +1,3 @@
-"""`rosrv standby promote` waits until the other appliance is active, although the process that answers ends."""
-
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,7 +24,7 @@ def state(role: str, epoch: int, holder: str) -> AdminAnswer[Any]:
 
 
 class Pair:
-    """Appliance `a` of two; it gives these answers to `standby` in turn, the last one again and again."""
+    """The answers to `standby` come in turn, the last one again and again."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -45,7 +43,6 @@ class Pair:
         return state("active", 4, "a")
 
     def promote(self, *options: str) -> tuple[int, str, str]:
-        """Run the verb; return the exit status and both outputs."""
         done = rosrv("standby", "promote", *options, ROSRV_STATE=str(self.folder))
         return done.returncode, done.stdout, done.stderr
 

@@ -1,5 +1,3 @@
-"""`rosrv standby join` with a running appliance, with earlier epochs, and when a step fails."""
-
 import json
 import os
 from pathlib import Path

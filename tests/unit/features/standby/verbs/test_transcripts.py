@@ -1,5 +1,3 @@
-"""`rosrv standby` and `rosrv audit verify --other` as users see them: the transcripts (`*.txt`) of this folder."""
-
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,5 +27,4 @@ def transcript(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Tran
 
 @pytest.mark.parametrize("section", sections(*sorted(Path(__file__).parent.glob("*.txt"))))
 def test_transcript(transcript: Transcript, section: Section) -> None:
-    """Each command makes the requests listed below it, and has the output and the exit status listed there."""
     assert section.played(transcript) == section.text
