@@ -376,7 +376,7 @@ def probe_calls(seconds: float, robot: Host, keep: bool, answers: Connection, be
 
 
 def realtime() -> None:
-    """Above everything that it measures."""
+    """The priority is above everything that the process measures."""
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
 
 
@@ -408,7 +408,7 @@ class Pipes:
             self.sent += count
 
     def at(self, rate: float, data: bytes) -> None:
-        """Forever."""
+        """This never ends."""
         for turn in itertools.count():
             if turn == 0:
                 start = time.monotonic()

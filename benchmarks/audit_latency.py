@@ -55,7 +55,7 @@ class Running:
         self._control = next(one["pid"] for one in processes if one["role"] == "control")
 
     def cpu(self) -> float:
-        """In seconds, of control."""
+        """Seconds of processor time of control."""
         fields = Path(f"/proc/{self._control}/stat").read_text().rsplit(")", 1)[1].split()
         return (int(fields[11]) + int(fields[12])) / _TICKS
 

@@ -189,7 +189,7 @@ def measure_forwarding(directory: Path, count: int) -> None:
 
 
 def timed(name: str, action: Callable[[], object]) -> None:
-    """The best of three runs."""
+    """Prints the best of three runs."""
     best = float("inf")
     for _ in range(3):
         start = time.perf_counter()

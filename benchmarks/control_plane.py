@@ -179,7 +179,7 @@ def free_port() -> int:
 
 
 def await_port(port: int) -> None:
-    """At most 30 seconds."""
+    """Waits at most 30 seconds."""
     deadline = time.monotonic() + 30
     while time.monotonic() < deadline:
         with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1):

@@ -45,7 +45,7 @@ class SimulatedLoad:
 
 
 def enrol(site: FleetSite, names: Sequence[str]) -> None:
-    """Their files exist."""
+    """The files of the appliances exist already."""
     assert site.data is not None
     robots = Robots(site.data / "robots")
     for name in names:

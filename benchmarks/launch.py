@@ -54,7 +54,7 @@ TOOLS = (("rostopic", "list"), ("rosnode", "info", "/node_0"), ("rosparam", "dum
 
 @dataclass
 class Start:
-    """In seconds."""
+    """Figures are in seconds."""
 
     figures: dict[str, float] = field(default_factory=dict)
 

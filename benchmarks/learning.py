@@ -185,7 +185,7 @@ class Seeding:
         return get(MESSAGES.decode(TYPES[topic], data), path)
 
     def span(self, topic: str, path: str) -> float:
-        """1 for a constant."""
+        """The span of a constant is 1."""
         values = [
             float(self.value(place, path)) for place, row in enumerate(self.drive.rows) if row[0] == topic
         ]

@@ -182,7 +182,7 @@ def show_topics(numbers: tuple[int, ...], rounds: int, seconds: float) -> None:
 
 
 def resident(pid: int | None) -> float:
-    """In MiB."""
+    """The memory is in MiB."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 

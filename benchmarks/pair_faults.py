@@ -230,7 +230,7 @@ def run(faults: Sequence[tuple[Fault, float]], *, done: int, load: int, limit: f
 
 
 def read(results: Path | None) -> list[Noticed]:
-    """Rows of earlier runs."""
+    """The rows of earlier runs."""
     if results is None or not results.exists():
         return []
     return [Noticed(**json.loads(line)) for line in results.read_text().splitlines()]

@@ -37,7 +37,7 @@ NEAR = message("sensor_msgs/LaserScan", ranges=[0.1] * 40)
 
 
 def alone(stops: int) -> dict[str, list[float]]:
-    """In milliseconds, without sockets."""
+    """Times are in milliseconds, and no sockets are used."""
     sent: list[int] = []
     monitors = QuietMonitors(lambda _topic, _data: sent.append(time.perf_counter_ns()))
     monitors.load(STOP)

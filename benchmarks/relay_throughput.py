@@ -195,7 +195,7 @@ class LoadApi:
 
 
 class RosRelay:
-    """Started again for each run."""
+    """The node is started again for each run."""
 
     def __init__(self, name: str = "topic_tools", command: Sequence[str] = (TOPIC_TOOLS,)) -> None:
         """`command` is called with the two topics."""

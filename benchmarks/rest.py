@@ -56,7 +56,7 @@ def free_port() -> int:
 
 
 class Client:
-    """One request at a time."""
+    """It has one request at a time."""
 
     def __init__(self, port: int, data: bytes) -> None:
         self.sock = socket.create_connection(("127.0.0.1", port))

@@ -50,7 +50,7 @@ def ids(count: int) -> list[bytes]:
 
 
 def monitors(text: str) -> MonitorSet:
-    """After their start."""
+    """The monitors have been started."""
     loaded = MonitorSet.of(compiled_from({"slices.rv": text}, standard_definitions()), slices=MANY)
     loaded.start(0)
     return loaded

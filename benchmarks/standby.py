@@ -246,7 +246,7 @@ def _behind(*, pair: bool) -> Iterator[Callable[[], list[float]]]:
 
 
 def _registered(master: str) -> list[float]:
-    """Seconds of each call."""
+    """The seconds of each call."""
     times = []
     with xmlrpc.client.ServerProxy(master) as proxy:
         proxy.getPid("/bench")

@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def ahead(folder: Path, tree: bytes, rate: int, seconds: float) -> list[float]:
-    """As the program does it."""
+    """The statements are kept as in the program."""
     store = StateStore(folder, failed=print)
     try:
         return _registering(
@@ -55,7 +55,7 @@ def ahead(folder: Path, tree: bytes, rate: int, seconds: float) -> list[float]:
 
 
 def commit(folder: Path, tree: bytes, rate: int, seconds: float) -> list[float]:
-    """In the answering thread."""
+    """The answering thread commits."""
     StateStore(folder, failed=print).close()
     registrations, parameters = _opened(folder), _opened(folder)
 
@@ -83,7 +83,7 @@ def _opened(folder: Path) -> sqlite3.Connection:
 def _registering(
     keep: Keep, keep_tree: Callable[[], None], tree: bytes, rate: int, seconds: float
 ) -> list[float]:
-    """Seconds of each registration."""
+    """The seconds of each registration."""
     over = threading.Event()
 
     def keep_trees() -> None:

@@ -66,7 +66,7 @@ class Robot:
         return max(at) - min(at), max(at) - began, _NODES * _TOPICS - len(at)
 
     def graph(self) -> float:
-        """In seconds."""
+        """The time is in seconds."""
         return float(self.session.run(PYTHON, "-c", _GRAPH, timeout=90).stdout)
 
 

@@ -35,7 +35,7 @@ _Answer = TypeVar("_Answer")
 
 
 class Definitions:
-    """It never changes."""
+    """A set of definitions never changes."""
 
     def __init__(
         self,
@@ -178,7 +178,7 @@ class Definitions:
         outer: tuple[str, ...],
         ask: Callable[[str, tuple[str, ...]], _Answer],
     ) -> _Answer | None:
-        """None for a built-in type."""
+        """None if the type of the field is built in."""
         if field.type in BUILTINS:
             return None
         if field.type not in self._messages:

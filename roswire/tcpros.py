@@ -36,7 +36,7 @@ def encode_header(fields: Mapping[str, str]) -> bytes:
 
 
 def encode_frame(body: bytes | bytearray | memoryview) -> bytes:
-    """The length, then the bytes."""
+    """A frame is the length, then the bytes."""
     return _LENGTH.pack(len(body)) + body
 
 

@@ -52,7 +52,7 @@ def main(lifeline_fd: int, config: Path) -> None:
 
 
 class _Application:
-    """Made at its first call."""
+    """The application is made at its first call."""
 
     def __init__(self, services: Services) -> None:
         self._services = services

@@ -31,7 +31,7 @@ _log = structlog.get_logger()
 
 
 class _Kept(msgspec.Struct):
-    """In nanoseconds."""
+    """Times are in nanoseconds."""
 
     lived: int  # running time of the machine while the process ran
     credited: int  # time since the epoch that counts in addition to `lived`

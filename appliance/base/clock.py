@@ -19,7 +19,7 @@ class ClockSource(Protocol):
     """All readings are in nanoseconds."""
 
     def now_ns(self) -> int:
-        """Only advances; begins anywhere."""
+        """This clock only advances, and may begin at any number."""
 
     def wall_ns(self) -> int:
         """Since the epoch; people and time services set it."""
@@ -72,7 +72,7 @@ def wall() -> float:
 
 
 def wall_ns() -> int:
-    """Since the epoch."""
+    """Nanoseconds since the epoch."""
     return _source.get().wall_ns()
 
 

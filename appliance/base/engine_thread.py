@@ -18,10 +18,10 @@ class Driver(Protocol):
     """Calls the turns of one engine. Thread-safe."""
 
     def wake(self) -> None:
-        """There is new work."""
+        """Call this when there is new work."""
 
     def hurry(self) -> None:
-        """A caller waits."""
+        """Call this when a caller waits for the work."""
 
     def end(self, seconds: float | None) -> bool:
         """Return whether the engine ended within `seconds`."""
@@ -49,7 +49,7 @@ class EngineThread:
         self._begun.wait()
 
     def wake(self) -> None:
-        """After the time for gathering."""
+        """The engine runs after the time for gathering."""
         if not self._wake.is_set():  # `set` takes a lock
             self._wake.set()
 

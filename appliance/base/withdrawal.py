@@ -42,7 +42,7 @@ _PRESENT: ContextVar[_Order | None] = ContextVar("order", default=None)
 
 @contextlib.contextmanager
 def awaited(given_up: Callable[[], bool]) -> Iterator[None]:
-    """`given_up()`: the client stopped waiting."""
+    """`given_up()` returns whether the client stopped waiting."""
     order = _Order(given_up)
     before = _PRESENT.set(order)
     try:

@@ -36,7 +36,7 @@ class AlarmList(msgspec.Struct, frozen=True):
 
 
 def open_alarms(status: Status) -> list[Alarm]:
-    """The most severe come first."""
+    """The most severe alarms come first."""
     found = [*_system(status), *_policy(status), *_monitors(status)]
     found += [("warning", "ipsec", "hosts", line) for line in status.ipsec.troubles]
     found += _blocks(status.blocks)

@@ -94,7 +94,7 @@ class Link:
         return channel
 
     def close(self) -> None:
-        """Open questions fail."""
+        """Open questions fail then."""
         if self.channel is None:
             return
         self.channel.close()

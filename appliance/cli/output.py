@@ -26,7 +26,7 @@ Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one
 
 
 def moment(seconds: float) -> str:
-    """To the minute, in UTC."""
+    """The text is in UTC, to the minute."""
     return datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%MZ")
 
 

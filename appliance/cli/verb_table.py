@@ -25,7 +25,7 @@ class Verb:
 
     @property
     def help(self) -> str:
-        """The module is not imported."""
+        """The module is not imported for this."""
         module, _colon, function = self.path.partition(":")
         file = _PACKAGES.joinpath(*module.split(".")).with_suffix(".py")
         return self.first or _first_sentence(file, function)

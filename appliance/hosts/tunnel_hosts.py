@@ -33,7 +33,7 @@ class TunnelHosts:
         )  # fmt: skip
 
     def rows(self) -> list[Host]:
-        """Enrolled, awaited or declared."""
+        """The hosts are enrolled, awaited or declared."""
         return []
 
     def served_by(self, pin: str) -> None:

@@ -46,7 +46,7 @@ class SignedRevocations:
         self._signed = b""
 
     async def signed(self) -> bytes:
-        """PEM. Raises `AuthorityError`."""
+        """The list is in PEM. Raises `AuthorityError`."""
         async with self._one_at_a_time:
             state = (self._table.revision, int(clock.wall() // _SIGNED_SECONDS))
             if state != self._state:

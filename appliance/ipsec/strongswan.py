@@ -64,14 +64,14 @@ charon-systemd {{
 
 @dataclass(frozen=True)
 class Proposals:
-    """The best first."""
+    """The best method comes first."""
 
     ike: tuple[str, ...] = IKE_PROPOSALS
     esp: tuple[str, ...] = ESP_PROPOSALS
 
     @property
     def key_exchange(self) -> list[str]:
-        """For status: `x25519+mlkem768`, `x25519`, `ecp384`."""
+        """The name in the status: `x25519+mlkem768`, `x25519` or `ecp384`."""
         words = [proposal.removeprefix("aes256gcm16-prfsha384-") for proposal in self.ike]
         return [word.replace("-ke1_", "+") for word in words]
 
@@ -100,7 +100,7 @@ def pool(host: TunnelHost) -> dict[str, Any]:
 
 
 def connection(host: TunnelHost, stated: TunnelsStated, proposals: Proposals) -> Mapping[str, Any]:
-    """For vici's `load-conn`."""
+    """The message `load-conn` of vici."""
     child = {
         "local_ts": [f"{stated.address}/32"],
         "remote_ts": ["dynamic"],

@@ -71,7 +71,7 @@ def parse_address(text: str) -> str:
 
 
 def local_port_range() -> PortRange:
-    """For IPv4 and IPv6."""
+    """The kernel has one range for IPv4 and IPv6."""
     try:
         first, last = RANGE_FILE.read_text(encoding="ascii").split()
     except (OSError, ValueError) as error:

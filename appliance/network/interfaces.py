@@ -168,7 +168,7 @@ def addresses(namespace: Namespace) -> list[str]:
 
 
 def addresses_by_interface(namespace: Namespace) -> dict[str, list[str]]:
-    """With prefix lengths."""
+    """The addresses have prefix lengths."""
 
     def read(route: Any) -> dict[str, list[str]]:
         names = _names(route)

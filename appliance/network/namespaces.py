@@ -201,7 +201,7 @@ class Namespace:
             return True
 
     def processes(self) -> list[int]:
-        """Without this one."""
+        """This process is not included."""
         if not self.exists():
             return []
         mark = self.path.stat()

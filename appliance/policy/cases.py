@@ -67,8 +67,7 @@ class CaseResult:
 
 
 def run_cases(policy: Policy, text: str, file: str) -> list[CaseResult]:
-    """`file` is the name of `text` in the results. Raises `PolicyError` with all mistakes in the text. Raises
-    `PolicyError` with all mistakes in the text.
+    """`file` is the name of `text` in the results. Raises `PolicyError` with all mistakes in the text.
 
     A file without cases is a mistake, because it would pass with every policy.
     """

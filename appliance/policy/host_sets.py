@@ -83,7 +83,7 @@ class HostSets:
         return self._parents[atom]
 
     def atoms_of(self, address: Address) -> frozenset[Atom]:
-        """Include `EVERYONE`."""
+        """`EVERYONE` is always included."""
         key = (address.version, int(address))
         kept = self.kept.get(key)
         if kept is None:

@@ -76,7 +76,7 @@ def _compatible(one: Step, other: Step) -> bool:
 
 
 def levels(name: str) -> list[str]:
-    """`/` has none."""
+    """The name `/` has no levels."""
     return name[1:].split("/") if name != "/" else []
 
 

@@ -142,7 +142,7 @@ class Decision:
 
     @property
     def word(self) -> Literal["allow", "deny", "would deny"]:
-        """In the audit log's words."""
+        """The words are those of the audit log."""
         return "would deny" if self.would_deny else "allow" if self.allowed else "deny"
 
 

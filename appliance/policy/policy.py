@@ -79,7 +79,7 @@ class RuleTable:
 
 
 class HostStanding(NamedTuple):
-    """`Policy.knows`, `names` and `alike`."""
+    """The answers of `Policy.knows`, `names` and `alike`."""
 
     known: bool
     named: bool
@@ -405,6 +405,6 @@ def _shortened(text: str, limit: int = 60) -> str:
 
 
 def place_of(rule: Rule) -> str:
-    """Short enough for a sentence."""
+    """The place is short enough for a sentence."""
     file = rule.file.rpartition("/")[2]
     return f"[{rule.section}] {_shortened(rule.key, 50)} ({_shortened(file, 30)}:{rule.line})"

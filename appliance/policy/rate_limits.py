@@ -37,7 +37,7 @@ class LimitScope(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """Per second; 0 means unlimited."""
+    """Rates are per second; 0 means unlimited."""
 
     messages: float = 0.0
     bytes: float = 0.0

@@ -130,7 +130,7 @@ class ConnectionTable(Generic[Holder]):
             pool.give_back(host)
 
     def file(self, connection: TrackedConnection, stage: Stage) -> None:
-        """The wait restarts."""
+        """The wait of the connection starts again."""
         host, pool = self._of.get(connection, (None, self.farewells))
         if host is None or pool is not self.connected:
             return
@@ -148,7 +148,7 @@ class ConnectionTable(Generic[Holder]):
         self.held.give_back(host, size)
 
     async def sweep(self) -> None:
-        """Once a second, until cancelled."""
+        """This runs once a second until it is cancelled."""
         while True:
             await asyncio.sleep(1.0)
             now = clock.now()

@@ -28,7 +28,7 @@ _FIELD_FRAMING = len(": \r\n")
 
 @dataclass(frozen=True, slots=True)
 class HttpLimits:
-    """In bytes and seconds."""
+    """Sizes are in bytes, times in seconds."""
 
     head_bytes: int = 64 << 10
     head_seconds: float = 10.0
@@ -39,7 +39,7 @@ class HttpLimits:
 
     @property
     def framing_bytes(self) -> int:
-        """Head, chunk sizes, trailers."""
+        """The limit of head, chunk sizes and trailers together."""
         return self.head_bytes + self.body_bytes // 16
 
 
@@ -100,7 +100,7 @@ class Front(asyncio.BaseProtocol, ABC):
         return True
 
     def parse(self, data: bytes) -> None:
-        """Within the limits."""
+        """Rejects a request that exceeds a limit."""
         if self.closing:
             return
         try:

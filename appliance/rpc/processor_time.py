@@ -51,7 +51,7 @@ class Line(Generic[Key, Item]):
         return sum(map(len, self.queues.values()))
 
     def used(self, key: Key) -> float:
-        """At least `start`."""
+        """The value is at least `start`."""
         used, start = self._used.get(key, self.start), self.start
         return used if used > start else start
 

@@ -253,7 +253,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
             self.transport.resume_reading()
 
     def parse(self, data: bytes) -> None:
-        """Limit the body too."""
+        """The body is limited too."""
         super().parse(data)
         if self.closing or not (self.in_request and self.head_done):
             return

@@ -124,7 +124,7 @@ def _program(tests: Sequence[tuple[Network, int]]) -> list[bytes]:
 
 
 def _tests(version: int, networks: list[tuple[Network, int]]) -> list[bytes]:
-    """Compare word by word."""
+    """Addresses are compared word by word."""
     words = 4 if version == 6 else 1
     code = []
     for word in range(words):

@@ -54,7 +54,7 @@ class Givens:
         return dropped
 
     def states(self, checked: CheckedSpecifications, monitor: str) -> list[GivenState]:
-        """With present values."""
+        """The states have the present values."""
         said = self.said.get(monitor, {})
         return [
             GivenState(
@@ -89,7 +89,7 @@ def parsed(
 
 
 def split(given: Given) -> tuple[dict[str, dict[str, str]], dict[str, dict[str, GivenValue]]]:
-    """A topic begins with `/`."""
+    """A string that begins with `/` is a topic."""
     topics: dict[str, dict[str, str]] = {}
     constants: dict[str, dict[str, GivenValue]] = {}
     for monitor, values in given.items():
@@ -142,7 +142,7 @@ def _holds(declared: GivenDeclared, values: Mapping[str, GivenValue]) -> bool:
 
 
 def _allowed(declared: GivenDeclared) -> str:
-    """The end of an error."""
+    """The text ends an error message."""
     unit = f" {declared.unit}" if declared.unit else ""
     if declared.kind == "bool":
         return "is not true or false"

@@ -334,7 +334,7 @@ class Rollout:
             self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
 
     async def _make(self, revision: Revision, of_file: Callable[[str], int]) -> None:
-        """Make only missing parts."""
+        """Only missing parts are made."""
         compiled = revision.checked.compiled
         wanted = parts_wanted(revision, self.allocation.relays, of_file)
         missing = [names for names in wanted if (compiled, names) not in self.compiled_parts]

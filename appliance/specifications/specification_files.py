@@ -61,7 +61,7 @@ class Sources(msgspec.Struct, frozen=True):
         )
 
     def without(self, files: set[str]) -> "Sources":
-        """Definitions stay."""
+        """The message definitions stay."""
         left, signatures = (
             {name: text for name, text in texts.items() if name not in files}
             for texts in (self.files, self.signatures)
@@ -218,7 +218,7 @@ def _read_folder(folder: Path) -> tuple[Sources, dict[str, str]]:
 
 
 def _definitions_in(own: Path) -> dict[str, Path]:
-    """By `package/Type.msg`. Raises `SpecificationsRefusedError`."""
+    """The keys are `package/Type.msg`. Raises `SpecificationsRefusedError`."""
     found = {}
     try:
         for path in files_below(own) if _is(stat.S_ISDIR, own) else ():
@@ -280,7 +280,7 @@ class SpecificationFolder:
         return read_folder(self.path) if self.path is not None else Sources()
 
     def read_usable(self, site_keys: Sequence[str]) -> tuple[Sources, dict[str, str]]:
-        """Like the function. Raises `SpecificationsRefusedError`."""
+        """See the function of this name. Raises `SpecificationsRefusedError`."""
         return read_usable(self.path, site_keys) if self.path is not None else (Sources(), {})
 
     def looked_at(self) -> Sources | None:

@@ -222,7 +222,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     @property
     def differs_from_folder(self) -> bool:
-        """False without a folder."""
+        """False if there is no folder."""
         found = self._folder.looked_at()
         return self.folder is not None and (
             found is None or found.with_topics(self.sources.topics) != self.sources
@@ -241,7 +241,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return self.checked.monitors[name]
 
     async def revisions(self, _request: admin.MonitorRevisions) -> answers.MonitorRevisionList:
-        """The newest first."""
+        """The newest revision comes first."""
         rows = [self._described(row) for row in await self._kept()]
         return answers.MonitorRevisionList(msgspec.convert(rows, list[answers.MonitorRevision]))
 
@@ -787,7 +787,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         }
 
     def _in_shadow(self, checked: CheckedSpecifications, files: Collection[str] = ()) -> set[str]:
-        """Include all monitors in `files`."""
+        """All monitors in `files` are included."""
         states = self.switches.states_of(checked)
         return {name for name, file in checked.monitors.items() if states[name] == SHADOW or file in files}
 

@@ -294,7 +294,7 @@ class ContainerIsolation(NoIsolation):
         return found
 
     def report(self) -> FirewallState:
-        """Install missing rules."""
+        """Missing rules are installed again."""
         with self._standing():
             if self.firewall is None:
                 return FirewallState()
@@ -309,7 +309,7 @@ class ContainerIsolation(NoIsolation):
         return FirewallState(report.backend, list(report.not_used), list(report.rules))
 
     def probe(self) -> str | None:
-        """Try as another local user."""
+        """The attempt is made as another local user."""
         ports = {
             "ROSMaster": self._ports.rosmaster,
             "the master-side proxy endpoint": self._ports.inner,
@@ -411,14 +411,14 @@ class NetnsIsolation(ContainerIsolation):
             yield
 
     def open_tunnels(self, pool: str, address: str) -> Esp:
-        """Then forward IKE and ESP to the namespace."""
+        """The namespace also gets the IKE and ESP packets of the host."""
         with self._standing():
             esp = super().open_tunnels(pool, address)
             self._isolation.forward_tunnels()
             return esp
 
     def open_own_network(self, network: str, ports: list[int]) -> None:
-        """Then forward the ports to the namespace."""
+        """The namespace also gets the connections to these ports of the host."""
         with self._standing():
             self._isolation.require_free(ports)
             super().open_own_network(network, ports)

@@ -190,7 +190,7 @@ def _reduce_capabilities(kept: int) -> None:
 
 
 def prctl(option: int, first: int, second: int = 0) -> None:
-    """`prctl(2)`. Raises `OSError`."""
+    """See `prctl(2)`. Raises `OSError`."""
     libc_call(f"prctl({option})", ctypes.c_int(option), *map(ctypes.c_ulong, (first, second, 0, 0)))
 
 

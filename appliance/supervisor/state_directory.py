@@ -131,7 +131,7 @@ class StateDirectory:
             self._written.append(name)
 
     def open_admin_socket(self) -> socket.socket:
-        """Replace an old one."""
+        """An old socket is replaced."""
         path = self.path / ADMIN_SOCKET
         path.unlink(missing_ok=True)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)

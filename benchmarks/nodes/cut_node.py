@@ -22,7 +22,7 @@ NAMES = [word for word in sys.argv if word.startswith("__")]
 
 
 def base(arrivals):
-    """Ends with the other node."""
+    """This ends with the other node."""
 
     def arrived(command):
         os.write(arrivals, ARRIVED.pack(time.monotonic(), command.linear.x))

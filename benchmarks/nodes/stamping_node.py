@@ -31,7 +31,7 @@ def publish(topic, size, hertz, seconds):
 
 
 def subscribe(topic):
-    """Ends with the input."""
+    """This ends with the input."""
     seen = []
     rospy.Subscriber(topic, String, lambda message: seen.append((time.monotonic_ns(), message.data[:20])))
     print(json.dumps({"event": "ready"}), flush=True)

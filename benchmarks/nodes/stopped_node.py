@@ -25,7 +25,7 @@ NAMES = [word for word in sys.argv if word.startswith("__")]
 
 
 def receive(arrivals):
-    """Ends with the other node."""
+    """This ends with the other node."""
 
     def arrived(_command):
         os.write(arrivals, ARRIVED.pack(time.monotonic()))

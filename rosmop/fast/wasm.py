@@ -128,7 +128,7 @@ def if_result(machine: int) -> bytes:
 
 
 def constant(machine: int, value: float) -> bytes:
-    """Integers wrap."""
+    """An integer wraps."""
     if machine in (I32, I64):
         bits = 32 if machine == I32 else 64
         whole = int(value) & (1 << bits) - 1

@@ -58,7 +58,7 @@ class Read(FormNode, frozen=True):
 
 
 class Assign(FormNode, frozen=True):
-    """The result is the value."""
+    """The result of the expression is the assigned value."""
 
     type: Type
     name: str

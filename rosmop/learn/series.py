@@ -113,7 +113,7 @@ class Series(msgspec.Struct):
         self.values.end()
 
     def merged(self, other: "Series") -> "Series":
-        """Both must have ended."""
+        """Both series must have ended."""
         return Series(
             self.period, self.count + other.count, self.changed + other.changed, self.nan or other.nan,
             self.infinite or other.infinite, self.highs.merged(other.highs), self.lows.merged(other.lows),

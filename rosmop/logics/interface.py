@@ -321,7 +321,7 @@ class Logic:
     properties: tuple[type[CompiledProperty], ...] = (FiniteProperty,)
     """The arguments of their constructors can be serialised."""
     suppresses: bool = False
-    """Does a dropped message not count? Other logics count each event whose action passes the message."""
+    """A dropped message does not count. Other logics count each event whose action passes the message."""
     failure: str | None = None
     """The category of failure.
 

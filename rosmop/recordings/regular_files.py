@@ -41,7 +41,7 @@ def open_regular(path: Path) -> BufferedReader:
 
 
 class _BoundedFile(BufferedReader):
-    """Limits each read."""
+    """Each read is limited."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Raises `ValueError` beyond `LARGEST_CHUNK` bytes."""

@@ -435,7 +435,7 @@ class MonitorSet:
 
     @staticmethod
     def topics_of(monitors: Iterable[MonitorInstance]) -> frozenset[str]:
-        """Include services."""
+        """Services are included."""
         return frozenset(
             step.event.topic for monitor in monitors for step in monitor.steps if step.event.topic
         )

@@ -141,7 +141,7 @@ class MonitorExecution:
         self._finish(message, writers, outcome)
 
     def tick(self, step: Step, time_ns: int) -> Outcome:
-        """The caller calls `collect`."""
+        """The caller must call `collect`."""
         self._sender, self._function = NOBODY, None
         self._taking_back.clear()
         step.monitor.move_to_python()

@@ -115,7 +115,7 @@ class FastLane(Protocol):
         """Return `Outcome.changed_by` for a set of events: bit N stands for event N."""
 
     def happened(self) -> Sequence[int]:
-        """Since the last call."""
+        """The events since the last call."""
 
     def ready(self) -> bool:
         """No monitor waits for its first message, or holds its topics."""

@@ -854,7 +854,7 @@ def _is_shared(name: str) -> bool:
 def conversion(  # noqa: PLR0911  one for each kind
     source: Type, target: Type
 ) -> Callable[[Any], Any] | None:
-    """Return None if nothing changes."""
+    """Returns None if nothing changes."""
     if source == target:
         return None
     if isinstance(target, value_types.BoolType):

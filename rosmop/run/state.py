@@ -33,7 +33,7 @@ _CLOCK = struct.Struct("<qq")
 
 
 class TimerSnapshot(msgspec.Struct, frozen=True, array_like=True):
-    """A periodic event."""
+    """The state of a periodic event."""
 
     due: int | None
     ticked: bool

@@ -49,7 +49,7 @@ def wrap(value: int, bits: int, signed: bool) -> int:
 
 
 def divide(left: int, right: int, site: int) -> int:
-    """Rounds toward zero."""
+    """The quotient is rounded toward zero."""
     if right == 0:
         raise FaultError(site, "division by zero")
     result = abs(left) // abs(right)
@@ -57,7 +57,7 @@ def divide(left: int, right: int, site: int) -> int:
 
 
 def remainder(left: int, right: int, site: int) -> int:
-    """Has the sign of `left`."""
+    """The result has the sign of `left`."""
     if right == 0:
         raise FaultError(site, "division by zero")
     result = abs(left) % abs(right)
@@ -111,7 +111,7 @@ def power(base: float, exponent: float) -> float:
 
 
 def round_half_away(value: float) -> float:
-    """C's `round`."""
+    """Rounds as C's `round`."""
     if not math.isfinite(value):
         return value
     whole = math.floor(abs(value))
@@ -119,7 +119,7 @@ def round_half_away(value: float) -> float:
 
 
 def round_half_even(value: float) -> float:
-    """C's `rint`."""
+    """Rounds as C's `rint`."""
     return math.copysign(float(round(value)), value) if math.isfinite(value) else value
 
 

@@ -275,7 +275,7 @@ def zero_of(kind: Type) -> bool | float | bytes | None:
 
 
 def unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequence[Any], int]]:
-    """Two codes are nanoseconds."""
+    """Two of the codes are nanoseconds."""
     plain = struct.Struct("<" + "".join(codes))
     unpack, size = plain.unpack_from, plain.size
     if all(len(code) == 1 for code in codes):
@@ -291,7 +291,7 @@ def unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequenc
 
 
 def packer(codes: Sequence[str]) -> Callable[[Sequence[Any]], bytes]:
-    """Two codes are nanoseconds."""
+    """Two of the codes are nanoseconds."""
     pack = struct.Struct("<" + "".join(codes)).pack
     if all(len(code) == 1 for code in codes):
         return lambda values: pack(*values)

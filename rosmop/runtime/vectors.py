@@ -29,7 +29,7 @@ def put(values: Values, index: int, value: Any, site: int) -> Any:
 
 
 def put_slot(record: Values, slot: int, value: Any) -> Any:
-    """Return the value."""
+    """Returns the assigned value."""
     record[slot] = value
     return value
 

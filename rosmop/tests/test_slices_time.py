@@ -69,7 +69,7 @@ def entries(outcomes: Iterable[Outcome], place: int) -> list[Entry]:
 
 
 def passed(monitors: MonitorSet, end: int) -> list[Outcome]:
-    """Several calls may be needed."""
+    """Several calls may be needed for all deadlines."""
     found: list[Outcome] = []
     for _ in range(1000):
         found += monitors.advance(end)

@@ -405,7 +405,7 @@ class _SendQueue:
         self._queues.queues.discard(self)
 
     async def send_to(self, writer: ByteWriter) -> None:
-        """Until the connection ends."""
+        """This runs until the connection ends."""
         try:
             while True:
                 await self._ready.wait()

@@ -14,7 +14,7 @@ from cryptography.x509.oid import NameOID
 
 @dataclass(frozen=True)
 class Certificates:
-    """For an address and logs.example."""
+    """The certificates are for an address and for logs.example."""
 
     ca: Path
     certificate: Path

@@ -139,7 +139,7 @@ class Engine:
         return self
 
     def stop(self) -> None:
-        """The data stays."""
+        """The data of the engine stays."""
         if self._process is not None and self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
             try:

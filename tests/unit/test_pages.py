@@ -53,7 +53,7 @@ def test_links_lead_to_headings(page: Path) -> None:
 
 
 def headings(page: Path) -> set[str]:
-    """As GitHub forms anchors."""
+    """GitHub forms anchors like this."""
     prose = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
     titles = re.findall(r"^#+ (.*)$", prose, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}

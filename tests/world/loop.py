@@ -79,7 +79,7 @@ class Process:
         return self.context.copy().run(act, *given)
 
     def call(self, seconds: float, act: Callable[..., object], *given: Any) -> None:
-        """Seconds of the world's time."""
+        """The seconds are those of the world's time."""
         loop = self.machine.loop
         loop.at(loop.present + seconds, act, given, self.context.copy())
 
@@ -91,7 +91,7 @@ class Process:
                 happen()
 
     def kill(self) -> None:
-        """It runs no further callback."""
+        """The process runs no further callback."""
         if self.alive:
             self.alive = False
             self.ready.clear()

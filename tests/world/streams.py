@@ -66,7 +66,7 @@ class StreamEnd:
             self._later(self._deliver)
 
     def take(self, data: bytes) -> None:
-        """Empty `data` is the end."""
+        """Empty `data` means the end."""
         if self.process.alive and not self.reader.at_eof():
             self.process.run(self.reader.feed_data if data else self._eof, data)
 

@@ -118,7 +118,7 @@ def pin_of(home: Path) -> str:
 
 
 def fingerprint_of(home: Path) -> str:
-    """Hexadecimal SHA-256."""
+    """The SHA-256 of the certificate, in hexadecimal."""
     certificate = x509.load_pem_x509_certificate((home / CERTIFICATE).read_bytes())
     return certificate.fingerprint(hashes.SHA256()).hex()
 

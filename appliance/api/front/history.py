@@ -66,7 +66,7 @@ class SampleHistory:
         self.seen = LastSample(0, None, None, _AWAY)
 
     def samples(self, most: int) -> list[Sample]:
-        """Evenly spaced, the newest last."""
+        """The samples are evenly spaced, the newest last."""
         kept = list(self._samples)
         step = -(-len(kept) // most)
         return kept[::-1][::step][::-1] if step > 1 else kept
@@ -130,7 +130,7 @@ class SampleHistory:
 
 
 async def measures_of(control: ControlLink) -> Measures:
-    """`MetricsWanted`. Raises `ControlAwayError`."""
+    """Sends `MetricsWanted`. Raises `ControlAwayError`."""
     answer = await control.ask(MetricsWanted(), None)
     if not answer.ok:
         raise ControlAwayError(answer.error, answer.active)

@@ -17,7 +17,7 @@ _Kind = tuple[str, str, str, str, int, str]
 
 
 class Journal:
-    """Call `flush` every `FOLD_SECONDS`."""
+    """The owner calls `flush` every `FOLD_SECONDS`."""
 
     def __init__(self, tell: Callable[[RestCalled], None], *, kinds: int = 512) -> None:
         self._tell = tell

@@ -206,7 +206,7 @@ class Listener:
             self._begin(self._websockets.pass_on(passage, head))
 
     def protocol_of(self, connection: _Connection) -> asyncio.Protocol:
-        """As uvicorn's server does."""
+        """Uvicorn's server makes it in the same way."""
         make = cast(Callable[..., asyncio.Protocol], self._config.http_protocol_class)
         return make(config=self._config, server_state=self._state, app_state={_CONNECTION: connection})
 

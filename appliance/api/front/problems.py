@@ -91,7 +91,7 @@ class ProblemError(Exception):
 
 
 def too_many(kind: str, detail: str, seconds: float) -> ProblemError:
-    """Status 429."""
+    """The status is 429."""
     return ProblemError(429, kind, detail, retry_after=int(seconds) + 1)
 
 

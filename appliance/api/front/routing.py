@@ -61,7 +61,7 @@ CONTRACT = Contract()
 
 
 def content(kind: Any) -> dict[str, Any]:
-    """For `responses=` of a route."""
+    """The argument `responses=` of a route."""
     return {_JSON: {"schema": CONTRACT.reference(kind)}}
 
 

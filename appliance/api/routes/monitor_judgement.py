@@ -90,7 +90,7 @@ class Compiler:
         return self._set(loaded).monitor(name).picture()
 
     def warnings(self, file: str) -> list[Finding]:
-        """From the last compilation."""
+        """The warnings of the last compilation."""
         assert self._last is not None  # noqa: S101  callers compile by `described` first
         return findings_of(
             [str(warning) for warning in self._last[1].warnings if warning.position.file == file]

@@ -52,7 +52,7 @@ class NodeWithdrawn(Message):
 
 
 class FlowLimit(msgspec.Struct, frozen=True, array_like=True):
-    """Per second; 0 means unlimited."""
+    """Limits are per second; 0 means unlimited."""
 
     messages: float = 0.0
     bytes: float = 0.0
@@ -394,7 +394,7 @@ class StateLeft(Message):
 
 
 class MonitorSwitched(Message):
-    """Applies from now on."""
+    """The switch applies from now on."""
 
     name: str
     enabled: bool
@@ -617,7 +617,7 @@ class LookWanted(Message):
 
 
 class LookEnded(Message):
-    """The tap is over."""
+    """The tap of the topic is over."""
 
     number: int
 

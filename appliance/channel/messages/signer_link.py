@@ -120,7 +120,7 @@ class RevocationsRequest(Message):
 
 
 class RevocationsMade(Message):
-    """A CRL in PEM."""
+    """The list is a CRL in PEM."""
 
     number: int
     revocations: bytes

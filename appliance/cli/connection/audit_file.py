@@ -86,7 +86,7 @@ class FileLog:
         return verify(path, key, signer if may else None, copies, progress)
 
     def checkpoints(self, after: int) -> list[SignedCheckpoint]:
-        """Empty at the end."""
+        """The list is empty at the end of the log."""
         return signed_checkpoints(self.path, after)
 
     def last(self) -> int:

@@ -286,7 +286,7 @@ def _assigned(text: str, form: str) -> tuple[str, str]:
 
 
 def _given_to_monitors(given: list[str]) -> dict[str, dict[str, GivenValue]]:
-    """By monitor and name."""
+    """The keys are the monitor and the name."""
     found: dict[str, dict[str, GivenValue]] = {}
     for text in given:
         path, value = _assigned(text, "--set MONITOR.NAME=VALUE")

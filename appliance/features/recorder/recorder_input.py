@@ -150,7 +150,7 @@ def _cover(
 
 
 def gaps(parts: Sequence[Span], span: Span) -> Iterator[Span]:
-    """Parts are ordered."""
+    """The parts must be in order."""
     at = span.since
     for part in parts:
         if part.since > at:

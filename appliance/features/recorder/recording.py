@@ -47,7 +47,7 @@ _LEVELS = {Severity.WARNING: WARN, Severity.ALARM: ERROR}
 
 
 class TopicCount(msgspec.Struct):
-    """By topic and type."""
+    """The count of one topic and type."""
 
     topic: str
     type: str

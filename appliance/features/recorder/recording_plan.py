@@ -84,7 +84,7 @@ class HourlyLimit:
                 self._begun.setdefault((recording.charged_to, trigger.what), deque()).append(trigger.time)
 
     def take(self, charged_to: str, what: TriggerKind, now: int) -> bool:
-        """Return False beyond the limit."""
+        """Returns False beyond the limit."""
         for key, begun in list(self._begun.items()) if len(self._begun) > _MOST_HOSTS else []:
             if begun[-1] + _HOUR <= now:
                 del self._begun[key]

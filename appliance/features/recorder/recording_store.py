@@ -139,7 +139,7 @@ class RecordingStore:
         self._temporary.append(recording)
 
     def _expire(self, now: int, most: int, seconds: float) -> None:
-        """Keep those younger than `seconds`."""
+        """Recordings younger than `seconds` stay."""
         while (
             len(self._temporary) > most and abs(now - self._temporary[0].triggers[0].time) > seconds * _SECOND
         ):

@@ -133,7 +133,7 @@ def _key_for(header: dict[str, Any], keys: Sequence[dict[str, Any]]) -> RSAKey |
 
 
 def _decoded(text: str) -> bytes:
-    """base64url without padding. Raises `ValueError`."""
+    """The text is base64url without padding. Raises `ValueError`."""
     return base64.urlsafe_b64decode(text + "=" * (-len(text) % 4))
 
 

@@ -158,6 +158,6 @@ def _await_acknowledgement(connection: socket.socket) -> None:
 
 
 def _unacknowledged(connection: socket.socket) -> int:
-    """`SIOCOUTQ`, tcp(7)."""
+    """The number of bytes by `SIOCOUTQ`, tcp(7)."""
     answer = fcntl.ioctl(connection.fileno(), termios.TIOCOUTQ, b"\0\0\0\0")
     return int(struct.unpack("i", answer)[0])

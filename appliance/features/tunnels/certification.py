@@ -183,7 +183,7 @@ class Certification:
         )
 
     async def revocations(self, _request: host_requests.RevocationsWanted) -> RevocationList:
-        """In PEM. Raises `HostRefusedError`."""
+        """The list is in PEM. Raises `HostRefusedError`."""
         try:
             listed = await self.tunnels.revocations.signed()
         except AuthorityError as error:
@@ -191,11 +191,11 @@ class Certification:
         return RevocationList(listed.decode())
 
     async def authority(self, _request: host_requests.AuthorityWanted) -> AuthorityCertificate:
-        """In PEM. Raises `HostRefusedError`."""
+        """The certificate is in PEM. Raises `HostRefusedError`."""
         return AuthorityCertificate((await self.authority_certificate()).decode())
 
     async def authority_certificate(self) -> bytes:
-        """In PEM. Raises `HostRefusedError`."""
+        """The certificate is in PEM. Raises `HostRefusedError`."""
         try:
             return await self._authority.certificate()
         except AuthorityError as error:

@@ -38,7 +38,7 @@ class Kit:
 
 
 def members(kit: Kit) -> list[tuple[str, str, int]]:
-    """Path, text, mode."""
+    """Each member has a path, a text and a mode."""
     host = kit.host
     found = [
         ("swanctl/swanctl.conf", swanctl_conf(kit), 0o644),
@@ -63,7 +63,7 @@ def members(kit: Kit) -> list[tuple[str, str, int]]:
 
 
 def filled(script: str, values: Mapping[str, str]) -> str:
-    """`@stop@` is `stop.inc`."""
+    """`@stop@` stands for the file `stop.inc`."""
     folder = files("appliance.features.tunnels").joinpath("kit_files")
     text, stop = (folder.joinpath(name).read_text(encoding="utf-8") for name in (script, "stop.inc"))
     return _Template(text.replace("@stop@\n", stop)).substitute(values)

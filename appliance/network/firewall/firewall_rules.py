@@ -176,7 +176,7 @@ class PacketRule:
         return (4, 6) if self.family is None else (self.family,)
 
     def describe(self) -> str:
-        """In netfilter's terms."""
+        """The text is in netfilter's terms."""
         matches = {
             "in": self.arrives_on,
             "out": self.leaves_on,
@@ -315,7 +315,7 @@ _sending = partial(PacketRule, chain=Chain.OUT)
 
 
 def appliance_rules(settings: FirewallSettings) -> tuple[PacketRule, ...]:
-    """In order."""
+    """The rules apply in their order."""
     return (
         *(
             _arriving(

@@ -76,7 +76,7 @@ class IptablesBackend:
         return self._namespace.run(_families)
 
     def install(self, rules: tuple[PacketRule, ...]) -> None:
-        """IPv4 first, then IPv6."""
+        """The rules of IPv4 come first, then those of IPv6."""
         elsewhere = [rule.purpose for rule in rules if rule.chain not in _CHAINS]
         if elsewhere:
             raise BackendMissingError(f"address translation needs nft, not iptables: {'; '.join(elsewhere)}")
@@ -84,7 +84,7 @@ class IptablesBackend:
         self._in_tables(lambda table: table.replace(rendered))
 
     def remove(self) -> None:
-        """No unused tables are created."""
+        """This creates no unused tables."""
         _in_used_tables(self._namespace, "filter", lambda table: table.replace([]))
 
     def counters(self) -> tuple[RuleCounter, ...]:
@@ -113,12 +113,12 @@ def load_modules() -> None:
 
 
 def foreign_translations(namespace: Namespace) -> tuple[str, ...]:
-    """Chains of legacy xtables."""
+    """Only chains of legacy xtables are returned."""
     return _foreign(namespace, "nat", lambda table: table.translating())
 
 
 def foreign_forward_drops(namespace: Namespace) -> tuple[str, ...]:
-    """Chains of legacy xtables."""
+    """Only chains of legacy xtables are returned."""
     return _foreign(namespace, "filter", lambda table: table.dropping("FORWARD"))
 
 

@@ -49,7 +49,7 @@ def traces(events: Sequence[str], longest: int) -> Iterator[tuple[str, ...]]:
 
 
 def refusal(logic: str, formula: str, events: Sequence[str] = ABC) -> list[str]:
-    """As ``line:column: text``."""
+    """Each finding is written ``line:column: text``."""
     try:
         compile_property(logic, formula, events, ORIGIN)
     except FormulaError as error:

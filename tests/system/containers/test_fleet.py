@@ -73,7 +73,7 @@ class Walk:
     contained: dict[str, Compose]
 
     def run(self, block: str, folder: str = "") -> str:
-        """Builds are done before."""
+        """The images are built before."""
         environment = {
             "PATH": f"{self.folder}/bin:{Path(ROSRV).parent}:{os.environ['PATH']}",
             "HOME": str(self.folder), "DOCKER_HOST": self.compose.engine.address, "COMPOSE_HTTP_TIMEOUT": "120",

@@ -26,7 +26,7 @@ from tests.support.waiting import allowed
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TunnelSite]:
-    """Without enrolled hosts at first."""
+    """At first no host is enrolled."""
     need_root()
     need_strongswan()
     with Lab("rosrv-ipsec") as lab, TunnelSite(lab, tmp_path_factory.mktemp("ipsec")) as one:

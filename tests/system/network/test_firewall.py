@@ -89,7 +89,7 @@ def settings(port: int, **others: Any) -> FirewallSettings:
 
 
 def ruleset(host: Host) -> str:
-    """Without counters."""
+    """Counters are left out."""
     commands = ("nft -s list ruleset", "iptables-legacy-save -t filter", "ip6tables-legacy-save -t filter")
     outputs = []
     for command in commands:

@@ -52,7 +52,7 @@ def calls_during(flood: "subprocess.Popen[str]", robot: Host, server: socket.soc
 
 
 def repeated_packets(connection: socket.socket) -> int:
-    """`tcpi_total_retrans` of `struct tcp_info` (linux/tcp.h)."""
+    """The number is `tcpi_total_retrans` of `struct tcp_info` (linux/tcp.h)."""
     return int.from_bytes(
         connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 104)[100:], sys.byteorder
     )

@@ -68,7 +68,7 @@ def primitive(type_name: str, data: bytes, position: int) -> Any:
 
 
 def nested(values: Values) -> Values:
-    """In genpy's structure."""
+    """The result has genpy's structure."""
     result: Values = {}
     for path, value in values.items():
         *outer, last = path.split(".")

@@ -16,7 +16,7 @@ PIECE = TURN_SECONDS / 4
 
 
 class Loop:
-    """Only `spend` moves the clock."""
+    """Only `spend` moves its clock."""
 
     def __init__(self) -> None:
         self.now = 0.0

@@ -99,7 +99,7 @@ def test_a_crashing_check_is_a_finding() -> None:
 
 
 def certificate(state: Path, days: int) -> None:
-    """`days` and an hour."""
+    """The certificate ends after `days` and an hour."""
     now = datetime.datetime.now(datetime.UTC)
     (state / "api").mkdir(parents=True, exist_ok=True)
     (state / "lock").write_text("")
