@@ -160,7 +160,7 @@ class ComparedRelay(Monitored):
         return {"counted": dict(self.counted), "rows": rows}
 
     def recovered(self, statement: SpecificationsStated) -> list[bytes]:
-        """Without times."""
+        """Times are left out."""
         left = StateKeeper(self.given, self.memory).recovered()
         monitors = Loader.load(statement, str)
         if left is None or isinstance(monitors, list):

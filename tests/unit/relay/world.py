@@ -59,7 +59,7 @@ CALL = {"callerid": "/client", "service": "/mode", "md5sum": "*"}
 
 
 class Peer:
-    """It never blocks."""
+    """Its socket never blocks."""
 
     def __init__(self, sock: socket.socket) -> None:
         sock.setblocking(False)
@@ -223,7 +223,7 @@ class World:
         return fields
 
     def gets(self, peer: Peer, data: bytes) -> None:
-        """Exactly these bytes."""
+        """The peer must have received exactly these bytes."""
 
         def whole() -> bool:
             peer.read()

@@ -50,7 +50,7 @@ class Keeper(Revisions[MonitorRevisionRow]):
 
 @pytest.fixture
 def keeper(tmp_path: Path) -> Iterator[Keeper]:
-    """Revisions 4, 5 and 7."""
+    """It has the revisions 4, 5 and 7."""
     store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     keeper = Keeper(store)
     for number in (4, 5, 7):

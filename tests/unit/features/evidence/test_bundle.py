@@ -560,7 +560,7 @@ def test_unproven_facts_are_listed(control: Control, tmp_path: Path, reviewer: R
 
 
 def _as_before(previous: bytes, columns: tuple[object, ...]) -> bytes:
-    """As version 0.1.0 computed it."""
+    """Version 0.1.0 computed the hash like this."""
     return hashlib.sha256(previous + msgspec.msgpack.encode(columns)).digest()
 
 

@@ -200,7 +200,7 @@ async def test_a_damaged_certificate(standby: Standby) -> None:
 
 
 class OwnCompiler(SpecificationCompiler):
-    """Counts the questions."""
+    """It counts the questions."""
 
     questions = 0
 

@@ -30,7 +30,7 @@ def after(tmp_path: Path, story: Callable[[Member, Member], Awaitable[None]]) ->
 
 
 async def sealed_by_b(a: Member, b: Member) -> SignedCheckpoint:
-    """b is active and replicates to a."""
+    """The records of `b`, which is active, are replicated to `a`."""
     async with b.active(1):
         await b.decide(3, 1)
         await b.sealed()

@@ -447,7 +447,7 @@ def test_an_older_copy(pair: Pair, tmp_path: Path) -> None:
 
 
 def overlapping(folder: Path, both: float, *, lasting: float = 60, clock_set: str = "") -> Pair:
-    """a decides for `both` seconds while b is active for `lasting` seconds."""
+    """Appliance a decides for `both` seconds while b is active for `lasting` seconds."""
 
     async def story(a: Member, b: Member, world: World) -> None:
         async with a.active(1):

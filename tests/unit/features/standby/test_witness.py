@@ -54,7 +54,7 @@ class Robot:
         self.disk = record
 
     def admit(self, name: str) -> None:
-        """Fails if the firewall does."""
+        """This fails if the firewall does."""
         if self.firewall_fails:
             raise WitnessError("nft: no")
         self.admits.append(name)

@@ -32,7 +32,7 @@ def receiver(limit: int = LIMIT, memory: int = 1 << 30) -> tuple[FrameReceiver, 
 
 
 def feed(one: FrameReceiver, data: bytes, cuts: list[int]) -> list[tuple[bytes, int, int]]:
-    """The last size repeats."""
+    """The last size is used repeatedly."""
     batches, position, turn = [], 0, 0
     while position < len(data):
         buffer = one.buffer()
