@@ -2,12 +2,12 @@
 
 Both masters are new in each round and take turns.
 
-- `parameters`: roslaunch clears a namespace and sets 4,000 parameters below it, in one multicall; - `nodes`: 100
-nodes at once publish ten topics each and subscribe to ten of the next one, each over a kept connection as with
-roscpp. It is over when every call is answered and every subscriber knows its publishers.
+- `parameters`: roslaunch clears a namespace and sets 4,000 parameters below it, in one multicall.
+- `nodes`: 100 nodes at once publish ten topics each and subscribe to ten of the next one, each over a kept connection
+  as with roscpp. It is over when every call is answered and every subscriber knows its publishers.
 
 Figures are medians of the rounds: seconds until it is over, and seconds of processor time (of RVMaster with the
-master that it hides). A ratio above 1: RVMaster is slower.
+master that it hides). A ratio above 1 means that RVMaster is slower.
 """
 
 import argparse
