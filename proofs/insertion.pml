@@ -804,7 +804,7 @@ end:
        }
     /* = appliance/master/endpoints/relay_control.py RelayControl.attach
        = appliance/specifications/rollout.py Rollout.statement
-       = appliance/master/endpoints/relay_control.py RelayControl._place
+       = appliance/master/endpoints/relay_control.py RelayControl._placed
        = appliance/control/supervisor_messages.py SupervisorMessages._relay_link
        = appliance/master/graph/graph.py RosGraph.tell_everybody */
     :: atomic {
