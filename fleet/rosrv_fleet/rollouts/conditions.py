@@ -28,8 +28,11 @@ class RobotCondition(NamedTuple):
 def conditions(
     rollout: BundleRollout | None, robots: Mapping[str, RobotSeen], now: float
 ) -> dict[str, RobotCondition]:
-    """Return the condition of each robot of a group; `rollout` is the group's last one, or None."""
-    sick = {} if rollout is None else unhealthy(rollout, robots, now)
+    """Return the condition of each robot of a group; `rollout` is the group's last one, or None.
+
+    What a robot said about the bundle of a reverted rollout does not count any more.
+    """
+    sick = {} if rollout is None or rollout.state == "reverted" else unhealthy(rollout, robots, now)
     silent = (HealthGates() if rollout is None else rollout.gates).silent_seconds
     found = {}
     for robot, seen in robots.items():

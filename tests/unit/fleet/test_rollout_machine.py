@@ -214,3 +214,16 @@ def test_the_condition_is_the_worst_that_applies(seen: RobotSeen, kind: str, why
 def test_without_a_rollout_a_robot_is_not_behind() -> None:
     found = conditions(None, {"r0": RobotSeen(1000), "r1": RobotSeen(1000, OLD), "r2": RobotSeen(5)}, 1000)
     assert [one.kind for one in found.values()] == ["no bundle", "in force", "silent"]
+
+
+@pytest.mark.parametrize(
+    ("seen", "kind"),
+    [
+        (RobotSeen(1000, OLD, refused=NEW, denials=500), "in force"),
+        (RobotSeen(1000, NEW, failing=1), "behind"),
+        (RobotSeen(1000, "", refused=OLD), "unhealthy"),
+    ],
+)
+def test_after_a_revert_the_conditions_are_about_the_bundle_before(seen: RobotSeen, kind: str) -> None:
+    rollout = reverted(advanced(begun(), all_at(0), 0), "reverted by olga")
+    assert conditions(rollout, all_at(1000) | {"r0": seen}, 1000)["r0"].kind == kind
