@@ -60,8 +60,11 @@ from rosmop.fast.wasm import (
     calculate,
     compare,
     constant,
+    function,
     if_result,
     load,
+    local_get,
+    local_set,
 )
 from rosmop.form import nodes
 from rosmop.runtime import times
@@ -268,34 +271,34 @@ class ArithmeticCodegen(FunctionBuilder):
         whole = self._get("moment", I64) + self._get("rest", I64) + I64_SUB
         return rest + whole + constant(I64, BILLION) + I64_DIV_S
 
-    def _in_seconds(self) -> bytes:
-        """Convert a time to seconds as a double, rounded only once.
-
-        A time of more than 53 bits is divided by 10^9 in two steps. It is divided by 5^9 in fixed point, with 40
-        fractional bits; the last bit is set if there is a remainder. The result is divided by 2^9.
-        """
-        code, value = self._set("moment", I64), self._get("moment", I64)
-        size = self._get("whole", I64)
-        negative = value + constant(I64, 0) + I64_LT_S
-        code += constant(I64, 0) + value + I64_SUB + value + negative + SELECT + self._set("whole", I64)
-        short = size + F64_CONVERT_I64_S + constant(F64, 1e9) + F64_DIV
-        over = constant(I64, 5**9)
-        rest = size + over + I64_REM_U + constant(I64, 40) + I64_SHL + self._set("rest", I64)
-        left = self._get("rest", I64) + over + I64_REM_U + I64_EQZ + I32_EQZ + I64_EXTEND_I32_U
-        behind = self._get("rest", I64) + over + I64_DIV_U + left + I64_OR + F64_CONVERT_I64_S
-        behind += constant(F64, 2.0**-40) + F64_MUL
-        long = rest + size + over + I64_DIV_U + F64_CONVERT_I64_S + behind + F64_ADD
-        long += constant(F64, 2.0**-9) + F64_MUL
-        code += size + constant(I64, 1 << 53) + I64_LT_U + if_result(F64) + short + ELSE + long + END
-        code += self._set("in seconds", F64)
-        result = self._get("in seconds", F64)
-        return code + result + F64_NEG + result + negative + SELECT
-
     def _parts_of(self, kind: Type, moment: bytes) -> tuple[bytes, bytes]:
         """Return code that splits a time, and code that packs both parts into 64 bits as in a message."""
         code = self._limited(kind, moment) + self._seconds() + self._set("whole", I64)
         low = self._get("whole", I64) + constant(I64, 0xFFFFFFFF) + I64_AND
         return code, low + self._get("rest", I64) + constant(I64, 32) + I64_SHL + I64_OR
+
+
+def in_seconds() -> bytes:
+    """Write a function that converts a time to seconds as a double, rounded only once.
+
+    A time of more than 53 bits is divided by 10^9 in two steps. It is divided by 5^9 in fixed point, with 40
+    fractional bits; the last bit is set if there is a remainder. The result is divided by 2^9.
+    """
+    moment, size, part, result = (local_get(local) for local in range(4))
+    negative = moment + constant(I64, 0) + I64_LT_S
+    code = constant(I64, 0) + moment + I64_SUB + moment + negative + SELECT + local_set(1)
+    short = size + F64_CONVERT_I64_S + constant(F64, 1e9) + F64_DIV
+    over = constant(I64, 5**9)
+    rest = size + over + I64_REM_U + constant(I64, 40) + I64_SHL + local_set(2)
+    left = part + over + I64_REM_U + I64_EQZ + I32_EQZ + I64_EXTEND_I32_U
+    behind = part + over + I64_DIV_U + left + I64_OR + F64_CONVERT_I64_S
+    behind += constant(F64, 2.0**-40) + F64_MUL
+    long = rest + size + over + I64_DIV_U + F64_CONVERT_I64_S + behind + F64_ADD
+    long += constant(F64, 2.0**-9) + F64_MUL
+    code += (
+        size + constant(I64, 1 << 53) + I64_LT_U + if_result(F64) + short + ELSE + long + END + local_set(3)
+    )
+    return function([(2, I64), (1, F64)], code + result + F64_NEG + result + negative + SELECT)
 
 
 def to_floating(source: int, target: int, *, signed: bool) -> bytes:

@@ -40,9 +40,11 @@ from rosmop.fast.abi import (
     CompiledModule,
     TopicCode,
 )
+from rosmop.fast.arithmetic import in_seconds
 from rosmop.fast.codegen import CHANGED, DROPPED, HAPPENED, REPLACED, RESET, ModuleCodegen, WasmFunction
 from rosmop.fast.function_parts import ELSEWHERE
 from rosmop.fast.memory_layout import NotCompiledError, reason_of
+from rosmop.fast.strings_codegen import mismatch
 from rosmop.fast.wasm import (
     ACTIVE,
     BLOCK,
@@ -147,7 +149,9 @@ class WasmModule(CompiledModule):
     refused: Mapping[str, NotCompiledError]
     """The reasons for topics that are not in the module."""
     left: Mapping[str, Sequence[NotCompiledError]]
-    """By function: the nodes at which it leaves a message to the interpreter."""
+    """By function: the places at which it leaves a message to the interpreter."""
+    routines: Mapping[str, int]
+    """Numbers of functions that the proof knows only by their results."""
 
 
 def written(
@@ -219,6 +223,11 @@ def written(
         len(writer.written),
         refused,
         writer.left,
+        {
+            write.__name__: number
+            for write in (mismatch, in_seconds)
+            if (number := writer.routine_of(write)) is not None
+        },
     )
 
 

@@ -28,7 +28,7 @@ from types import MappingProxyType
 from typing import Any
 
 from rosmop.fast.abi import NOW, POSITION, SAID, UNDO, Cells, kept_size
-from rosmop.fast.arithmetic import to_floating
+from rosmop.fast.arithmetic import in_seconds, to_floating
 from rosmop.fast.codegen_access import loaded, root_of
 from rosmop.fast.deferred_output import BYTES, HEAD, OutputLine, is_text
 from rosmop.fast.memory_layout import LINES, MemoryLayout, NotCompiledError, is_signed, machine_type
@@ -188,21 +188,28 @@ class ModuleCodegen(MemoryLayout):
             self.written.append(written)
         return self._numbers[key]
 
-    def routine(self, key: tuple[object, ...], parameters: int, write: Callable[[], bytes]) -> int:
-        """Write a function of this number of addresses once."""
+    def routine(
+        self, key: tuple[object, ...], parameters: tuple[int, ...], write: Callable[[], bytes], result: int
+    ) -> int:
+        """Return the number of a function with these parameters. The function is written only once."""
         if key not in self._numbers:
-            self._numbers[key] = self._added((I32,) * parameters, write())
+            self._numbers[key] = self._added(parameters, write(), result)
         return self._numbers[key].number
+
+    def routine_of(self, write: Callable[..., bytes]) -> int | None:
+        """Return the number of the function that this writes without arguments; None if the module has none."""
+        written = self._numbers.get((write,))
+        return None if written is None else written.number
 
     def settling(self, cells: Cells) -> int:
         """Return the function that copies the strings of variables, all of which must be known before."""
         cells.settle = self._added((), settling(self, cells)).number
         return cells.settle
 
-    def _added(self, parameters: tuple[int, ...], code: bytes) -> WasmFunction:
-        """Add a function that is not in the intermediate form; its result has 32 bits."""
+    def _added(self, parameters: tuple[int, ...], code: bytes, result: int = I32) -> WasmFunction:
+        """Add a function that the intermediate form does not contain."""
         written = WasmFunction(
-            len(self.written), parameters, I32, code, frozenset(), 0,
+            len(self.written), parameters, result, code, frozenset(), 0,
             drops=False, brief=True, passes=True, says=False, early=False, changes_elements=False,
         )  # fmt: skip
         self.written.append(written)
@@ -272,8 +279,10 @@ class _FunctionCodegen(StringCodegen):
             tuple(self._references.items()),
         )
 
-    def _routine(self, parameters: int, write: Callable[..., bytes], *given: Any) -> bytes:
-        number = self._writer.routine((write, *given), parameters, partial(write, *given))
+    def _routine(
+        self, parameters: tuple[int, ...], write: Callable[..., bytes], *given: Any, result: int = I32
+    ) -> bytes:
+        number = self._writer.routine((write, *given), parameters, partial(write, *given), result)
         return call(number)
 
     # Statements
@@ -834,7 +843,7 @@ _OF_MOMENTS: Mapping[str, Callable[[_FunctionCodegen], bytes]] = MappingProxyTyp
     {
         "m_nsec": _FunctionCodegen._nanoseconds,
         "m_sec": _FunctionCodegen._seconds,
-        "m_seconds": _FunctionCodegen._in_seconds,
+        "m_seconds": lambda codegen: codegen._routine((I64,), in_seconds, result=F64),
     }
 )
 

@@ -59,8 +59,10 @@ class FunctionBuilder(ABC):
         """Push the value. Raises `NotCompiledError` unless it is a number."""
 
     @abstractmethod
-    def _routine(self, parameters: int, write: Callable[..., bytes], *given: Any) -> bytes:
-        """Call a function of addresses (i32), which `write` writes from the arguments `given`."""
+    def _routine(
+        self, parameters: tuple[int, ...], write: Callable[..., bytes], *given: Any, result: int = I32
+    ) -> bytes:
+        """Call a function with parameters of these types. `write` writes it from the arguments `given`."""
 
     def _local(self, name: str, machine: int) -> int:
         number, known = self._locals.setdefault(name, (len(self._locals), machine))

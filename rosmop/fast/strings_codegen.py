@@ -150,7 +150,7 @@ class StringCodegen(MessageAccess):
             code += self._when(long, lambda: self._spend(spent))
         if not any(self._is_bounded(side) for side in (node.left, node.right)):
             self._brief = False
-        call = self._routine(3, mismatch)
+        call = self._routine((I32, I32, I32), mismatch)
         if node.operator in ("==", "!="):
             same = place + other + count + I32_WRAP_I64 + call + I64_EXTEND_I32_U + count + I64_EQ
             alike = count + length + I64_EQ + if_result(I32) + same + ELSE + constant(I32, 0) + END

@@ -9,7 +9,8 @@ all of these hold:
 - the bytes of the message, the variables and the rest of the budget are the same,
 - the lines of output are the same, in order.
 
-An event that reads or keeps a string in a variable is not proved. If the function leaves the message, its effects are
+Strings in variables and names of senders have an address and a length; whether two are equal is left open. An event
+that reads their bytes is not proved. If the function leaves the message, its effects are
 undone: each variable that it wrote must be among those that are restored, and each byte must be in the log
 (`module_terms.py`).
 """
@@ -27,9 +28,11 @@ from rosmop.form.compiled import Compiled
 from rosmop.form.specification_groups import groups
 from rosmop.prove.decoding import functions_of
 from rosmop.prove.form_terms import FormTerms, wrapped
-from rosmop.prove.module_terms import ModuleExecution, ModuleResult
+from rosmop.prove.module_terms import ModuleExecution, ModuleResult, Pointer
 from rosmop.prove.terms import (
     DOUBLE,
+    MISMATCH,
+    SECONDS,
     SINGLE,
     DiffersError,
     FormResult,
@@ -37,6 +40,7 @@ from rosmop.prove.terms import (
     NotProvedError,
     StartTerms,
     Term,
+    TextTerm,
     abstracted,
     as_bits,
     both,
@@ -111,10 +115,17 @@ class Validation:
         self._clock = clock
         self._patience = patience
         self.codes = functions_of(module.code)
-        self._strings = [range(at, at + 8) for own in module.cells for at in own.kept]
+        self._strings = [
+            range(at, at + 8)
+            for own in module.cells
+            for at, kind in own.variables.values()
+            if kept_size(kind) and not isinstance(kind, value_types.StringType)
+        ]
         self._strings += [range(at, at + len(raw)) for raw, at in module.strings.items()]
         self._strings += module.references
-        self._strings += [range(at, at + SENDER) for at in module.senders.values()]
+        self._strings += [range(at + 16, at + SENDER) for at in module.senders.values()]
+        known = {"mismatch": MISMATCH, "in_seconds": SECONDS}
+        self._routines = {number: known[name] for name, number in module.routines.items()}
 
     def finding(self, topic: str, event: str, function: str, place: int) -> ProofFinding:
         feed = self._module.feeds.get(topic)
@@ -131,7 +142,9 @@ class Validation:
         begin, cells, known = self._beginning()
         module = self._module
         meant = FormTerms(self._forms, self._values, begin, name, topic=topic, lines=module.lines).result()
-        done = ModuleExecution(self.codes, number, begin.message, begin.size, cells, self._strings).done()
+        done = ModuleExecution(
+            self.codes, number, begin.message, begin.size, cells, self._strings, self._routines
+        ).done()
         self._check_undone(done, topic)
         left = either(done.trapped, done.bits == _ELSEWHERE)
         unknown = either(*meant.unknown.values())
@@ -207,6 +220,9 @@ class Validation:
         variables: dict[str, Any] = {}
         for component in self._module.cells:
             for name, (address, kind) in component.variables.items():
+                if isinstance(kind, value_types.StringType):
+                    variables[name] = _text(name, address, cells)
+                    continue
                 if kept_size(kind):
                     continue
                 variables[name] = cells[address] = _variable(name, kind)
@@ -221,19 +237,31 @@ class Validation:
         for key, address in self._module.throttles.items():
             known.append(throttles[key] >= 0)
             cells[address] = throttles[key]
+        senders = {
+            (context, part): _text(f"{part} of {context}", at + 8 * place, cells)
+            for context, at in self._module.senders.items()
+            for place, part in enumerate(("host", "caller"))
+        }
         message = z3.Array("message", z3.BitVecSort(32), z3.BitVecSort(8))
-        return StartTerms(message, size, now, variables, budgets, throttles), cells, known
+        constants = self._module.strings
+        begin = StartTerms(message, size, now, variables, budgets, throttles, senders, constants)
+        return begin, cells, known
 
     def _ends(self, meant: FormResult) -> Iterator[tuple[int, Term]]:
         for component in self._module.cells:
             for name, (address, _) in component.variables.items():
-                if name in meant.variables:
-                    yield address, meant.variables[name]
+                value = meant.variables.get(name)
+                if isinstance(value, TextTerm):
+                    yield address, value.place
+                    yield address + 4, z3.Extract(31, 0, value.count)
+                elif value is not None:
+                    yield address, value
         for context, address in self._module.budgets.items():
             yield address, meant.budgets[context]
 
     def _check_undone(self, done: ModuleResult, topic: str) -> None:
-        taken_back = {address for address, _ in self._module.feeds[topic].undo}
+        undone = [address for address, _ in self._module.feeds[topic].undo]
+        taken_back = {*undone, *(address + 4 for address in undone)}  # eight bytes each
         for address in sorted(done.stored - set(self._module.budgets.values()) - taken_back):
             raise DiffersError(f"its write at {address} is not undone")
 
@@ -257,7 +285,16 @@ def _example(model: Any) -> str:
     )
 
 
+def _text(name: str, address: int, cells: dict[int, Term]) -> TextTerm:
+    """Return a string whose address and length are in these cells."""
+    place, length = (z3.BitVec(f"{part} of {name}", 32) for part in ("address", "length"))
+    cells |= {address: place, address + 4: length}
+    return TextTerm(place, z3.ZeroExt(32, length))
+
+
 def _same(held: Term, value: Term) -> Term:
+    if isinstance(held, Pointer):
+        raise NotProvedError("keeps a string of the message")
     return held == (as_bits(value) if z3.is_bool(value) and not z3.is_bool(held) else value)
 
 

@@ -18,14 +18,17 @@ from typing import Any
 
 import z3
 
+from rosmop.fast.abi import MOST_KEPT
 from rosmop.fast.deferred_output import BYTES, HEAD, OutputLine
 from rosmop.form import nodes
 from rosmop.prove.terms import (
     AT,
     DOUBLE,
     FRAME,
+    MISMATCH,
     MIXED,
     NEAREST,
+    SECONDS,
     SINGLE,
     FormResult,
     LineTerm,
@@ -33,6 +36,7 @@ from rosmop.prove.terms import (
     StartTerms,
     State,
     Term,
+    TextTerm,
     as_bits,
     both,
     choice,
@@ -272,6 +276,8 @@ class FormTerms:
         cost, words = integer(line.cost, 64), []
         for expression in line.values:
             value = self._value(expression, state)
+            if isinstance(value, TextTerm):
+                raise UnknownError("a constant string or array")
             if isinstance(value, _View):
                 cost = cost + z3.UDiv(value.count, integer(BYTES, 64))
                 words.append(_text(value))
@@ -454,11 +460,18 @@ class FormTerms:
     def _literal(self, node: nodes.Literal, _state: State) -> Any:
         if node.value is None:
             return None
+        if isinstance(node.value, bytes) and isinstance(node.type, value_types.StringType):
+            return self._constant_text(node.value)
         if isinstance(node.value, bytes | str):
             raise UnknownError("a constant string or array")
         if isinstance(node.type, value_types.FloatingType):
             return floating(node.value, node.type.bits)
         return self._whole_number(int(node.value), node.type)
+
+    def _constant_text(self, raw: bytes) -> TextTerm:
+        if raw not in self._beginning.constants:
+            raise UnknownError("a constant string or array")
+        return TextTerm(integer(self._beginning.constants[raw], 32), integer(len(raw), 64))
 
     def _whole_number(self, value: int, kind: Type) -> Term:
         return (
@@ -468,6 +481,8 @@ class FormTerms:
     def _zero(self, node: nodes.Zero, state: State) -> Any:
         if isinstance(node.type, value_types.FloatingType):
             return self._literal(nodes.Literal(node.type, 0.0), state)
+        if isinstance(node.type, value_types.StringType):
+            return self._constant_text(b"")
         if not isinstance(
             node.type,
             value_types.BoolType | value_types.IntegerType | value_types.TimeType | value_types.DurationType,
@@ -480,6 +495,12 @@ class FormTerms:
         value = state.slots.get(own if own in state.slots else shared)
         if value is None or value is MIXED:
             raise UnknownError(f"a variable of type {node.type}")
+        return value if own in state.slots else self._kept(value, state)
+
+    def _kept(self, value: Any, state: State) -> Any:
+        """Leave the message to Python if a string is longer than the module keeps."""
+        if isinstance(value, TextTerm):
+            self._leave_to_python(state, z3.UGT(value.count, MOST_KEPT))
         return value
 
     def _assign(self, node: nodes.Assign, state: State) -> Any:
@@ -487,7 +508,7 @@ class FormTerms:
         where: int | str = "shared" if node.name in self._shared else self._frame
         if where == "shared" and node.name not in self._beginning.variables:
             raise UnknownError(f"a variable of type {node.type}")
-        state.slots[where, node.name] = value
+        state.slots[where, node.name] = self._kept(value, state) if where == "shared" else value
         return value
 
     def _convert(self, node: nodes.Convert, state: State) -> Any:
@@ -607,15 +628,38 @@ class FormTerms:
             (node.right, node.left) if isinstance(node.left, nodes.Literal) else (node.left, node.right)
         )
         text = known.value if isinstance(known, nodes.Literal) else None
+        if node.operator in ("==", "!=") and text is None:
+            return self._same_texts(node, state)
         if node.operator not in ("==", "!=") or not node.short or not isinstance(text, bytes):
             raise UnknownError("a comparison of strings")
         view = self._value(given, state)
+        if isinstance(view, TextTerm) and not text:
+            return view.count == 0 if node.operator == "==" else opposite(view.count == 0)
         if not isinstance(view, _View) or len(text) > nodes.SHORT:
             raise UnknownError("a comparison of strings")
         place = z3.Extract(31, 0, view.start)
         letters = [number_at(view.message, place + more, 1) == letter for more, letter in enumerate(text)]
         same = both(view.count == len(text), *letters)
         return same if node.operator == "==" else opposite(same)
+
+    def _same_texts(self, node: nodes.CompareTexts, state: State) -> Term:
+        """Compare two strings whose bytes are not known; `MISMATCH` is their length if they are equal."""
+        one, other = self._value(node.left, state), self._value(node.right, state)
+        if not isinstance(one, TextTerm) or not isinstance(other, TextTerm):
+            raise UnknownError("a comparison of strings")
+        if not node.short:
+            long = z3.UGT(one.count, integer(nodes.SHORT, 64))
+            if isinstance(node.right, nodes.Read):
+                long = both(long, z3.UGT(other.count, integer(nodes.SHORT, 64)))
+            yes, no = state.where(long), state.where(opposite(long))
+            self._spend(z3.UDiv(one.count, integer(BYTES_PER_INSTRUCTION, 64)), yes)
+            state.join(long, yes, no)
+        first = MISMATCH(one.place, other.place, z3.Extract(31, 0, one.count))
+        same = both(one.count == other.count, z3.ZeroExt(32, first) == one.count)
+        return same if node.operator == "==" else opposite(same)
+
+    def _sender(self, node: nodes.SenderName, state: State) -> Any:
+        return self._kept(self._beginning.senders[self._context, node.part], state)
 
     def _logical(self, node: nodes.Logical, state: State) -> Any:
         left = self._value(node.left, state)
@@ -833,6 +877,7 @@ _OF_MOMENTS: Mapping[str, Callable[[FormTerms, Term], Term]] = MappingProxyType(
     {
         "m_is_zero": lambda _, value: value == 0,
         "m_whole": lambda _, value: value,
+        "m_seconds": lambda _, value: SECONDS(value),
         "m_sec": lambda meaning, value: meaning._parts(value)[0],
         "m_nsec": lambda meaning, value: meaning._parts(value)[1],
     }
@@ -902,7 +947,7 @@ EXPRESSIONS: Mapping[type[nodes.FormNode], Callable[[FormTerms, Any, State], Any
             nodes.Log: FormTerms._log,
             nodes.Throttle: FormTerms._throttle,
             nodes.Now: FormTerms._now,
-            nodes.SenderName: nodes.Left("the sender of the message"),
+            nodes.SenderName: FormTerms._sender,
             nodes.Whole: nodes.Left("MESSAGE"),
         }
     )

@@ -8,8 +8,9 @@ Memory has these parts; access to any other address counts as a difference:
 - the log, which restores a message that is left. Each write to the message is preceded by an entry with address, size
   and old bytes. Entries are never overwritten.
 
-For strings in variables, and for constant strings, only the addresses are known. Code that reads such strings is not
-proved. A message that is left (`ELSEWHERE`) and a trap are treated alike: the effects are undone.
+For strings in variables, names of senders and constant strings, only the addresses and lengths are known. Code that
+reads their bytes is not proved, except that two of them are equal or not by the result of one function. A message that
+is left (`ELSEWHERE`) and a trap are treated alike: the effects are undone.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -89,7 +90,8 @@ class ModuleResult:
 class ModuleExecution:
     """Executes the function of one event on these cells. Booleans in cells are also numbers.
 
-    `strings` are the addresses of strings, and of the cells that refer to strings.
+    `strings` are the addresses of strings, and of the cells that refer to arrays. `routines` are functions of z3 for
+    the results of functions that are not translated, by their numbers.
     """
 
     def __init__(  # noqa: PLR0917  a function, its message and its cells
@@ -100,9 +102,11 @@ class ModuleExecution:
         size: Term,
         cells: Mapping[int, Term],
         strings: Sequence[range] = (),
+        routines: Mapping[int, Any] = MappingProxyType({}),
     ) -> None:
         self._functions = functions
         self._strings = strings
+        self._routines = routines
         self._size = size
         self._trapped: list[Term] = []
         self._outside: list[Term] = []
@@ -217,6 +221,11 @@ class ModuleExecution:
         count = len(self._functions[number].parameters)
         arguments = stack[len(stack) - count :]
         del stack[len(stack) - count :]
+        if number in self._routines:
+            if any(isinstance(argument, Pointer) or argument is MIXED for argument in arguments):
+                raise NotProvedError("not loop-free: it compares or copies strings, byte by byte")
+            stack.append(self._routines[number](*map(_bits, arguments)))
+            return
         stack.append(self._call(number, arguments, state))
 
     def _drop(self, instruction: WasmInstruction, state: State, stack: list[Any]) -> None:
@@ -249,6 +258,10 @@ class ModuleExecution:
         value = state.slots.get(("cell", place))
         if value is MIXED:
             raise NotProvedError("uses a variable for an address and a number")
+        if (family, how) == ("i64", "32_u") and value is not None and _fits(value, "i32"):
+            if isinstance(value, Pointer):
+                raise DiffersError("it calculates with an address")
+            return z3.ZeroExt(32, _bits(value))
         if how or value is None or not _fits(value, family):
             raise DiffersError(f"it reads {each_name(family, how)} at {place}, where no such value is stored")
         return value

@@ -22,6 +22,20 @@ AT = z3.BitVec("at", 32)
 FRAME = z3.BitVec("position", 32)
 
 
+MISMATCH = z3.Function("mismatch", *[z3.BitVecSort(32)] * 4)
+"""The place of the first difference of two strings (addresses and length), or the length. It is not translated."""
+SECONDS = z3.Function("seconds", z3.BitVecSort(64), DOUBLE)
+"""A time as seconds. It is not translated."""
+
+
+@dataclass(frozen=True)
+class TextTerm:
+    """A string outside the message: address (32 bits) and length (64 bits). Nothing else is known of its bytes."""
+
+    place: Term
+    count: Term
+
+
 class NotProvedError(Exception):
     """Nothing is known about an event; the text gives the reason."""
 
@@ -148,7 +162,9 @@ def merged(test: Term, yes: State, no: State) -> dict[Any, Any]:
 
 @dataclass(frozen=True)
 class StartTerms:
-    """The initial state of an event; budgets are by context, times of output by context and site."""
+    """The initial state of an event: message and size, time, variables by name, budgets by context, and times of output
+    by context and site. `senders` are by context and part, `constants` the addresses of constant strings.
+    """
 
     message: Term
     size: Term
@@ -156,6 +172,8 @@ class StartTerms:
     variables: Mapping[str, Any]
     budgets: Mapping[str, Term]
     throttles: Mapping[tuple[str, int], Term]
+    senders: Mapping[tuple[str, str], TextTerm]
+    constants: Mapping[bytes, int]
 
 
 @dataclass(frozen=True)

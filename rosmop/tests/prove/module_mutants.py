@@ -131,6 +131,9 @@ FAULTY = {
     "a string and what stands behind it": """s() { int n = 0; double d = 0;
         event e(std::string f, double a) /stamped own/Stamped '{frame:f, values[1]:a}' when (f == "abc") {
             n = f.size(); d = a; } }""",
+    "names that are kept, and seconds": """s() { std::string last; double at = 0; int n = 0;
+        event e() /plain own/Plain '{}' { std::string node = caller(e) == "" ? "a" : caller(e);
+        if (last == "" || last == node) { last = node; at = ros::Time::now().toSec(); } else { n++; return; } } }""",
     "output, and what the module leaves": event(
         'if (x > 3) { ROS_INFO("%d", x + 1); n += x; } if (n > 7) { ROS_WARN("%d %d", n, x); }'
         " if (n == 5) { PUBLISH(/told, std_msgs/Int32, told); }",
@@ -152,6 +155,7 @@ def faulty(text: str, every: int = 1) -> Iterator[tuple[str, str]]:
     validation = Validation(code.functions, values, module, time.monotonic, patience=100)
     ((topic, (one,)),) = group.component.topics
     assert validation.finding(topic, "s.e", one.function, 0).answer == EQUAL
-    for kind, wrong in islice(mutants(validation.codes[0]), 0, None, every):
-        validation.codes[0] = wrong
+    number = module.feeds[topic].functions[0]
+    for kind, wrong in islice(mutants(validation.codes[number]), 0, None, every):
+        validation.codes[number] = wrong
         yield kind, validation.finding(topic, "s.e", one.function, 0).answer.partition(":")[0]
