@@ -222,11 +222,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     @property
     def differs_from_folder(self) -> bool:
-        """False if there is no folder."""
-        found = self._folder.looked_at()
-        return self.folder is not None and (
-            found is None or found.with_topics(self.sources.topics) != self.sources
-        )
+        """Whether the specifications in force differ from the folder's; False without a folder."""
+        return self.folder is not None and not self._is_folder(self.sources)
 
     def names(self) -> list[str]:
         """In the order in which they get messages."""
@@ -384,10 +381,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 text = f"this would also remove {', '.join(left)} from the same file: name the file, or load it without"
                 raise SpecificationsRefusedError([text])
             sources, note = self.sources.without(files), f"removed {', '.join(sorted(files))}"
-            found = self._folder.looked_at() if self.folder is not None else None
-            of_folder = found is not None and found.with_topics(sources.topics) == sources
-            keeper = DISK if of_folder else who  # what is left is the baseline again
-            return await self._change(sources, keeper, who, note, request.confirm_within, consent=_Consent())
+            keeper, within = who, request.confirm_within
+            if within is None and self._is_folder(sources):
+                keeper = DISK  # the baseline again, so the next start reads the folder
+            return await self._change(sources, keeper, who, note, within, consent=_Consent())
 
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
         """None is the previous revision, 0 no specifications.
@@ -668,6 +665,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self.rollout.lost(relay)
 
     # --- internals ---
+
+    def _is_folder(self, sources: Sources) -> bool:
+        """Return whether these are the folder's; False without a folder, or if it is not valid."""
+        found = self._folder.looked_at() if self.folder is not None else None
+        return found is not None and found.with_topics(sources.topics) == sources
 
     def _revision(self, number: int, sources: Sources, checked: CheckedSpecifications) -> Revision:
         return Revision(number, sources, checked, self.switches.shadows_of(checked))

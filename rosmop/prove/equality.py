@@ -21,7 +21,7 @@ from typing import Any
 
 import z3
 
-from rosmop.fast.abi import AREA, SENDER, kept_size
+from rosmop.fast.abi import AREA, MOST_KEPT, SENDER, kept_size
 from rosmop.fast.batch_codegen import WasmModule, written
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled
@@ -122,6 +122,9 @@ class Validation:
             if kept_size(kind) and not isinstance(kind, value_types.StringType)
         ]
         self._strings += [range(at, at + len(raw)) for raw, at in module.strings.items()]
+        self._strings += [
+            range(begin, begin + 2 * MOST_KEPT) for own in module.cells for begin in own.texts.values()
+        ]
         self._strings += module.references
         self._strings += [range(at + 16, at + SENDER) for at in module.senders.values()]
         known = {"mismatch": MISMATCH, "in_seconds": SECONDS}
