@@ -224,8 +224,8 @@ def written(
         refused,
         writer.left,
         {
-            write.__name__: number
-            for write in (mismatch, in_seconds)
+            name: number
+            for name, write in (("mismatch", mismatch), ("seconds", in_seconds))
             if (number := writer.routine_of(write)) is not None
         },
     )

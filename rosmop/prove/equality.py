@@ -127,7 +127,7 @@ class Validation:
         ]
         self._strings += module.references
         self._strings += [range(at + 16, at + SENDER) for at in module.senders.values()]
-        known = {"mismatch": MISMATCH, "in_seconds": SECONDS}
+        known = {"mismatch": MISMATCH, "seconds": SECONDS}
         self._routines = {number: known[name] for name, number in module.routines.items()}
 
     def finding(self, topic: str, event: str, function: str, place: int) -> ProofFinding:

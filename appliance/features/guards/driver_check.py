@@ -107,7 +107,8 @@ class DriverChecks:
         self._asked_at = clock.now()
         if self._under_way():
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._ended.wait(), _ANSWER_SECONDS)
+                async with asyncio.timeout(_ANSWER_SECONDS):
+                    await self._ended.wait()
         return self._check
 
     async def watch(self) -> None:
@@ -117,7 +118,7 @@ class DriverChecks:
             await asyncio.sleep(_LOOK_SECONDS)
 
     async def look(self) -> None:
-        """End a check that nobody waits for, or whose relay is gone; remove the monitor without a running check."""
+        """End a check that no client waits for, or whose relay is gone; remove the monitor without a running check."""
         if NAME not in self._monitors.checked.monitors:
             if self._under_way():
                 self._end("interrupted", None, "its monitor was removed")

@@ -49,7 +49,7 @@ class GuardDraft(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class NewDriverCheck(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A check of a robot's driver to begin; somebody drives the base slowly meanwhile."""
+    """A check of a robot's driver to begin; a person drives the base slowly while it lasts."""
 
     command: Annotated[_Name, doc("the topic of the base's velocities")]
     by: Annotated[_Name, doc("the topic that shows how the base moves")]

@@ -1,4 +1,4 @@
-"""`rosrv guard check-driver` measures a real base, and ends by itself whatever dies meanwhile."""
+"""`rosrv guard check-driver` measures a real base, and ends also if a process dies during the check."""
 
 import signal
 import subprocess
@@ -108,7 +108,7 @@ def test_commands_pass_and_guards_act_after_a_death_during_the_measurement(
 
 
 def test_a_killed_command_withholds_nothing_later(guarded: Appliance, ros: RosSession) -> None:
-    """It is killed while it waits for a drive; somebody drives afterwards."""
+    """It is killed while it waits for a drive; a person drives afterwards."""
     base = ros.node("rospy", "driven_base", "0")
     idle = ros.node("rospy", "driver", name="idle")
     base.wait_for(event="moves")
