@@ -49,7 +49,7 @@ class MonitorRecords:
             if event.kind in ("drop", "change"):
                 self.at[event.kind, event.resource] += event.count or 1
             self._record(event)
-            for tell in self.told:
+            for tell in tuple(self.told):  # one may remove itself
                 tell(event)
         if lost:
             text = f"{lost} reports of monitors were lost while control was not running"

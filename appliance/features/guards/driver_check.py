@@ -66,7 +66,6 @@ class DriverChecks:
         self._relays: list[int] = []
         self._changing = asyncio.Lock()
         self._ended = asyncio.Event()
-        monitors.records.told.append(self._reported)
 
     def methods(self) -> tuple[RequestMethod[Any], ...]:
         return (
@@ -97,6 +96,7 @@ class DriverChecks:
         except BaseException:
             self._check = before
             raise
+        monitors.records.told.append(self._reported)
         self._asked_at, self._until = clock.now(), clock.now() + seconds + _FURTHER_SECONDS
         self._relays = relays
         if not monitors.switches.enabled(NAME):
@@ -154,6 +154,7 @@ class DriverChecks:
 
     def _end(self, outcome: str, seconds: float | None, why: str = "") -> None:
         self._ended.set()
+        self._monitors.records.told.remove(self._reported)
         check, text = self._check, sentence_of(outcome, seconds, why)
         self._check = DriverCheck(check.command, check.by, outcome, seconds, text)
         self._trail.happened(
