@@ -235,11 +235,11 @@ class SegmentReader:
             fields = msgspec.json.decode(line)
             entry, chain = entry_of(fields), msgspec.convert(fields["chain"], ChainProof)
             columns, digest = to_columns(entry.record, entry.sequence), bytes.fromhex(chain.hash)
-            fault = next(walk.add(columns.sequence, previous, packed(columns), digest), None)
-            same = fault is not None or _line(columns, previous, digest, self.header.end) == line
+            faults = walk.add(columns.sequence, previous, packed(columns), digest)
+            same = bool(faults) or _line(columns, previous, digest, self.header.end) == line
         except _NOT_A_RECORD as error:
             raise SegmentError(f"record {sequence}: {error}") from error
-        if fault is not None:
+        if faults:
             raise SegmentError(
                 f"record {sequence} does not follow record {sequence - 1}: changed, missing or moved"
             )

@@ -17,7 +17,7 @@ from __future__ import annotations
 import enum
 import hashlib
 import re
-from typing import Callable, Iterator, NamedTuple
+from typing import Callable, NamedTuple
 
 NO_CHECKPOINT = "0" * 64  # the hash before the first checkpoint
 HasSigned = Callable[[bytes, bytes, bytes], bool]
@@ -72,14 +72,13 @@ class Excerpt:
         self.sequence, self.hash = sequence, digest
         self.begin = sequence + 1 if digest else 0
 
-    def add(self, sequence: int, previous: bytes, packed: bytes, digest: bytes) -> Iterator[ProofFault]:
-        """Go to the next record. Yield its faults."""
-        if not follows(previous, packed, digest):
-            yield ProofFault.CHANGED
+    def add(self, sequence: int, previous: bytes, packed: bytes, digest: bytes) -> list[ProofFault]:
+        """Go to the next record; return its faults."""
+        changed = not follows(previous, packed, digest)
         is_next = (sequence, previous) == (self.sequence + 1, self.hash)
-        if self.hash and not is_next and (self.begin or sequence <= self.sequence + 1):
-            yield ProofFault.MOVED
+        moved = self.hash and not is_next and (self.begin or sequence <= self.sequence + 1)
         self.sequence, self.hash, self.begin = sequence, digest, self.begin or sequence
+        return [ProofFault.CHANGED] * changed + [ProofFault.MOVED] * bool(moved)
 
     def skip(self, content: bytes) -> None:
         """Go to the next record, of which only the content hash is known."""
@@ -153,11 +152,10 @@ def signature_fault(
     if key != expected:
         return ProofFault.KEY
     try:
-        made = bytes.fromhex(signature)
+        made, signer = bytes.fromhex(signature), bytes.fromhex(expected)
     except ValueError:
         return ProofFault.SIGNATURE
-    valid = made.hex() == signature and has_signed(bytes.fromhex(expected), made, text)
-    return None if valid else ProofFault.SIGNATURE
+    return None if made.hex() == signature and has_signed(signer, made, text) else ProofFault.SIGNATURE
 
 
 class Removal(NamedTuple):

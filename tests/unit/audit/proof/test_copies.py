@@ -2,6 +2,7 @@ import json
 import sqlite3
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -17,6 +18,7 @@ from appliance.audit.proof.copies import (
     signed_checkpoints,
 )
 from appliance.audit.proof.verification import verify
+from appliance.signing.log_proof import ProofFault
 from tests.support.audit import decision, settle
 from tests.support.forgery import write_anew
 from tests.unit.audit.conftest import MakeLog, Notary
@@ -164,6 +166,15 @@ def test_a_file_without_checkpoints_is_an_error(tmp_path: Path, text: str) -> No
         read_copies(file)
     with pytest.raises(CopiesUnreadableError, match="nowhere: No such file"):
         read_copies(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("changes", [{"key": "no key"}, {"signature": "none"}, {"hash": "x"}, {"number": -1}])
+def test_fields_that_nothing_signs_are_a_fault(log: Path, changes: dict[str, Any]) -> None:
+    one = signed_checkpoints(log)[0]
+    assert one.fault() is one.fault(one.key) is None
+    assert one.fault("no key") is ProofFault.KEY
+    changed = msgspec.structs.replace(one, **changes)
+    assert changed.fault() is changed.fault(changed.key) is ProofFault.SIGNATURE
 
 
 def test_json_and_back(log: Path) -> None:
