@@ -14,6 +14,7 @@ ANY = "*"
 """The md5sum, or the name, of any type."""
 
 _LENGTH = struct.Struct("<I")
+_READ_BYTES = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +52,67 @@ async def read_frame(reader: asyncio.StreamReader, limit: int) -> bytes:
     ends.
     """
     try:
-        (size,) = _LENGTH.unpack(await reader.readexactly(_LENGTH.size))
-        if size > limit:
-            raise LimitExceededError(f"frame of {size} bytes; at most {limit} are allowed")
-        return await reader.readexactly(size)
+        return await reader.readexactly(_size(await reader.readexactly(_LENGTH.size), 0, limit))
     except asyncio.IncompleteReadError:
-        raise ConnectionResetError("the peer ended the connection") from None
+        raise _ended() from None
+
+
+class FrameReader:
+    """Reads the frames of one connection: small ones many at once, and large ones without a further copy."""
+
+    def __init__(self, reader: asyncio.StreamReader, limit: int) -> None:
+        self._reader = reader
+        self._limit = limit
+        self._begun = b""
+        self._large = False  # whether the last frame was
+
+    async def next(self) -> list[bytes]:
+        """Return the next frames, at least one. Raises what `read_frame` raises."""
+        try:
+            if self._large and not self._begun:
+                return [self._noted(await read_frame(self._reader, self._limit))]
+            while not (frames := self._complete()):
+                if len(self._begun) >= _LENGTH.size:
+                    return [await self._rest()]
+                data = await self._reader.read(_READ_BYTES)
+                if not data:
+                    raise _ended()
+                self._begun += data
+            return frames
+        except asyncio.IncompleteReadError:
+            raise _ended() from None
+
+    async def _rest(self) -> bytes:
+        begun, self._begun = self._begun, b""
+        missing = _LENGTH.size + _size(begun, 0, self._limit) - len(begun)
+        return self._noted(begun[_LENGTH.size :] + await self._reader.readexactly(missing))
+
+    def _complete(self) -> list[bytes]:
+        data, begin, frames = self._begun, 0, []
+        while (body := begin + _LENGTH.size) <= len(data):
+            end = body + _size(data, begin, self._limit)
+            if end > len(data):
+                break
+            frames.append(self._noted(data[body:end]))
+            begin = end
+        self._begun = data[begin:]
+        return frames
+
+    def _noted(self, frame: bytes) -> bytes:
+        self._large = len(frame) > _READ_BYTES
+        return frame
+
+
+def _size(data: bytes, begin: int, limit: int) -> int:
+    """Return the length that a frame announces. Raises `LimitExceededError`."""
+    (size,) = _LENGTH.unpack_from(data, begin)
+    if size > limit:
+        raise LimitExceededError(f"frame of {size} bytes; at most {limit} are allowed")
+    return int(size)
+
+
+def _ended() -> ConnectionResetError:
+    return ConnectionResetError("the peer ended the connection")
 
 
 async def read_header(reader: asyncio.StreamReader, seconds: float) -> dict[str, str]:

@@ -5,7 +5,6 @@ A publisher never waits: if a subscriber is slower than its topic, the oldest wa
 
 import asyncio
 import contextlib
-import itertools
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from roswire.errors import LimitExceededError, ProtocolError, RosError
 from roswire.node.network import ByteWriter, NodeNetwork, OwnedTasks
 from roswire.node.tcpros_streams import (
     ANY,
+    FrameReader,
     MessageType,
     NodeLimits,
     exchange_headers,
@@ -138,14 +138,16 @@ class NodeSubscription:
             self.connected[uri] = header
             self._connection.set()
             self.problems.pop(uri, None)
-            latched = header.get("latching") == "1"
-            for number in itertools.count(1):
-                body = await read_frame(reader, self._link.limits.message_bytes)
-                if latched:
-                    self._latest[uri] = number, hash(body)
-                self._received(body, header)
-                if number % _TURN == 0:
-                    await asyncio.sleep(0)
+            frames = FrameReader(reader, self._link.limits.message_bytes)
+            latched, number = header.get("latching") == "1", 0
+            while True:
+                for body in await frames.next():
+                    number += 1
+                    if latched:
+                        self._latest[uri] = number, hash(body)
+                    self._received(body, header)
+                    if number % _TURN == 0:
+                        await asyncio.sleep(0)
 
     @contextlib.asynccontextmanager
     async def _connection_to(self, uri: str) -> AsyncIterator[tuple[asyncio.StreamReader, Mapping[str, str]]]:

@@ -35,22 +35,27 @@ class ClientMemory:
         self.held = 0
         self.closed = False
         self._door = door
+        self._shared = 0  # of the bytes that it holds, those of the shared half
 
     def add(self, size: int) -> None:
         """Charge `size` bytes; give bytes back if `size` is negative."""
-        if not self.closed:
-            before = self._shared(self.held)
-            self.held += size
-            self._door.shared += self._shared(self.held) - before
+        if self.closed:
+            return
+        self.held += size
+        shared = max(0, self.held - self._door.least)
+        self._door.shared += shared - self._shared
+        self._shared = shared
 
     def refusal(self, size: int) -> str:
         """Return why this client should not hold `size` more bytes; empty if it may."""
-        held, most = self.held + size, DOOR_BYTES.bounds.host
-        mine = self._shared(held)
-        left = self._door.most_shared - self._door.shared + self._shared(self.held) - mine
+        held = self.held + size
+        if held <= self._door.least:
+            return ""
+        shared, most = held - self._door.least, DOOR_BYTES.bounds.host
+        left = self._door.most_shared - self._door.shared + self._shared - shared
         if held > most:
             return f"the client would hold {held} bytes; at most {most}"
-        if mine > max(left, 0):
+        if shared > max(left, 0):
             return f"the client would hold {held} bytes of its door and leave {max(left, 0)} for all others"
         return ""
 
@@ -69,6 +74,3 @@ class ClientMemory:
         """Give back all that this client holds."""
         self.add(-self.held)
         self.closed = True
-
-    def _shared(self, held: int) -> int:
-        return max(0, held - self._door.least)

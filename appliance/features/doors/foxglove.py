@@ -35,6 +35,7 @@ from appliance.features.doors.requests import (
     CallOfService,
     DoorRequest,
     Frame,
+    Pieces,
     PublishMessage,
     ReadParameters,
     SubscribeParameter,
@@ -395,14 +396,14 @@ class Foxglove:
         for number in self._by_topic.get(message.topic, ()):
             self.queue.put(number, message, len(message.body), now)
 
-    def next_frame(self, now: float) -> Frame | None:
+    def next_frame(self, now: float) -> Frame | Pieces | None:
         taken = self.queue.take(now)
         if taken is None or taken[0] is None:
             return None if taken is None else taken[1]
         number, message = taken
         if isinstance(message, str):  # of a parameter
             return message
-        return _MESSAGE_DATA.pack(1, number, message.received) + bytes(message.body)
+        return _MESSAGE_DATA.pack(1, number, message.received), message.body
 
     def next_time(self) -> float | None:
         return self.queue.next_time()

@@ -151,3 +151,6 @@ DoorRequest: TypeAlias = (
 )
 Frame: TypeAlias = str | bytes
 """A WebSocket message: text or binary."""
+
+Pieces: TypeAlias = tuple[bytes, bytes]
+"""The head and the body of a binary WebSocket message to a client: a body is large, and not copied."""

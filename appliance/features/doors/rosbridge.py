@@ -26,6 +26,7 @@ from appliance.features.doors.requests import (
     DoorRequest,
     Frame,
     OfferService,
+    Pieces,
     PublishMessage,
     SubscribeTopic,
     UnadvertiseTopic,
@@ -362,7 +363,7 @@ class Rosbridge:
         for spelling in self._spellings.get(message.topic, ()):
             self.queue.put(spelling, message, len(message.body), now)
 
-    def next_frame(self, now: float) -> Frame | None:
+    def next_frame(self, now: float) -> Frame | Pieces | None:
         taken = self.queue.take(now)
         if taken is None or taken[0] is None:
             return None if taken is None else taken[1]

@@ -12,7 +12,7 @@ from msgspec import Meta, Raw, Struct
 from appliance.features.doors.cbor_frames import json_of_cbor
 from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.message_reader import MessageValueError
-from appliance.features.doors.requests import ClientId, Frame
+from appliance.features.doors.requests import ClientId, Frame, Pieces
 from appliance.features.doors.values import cbor
 from roswire.errors import PeerError, quoted
 
@@ -150,18 +150,33 @@ class Envelope(Struct):
     receiver: Any = None
 
 
-def publish_frame(topic: str, message: DoorMessage, compression: Compression) -> str | bytes:
+def publish_frame(topic: str, message: DoorMessage, compression: Compression) -> Frame | Pieces:
     """Return a message for a client; raises `MessageValueError`."""
     if compression == "cbor-raw":
-        secs, nsecs = divmod(message.received, 1_000_000_000)
-        raw = {"secs": secs, "nsecs": nsecs, "bytes": message.body}
-        return cbor({"op": "publish", "topic": topic, "msg": raw})
+        return _raw_head(topic, message), message.body
     if compression == "cbor":
         return cbor({"op": "publish", "topic": topic, "msg": message.cbor_values})
     text = msgspec.json.encode({"op": "publish", "topic": topic, "msg": message.json})
     if compression == "png":
         return json_frame({"op": "png", "data": base64.b64encode(as_png(text)).decode("ascii")})
     return text.decode()
+
+
+def _raw_head(topic: str, message: DoorMessage) -> bytes:
+    """Return the CBOR of a raw message up to its bytes, which follow: two maps of three fields."""
+    secs, nsecs = divmod(message.received, 1_000_000_000)
+    return b"".join(
+        (
+            b"\xa3\x62op\x67publish\x65topic",
+            cbor(topic),
+            b"\x63msg\xa3\x64secs\x1a",
+            secs.to_bytes(4, "big"),
+            b"\x65nsecs\x1a",
+            nsecs.to_bytes(4, "big"),
+            b"\x65bytes\x5a",
+            len(message.body).to_bytes(4, "big"),
+        )
+    )
 
 
 def json_frame(fields: dict[str, Any], reply_to: ClientId = None) -> str:

@@ -13,6 +13,7 @@ The front process identifies the client, and passes its connection here as a str
 
 import asyncio
 import contextlib
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
@@ -37,6 +38,7 @@ from appliance.features.doors.requests import (
     AdvertiseTopic,
     DoorRequest,
     Frame,
+    Pieces,
     PublishMessage,
     UnadvertiseTopic,
 )
@@ -104,7 +106,7 @@ class ClientProtocol(Protocol):
     def message(self, message: DoorMessage, now: float) -> None:
         """Queue a message."""
 
-    def next_frame(self, now: float) -> Frame | None:
+    def next_frame(self, now: float) -> Frame | Pieces | None:
         """Return the next frame to send now, or None."""
 
     def next_time(self) -> float | None:
@@ -146,6 +148,7 @@ class DoorSession:
         self._unfinished = 0  # bytes of a frame that has not come whole, as charged to the memory
         self._frame = bytearray()  # the fragments that have come; empty ones take nothing
         self._is_text = False
+        self._pieces: list[bytes] = []  # of frames for the client
         self._wake = asyncio.Event()
         self._over = asyncio.Event()
         self._socket = ServerProtocol(
@@ -355,20 +358,30 @@ class DoorSession:
         await asyncio.sleep(_CLOSING_SECONDS)  # for the client's answer to the closing frame
 
     def _take_frames(self, now: float) -> int:
-        """Give frames that may be sent now to the WebSocket; return their number of bytes, about `_BATCH_BYTES`."""
+        """Give frames that may be sent now to the WebSocket; return their number of bytes, about `_BATCH_BYTES`.
+
+        Without deflate, the session writes their heads itself, and their bodies are not copied. `_flush` sends them
+        before anything else can be added, so nothing follows a closing frame.
+        """
         size = 0
         while size < _BATCH_BYTES and (frame := self._protocol.next_frame(now)) is not None:
-            if isinstance(frame, str):
-                self._socket.send_text(frame.encode())
+            opcode = Opcode.TEXT if isinstance(frame, str) else Opcode.BINARY
+            pieces = (frame.encode(),) if isinstance(frame, str) else frame
+            pieces = (pieces,) if isinstance(pieces, bytes) else pieces
+            length = sum(map(len, pieces))
+            if self._socket.extensions:
+                send = self._socket.send_text if opcode is Opcode.TEXT else self._socket.send_binary
+                send(b"".join(pieces))
             else:
-                self._socket.send_binary(frame)
-            size += len(frame)
+                self._pieces += (frame_head(opcode, length), *pieces)
+            size += length
             self.sent += 1
         return size
 
     async def _flush(self) -> None:
         self._pings = 0
-        pieces = self._socket.data_to_send()
+        pieces = self._pieces + self._socket.data_to_send()
+        self._pieces = []
         if sum(map(len, pieces)) <= 2 * _BATCH_BYTES:
             pieces = [b"".join(pieces)]
         for data in pieces:
@@ -423,6 +436,16 @@ class DoorSession:
         except ViewerStalledError as error:
             self._disconnect(CloseCode.POLICY_VIOLATION, str(error))
         self._wake.set()
+
+
+def frame_head(opcode: Opcode, length: int) -> bytes:
+    """Return the head of a final, unmasked frame (RFC 6455, section 5.2)."""
+    first = 0x80 | opcode
+    if length < 126:
+        return struct.pack(">BB", first, length)
+    if length < 1 << 16:
+        return struct.pack(">BBH", first, 126, length)
+    return struct.pack(">BBQ", first, 127, length)
 
 
 def _reason(socket: ServerProtocol) -> str:

@@ -202,6 +202,12 @@ async def test_a_denied_look_is_one_status_in_words() -> None:
         assert frames[1]["level"] == 2 and "site.ini:4" in frames[1]["message"]
 
 
+def text_frame(foxglove: Foxglove) -> str | None:
+    frame = foxglove.next_frame(0.0)
+    assert frame is None or isinstance(frame, str)
+    return frame
+
+
 def viewer(**limits: int) -> tuple[Foxglove, ViewerQueue[int | str]]:
     """The connection has announced the channel 1."""
     queue: ViewerQueue[int | str] = ViewerQueue()
@@ -242,7 +248,7 @@ def viewer(**limits: int) -> tuple[Foxglove, ViewerQueue[int | str]]:
 def test_a_frame_that_breaks_the_protocol_is_refused(frame: str | bytes, words: str) -> None:
     foxglove, _queue = viewer()
     assert foxglove.receive(frame) == []
-    answer = json.loads(foxglove.next_frame(0.0) or "")
+    answer = json.loads(text_frame(foxglove) or "")
     assert answer["op"] == "status" and answer["level"] == 2 and words in answer["message"]
 
 
@@ -250,7 +256,7 @@ def test_a_frame_that_breaks_the_protocol_is_refused(frame: str | bytes, words: 
 def test_a_call_of_an_unknown_service_fails_in_words(service: int) -> None:
     foxglove, _queue = viewer()
     assert foxglove.receive(struct.pack("<BIII", 2, service, 3, 0xFFFFFFFF)) == []
-    answer = json.loads(foxglove.next_frame(0.0) or "")
+    answer = json.loads(text_frame(foxglove) or "")
     assert (
         answer["op"] == "serviceCallFailure"
         and answer["callId"] == 3
@@ -280,7 +286,7 @@ def test_a_channel_that_comes_back_has_a_new_number() -> None:
     for number in range(100):
         seen = [SeenTopic(f"/t{number % 2}", "a/B", "int8 x")]
         foxglove.surroundings(DoorSurroundings(VisibleGraph({}, {}, {}, {}), seen, []))
-        while (frame := foxglove.next_frame(0.0)) is not None:
+        while (frame := text_frame(foxglove)) is not None:
             announced += [one["id"] for one in json.loads(frame).get("channels", ())]
     assert announced == [*range(2, 102)]
 

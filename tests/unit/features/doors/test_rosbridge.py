@@ -50,7 +50,8 @@ class Client:
     def gets(self) -> list[Any]:
         frames = []
         while (frame := self.rosbridge.next_frame(self.now)) is not None:
-            frames.append(json.loads(frame) if isinstance(frame, str) else cbor2.loads(frame))
+            data = b"".join(frame) if isinstance(frame, tuple) else frame
+            frames.append(json.loads(data) if isinstance(data, str) else cbor2.loads(data))
         return frames
 
     def hears(self, text: str, topic: str = "/chatter") -> None:

@@ -182,6 +182,36 @@ async def test_a_frame_without_memory_to_carry_it_out_ends_the_connection_with_t
         assert "the client would hold" in await client.closed()
 
 
+@pytest.mark.parametrize("deflate", [False, True])
+async def test_messages_of_every_size_have_frames_that_clients_read(deflate: bool) -> None:
+    async with door_world() as world:
+        publication = await talks(await world.robot("10.0.0.3", "/robot"), "/state")
+        world.master.answers["getSystemState"] = [[["/state", ["/robot"]]], [], []]
+        world.master.answers["getTopicTypes"] = [["/state", "std_msgs/String"]]
+        clients = {
+            kind: await world.client(
+                deflate=deflate, subprotocols=["foxglove.websocket.v1"] if kind == "f" else ()
+            )
+            for kind in ("none", "cbor", "cbor-raw", "f")
+        }
+        for kind in ("none", "cbor", "cbor-raw"):
+            clients[kind].send({"op": "subscribe", "topic": "/state", "compression": kind})
+        assert (await clients["f"].next())["op"] == "serverInfo"
+        channels: list[Any] = []
+        while not channels:
+            channels = (await clients["f"].next()).get("channels", [])
+        number = next(one["id"] for one in channels if one["topic"] == "/state")
+        clients["f"].send({"op": "subscribe", "subscriptions": [{"id": 9, "channelId": number}]})
+        await asyncio.sleep(1)
+        for size in (0, 1, 40, 121, 122, 125, 126, 127, 65_400, 65_535, 65_536, 70_000, 300_000):
+            publication.publish(string("x" * size))
+            assert (await clients["none"].next())["msg"]["data"] == "x" * size
+            assert (await clients["cbor"].next())["msg"]["data"] == "x" * size
+            assert (await clients["cbor-raw"].next())["msg"]["bytes"] == string("x" * size)
+            opcode, subscription, _stamp = struct.unpack_from("<BIQ", data := await clients["f"].next())
+            assert (opcode, subscription, data[13:]) == (1, 9, string("x" * size))
+
+
 async def test_a_client_that_does_not_read_pictures_is_heard_at_once() -> None:
     """Its stop does not wait until the network has taken the pictures."""
     async with door_world() as world:
