@@ -1,4 +1,4 @@
-"""Launch a robot beside plain `rosmaster`: python -m benchmarks.launch [--nodes 40] [--rounds 5] [--rospy] [--busy]
+"""Launch a robot beside plain `rosmaster`: python -m benchmarks.launch [--nodes 40] [--rounds 8] [--rospy] [--busy]
 
 `roslaunch` starts nodes; each reads 20 private parameters, publishes five topics, subscribes to five of the next node,
 and is up when all five bring messages. Both masters are new in each round and take turns: `rosmaster` with `rosout`,
@@ -11,6 +11,13 @@ and the appliance that `rosrv up` has started. Measured are
 
 Figures are medians of the rounds; a ratio is the median of the rounds' ratios, above 1 where the appliance is slower.
 With `--busy`, a program for each processor works half of the time.
+
+The last lines are findings: the rows whose ratio is in every round more than 20 % above, or in every round more than
+20 % below, the ratio of the same robot in `benchmarks/RESULTS.md`. If the true median is within the 20 %, a round is on
+the far side of either limit with a chance of at most one half. So chance makes a row a finding in at most one of 128
+measurements of eight rounds.
+
+Needs root, and runs in a process namespace of its own: the kernel ends all that it started with it, however it ends.
 """
 
 import argparse
@@ -27,7 +34,7 @@ import threading
 import time
 import xmlrpc.client
 import xmlrpc.server
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -40,6 +47,12 @@ from tests.support.nodes import BUILD, ROOT, RosSession
 from tests.support.rosmaster import PlainMaster, free_port
 
 HERE = Path(__file__).parent / "nodes"
+RESULTS = Path(__file__).with_name("RESULTS.md")
+_CONTAINED = (
+    "setpriv", "--pdeathsig", "KILL", "unshare", "--pid", "--fork", "--kill-child", "--mount-proc",
+    sys.executable, "-m", "benchmarks.launch",
+)  # fmt: skip
+CHANGE = 1.2  # a ratio that differs from the table by more than this factor is a finding
 PARAMETERS = 20
 LIMIT = 180.0  # seconds until a start counts as failed
 PAUSE = 0.02  # seconds between two calls of the other client
@@ -175,10 +188,12 @@ def start(session: RosSession, masters: list[int], nodes: int, *, rospy: bool) -
             last = reports.wait(set(range(nodes)))
         measured.figures["last node is up"] = last - began
         now = _used(masters)
-        measured.figures["processor time"] = sum(now[pid] - used.get(pid, 0.0) for pid in now)
+        measured.figures["processor time of all processes"] = sum(
+            now[pid] - used.get(pid, 0.0) for pid in now
+        )
         for method, delays in other.delays.items():
-            measured.figures[f"one {method}"] = statistics.median(delays)
-        measured.figures["killed node works again"] = killed(session, folder, reports, nodes, path)
+            measured.figures[f"one {method} during the start"] = statistics.median(delays)
+        measured.figures["a killed node works again"] = killed(session, folder, reports, nodes, path)
         for tool in TOOLS:
             taken = time.monotonic()
             session.run(*tool)
@@ -237,15 +252,41 @@ def deployed() -> Iterator[tuple[RosSession, list[int]]]:
             yield session, [appliance.process.pid]
 
 
-def main() -> None:
+def table_ratios(text: str, robot: str) -> dict[str, float]:
+    """Return the ratio of each row in the column of this robot, from the text of `RESULTS.md`; {} without a column."""
+    tables = [part.splitlines() for part in text.split("\n\n") if f"| {robot}, load" in part]
+    if not tables:
+        return {}
+    [lines] = tables
+    head, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    [column] = [number for number, title in enumerate(head) if title.startswith(f"{robot}, load")]
+    return {
+        row[0].replace("`", ""): float(row[column].rpartition(", ")[2]) for row in rows if "," in row[column]
+    }
+
+
+def findings(measured: Mapping[str, Sequence[float]], table: Mapping[str, float]) -> list[str]:
+    """Return a line for each row whose ratio is outside of the table's 20 % on the same side in every round."""
+    found = []
+    for what, ratios in measured.items():
+        known = table[what]
+        if min(ratios) > known * CHANGE or max(ratios) < known / CHANGE:
+            now = f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
+            found.append(f"finding: {what}: {now} times the plain master's, {known:.2f} in the table")
+    return found
+
+
+def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--nodes", type=int, default=40)
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--rounds", type=int, default=8)
     parser.add_argument("--rospy", action="store_true")
     parser.add_argument("--busy", action="store_true")
     given = parser.parse_args()
+    if os.getpid() != 1:
+        return _contained(sys.argv[1:])
     load = os.getloadavg()[0]
     programs = [
         subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(os.cpu_count() or 1) if given.busy
@@ -262,12 +303,38 @@ def main() -> None:
         for program in programs:
             program.kill()
             program.wait()
-    title = f"{given.nodes} nodes, {given.rounds} rounds, load average {load:.1f}"
+    robot = f"{given.nodes} {'rospy' if given.rospy else 'roscpp'} nodes" + (
+        ", `--busy`" if given.busy else ""
+    )
+    _print(runs, f"{robot}, {given.rounds} rounds, load average {load:.1f}")
+    ratios = {
+        what: [ours.figures[what] / theirs.figures[what] for theirs, ours in runs]
+        for what in runs[0][0].figures
+    }
+    known = table_ratios(RESULTS.read_text(encoding="utf-8"), robot)
+    print("\n".join(findings(ratios, known)) if known else f"{RESULTS.name} has no column for this robot")
+    return 0
+
+
+def _contained(arguments: list[str]) -> int:
+    """Run this program again as the first process of a namespace, which ends with this process."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        Path(folder).chmod(0o755)  # the appliance's processes run as other users
+        inside = subprocess.Popen([*_CONTAINED, *arguments], env=os.environ | {"TMPDIR": folder})
+        try:
+            return inside.wait()
+        finally:
+            inside.kill()
+            inside.wait()
+
+
+def _print(runs: list[tuple[Start, Start]], title: str) -> None:
     table = Table("", "rosmaster", "appliance", "ratio (least to greatest)", title=title)
     for what in runs[0][0].figures:
         pairs = [(ours.figures[what], theirs.figures[what]) for theirs, ours in runs]
-        ratios = [ours / theirs for ours, theirs in pairs if theirs]
-        ratio = f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})" if ratios else ""
+        ratios = [ours / theirs for ours, theirs in pairs]
+        ratio = f"{statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
         ours, theirs = (statistics.median(side) for side in zip(*pairs, strict=True))
         table.add_row(what, _seconds(theirs), _seconds(ours), ratio)
     Console(width=110).print(table)
@@ -278,4 +345,4 @@ def _seconds(value: float) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

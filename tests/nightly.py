@@ -4,7 +4,10 @@ The gate (`make test`) runs only what cannot fail by chance. This program runs e
 property, and never stops at a failure. It writes `build/nightly/results.json`: for each test its passes, failures and
 seconds, and for each run its commit, start, end and load average. Runs of the same commit add up.
 
-The exit status is 1 if a test failed that `tests/unsteady.txt` does not list.
+Then it measures a robot's start (`benchmarks/launch.py`). A change of more than 20 % against the table in
+`benchmarks/RESULTS.md` is printed and stored as a finding, for people to look at.
+
+The exit status is 1 if a test failed that `tests/unsteady.txt` does not list, or if the robot did not start.
 """
 
 import argparse
@@ -24,6 +27,7 @@ from tests.support.sources import ROOT
 
 FOLDER = ROOT / "build" / "nightly"
 RESULTS = FOLDER / "results.json"
+START = FOLDER / "start.log"
 UNSTEADY = ROOT / "tests" / "unsteady.txt"
 _STAGE_SECONDS = 90 * 60.0  # a stage that hangs ends, and counts as failed
 
@@ -162,6 +166,24 @@ def run_stage(stage: Stage, files: list[str]) -> tuple[list[tuple[str, str, floa
     return (list(outcomes_of(report)) if report.exists() else []), wrong
 
 
+def measure_start() -> tuple[list[str], str]:
+    """Measure a robot's start; return the findings, and what went wrong."""
+    command = [sys.executable, "-m", "benchmarks.launch"]
+    with START.open("wb") as log:
+        try:
+            done = subprocess.run(
+                command, cwd=ROOT, stdout=log, stderr=log, timeout=_STAGE_SECONDS, check=False
+            )
+        except subprocess.TimeoutExpired:
+            return [], f"not finished after {_STAGE_SECONDS / 60:.0f} minutes"
+    wrong = f"benchmarks.launch ended with status {done.returncode}" if done.returncode else ""
+    return findings_of(START.read_text(encoding="utf-8")), wrong
+
+
+def findings_of(output: str) -> list[str]:
+    return [line for line in output.splitlines() if line.startswith("finding: ")]
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--lane", choices=["core", *LANES], help="run the tests of one lane only")
@@ -196,6 +218,12 @@ def main() -> int:
             f"{stage.name}: {count['passed']} passed, {count['failed']} failed, {count['skipped']} skipped",
             flush=True,
         )
+    if lane in (None, "core"):
+        found, wrong = measure_start()
+        results["findings"] += found
+        failed += [f"start: {wrong} (build/nightly/{START.name})"] if wrong else []
+        RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+        print("\n".join([*found, f"start: {len(found)} findings (build/nightly/{START.name})"]))
     return _report(failed)
 
 
@@ -218,8 +246,8 @@ def _earlier(commit: str) -> dict[str, Any]:
     if RESULTS.exists():
         results: dict[str, Any] = json.loads(RESULTS.read_text(encoding="utf-8"))
         if results["commit"] == commit:
-            return results
-    return {"commit": commit, "runs": [], "tests": {}}
+            return {"findings": []} | results
+    return {"commit": commit, "runs": [], "tests": {}, "findings": []}
 
 
 def _commit() -> str:

@@ -8,7 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.nightly import LANES, STAGES, UNSTEADY, files_of_stages, lane_of, outcomes_of, unsteady
+from benchmarks.launch import RESULTS, findings, table_ratios
+from tests.nightly import (
+    LANES,
+    STAGES,
+    UNSTEADY,
+    files_of_stages,
+    findings_of,
+    lane_of,
+    outcomes_of,
+    unsteady,
+)
 from tests.steady import largest_chance
 from tests.support.determinism import WATCH, ChanceError
 
@@ -52,6 +62,30 @@ def test_results_are_read_from_the_report(tmp_path: Path) -> None:
         ("tests/a.py::test_two", "failed", 0.1),
         ("tests/a.py::test_three", "skipped", 0.0),
     ]
+
+
+def test_the_table_of_a_start_has_a_ratio_for_each_measured_row() -> None:
+    for robot in ("40 roscpp nodes", "100 roscpp nodes", "40 rospy nodes", "40 roscpp nodes, `--busy`"):
+        ratios = table_ratios(RESULTS.read_text(), robot)
+        assert len(ratios) == 8
+        assert all(0.1 < ratio < 10 for ratio in ratios.values())
+    assert table_ratios(RESULTS.read_text(), "40 roscpp nodes")["one getParam during the start"] > 0
+    assert table_ratios(RESULTS.read_text(), "7 roscpp nodes") == {}
+
+
+def test_a_start_is_a_finding_only_if_every_round_differs_by_a_fifth() -> None:
+    """A single round within 20 % of the table, or on its other side, is enough to see no change."""
+    table = {"up": 2.0}
+    assert findings({"up": [2.41, 2.5, 3.0]}, table)
+    assert findings({"up": [1.0, 1.5, 1.66]}, table)
+    assert findings({"up": [2.39, 2.5, 3.0]}, table) == []
+    assert findings({"up": [1.0, 1.5, 3.0]}, table) == []
+
+
+def test_the_findings_of_a_start_are_read_from_its_output() -> None:
+    [line] = findings({"up": [3.0, 4.0, 5.0]}, {"up": 2.0})
+    assert line == "finding: up: 4.00 (3.00 to 5.00) times the plain master's, 2.00 in the table"
+    assert findings_of(f"  8 rounds\n{line}\nno finding\n") == [line]
 
 
 def test_the_bound_of_a_chance() -> None:
