@@ -86,7 +86,7 @@ class DriverChecks:
             raise SenselessError("specifications wait for rosrv monitor confirm: confirm them, or wait")
         text, seconds = self._text(request), request.patience + request.seconds
         order = admin.MonitorLoad(
-            {_FILE: text}, note=described(text), expected=request.expected, confirm_within=seconds + _LIMIT_SECONDS
+            {_FILE: text}, note=described(text), confirm_within=seconds + _LIMIT_SECONDS
         )  # fmt: skip
         before, relays = self._check, self._pids()
         self._check, self._who = DriverCheck(request.command, request.by), who

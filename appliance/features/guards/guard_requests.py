@@ -117,7 +117,7 @@ class GuardTry(WaitingRequest[GuardPlan], frozen=True, tag="guard try"):
 
 
 @rest(
-    "admin", "POST", "/v1/guards/driver-check", name="check_driver", body=NewDriverCheck, of=MONITORS,
+    "admin", "POST", "/v1/guards/driver-check", name="check_driver", body=NewDriverCheck, seconds=40.0,
 )  # fmt: skip
 class DriverCheckBegin(AdminRequest[DriverCheck], frozen=True, tag="driver check"):
     """Withhold the motions of a slowly driven base once, to measure how long its driver takes to stop it.
@@ -130,10 +130,9 @@ class DriverCheckBegin(AdminRequest[DriverCheck], frozen=True, tag="driver check
     by: str
     seconds: float = 2.0
     patience: float = 30.0
-    expected: str | None = None
 
 
-@rest("operator", "GET", "/v1/guards/driver-check", name="driver_check")
+@rest("viewer", "GET", "/v1/guards/driver-check", name="driver_check")
 class DriverCheckWanted(WaitingRequest[DriverCheck], frozen=True, tag="driver check wanted"):
     """The check of a driver. If it is under way, the answer comes with its end, or after a second."""
 

@@ -167,7 +167,7 @@ def test_without_time_nothing_is_proved() -> None:
     [
         ("fields, variables, a drop", 9, 4),
         ("output, and what the module leaves", 23, 2),
-        ("names that are kept, and seconds", 7, 1),
+        ("names that are kept, and seconds", 8, 1),
     ],
 )
 def test_wrong_modules_are_found(name: str, every: int, times: int) -> None:

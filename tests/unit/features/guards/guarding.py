@@ -58,7 +58,7 @@ class Guarded:
 
     def advance(self, at: int) -> None:
         for one in self.monitors.advance(BEGIN + at * MS):
-            self._sent(one, (one.time - BEGIN) // MS)
+            self.receive(one, (one.time - BEGIN) // MS)
 
     def tell(self, given: str, data: bytes, at: int, node: str = "/a", *, faults: bool = False) -> Outcome:
         """`faults`: the message is too much for the guard."""
@@ -68,7 +68,7 @@ class Guarded:
             topic, bytearray(data), BEGIN + at * MS, MessageSender(NODES.index(node))
         )
         assert bool(outcome.faults) == faults
-        self._sent(outcome, at)
+        self.receive(outcome, at)
         if given == "command" and outcome.result != "dropped":
             self.got.append((at, bytes(outcome.buffer)))
         return outcome
@@ -78,7 +78,7 @@ class Guarded:
         outcome = self.tell("command", data, at, node)
         return () if outcome.result == "dropped" else legs_of(bytes(outcome.buffer))
 
-    def _sent(self, outcome: Outcome, at: int) -> None:
+    def receive(self, outcome: Outcome, at: int) -> None:
         self.got += [(at, bytes(one.data)) for one in outcome.sent()]
 
 

@@ -67,7 +67,7 @@ class Site:
         ]
         self.checks = DriverChecks(
             manager, trail, lambda: Graph([], topics, []),  # type: ignore[arg-type]  # as much of them as checks need
-            lambda: [SimpleNamespace(role="relay", pid=self.pid), SimpleNamespace(role="api", pid=9)],  # type: ignore[list-item]
+            lambda: [SimpleNamespace(role="relay", pid=self.pid), SimpleNamespace(role="api", pid=9)],  # type: ignore[list-item]  # the same
         )  # fmt: skip
 
 
@@ -123,7 +123,7 @@ async def relay_dies(site: Site, _manager: Manager) -> None:
 async def no_line(site: Site, _manager: Manager) -> None:
     for _second in range(45):
         let_time_pass(1)
-        site.checks._asked_at += 1
+        await site.checks.wanted(DriverCheckWanted())
 
 
 async def removed(_site: Site, manager: Manager) -> None:

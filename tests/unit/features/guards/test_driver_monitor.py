@@ -49,8 +49,8 @@ class Drive(Guarded):
         """Return the longest time without a command for the base, in milliseconds."""
         return max(b - a for a, b in pairwise([0, *(at for at, _data in self.got), self.at]))
 
-    def _sent(self, outcome: Outcome, at: int) -> None:
-        super()._sent(outcome, at)
+    def receive(self, outcome: Outcome, at: int) -> None:
+        super().receive(outcome, at)
         for line in outcome.log:
             found = re.fullmatch(r"driver check: (\w+) after ([\d.]+) s", line.text)
             assert found, line.text
