@@ -50,6 +50,9 @@ from roswire.node import (
 from roswire.node.network import OwnedTasks
 from roswire.node.tcpros_streams import ANY
 
+_SMALL_BYTES = 1 << 16
+"""The memory for writing a message, such as a stop, that no other memory in use refuses."""
+
 _LINGER_SECONDS = 10.0
 _REPLAY_SECONDS = 1.0  # not longer: an old command must not reach a robot
 _LEARN_SECONDS = 1.0
@@ -447,9 +450,10 @@ class DoorNode:
 
 
 def _written(writer: MessageWriter, values: Raw | bytes, memory: ClientMemory) -> bytes:
-    """Return a message of JSON values, charged while it is written. Raises `PeerError`."""
+    """Return a message of JSON values, charged while it is written, unless it is small. Raises `PeerError`."""
     text = bytes(values)
-    with memory.holding(writer.cost(text)):
+    cost = writer.cost(text)
+    with memory.holding(cost) if cost > _SMALL_BYTES else contextlib.nullcontext():
         return writer.from_json(text, present_time())
 
 

@@ -267,7 +267,7 @@ class DoorSession:
             if self._pings > _MOST_PINGS:
                 await self._flush()
         self.end = self.end or f"the client ended the connection{_reason(self._socket)}"
-        if self._socket.parser_exc is not None:
+        if self._socket.parser_exc is not None or self._over.is_set():
             await self._drop_rest()
 
     def _charge_unfinished(self) -> None:
@@ -298,8 +298,9 @@ class DoorSession:
             if self._frame:
                 data = bytes(self._frame)
                 self._frame.clear()
+            large = len(data) > _READ_BYTES  # a small one, such as a stop, is always carried out
             try:
-                with self.memory.holding(_COPIES * len(data)):
+                with self.memory.holding(_COPIES * len(data)) if large else contextlib.nullcontext():
                     await self._carry_out(data.decode() if self._is_text else data)
             except LimitExceededError as error:
                 self._disconnect(CloseCode.MESSAGE_TOO_BIG, str(error))

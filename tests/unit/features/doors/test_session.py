@@ -170,16 +170,23 @@ async def test_a_frame_of_few_bytes_that_takes_much_memory_is_refused_in_words()
         assert client.frames.empty() and client.is_open
 
 
-async def test_a_frame_without_memory_to_carry_it_out_ends_the_connection_with_the_reason() -> None:
+async def test_without_memory_small_frames_are_carried_out_and_a_large_one_ends_the_connection() -> None:
     async with door_world() as world:
-        client = await world.client()
-        await asyncio.sleep(1)
-        world.memories[-1].add(DOOR_BYTES.bounds.host - 1_000_000)
+        robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
+        heard: list[bytes] = []
+        await robot.subscribe("/a", lambda body, _header: heard.append(body))
+        for memory in world.memories:
+            memory.add(DOOR_BYTES.bounds.host)
         client.send({"op": "advertise", "topic": "/a", "type": "std_msgs/String"})
+        client.send({"op": "publish", "topic": "/a", "msg": {"data": "stop"}})
         await asyncio.sleep(1)
-        assert client.is_open and world.node.publishers
+        world.waiting.add(-DOOR_BYTES.bounds.host)
+        client.send({"op": "publish", "topic": "/a", "msg": {"data": "stop"}})
+        await asyncio.sleep(1)
+        assert client.is_open and heard == [string("stop")]
         client.send({"op": "publish", "topic": "/a", "msg": {"data": "x" * 400_000}})
         assert "the client would hold" in await client.closed()
+        world.calls.add(-DOOR_BYTES.bounds.host)
 
 
 @pytest.mark.parametrize("deflate", [False, True])
