@@ -451,10 +451,9 @@ class DoorNode:
 
 def _written(writer: MessageWriter, values: Raw | bytes, memory: ClientMemory) -> bytes:
     """Return a message of JSON values, charged while it is written, unless it is small. Raises `PeerError`."""
-    text = bytes(values)
-    cost = writer.cost(text)
+    cost = writer.cost(values)
     with memory.holding(cost) if cost > _SMALL_BYTES else contextlib.nullcontext():
-        return writer.from_json(text, present_time())
+        return writer.from_json(values, present_time())
 
 
 def _named(values: Raw, names: list[str]) -> bytes:

@@ -51,7 +51,7 @@ from roswire.xmlrpc import Value
 _READ_BYTES = 1 << 16
 _READ_DEFLATED_BYTES = 1 << 12  # the frames that are read at once take up to 1000 times as much inflated
 _BATCH_BYTES = 1 << 15
-_COPIES = 3  # of a frame while it is carried out: its bytes, its text, and its operation
+_COPIES = 2  # of a frame while it is carried out: its text, and its operation
 _TURN = 64  # frames after which frames for clients are sent, although more have come
 _CLOSING_SECONDS = 2.0
 _WATCH_SECONDS = 2.0  # between two looks at the surroundings
@@ -298,10 +298,15 @@ class DoorSession:
             if self._frame:
                 data = bytes(self._frame)
                 self._frame.clear()
-            large = len(data) > _READ_BYTES  # a small one, such as a stop, is always carried out
+            size = len(data)
+            self.memory.add(-self._unfinished)
+            self._unfinished = 0
+            # A small frame, such as a stop, is always carried out.
             try:
-                with self.memory.holding(_COPIES * len(data)) if large else contextlib.nullcontext():
-                    await self._carry_out(data.decode() if self._is_text else data)
+                with self.memory.holding(_COPIES * size) if size > _READ_BYTES else contextlib.nullcontext():
+                    whole = data.decode() if self._is_text else data
+                    del data
+                    await self._carry_out(whole)
             except LimitExceededError as error:
                 self._disconnect(CloseCode.MESSAGE_TOO_BIG, str(error))
             except UnicodeDecodeError:

@@ -1,6 +1,7 @@
 """A door in virtual time."""
 
 import asyncio
+import base64
 import struct
 import tracemalloc
 from typing import Any
@@ -168,6 +169,25 @@ async def test_a_frame_of_few_bytes_that_takes_much_memory_is_refused_in_words()
         client.send({"op": "publish", "topic": "/markers", "msg": {"markers": [{}] * 20_000}})
         await asyncio.sleep(1)
         assert client.frames.empty() and client.is_open
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        ("std_msgs/UInt8MultiArray", base64.b64encode(bytes(6_200_000)).decode()),
+        ("std_msgs/String", "x" * 8_300_000),
+    ],
+)
+async def test_a_message_of_the_largest_frame_is_published(kind: str, text: str) -> None:
+    async with door_world() as world:
+        robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
+        heard: list[int] = []
+        await robot.subscribe("/a", lambda body, _header: heard.append(len(body)))
+        client.send({"op": "advertise", "topic": "/a", "type": kind, "latch": True})
+        await asyncio.sleep(1)
+        client.send({"op": "publish", "topic": "/a", "msg": {"data": text}})
+        await asyncio.sleep(1)
+        assert client.frames.empty() and len(heard) == 1 and heard[0] > 6_000_000
 
 
 async def test_without_memory_small_frames_are_carried_out_and_a_large_one_ends_the_connection() -> None:
