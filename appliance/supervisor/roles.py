@@ -24,6 +24,7 @@ ROSOUT = Path("/usr/lib/rosout/rosout")
 SYSTEM_PYTHON = Path("/usr/bin/python3")
 _SHORTEST_SLICE = 100_000  # nanoseconds, the kernel's minimum
 _RELAY_NICE = -10  # ten times the share of a busy program, so that no stop waits behind it
+_CONTROL_NICE = -5  # three times the share, because all nodes of a starting robot wait for it
 ROS_PROGRAMS = {ROSMASTER: "python3-rosmaster", ROSOUT: "rosout"}
 
 
@@ -78,7 +79,7 @@ ROLES = (
     ),
     _ours(
         "control", "rosrv", "control", "appliance.control.process:main",
-        ended_early=100, files=65_536,
+        ended_early=100, files=65_536, nice=_CONTROL_NICE,
         links=(
             "relay", "signer", "compiler", "api", *(role.name for role in _OF_FEATURES),
         ),

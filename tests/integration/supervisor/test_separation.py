@@ -79,7 +79,7 @@ def test_the_weights_of_processes(appliance: Appliance) -> None:
     nice = {role: os.getpriority(os.PRIO_PROCESS, pid) for role, pid in pids.items()}
     own = os.getpriority(os.PRIO_PROCESS, 0)
     assert nice["relay"] == own - 10 and nice["api"] == own + 10
-    assert nice["control"] == nice["rosmaster"] == own
+    assert nice["control"] == own - 5 and nice["rosmaster"] == own
     for role in ("relay", "control", "api"):
         group = Path(f"/proc/{pids[role]}/autogroup")
         if group.exists() and (text := group.read_text()):
