@@ -165,7 +165,7 @@ hidden byte i, j, list, number, flags;                           /* for the leng
 
 /* --- control: what subscribers are told ------------------------------------------------------------------- */
 
-/* = appliance/master/graph/graph.py RosGraph._tell_one */
+/* = appliance/master/reconcile/subscribers.py Subscribers._state */
 inline tell(s) {
     list = 0;
     for (i : 0 .. PUBLISHERS - 1) {
@@ -178,7 +178,7 @@ inline tell(s) {
     news[s]!list
 }
 
-/* = appliance/master/graph/graph.py RosGraph.tell */
+/* = appliance/master/reconcile/subscribers.py Subscribers.flush */
 inline tell_all() {
     for (j : 0 .. SUBSCRIBERS - 1) {
         if
@@ -244,7 +244,7 @@ inline revoke_publication(p) {
 }
 
 /* = appliance/master/graph/graph.py RosGraph._give_up
-   = appliance/master/graph/graph.py _emptied
+   = appliance/master/reconcile/subscribers.py Subscribers._wanted
    = appliance/master/graph/revocation.py Revocation._revoke */
 inline revoke_subscription(s) {
     may_subscribe[s] = false;
@@ -270,7 +270,7 @@ inline give_publication(p) {
     fi
 }
 
-/* = appliance/master/graph/graph.py RosGraph.remind */
+/* = appliance/master/reconcile/subscribers.py Subscribers.flush */
 inline give_subscription(s) {
     may_subscribe[s] = true;
     for (j : 0 .. PUBLISHERS - 1) { barred[PAIR(j, s)] = barred[PAIR(j, s)] && !may_publish[j] }
@@ -441,7 +441,7 @@ end:
     /* It registers, once: a turn of control.
        = appliance/master/calls/registration.py RegistrationCalls.register_publisher
        = appliance/master/graph/graph.py RosGraph.registered
-       = appliance/master/endpoints/relay_control.py RelayControl.place */
+       = appliance/master/endpoints/relay_control.py RelayControl.flush */
     :: atomic {
         !came_p[me] -> came_p[me] = true;
         if
@@ -463,7 +463,7 @@ end:
     do
     /* It registers, once: a turn of control; the answer has its list.
        = appliance/master/calls/registration.py RegistrationCalls.register_subscriber
-       = appliance/master/graph/graph.py RosGraph.list_for */
+       = appliance/master/reconcile/subscribers.py Subscribers.list_for */
     :: atomic {
         !came_s[me] -> came_s[me] = true;
         if
@@ -626,7 +626,7 @@ end:
 
 /* The policy is changed: one node's right is taken or given.
    = appliance/control/assembly/policies.py Policies.reload
-   = appliance/master/graph/revocation.py Revocation.policy_changed */
+   = appliance/master/reconcile/sinks.py Enforcement.policy_changed */
 proctype Policy() POSSIBLE {
     byte who;
 end:
@@ -804,9 +804,9 @@ end:
        }
     /* = appliance/master/endpoints/relay_control.py RelayControl.attach
        = appliance/specifications/rollout.py Rollout.statement
-       = appliance/master/endpoints/relay_control.py RelayControl._placed
+       = appliance/master/endpoints/relay_control.py RelayControl._state_node
        = appliance/control/supervisor_messages.py SupervisorMessages._relay_link
-       = appliance/master/graph/graph.py RosGraph.tell_everybody */
+       = appliance/master/reconcile/subscribers.py Subscribers.remind_all */
     :: atomic {
         !up -> up = true; linked = true; lost = false;
 #ifdef MUTANT_STATED_LATER

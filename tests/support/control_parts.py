@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple, Self, cast
 
 from appliance.channel import messages
+from appliance.channel.channel import ChannelFullError
 from appliance.configuration import settings
 from appliance.master.caller import Answer, ApiUri, Caller
 from appliance.master.calls.parameter_rights import ParameterRights
@@ -154,10 +155,11 @@ class Deliveries:
 
 
 class RelayEnd:
-    """A relay's end of its link, which notes what it gets."""
+    """A relay's end of its link, which notes what it gets, unless it is `full()`."""
 
-    def __init__(self, note: Callable[[messages.Message], None]) -> None:
+    def __init__(self, note: Callable[[messages.Message], None], full: Callable[[], bool]) -> None:
         self._note = note
+        self._full = full
 
     def attach(self, *_given: object) -> None:
         """Act as `Channel`."""
@@ -166,6 +168,8 @@ class RelayEnd:
         """Act as `Channel`."""
 
     def send(self, message: messages.Message, _descriptors: tuple[int, ...] = (), **_when: bool) -> None:
+        if self._full():
+            raise ChannelFullError("the relay does not read")
         self._note(message)
 
 
@@ -368,6 +372,7 @@ class ControlParts:
         self._not_ours = asyncio.all_tasks()  # the test's own
         self.current = compile_policy(OPEN, file="policy")
         self.seen: list[Seen] = []
+        self.full = False  # whether the relay takes no messages
         note = self.seen.append
         self.registry = Registry(woken=lambda: self.sinks.soon())  # noqa: PLW0108  it is made later
         self.grants = Grants(self.registry.mark, set)
@@ -514,7 +519,7 @@ class ControlParts:
 
     def start_relay(self) -> None:
         """Attach a new relay."""
-        self.relay.attach(0, cast(Any, RelayEnd(self.seen.append)))
+        self.relay.attach(0, cast(Any, RelayEnd(self.seen.append, lambda: self.full)))
 
     async def round(self) -> None:
         await self.reconciler.round()

@@ -43,15 +43,16 @@ def _nothing(*_given: Any, **_named: Any) -> Any:
 async def _at_once(*_given: Any, **_named: Any) -> None: ...
 
 
-_state_node, _state_fact = RelayControl._state_node, RelayControl._state_fact
+_attach, _state_fact = RelayControl.attach, vars(RelayControl)["_state_fact"]
 
 
-def _granted_nowhere(self: RelayControl, post: Any, node: Incarnation) -> None:
-    self.grants.of = lambda _key: ()  # type: ignore[assignment, method-assign]
+def _without_grants(self: RelayControl, index: int, channel: Any) -> None:
+    """Attach a new relay, and state no grants to it."""
+    vars(self.grants)["of"] = lambda _key: ()
     try:
-        _state_node(self, post, node)
+        _attach(self, index, channel)
     finally:
-        del self.grants.of
+        del vars(self.grants)["of"]
 
 
 def _not_stated(kind: type[Any], *, withdrawn: bool = False) -> Callable[..., None]:
@@ -87,7 +88,7 @@ MUTANTS: dict[str, tuple[Any, str, Any]] = {
     "what a policy took is not put back": (Revocation, "returned", _nothing),
     "an earlier life keeps its name": (RosGraph, "_take_name", _nothing),
     "a lost node keeps its publications": (Registry, "_unindex", _nothing),
-    "a new relay is not told of grants": (RelayControl, "_state_node", _granted_nowhere),
+    "a new relay is not told of grants": (RelayControl, "attach", _without_grants),
     "a grant is not kept": (StateStore, "save_permission", _nothing),
     "a registration is not kept": (StateStore, "save_registration", _nothing),
     "the relay is not told of a grant": (RelayControl, "_state_fact", _not_stated(PermissionRow)),
