@@ -125,7 +125,7 @@ CALLS = {
     "metrics_v1": of(), "history": of(points=2), "whoami": of(), "challenge": of(), "live_state": of(graph=False),
     "graph": of(), "topic_messages": of(topic="/odom", messages=1, seconds=10.0), "tokens": of(),
     "alarms": of(), "limits": of(), "host_names": of(),
-    "guards": of(), "guard_suggestions": of(), "doors": of(), "own_door": of(),
+    "guards": of(), "guard_suggestions": of(), "driver_check": of(), "doors": of(), "own_door": of(),
     "drive": of(), "approvals": of(), "sso_sessions": of(),
     "revoke_token": of(name="shift"),
     "record_now": of(),
@@ -171,7 +171,7 @@ REFUSED: dict[str, dict[str, Any]] = {
 They return the promised problem.
 """
 
-ELSEWHERE = {"begin_sign_on", "complete_sign_on", "new_guard", "set_guard", "add_door"}
+ELSEWHERE = {"begin_sign_on", "complete_sign_on", "new_guard", "set_guard", "check_driver", "add_door"}
 """Operations that need a provider, a guard's topics or a door: the tests of these features call them."""
 
 FOR_INVESTIGATORS = {"recording_of_memory", "recording_messages", "recording_bag", "recording_evidence"}

@@ -30,7 +30,7 @@ def conditions(
 ) -> dict[str, RobotCondition]:
     """Return the condition of each robot of a group; `rollout` is the group's last one, or None.
 
-    What a robot said about the bundle of a reverted rollout does not count any more.
+    A report about the bundle of a reverted rollout no longer counts.
     """
     sick = {} if rollout is None or rollout.state == "reverted" else unhealthy(rollout, robots, now)
     silent = (HealthGates() if rollout is None else rollout.gates).silent_seconds
