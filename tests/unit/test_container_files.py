@@ -40,7 +40,7 @@ def test_each_appliance_has_a_name() -> None:
 
 
 def test_every_process_is_in_the_table_of_processes() -> None:
-    text = (ROOT / "docs" / "operating.md").read_text()
+    text = (ROOT / "docs" / "reference" / "processes.md").read_text()
     rows = re.findall(r"^\| `([a-z]+)` \| `([a-z-]+)` \| ([^|]*) \|", text, re.MULTILINE)
     documented = {name: (user, set(re.findall(r"[A-Z][A-Z_]+", rights))) for name, user, rights in rows}
     expected = {role.name: (role.user, set(role.capabilities)) for role in ROLES}

@@ -20,7 +20,7 @@ MACHINE = "10.79.0.1"
 ROBOT_SIDE, OPERATOR_SIDE, OUTSIDE = "172.29.77.2", "172.29.78.2", "172.29.76.2"
 LANDSHARK, OCU, TABLET = "172.29.77.10", "172.29.78.20", "172.29.78.66"
 NODE_PORTS = range(19001, 26001)
-PAGE = ROOT / "docs" / "operating.md"
+PAGE = ROOT / "docs" / "reference" / "processes.md"
 LAST_ATTACK = "stop the master"
 # Python runs the health check, sh and cat this test, and nft is a query of the isolation watchdog.
 HELPERS = {"tini", "python", "sh", "cat", "nft"}
