@@ -17,7 +17,7 @@ from tests.system.fleet.fleet_site import FleetSite
 from tests.system.fleet.test_appliance import pushing
 
 BUNDLE = "site-a/arms/1.tar"
-PAGE_METRICS = set(re.findall(r"`(rosrv_fleet_\w+)`", (ROOT / "docs/fleet.md").read_text()))
+PAGE_METRICS = set(re.findall(r"`(rosrv_fleet_\w+)`", (ROOT / "docs/reference/fleet.md").read_text()))
 POLICY = (
     "[Nodes]\ndefault = *\n[Publishers]\ndefault = *\n[Subscribers]\ndefault = *\n[Commands]\ndefault = *\n"
     "# of the bundle\n"

@@ -9,7 +9,9 @@ from appliance.telemetry.metric_table import METRICS
 
 FOLDER = Path(__file__).parents[3] / "examples" / "prometheus"
 # tests/system/fleet/test_bundles.py compares the page with what the collector serves.
-COLLECTORS = set(re.findall(r"`(rosrv_fleet_\w+)`", (FOLDER.parents[1] / "docs/fleet.md").read_text()))
+COLLECTORS = set(
+    re.findall(r"`(rosrv_fleet_\w+)`", (FOLDER.parents[1] / "docs/reference/fleet.md").read_text())
+)
 
 
 def rules() -> list[dict[str, Any]]:
