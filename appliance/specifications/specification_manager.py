@@ -255,10 +255,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     # --- changing ---
 
-    async def load(self, request: admin.MonitorLoad, who: str) -> Replacement:
+    async def load(self, request: admin.MonitorLoad, who: str, *, enable: bool = False) -> Replacement:
         """Files of the same names are replaced. Raises `SpecificationsRefusedError`.
 
-        With `confirm_within`, this change, like any other, is rolled back automatically after that many seconds
+        With `enable`, monitors that would be disabled by the setting of this name are enabled. With `confirm_within`, this change, like any other, is rolled back automatically after that many seconds
         unless confirmed.
         """
         async with self._changing(request.expected):
@@ -277,6 +277,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 note,
                 within,
                 shadow=shadow,
+                enable=frozenset(new.files) if enable else (),
                 consent=how,
                 topics=topics,
                 constants=constants,
@@ -710,6 +711,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         switches: Mapping[str, Switch] = {},
         given: Given = NO_VALUES,
         shadow: Collection[str] = (),
+        enable: Collection[str] = (),
         consent: _Consent,
         topics: Mapping[str, Mapping[str, str]] = MappingProxyType({}),
         constants: Given = NO_VALUES,
@@ -717,7 +719,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         """`kept` are files that are not in the folder.
 
         `switches`, and the values `given`, are for monitors that are not in force yet; monitors in the files `shadow`
-        start in shadow mode. `topics` and `constants` are new values of this change.
+        start in shadow mode, and those in the files `enable` not disabled. `topics` and `constants` are new values of this change.
         """
         before, previous, switched = self.revision, self.sources, self.switches.said
         said = self.givens.said
@@ -731,7 +733,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             new = self._check_given(topics, constants, checked)
             back = {name: dict(values) for name, values in given.items() if name not in self.checked.monitors}
             self.givens.said = {**back, **said} | {name: {**said.get(name, {}), **new[name]} for name in new}
-            put = {name: SHADOW for name, file in checked.monitors.items() if file in shadow}
+            states, files = self.switches.states_of(checked), checked.monitors.items()
+            put: dict[str, Switch] = {name: SHADOW for name, file in files if file in shadow}
+            put |= {name: True for name, file in files if file in enable and states[name] is False}
             in_force = {name: True for name in checked.monitors if self.switches.enabled(name)} | put
             self.switches.said |= put
             warnings = self._judged(checked, self._in_shadow(checked), consent) + self.givens.dropped(checked)
@@ -762,8 +766,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             began=began,
             warnings=warnings,
         )
-        for name in put:
-            self._say_switched(name, SHADOW, who, ", as it was loaded")
+        for name, to in put.items():
+            self._say_switched(name, to, who, ", as it was loaded")
         for name in new:
             self._say_given(name, {one: said.get(name, {}).get(one, "the default") for one in new[name]}, who)
         await self.store.settled()

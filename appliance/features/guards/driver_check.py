@@ -92,7 +92,7 @@ class DriverChecks:
         self._check, self._who = DriverCheck(request.command, request.by), who
         self._ended.clear()
         try:
-            await monitors.load(order, who)
+            await monitors.load(order, who, enable=True)
         except BaseException:
             self._check = before
             raise
@@ -100,7 +100,7 @@ class DriverChecks:
         self._asked_at, self._until = clock.now(), clock.now() + seconds + _FURTHER_SECONDS
         self._relays = relays
         if not monitors.switches.enabled(NAME):
-            self._end("interrupted", None, "a new monitor is disabled or in shadow mode here (--enable)")
+            self._end("interrupted", None, "a new monitor is in shadow mode here (--enable shadow)")
         return self._check
 
     async def wanted(self, _request: DriverCheckWanted) -> DriverCheck:

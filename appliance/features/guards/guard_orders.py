@@ -109,13 +109,13 @@ class GuardOrders:
         return Suggestions(_suggestions_of(self._graph()))
 
     async def new(self, request: guard_requests.GuardNew, who: str) -> Replacement:
-        """Make a guard and load it. Raises `SenselessError`, and the errors of a load."""
+        """Make a guard, load it and enable it. Raises `SenselessError`, and the errors of a load."""
         file, text = self._made(request)
         order = admin.MonitorLoad(
             {file: text}, note=described(text), expected=request.expected, confirm_within=request.confirm_within,
             shadow=request.shadow, hold=request.hold,
         )  # fmt: skip
-        return await self._monitors.load(order, who)
+        return await self._monitors.load(order, who, enable=not request.shadow)
 
     async def set(self, request: guard_requests.GuardSet, who: str) -> GuardList:
         """Set values of a guard. Raises `UnknownThingError`, `SenselessError`, and the errors of monitors."""

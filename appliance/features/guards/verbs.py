@@ -17,7 +17,7 @@ from appliance.cli.monitor.in_force import say_replaced, say_shadow_deadline
 from appliance.cli.output import moment, say_json
 from appliance.features.guards.guard_answers import GuardRow
 from appliance.features.guards.guard_facts import facts_of, preset_row
-from appliance.features.guards.guard_requests import GuardsWanted, GuardTry
+from appliance.features.guards.guard_requests import GuardNew, GuardsWanted, GuardTry
 from appliance.features.guards.plans import planned
 from appliance.features.guards.presets import (
     PRESETS,
@@ -150,7 +150,10 @@ def new(
         raise GuardError(
             f"a monitor {guard.name} is loaded: give --name, or change it with rosrv guard set {guard.name}"
         )
-    body = _load(appliance, file, text, shadow=shadow, confirm_within=confirm_within, hold=hold)
+    body = appliance.answer_or_exit(
+        GuardNew(preset, topics, _pairs(values, "PARAMETER=VALUE"), _pairs(kinds, "--type NAME=TYPE"), guard.name,
+                 shadow, confirm_within=seconds_within(confirm_within, "guard"), hold=hold)
+    )  # fmt: skip
     say_replaced(body)
     _write(loaded, file, text, temporary=body.confirm_by is not None)
     if shadow:
@@ -276,12 +279,8 @@ def _in_force(row: MonitorState, preset: Preset) -> dict[str, str]:
     }
 
 
-def _load(
-    appliance: Appliance, file: str, text: str, *, shadow: bool, hold: bool, confirm_within: str | None = None
-) -> Replacement:
-    within = seconds_within(confirm_within, "guard")
-    note = described(text)
-    order = admin.MonitorLoad({file: text}, note=note, confirm_within=within, shadow=shadow, hold=hold)
+def _load(appliance: Appliance, file: str, text: str, *, shadow: bool, hold: bool) -> Replacement:
+    order = admin.MonitorLoad({file: text}, note=described(text), shadow=shadow, hold=hold)
     return appliance.answer_or_exit(order)
 
 

@@ -60,6 +60,16 @@ async def test_a_monitor_that_is_disabled_for_a_time_comes_back(desk: Desk) -> N
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(("setting", "state"), [("none", True), ("all", True), ("shadow", "shadow")])
+async def test_a_load_that_enables_ends_no_shadow_mode(desk: Desk, setting: str, state: object) -> None:
+    monitors = await desk.monitors(setting)
+    await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve", enable=True)
+    assert monitors.switches.states["b"] == state
+    assert monitors.switches.enabled("a") is (setting == "all")
+    again = await desk.monitors(setting, restarted=True)
+    assert again.switches.states["b"] == state
+
+
 def killed() -> None:
     for task in asyncio.all_tasks() - {asyncio.current_task()}:
         if "TimedSwitches" in str(task.get_coro()):

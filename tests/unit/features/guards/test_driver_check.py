@@ -33,7 +33,8 @@ class Manager:
         self.switches = SimpleNamespace(enabled=lambda _name: self.enabled)
         self.records = SimpleNamespace(told=[])
 
-    async def load(self, request: admin.MonitorLoad, _who: str) -> None:
+    async def load(self, request: admin.MonitorLoad, _who: str, *, enable: bool) -> None:
+        assert enable  # also where new monitors are disabled
         if self.refusals:
             raise SpecificationsRefusedError(["it would hold /cmd_vel"])
         self.orders.append(request)
@@ -186,7 +187,7 @@ async def test_one_check_at_a_time_and_none_beside_an_unconfirmed_change(
         await site.checks.begin(BEGIN, "eve")
 
 
-async def test_a_check_that_is_refused_or_disabled_does_not_begin(manager: Manager, site: Site) -> None:
+async def test_a_check_that_is_refused_or_in_shadow_mode_does_not_begin(manager: Manager, site: Site) -> None:
     manager.refusals = 1
     with pytest.raises(SpecificationsRefusedError):
         await site.checks.begin(BEGIN, "eve")

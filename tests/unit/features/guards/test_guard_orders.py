@@ -25,6 +25,7 @@ class Manager:
 
     def __init__(self) -> None:
         self.orders: list[Any] = []
+        self.enabling: list[bool] = []
         self.objection: list[str] = []
         self.sources = SimpleNamespace(files={"fence.rv": text_of(FENCE), "other.rv": "other() { }"})
         self.checked = SimpleNamespace(monitors={"fence": "fence.rv", "other": "other.rv"})
@@ -36,8 +37,9 @@ class Manager:
         self.returns = SimpleNamespace(until=lambda _name: None, confirm_by=lambda _name: None)
         self.records = SimpleNamespace(counts=Counter())
 
-    async def load(self, request: Any, _who: str) -> Any:
+    async def load(self, request: Any, _who: str, *, enable: bool = False) -> Any:
         self.orders.append(request)
+        self.enabling.append(enable)
         return request
 
     give = load
@@ -161,10 +163,15 @@ async def test_a_monitor_that_is_not_a_guard_is_unknown(orders: GuardOrders) -> 
         await orders.set(guard_requests.GuardSet("other", {"margin": "1"}), "eve")
 
 
-async def test_a_new_guard_is_loaded(manager: Manager, orders: GuardOrders) -> None:
+@pytest.mark.parametrize("shadow", [True, False])
+async def test_a_new_guard_is_in_shadow_mode_or_in_force(
+    manager: Manager, orders: GuardOrders, shadow: bool
+) -> None:
+    """Also where new monitors are disabled (`enable: none`, as in the package): it would stop nothing."""
     request = guard_requests.GuardNew("speed", {"command": "/c"}, {"vMax": "0.3"}, {"command": TYPES["command"]},
-                                      shadow=True, confirm_within=300.0)  # fmt: skip
+                                      shadow=shadow, confirm_within=300.0)  # fmt: skip
     await orders.new(request, "eve")
     [load] = manager.orders
+    assert manager.enabling == [not shadow]
     assert "double vMax = 0.3 m/s" in load.files["speed.rv"]
-    assert (load.shadow, load.confirm_within, load.note[:14]) == (True, 300.0, "preset speed 1")
+    assert (load.shadow, load.confirm_within, load.note[:14]) == (shadow, 300.0, "preset speed 1")

@@ -8,7 +8,7 @@ import typer
 from appliance.channel import admin
 from appliance.features.guards import verbs
 from appliance.features.guards.guard_answers import GuardPlan, GuardRow
-from appliance.features.guards.guard_requests import GuardsWanted, GuardTry
+from appliance.features.guards.guard_requests import GuardNew, GuardsWanted, GuardTry
 from appliance.features.guards.presets import PRESETS, Guard, GuardError, text_of
 from tests.unit.features.guards.test_suggestions import graph_of
 
@@ -76,9 +76,9 @@ def run(verb: Any, robot: Robot, *arguments: Any, **options: Any) -> Any:
 
 def test_a_new_guard_is_loaded_and_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     order = run(verbs.new, Robot(tmp_path), "fence", "/cmd_vel", ["margin=0.5"], by="/odom", shadow=True)
-    assert (order.shadow, order.hold, order.note[:14]) == (True, False, "preset fence 1")
-    assert (tmp_path / "fence.rv").read_text() == order.files["fence.rv"]
-    assert "double margin = 0.5 m" in order.files["fence.rv"]
+    topics = {"command": "/cmd_vel", "by": "/odom"}
+    assert order == GuardNew("fence", topics, {"margin": "0.5"}, name="fence", shadow=True)
+    assert "double margin = 0.5 m" in (tmp_path / "fence.rv").read_text()
     assert "rosrv guard enforce fence" in capsys.readouterr().out
 
 
