@@ -258,8 +258,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     async def load(self, request: admin.MonitorLoad, who: str, *, enable: bool = False) -> Replacement:
         """Files of the same names are replaced. Raises `SpecificationsRefusedError`.
 
-        With `enable`, monitors that would be disabled by the setting of this name are enabled. With `confirm_within`, this change, like any other, is rolled back automatically after that many seconds
-        unless confirmed.
+        With `enable`, monitors that would be disabled by the setting of this name are enabled. With `confirm_within`,
+        this change, like any other, is rolled back automatically after that many seconds unless confirmed.
         """
         async with self._changing(request.expected):
             topics, constants = split(request.given)
@@ -719,7 +719,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         """`kept` are files that are not in the folder.
 
         `switches`, and the values `given`, are for monitors that are not in force yet; monitors in the files `shadow`
-        start in shadow mode, and those in the files `enable` not disabled. `topics` and `constants` are new values of this change.
+        start in shadow mode, and those in the files `enable` are not disabled. `topics` and `constants` are new values
+        of this change.
         """
         before, previous, switched = self.revision, self.sources, self.switches.said
         said = self.givens.said

@@ -150,13 +150,13 @@ def new(
         raise GuardError(
             f"a monitor {guard.name} is loaded: give --name, or change it with rosrv guard set {guard.name}"
         )
-    body = appliance.answer_or_exit(
+    body = appliance.ask_or_exit(
         GuardNew(preset, topics, _pairs(values, "PARAMETER=VALUE"), _pairs(kinds, "--type NAME=TYPE"), guard.name,
                  shadow, confirm_within=seconds_within(confirm_within, "guard"), hold=hold)
     )  # fmt: skip
-    say_replaced(body)
-    _write(loaded, file, text, temporary=body.confirm_by is not None)
-    if shadow:
+    _say_changed(appliance, body)
+    _write(appliance, loaded, file, text, temporary=body.confirm_by is not None)
+    if shadow and not appliance.as_json:
         say(f"in shadow mode: {guard.name}; rosrv guard enforce {guard.name}", "yellow")
 
 
@@ -193,11 +193,12 @@ def set_values(
     in_text = {each: value for each, value in checked.items() if preset.parameter(each).loads}
     if in_text:
         changed = with_values(text, in_text)
-        say_replaced(_load(appliance, row.file, changed, shadow=row.shadow, hold=hold))
-        _write(loaded, row.file, changed)
+        order = admin.MonitorLoad({row.file: changed}, note=described(changed), shadow=row.shadow, hold=hold)
+        _say_changed(appliance, appliance.ask_or_exit(order))
+        _write(appliance, loaded, row.file, changed)
     constants: dict[str, GivenValue] = {each: value for each, value in checked.items() if each not in in_text}
     if constants:
-        answer = appliance.ask_or_exit(admin.MonitorGive(name, constants))
+        answer = appliance.answer_or_exit(admin.MonitorGive(name, constants))
         say(
             f"{name}: set {', '.join(f'{each}={constants[each]}' for each in answer.changed) or 'no difference'}"
         )
@@ -233,8 +234,8 @@ def remove(appliance: Appliance, name: _Name, confirm_within: ConfirmWithin = No
     """
     loaded, row, _text = _guard(appliance, name)
     order = admin.MonitorRemove([name], confirm_within=seconds_within(confirm_within, "guard"))
-    body = appliance.answer_or_exit(order)
-    say_replaced(body)
+    body = appliance.ask_or_exit(order)
+    _say_changed(appliance, body)
     if loaded.folder and body.confirm_by is None:
         file_of(row.file.removesuffix(".rv"), Path(loaded.folder)).unlink(missing_ok=True)
 
@@ -279,25 +280,31 @@ def _in_force(row: MonitorState, preset: Preset) -> dict[str, str]:
     }
 
 
-def _load(appliance: Appliance, file: str, text: str, *, shadow: bool, hold: bool) -> Replacement:
-    order = admin.MonitorLoad({file: text}, note=described(text), shadow=shadow, hold=hold)
-    return appliance.answer_or_exit(order)
+def _say_changed(appliance: Appliance, body: Replacement) -> None:
+    if appliance.as_json:
+        say_json(body)
+    else:
+        say_replaced(body)
 
 
-def _write(loaded: Monitors, file: str, text: str, *, temporary: bool = False) -> None:
+def _write(appliance: Appliance, loaded: Monitors, file: str, text: str, *, temporary: bool = False) -> None:
     """Write a guard into the folder of specifications, if it is on this machine and the load is permanent."""
     if loaded.folder is None or not Path(loaded.folder).is_dir():
-        say("the appliance keeps the text; it has no folder of specifications on this machine", "dim")
+        obstacle = "the appliance keeps the text; it has no folder of specifications on this machine"
     elif temporary:
-        say(f"{loaded.folder} is not changed while the load waits for rosrv monitor confirm", "yellow")
+        obstacle = f"{loaded.folder} is not changed while the load waits for rosrv monitor confirm"
     else:
         try:
             write_where_told(Path(loaded.folder) / file, text.encode())
+            return
         except OSError as error:
-            say(
-                f"the appliance keeps the text, but {loaded.folder}/{file} is not written: {error.strerror}",
-                "yellow",
+            obstacle = (
+                f"the appliance keeps the text, but {loaded.folder}/{file} is not written: {error.strerror}"
             )
+    if appliance.as_json:
+        typer.echo(obstacle, err=True)
+    else:
+        say(obstacle, "yellow")
 
 
 def _plan(appliance: Appliance, request: GuardTry) -> None:

@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -6,6 +7,8 @@ import pytest
 import typer
 
 from appliance.channel import admin
+from appliance.channel.answers.monitor_answers import GivenSet, Replacement, Switched
+from appliance.cli.output import say_json
 from appliance.features.guards import verbs
 from appliance.features.guards.guard_answers import GuardPlan, GuardRow
 from appliance.features.guards.guard_requests import GuardNew, GuardsWanted, GuardTry
@@ -48,21 +51,22 @@ class Robot:
             case admin.MonitorsWanted():
                 return SimpleNamespace(monitors=self.rows, files=self.files, folder=self.folder)
         self.orders.append(request)
-        changed = [*getattr(request, "values", {})]
-        return SimpleNamespace(
-            revision=2,
-            replaced=1,
-            added=[],
-            changed=changed,
-            removed=[],
-            warnings=[],
-            moved=[],
-            confirm_by=getattr(request, "confirm_within", None),
-            names=["fence"],
-            began=[],
-        )
+        return _changed(request)
 
-    answer_or_exit = ask_or_exit
+    def answer_or_exit(self, request: Any) -> Any:
+        answer = self.ask_or_exit(request)
+        if self.as_json:
+            say_json(answer)
+            raise typer.Exit
+        return answer
+
+
+def _changed(order: Any) -> Any:
+    if isinstance(order, admin.MonitorGive):
+        return GivenSet(order.name, [*order.values], [], 2, "2.1")
+    if isinstance(order, admin.MonitorShadow):
+        return Switched(["fence"], 2, "2.1")
+    return Replacement(2, "2.0", 1, [], [], [], [], [], [], [], getattr(order, "confirm_within", None))
 
 
 FENCE = Guard("fence", PRESETS["fence"], types={"command": "geometry_msgs/Twist", "by": "nav_msgs/Odometry"})
@@ -110,6 +114,21 @@ def test_a_name_that_is_taken_is_refused(tmp_path: Path) -> None:
     with pytest.raises(GuardError, match="a monitor fence is loaded: give --name"):
         run(verbs.new, robot, "fence", "/cmd_vel", by="/odom")
     assert not robot.orders
+
+
+def test_json_changes_no_less(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each change is a line of JSON, and the folder is written and emptied as without it."""
+    robot = Robot(tmp_path, FENCE)
+    robot.as_json = True
+    run(verbs.new, robot, "speed", "/cmd_vel")
+    assert (tmp_path / "speed.rv").exists()
+    with pytest.raises(typer.Exit):
+        run(verbs.set_values, robot, "fence", ["margin=0.5", "polygon=0,0 1,0 1,1"])
+    assert "{0, 0, 1, 0, 1, 1}" in (tmp_path / "fence.rv").read_text()
+    run(verbs.remove, robot, "fence")
+    assert not (tmp_path / "fence.rv").exists()
+    shown = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [one["revision"] for one in shown] == [2] * len(robot.orders) == [2] * 4
 
 
 def test_a_constant_is_set_and_a_polygon_is_loaded(tmp_path: Path) -> None:
