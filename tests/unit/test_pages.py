@@ -9,6 +9,9 @@ from rosrv_fleet.cli import app as fleet_app
 
 from appliance.channel.operations import OPERATIONS
 from appliance.configuration.settings import Settings
+from appliance.supervisor.role import Facts
+from appliance.supervisor.roles import ROLES
+from appliance.supervisor.sandbox.sandbox_plan import NETWORK, ROUTES, UNIX
 from distribution import command_line_page, settings_page
 from rosmop.tool.command import app as rosmop_app
 from tests.support.command import commands
@@ -74,6 +77,64 @@ def test_modules_that_are_named_are_there(page: str) -> None:
     names = re.findall(r"\b(?:[a-z_]+/)+[a-z_]+\.(?:py|sh|js|rv|toml|yaml)\b", (ROOT / page).read_text())
     folders = (ROOT, ROOT / "appliance", ROOT / "appliance" / "api" / "console")
     assert [name for name in names if not any((folder / name).exists() for folder in folders)] == []
+
+
+def test_the_path_of_a_call_counts_its_files() -> None:
+    """The number of each step, and their sum in the sentence above."""
+    page = (ROOT / "docs/dev/architecture.md").read_text()
+    [path] = re.findall(r"^## The path of one registerPublisher\n(.*?)^`", page, re.DOTALL | re.MULTILINE)
+    steps_of_path = re.findall(r"^\|[^|]+\|(.*`.*)\| (\d+) \|$", path, re.MULTILINE)
+    files = [file for text, _number in steps_of_path for file in re.findall(r"`([^`]+)`", text)]
+    assert [int(number) for _text, number in steps_of_path] == [
+        text.count("`") // 2 for text, _ in steps_of_path
+    ]
+    assert re.findall(r"enters (\d+) files", path) == [str(len(files))] == [str(len(set(files)))]
+
+
+def test_the_sandbox_of_each_process_is_in_the_architecture() -> None:
+    """Its user, its kind of system calls, its sockets, and whether it uses TCP."""
+    page = (ROOT / "docs/dev/architecture.md").read_text().split("\n## Sandbox", 1)[1]
+    rows = re.findall(
+        r"^\| (\w+) \| `([\w-]+)` \| (\w+) \| ([^|]+) \| ([^|]+), ([^|]+) \|", page, re.MULTILINE
+    )
+    sockets = {UNIX: "Unix", NETWORK: "Unix, IP", ROUTES: "Unix, IP, netlink"}
+    expected = []
+    for role in ROLES:
+        plan = role.sandbox(Facts(ROOT, ROOT / "config.json", 12311, "http://127.0.0.1:5"))
+        calls = "allowlisted" if plan.allowlist else "usual"
+        expected.append((role.name, role.user, calls, sockets[plan.families], plan.binds is None))
+    assert sorted((*row[:4], row[4] == "any") for row in rows) == sorted(expected)
+
+
+def test_the_state_directory_is_described() -> None:
+    """An operator looks up what a folder holds before they remove it, or wonder what a backup lacks."""
+    page = (ROOT / "docs/reference/processes.md").read_text()
+    table = page.split("\n## The state directory", 1)[1].split("\n## ", 1)[0]
+    folders = {
+        name.partition("/")[0]
+        for row in re.findall(r"^\| (`[^|]*) \|", table, re.MULTILINE)
+        for name in re.findall(r"`([^`]+)`", row)
+    }
+    assert {role.part for role in ROLES} - folders == set()
+
+
+def test_settings_that_pages_name_exist() -> None:
+    """A page names a setting by its path in `appliance.yaml`; pages of the collector name its own."""
+    sections = {name: kind for name, kind in get_type_hints(Settings).items() if is_dataclass(kind)}
+    files = {"audit.pub", "firewall.translations"}  # of the state directory, and of the status
+    pages = [page for page in WITH_LINKS[:-1] if "fleet" not in page.name]
+    named = {name for page in pages for name in re.findall(r"`([a-z_]+(?:\.[a-z_]+)+)[`:]", page.read_text())}
+    named = {name for name in named - files if name.partition(".")[0] in sections}
+    assert [name for name in named if not _is_setting(f"ROSRV_{name.replace('.', '__').upper()}")] == []
+    assert len(named) > 30
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_tests_that_pages_name_are_there(page: Path) -> None:
+    named = set(re.findall(r"`(test_\w+)(?:\[[^`]*\])?`", page.read_text()))
+    files = (*(ROOT / "tests").rglob("*.py"), *(ROOT / "rosmop/tests").rglob("*.py"))
+    texts = [file.read_text() for file in files] if named else []
+    assert [name for name in named if not any(f"def {name}(" in text for text in texts)] == []
 
 
 def test_tests_that_the_assurance_names_are_there() -> None:
