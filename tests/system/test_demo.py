@@ -74,7 +74,7 @@ def test_demo(tmp_path: Path, temporary: Path) -> None:
         "console:           https://127.0.0.1:",
     ):
         assert line in said
-    assert picture.read_text().count("<polyline") == 2
+    assert picture.read_text().count("<polyline") == 4, "the drive and the cut link, each without and with"
     require_no_hosts(demo.pid)
 
 
