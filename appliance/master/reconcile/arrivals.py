@@ -64,8 +64,8 @@ class Arrivals:
         incarnation = self._make(caller, api)
         try:
             with EvictionGuard(incarnation):
+                await self.faces.open(incarnation)  # first, so that the end of the node closes its ports
                 await self._check_place(caller, incarnation)
-                await self.faces.open(incarnation)
         except (NoPortError, NodeElsewhereError):
             self.graph.forgotten(incarnation)
             raise
@@ -107,6 +107,7 @@ class Arrivals:
     def _open_ports(self, host: Address) -> tuple[int, ...]:
         """Return ports for a node of this host. Evict unused incarnations if necessary. Raises `NoPortError`."""
         while True:
+            self.flush()  # closes the ports of forgotten nodes
             try:
                 return self.places.open(host)
             except NoPortError:
@@ -114,7 +115,6 @@ class Arrivals:
                 if evicted is None:
                     raise
                 self.graph.forgotten(evicted)
-                self.flush()  # closes its ports
 
 
 class EvictionGuard:

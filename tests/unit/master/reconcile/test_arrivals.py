@@ -1,9 +1,12 @@
 import asyncio
+from ipaddress import ip_network
 from typing import Any, cast
 
 import pytest
 
-from appliance.master.endpoints.node_ports import NoPortError
+from appliance.master.endpoints import node_ports
+from appliance.master.endpoints.node_ports import NodePorts, NoPortError
+from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
 from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.reconcile.arrivals import Arrivals
 from appliance.policy.model import Address
@@ -103,3 +106,74 @@ async def test_a_node_of_another_machine_is_refused() -> None:
     # A node with another address of its machine in its URI has its port open; the caller's own address needs no check.
     for node, uri in (("/near", "http://192.168.1.10:4001/"), ("/here", "http://10.0.0.5:4002/")):
         assert (await world.ask("registerPublisher", node, *call, uri))[0] == 1  # type: ignore[index]  # an answer is a list
+
+
+class Listening:
+    """A listening socket, and the server of a proxy endpoint on it."""
+
+    def __init__(self, _host: str, port: int) -> None:
+        self.port = port
+
+    def getsockname(self) -> tuple[str, int]:
+        return "10.0.0.1", self.port
+
+    def dup(self) -> "Listening":
+        return self
+
+    async def start(self) -> None:
+        await asyncio.sleep(0)
+
+    def close(self) -> None: ...
+
+
+async def world_with_ports(monkeypatch: pytest.MonkeyPatch) -> tuple[ControlParts, NodePorts]:
+    """Return a world whose nodes have ports in a range for `_NODES` nodes."""
+    monkeypatch.setattr(node_ports, "listen", Listening)
+    world = await ControlParts.begun()
+    places = NodePorts(
+        "10.0.0.1", range(1, 1 + 2 * _NODES), keep=lambda *_: None, drop=lambda _: None,
+        named_as=lambda host: ip_network(host),
+    )  # fmt: skip
+    faces = ProxyEndpoints(
+        world.registry, places, 9, lambda: cast(Any, lambda _node: None), lambda sock, _: cast(Any, sock)
+    )
+    arrivals = Arrivals(
+        world.registry,
+        world.graph,
+        world.sinks.flush,
+        world.liveness,
+        places,
+        faces,
+        cast(Any, world.addresses),
+    )
+    monkeypatch.setattr(world.faces, "incarnation_for", arrivals.incarnation_for)
+    monkeypatch.setattr(world.faces, "close", faces.close)
+    return world, places
+
+
+async def test_a_refused_node_keeps_no_ports(monkeypatch: pytest.MonkeyPatch) -> None:
+    world, places = await world_with_ports(monkeypatch)
+    world.clients.gone.add("/far")
+    for _attempt in range(2 * _NODES):
+        answer: Any = await world.ask(
+            "registerPublisher", "/far", "/t", "std_msgs/String", "http://robot2:4000/"
+        )
+        assert "has no node on port 4000" in answer[1]
+    world.sinks.flush()
+    assert len(places.unused) == 2 * _NODES
+
+
+async def test_a_node_beyond_a_limit_takes_the_ports_of_one_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The ports of a node that was evicted for the limit of its host are used before another node is evicted."""
+    world, places = await world_with_ports(monkeypatch)
+    monkeypatch.setattr(world.registry, "_most_of_host", _NODES - 1)
+    for number in range(_NODES - 1):
+        uri = f"http://10.0.0.5:{4000 + number}/"
+        await world.ask("registerPublisher", f"/n{number}", "/t", "std_msgs/String", uri)
+        world.graph.lost(world.registry.all()[-1], "away")
+    places.unused.clear()
+    answer: Any = await world.ask(
+        "registerPublisher", "/new", "/t", "std_msgs/String", "http://10.0.0.5:5000/"
+    )
+    assert answer[0] == 1, answer
+    assert [node.name for node in world.registry.all()] == ["/n1", "/n2", "/new"]
