@@ -5,19 +5,21 @@ sent to the relay that carries it (`allocation`). A node is sent to all relays t
 
 For each relay, control keeps the facts that it has stated. A change names what may differ; `_state_fact` compares the
 wanted fact with the stated one, and sends the difference. A new relay has no facts, so it gets all of them, between
-`StateBegan` and `StateEnded`; it removes everything else.
+`StateBegan` and `StateEnded`; it removes everything else. A change that cannot be sent (the relay does not read, or
+control has no descriptor for a port) is tried again every `_AGAIN_SECONDS`. Until then, `carried_out` waits.
 """
 
 import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+import structlog
+
 from appliance.channel import messages
-from appliance.channel.channel import Channel
+from appliance.channel.channel import Channel, ChannelFullError
 from appliance.channel.link import Link
 from appliance.master.endpoints.node_api import NodeApiClient
 from appliance.master.endpoints.node_ports import NodePorts
@@ -48,13 +50,16 @@ class RelayOutbox(Link):
         super().__init__(heard, lost)
         self.index = index
         self.stated: dict[str, dict[Change, messages.RelayFact]] = {}  # by key of the node, whose port it has
-        self._epoch = 0
+        self.unstated: dict[Change, None] = {}  # the changes that could not be sent
+        self.again: asyncio.TimerHandle | None = None  # the next attempt to send them
+        self.epoch = 0  # the number of relays so far
         self._orders: deque[asyncio.Future[None]] = deque()
 
     def close(self) -> None:
         """Close the link; nothing waits any longer for the relay's orders."""
         super().close()
         self.stated.clear()
+        self.unstated.clear()
         while self._orders:
             self.carried_out()
 
@@ -72,21 +77,16 @@ class RelayOutbox(Link):
         if not (done := self._orders.popleft()).done():
             done.set_result(None)
 
-    @contextmanager
-    def restating(self) -> Iterator[None]:
-        """Mark the messages that are sent inside this block as the whole state of the relay."""
-        self._epoch += 1
-        self.send(messages.StateBegan(self._epoch))
-        yield
-        self.send(messages.StateEnded(self._epoch))
-
 
 RELAY_NAME = "/rosrv"
 OwnCall = messages.OwnServiceCalled | messages.MonitorCallWanted | messages.ApprovalWanted
 OwnAnswer = messages.OwnServiceAnswered | messages.MonitorCallAnswered | messages.ApprovalAnswered
 _STOP_SECONDS = 5.0
+_AGAIN_SECONDS = 0.1
 _KINDS = {TOPIC: Kind.PUBLICATION, SERVICE: Kind.SERVICE}
 _WORDS = {kind: word for word, kind in _KINDS.items()}
+
+_log = structlog.get_logger()
 
 
 @dataclass(slots=True)
@@ -144,9 +144,10 @@ class RelayControl:
         post.send(self.monitors().statement(index))
         if self.own_header is not None:
             post.send(self.own_header)
-        with post.restating():
-            for node in self.registry.live():
-                self._state_node(post, node)
+        post.epoch += 1
+        post.send(messages.StateBegan(post.epoch))
+        self._state_all(post, self.registry.live())
+        post.send(messages.StateEnded(post.epoch))
 
     def _lost(self, index: int, _reason: str) -> None:
         self.carried.lost(index)
@@ -166,6 +167,8 @@ class RelayControl:
         after `ANSWER_SECONDS` without an answer, and the next one begins with these orders.
         """
         posts = self._posts if topics is None else {self._post(TOPIC, topic) for topic in topics}
+        while any(post.unstated for post in posts):
+            await asyncio.sleep(_AGAIN_SECONDS)
         if waiting := [order for post in posts for order in post.orders()]:
             await asyncio.wait(waiting)
 
@@ -215,9 +218,9 @@ class RelayControl:
 
     def flush(self, changed: Iterable[Change]) -> None:
         """State what these changes have changed, at once if it is a grant."""
-        for change in changed:
-            for post in self._posts:
-                self._state(post, change)
+        changes = list(changed)
+        for post in self._posts:
+            self._state_all(post, changes)
 
     def compare(self) -> None:
         """State all that a new policy has changed: limits, named hosts, hosts that command, and approvals."""
@@ -241,6 +244,25 @@ class RelayControl:
                     if (row.kind, row.resource) == (move.kind, move.name):
                         yield row
 
+    def _state_all(self, post: RelayOutbox, changes: Iterable[Change] = ()) -> None:
+        """State these changes after those that could not be sent; try again soon what cannot be sent now."""
+        post.unstated |= dict.fromkeys(changes)
+        why: Exception | None = None
+        for change in list(post.unstated):
+            if isinstance(why, ChannelFullError):
+                break
+            try:
+                self._state(post, change)
+                del post.unstated[change]
+            except (ChannelFullError, OSError) as error:  # OSError: no descriptor for the port of this node
+                why = error
+        if post.again is not None:
+            post.again.cancel()
+        elif why is not None:
+            _log.error("a relay cannot be sent all changes", relay=post.index, error=str(why))
+        loop = asyncio.get_running_loop()
+        post.again = loop.call_later(_AGAIN_SECONDS, self._state_all, post) if post.unstated else None
+
     def _state(self, post: RelayOutbox, change: Change) -> None:
         match change:
             case Incarnation():
@@ -260,8 +282,9 @@ class RelayControl:
                 self._state(post, RegistrationKey(node, kind, resource))
             for row in self.grants.of(node.key):
                 self._state(post, row)
-        elif post.stated.pop(node.key, None) is not None:
+        elif node.key in post.stated:
             post.send(messages.NodeWithdrawn(node.key))
+            del post.stated[node.key]
 
     def _state_fact(
         self, post: RelayOutbox, node: Incarnation, fact: Change, wanted: messages.RelayFact | None
@@ -325,20 +348,14 @@ class RelayControl:
     def _received(self, index: int, message: messages.Message) -> None:
         post = self._posts[index]
         match message:
-            case (
-                messages.UpstreamWanted()
-                | messages.OwnServiceCalled()
-                | messages.MonitorCallWanted()
-                | messages.ApprovalWanted()
-            ):
+            case _ if isinstance(message, messages.UpstreamWanted | OwnCall):
                 task = asyncio.get_running_loop().create_task(self._answer(post, message))
                 self._asking.add(task)
                 task.add_done_callback(self._asking.discard)
             case messages.UpstreamLost():
-                incarnation = self.registry.by_key(message.key)
-                if incarnation is not None:
-                    self.carried.upstream_lost(message, str(incarnation.host))
-                    self.broken(incarnation)
+                if (node := self.registry.by_key(message.key)) is not None:
+                    self.carried.upstream_lost(message, str(node.host))
+                    self.broken(node)
             case messages.LatchRefused() | messages.MessagesLimited():
                 self._held_back(message)
             case messages.TrafficReported():
@@ -376,10 +393,8 @@ class RelayControl:
         if isinstance(message, messages.MessagesLimited):
             for row in message.rows:
                 self.carried.limited(row, self.policy().limit_rule(row.topic) if row.topic else None)
-        else:
-            incarnation = self.registry.by_key(message.key)
-            if incarnation is not None:
-                self.carried.latch_refused(message, str(incarnation.host))
+        elif (node := self.registry.by_key(message.key)) is not None:
+            self.carried.latch_refused(message, str(node.host))
 
     async def _find_upstream(self, post: RelayOutbox, key: str, topic: str) -> None:
         incarnation = self.registry.by_key(key)

@@ -309,17 +309,17 @@ class Registry:
     # --- changing ---
 
     def add(self, incarnation: Incarnation) -> None:
-        self.version += 1
-        self._by_key[incarnation.key] = incarnation
-        self._known[incarnation.name, incarnation.host, incarnation.api_text] = incarnation
-        self._nodes_of[incarnation.host] += 1
+        self._know(incarnation)
         self.mark(incarnation)
 
-    def restore(self, incarnation: Incarnation) -> None:
+    def _know(self, incarnation: Incarnation) -> None:
         self.version += 1
         self._by_key[incarnation.key] = incarnation
         self._known[incarnation.name, incarnation.host, incarnation.api_text] = incarnation
         self._nodes_of[incarnation.host] += 1
+
+    def restore(self, incarnation: Incarnation) -> None:
+        self._know(incarnation)
         self._registrations_of[incarnation.host] += len(incarnation.registrations)
         for registration in incarnation.registrations.values():
             self._order = max(self._order, registration.order)
@@ -331,8 +331,6 @@ class Registry:
 
     def register(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> None:
         self.version += 1
-        if incarnation.life is Life.SHADOW:  # the node was lost while its call was under way
-            self.revive(incarnation, incarnation.changed)
         self._live[incarnation.name] = incarnation
         registration = incarnation.registrations.get((kind, resource))
         if registration is None or registration.detail != detail:

@@ -5,6 +5,7 @@ compares the wanted state of each key with what it has stated, and states the di
 change, a repetition, and a sink that starts again without any state. Invariants:
 
 1. A call is answered after its changes are flushed: they are stored, and the relay has them before a peer can use them.
+   Exception: a relay that cannot take a change gets it soon (`relay_control.py`), and the orders of operators wait.
 2. Whatever else changes the registry, `soon` flushes it before the event loop waits again.
 3. The ROS master gets its changes behind the answers (`entries.py`).
 
@@ -13,6 +14,7 @@ After a restart, `restore` reads the registry from the store.
 
 import asyncio
 from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 from appliance.base import clock
@@ -37,8 +39,6 @@ from appliance.policy.policy import Policy
 from appliance.store.state_file import IncarnationRow, PermissionRow, RegistrationRow, StateStore
 from roswire.uris import parse_node_uri
 
-_ENDED = (Life.REPLACED, Life.FORGOTTEN)
-
 
 @dataclass(frozen=True, slots=True)
 class Sinks:
@@ -60,16 +60,17 @@ class Sinks:
         changed = self.registry.take_changes()
         if not changed:
             return
-        save(changed, self.grants, self.store)
-        self.subscribers.flush(changed)
-        self.entries.flush(changed)
-        try:
-            self.relay.flush(changed)
-        finally:
-            for node in changed:
-                if isinstance(node, Incarnation) and node.life in _ENDED:
-                    self.relay.carried.forgotten(node.key)
-                    self.faces.close(node)
+        with ExitStack() as others:  # a defect of a sink takes no change from the others
+            others.callback(self._close_ended, changed)
+            for sink in (self.relay, self.entries, self.subscribers):
+                others.callback(sink.flush, changed)
+            save(changed, self.grants, self.store)
+
+    def _close_ended(self, changed: Iterable[Change]) -> None:
+        for node in changed:
+            if isinstance(node, Incarnation) and node.life in {Life.REPLACED, Life.FORGOTTEN}:
+                self.relay.carried.forgotten(node.key)
+                self.faces.close(node)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,9 +101,6 @@ class Enforcement:
         self.revocation.redecide_for(host, caller_id)
         self.sinks.flush()
 
-    async def carried_out(self) -> None:
-        await self.sinks.relay.carried_out()
-
 
 _SHELVED = "revoked "  # the prefix of the stored kind of a withdrawn registration
 
@@ -120,27 +118,20 @@ def save(changed: Iterable[Change], grants: Grants, store: StateStore) -> None:
                         change.relay_port, change.own, change.life.value, change.changed, change.more_relay_ports,
                     )
                 )  # fmt: skip
-            case RegistrationKey(node, kind, resource, shelved):
-                if node.life is not Life.FORGOTTEN:
-                    _save_registration(node, kind, resource, store, shelved=shelved)
+            case RegistrationKey(node, kind, resource, shelved) if node.life is not Life.FORGOTTEN:
+                stored_kind = f"{_SHELVED}{kind.value}" if shelved else kind.value
+                one = (node.shelf if shelved else node.registrations).get((kind, resource))
+                if one is None:
+                    store.remove_registration(node.key, stored_kind, resource)
+                else:
+                    store.save_registration(
+                        RegistrationRow(node.key, stored_kind, resource, one.detail, one.order)
+                    )
             case PermissionRow():
                 if change in grants.of(change.key):
                     store.save_permission(change)
                 else:
                     store.remove_permission(change)
-
-
-def _save_registration(
-    node: Incarnation, kind: Kind, resource: str, store: StateStore, *, shelved: bool
-) -> None:
-    rows, stored_kind = (
-        (node.shelf, f"{_SHELVED}{kind.value}") if shelved else (node.registrations, kind.value)
-    )
-    one = rows.get((kind, resource))
-    if one is None:
-        store.remove_registration(node.key, stored_kind, resource)
-    else:
-        store.save_registration(RegistrationRow(node.key, stored_kind, resource, one.detail, one.order))
 
 
 def restore(registry: Registry, store: StateStore) -> int:

@@ -165,14 +165,11 @@ class Subscribers:
         """Note that the answer to a subscription has the value of a parameter; only later changes are sent."""
         self._stated.setdefault(subscriber, {})[Kind.PARAMETER, key] = ()
 
-    def parameter_set(self, key: str, value: Value, caller_id: str) -> None:
-        """Send a value that the ROS master accepted; the caller does not get exactly this key."""
-        self._tell_parameters(key, value, caller_id)
-
     def parameter_deleted(self, key: str) -> None:
-        self._tell_parameters(key, {}, None)
+        self.parameter_set(key, {}, None)
 
-    def _tell_parameters(self, key: str, value: Value, caller_id: str | None) -> None:
+    def parameter_set(self, key: str, value: Value, caller_id: str | None) -> None:
+        """Send a value that the ROS master accepted; the caller does not get exactly this key."""
         if not self.registry.tells_parameters:
             return
         calls: dict[str, NodeCall] = {}

@@ -49,6 +49,8 @@ def test_invariants(steps: list[tuple[str, int, Kind, str]]) -> None:
                 holder = registry.holder(one.name)
                 if holder is not None and holder is not one:  # as `Graph.registered` does
                     registry.replace(holder, 1.0)
+                if one.life is Life.SHADOW:
+                    registry.revive(one, 2.0)
                 registry.register(one, kind, resource, "t")
             case "unregister":
                 registry.unregister(one, kind, resource)

@@ -132,7 +132,7 @@ async def world_with_ports(monkeypatch: pytest.MonkeyPatch) -> tuple[ControlPart
     world = await ControlParts.begun()
     places = NodePorts(
         "10.0.0.1", range(1, 1 + 2 * _NODES), keep=lambda *_: None, drop=lambda _: None,
-        named_as=lambda host: ip_network(host),
+        named_as=ip_network,
     )  # fmt: skip
     faces = ProxyEndpoints(
         world.registry, places, 9, lambda: cast(Any, lambda _node: None), lambda sock, _: cast(Any, sock)

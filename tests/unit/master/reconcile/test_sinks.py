@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.channel import messages
-from appliance.channel.channel import ChannelFullError
 from appliance.master.endpoints.delivery import NodeCall
+from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.master.reconcile.sinks import restore
-from appliance.store.state_file import StateStore
+from appliance.store.state_file import PermissionRow, StateStore
 from roswire.xmlrpc import Value
 from tests.support import autojump
 from tests.support.control_parts import HOST, OPEN, POLICY, ControlParts, Told
@@ -211,9 +211,88 @@ async def test_a_relay_that_takes_no_messages_delays_no_other_sink() -> None:
 
     world.full = True
     world.graph.registered(new, Kind.PUBLICATION, "/t", "t")
-    with pytest.raises(ChannelFullError):
-        world.sinks.flush()
     await world.settle()
     assert [name for name, method, _ in world.deliveries.told if method == "shutdown"] == ["/n"]
     assert world.hidden.nodes["/n"] == world.faces.inner_uri(new)
     assert ("close", old) in world.seen
+
+
+@pytest.mark.anyio
+async def test_a_relay_gets_what_it_could_not_take_as_soon_as_it_reads() -> None:
+    """Neither a grant, a revocation nor the end of a node waits for a later change or for a new relay."""
+    world = await ControlParts.begun()
+    ended, node = world.node("/ended", 1), world.node("/n", 2)
+    for one in (ended, node):
+        await world.register(one, Kind.PUBLICATION, "/t")
+    world.graph.topic_granted(node, "/t", HOST, "/old")
+    await world.settle()
+
+    world.full = True
+    world.graph.forgotten(ended)
+    world.grants.take(PermissionRow(node.key, "topic", "/t", str(HOST), "/old"))
+    world.graph.topic_granted(node, "/t", HOST, "/new")
+    world.sinks.flush()
+    order = asyncio.ensure_future(world.relay.carried_out())
+    await asyncio.sleep(3)
+    assert not order.done()
+    world.seen.clear()
+    world.full = False
+    await asyncio.sleep(0.2)
+    assert [
+        seen for seen in world.seen if isinstance(seen, messages.NodeWithdrawn | messages.GrantRevoked)
+    ] == [
+        messages.NodeWithdrawn(ended.key),
+        messages.GrantRevoked(node.key, "/t", str(HOST), "/old"),
+    ]
+    assert [
+        (seen.key, seen.caller_id) for seen in world.seen if isinstance(seen, messages.GrantInstalled)
+    ] == [(node.key, "/new")]
+    assert world.seen[-1] == messages.OrdersAsked()
+    order.cancel()
+
+
+@pytest.mark.anyio
+async def test_a_node_without_a_descriptor_delays_no_other_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = await ControlParts.begun()
+    first, second = world.node("/first", 1), world.node("/second", 2)
+    place = world.relay._place_node
+
+    def refuse(post: Any, node: Incarnation) -> None:
+        if node is first:
+            raise OSError(24, "Too many open files")
+        place(post, node)
+
+    def placed() -> list[str]:
+        return [seen.key for seen in world.seen if isinstance(seen, messages.PublicationPlaced)]
+
+    with monkeypatch.context() as patched:
+        patched.setattr(RelayControl, "_place_node", lambda _relay, post, node: refuse(post, node))
+        for node in (first, second):
+            world.graph.registered(node, Kind.PUBLICATION, "/t", "t")
+        world.sinks.flush()
+        assert placed() == [second.key]
+        world.seen.clear()
+        world.start_relay()
+        assert placed() == [second.key]
+        assert messages.StateEnded in {type(seen) for seen in world.seen}
+    await asyncio.sleep(0.2)
+    assert placed() == [second.key, first.key]
+
+
+@pytest.mark.anyio
+async def test_a_defect_of_a_sink_takes_no_change_from_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = await ControlParts.begun()
+    node = world.node("/n")
+    await world.register(node, Kind.PUBLICATION, "/t")
+
+    def fail(_sink: object, _changed: object) -> None:
+        raise ArithmeticError
+
+    with monkeypatch.context() as patched:
+        for sink in (type(world.subscribers), type(world.entries)):
+            patched.setattr(sink, "flush", fail)
+        world.graph.forgotten(node)
+        with pytest.raises(ArithmeticError):
+            world.sinks.flush()
+    assert messages.NodeWithdrawn(node.key) in world.seen
+    assert ("close", node) in world.seen
