@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from appliance.channel import messages
 from appliance.master.endpoints.delivery import NodeCall
-from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.master.reconcile.sinks import restore
 from appliance.store.state_file import PermissionRow, StateStore
@@ -255,18 +254,19 @@ async def test_a_relay_gets_what_it_could_not_take_as_soon_as_it_reads() -> None
 async def test_a_node_without_a_descriptor_delays_no_other_node(monkeypatch: pytest.MonkeyPatch) -> None:
     world = await ControlParts.begun()
     first, second = world.node("/first", 1), world.node("/second", 2)
-    place = world.relay._place_node
+    first.relay_port = 7
+    ports = world.relay.places.socket
 
-    def refuse(post: Any, node: Incarnation) -> None:
-        if node is first:
+    def socket(port: int) -> Any:
+        if port == first.relay_port:
             raise OSError(24, "Too many open files")
-        place(post, node)
+        return ports(port)
 
     def placed() -> list[str]:
         return [seen.key for seen in world.seen if isinstance(seen, messages.PublicationPlaced)]
 
     with monkeypatch.context() as patched:
-        patched.setattr(RelayControl, "_place_node", lambda _relay, post, node: refuse(post, node))
+        patched.setattr(world.relay.places, "socket", socket)
         for node in (first, second):
             world.graph.registered(node, Kind.PUBLICATION, "/t", "t")
         world.sinks.flush()
