@@ -19,7 +19,8 @@ class Switches:
     """`said` has the switches that were made; `enable` is the start option."""
 
     def __init__(self, enable: str) -> None:
-        self._all: Switch = SHADOW if enable == "shadow" else enable == "all"
+        self.starts_in_shadow = enable == "shadow"
+        self._all: Switch = SHADOW if self.starts_in_shadow else enable == "all"
         words = {"all", "none", "shadow"}
         self.named = set() if enable in words else {name.strip() for name in enable.split(",")}
         self.said: dict[str, Switch] = {}

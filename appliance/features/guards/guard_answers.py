@@ -86,6 +86,7 @@ class GuardPlan(msgspec.Struct, frozen=True):
     refused: Annotated[
         list[str], doc("why the change would be refused, for example because topics would be held")
     ]
+    off: Annotated[bool, doc("it is disabled, and would stay so")] = False
 
 
 class Suggestion(msgspec.Struct, frozen=True):

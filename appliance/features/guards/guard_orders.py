@@ -138,13 +138,15 @@ class GuardOrders:
         changed: dict[str, list[str]] = {}
         if request.preset:
             file, text = self._made(request)
-            shadow, topics, stops = request.shadow, topics_in(text), 0
+            shadow = request.shadow or monitors.switches.starts_in_shadow
+            off, topics, stops = False, topics_in(text), 0
             changed = {each: ["", value] for each, value in request.values.items()}
         else:
             present, text, _constants = self._changed(name, request.values)
             file = "" if text == present else monitors.checked.monitors[name]
             row = self._row(name, self._guards()[name])
             shadow = monitors.switches.in_shadow(name) and not request.enforce
+            off = not shadow and not request.enforce and not monitors.switches.enabled(name)
             topics, stops = row.topics, row.stops
             before = row.loads | {one.name: _written(one.value) for one in row.given if one.kind != "topic"}
             after = {
@@ -154,7 +156,7 @@ class GuardOrders:
         warnings, refused = await self._judged(request, file, text, who, shadow=shadow)
         return GuardPlan(
             monitors.revision, monitors.tag, name, file, text if file else "", bool(file), shadow, changed, topics,
-            stops, warnings, refused,
+            stops, warnings, refused, off,
         )  # fmt: skip
 
     async def _judged(

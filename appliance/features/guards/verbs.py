@@ -237,7 +237,13 @@ def remove(appliance: Appliance, name: _Name, confirm_within: ConfirmWithin = No
     body = appliance.ask_or_exit(order)
     _say_changed(appliance, body)
     if loaded.folder and body.confirm_by is None:
-        file_of(row.file.removesuffix(".rv"), Path(loaded.folder)).unlink(missing_ok=True)
+        path = file_of(row.file.removesuffix(".rv"), Path(loaded.folder))
+        try:
+            if path.exists():  # on a read-only mount, the removal of a missing file also fails
+                path.unlink()
+        except OSError as error:
+            why = f"{path} is not removed: {error.strerror}; a reload of the folder loads the guard again"
+            _say_obstacle(appliance, why)
 
 
 def _runs(appliance: Appliance) -> bool:
@@ -301,6 +307,10 @@ def _write(appliance: Appliance, loaded: Monitors, file: str, text: str, *, temp
             obstacle = (
                 f"the appliance keeps the text, but {loaded.folder}/{file} is not written: {error.strerror}"
             )
+    _say_obstacle(appliance, obstacle)
+
+
+def _say_obstacle(appliance: Appliance, obstacle: str) -> None:
     if appliance.as_json:
         typer.echo(obstacle, err=True)
     else:
@@ -309,11 +319,11 @@ def _write(appliance: Appliance, loaded: Monitors, file: str, text: str, *, temp
 
 def _plan(appliance: Appliance, request: GuardTry) -> None:
     """Print what a change would do. Exit status 1 if it would be refused."""
-    plan = appliance.answer_or_exit(request)
+    plan = appliance.ask_or_exit(request)
     if appliance.as_json:
         say_json(plan)
     else:
-        how = "in shadow mode" if plan.shadow else "in force"
+        how = "in shadow mode" if plan.shadow else "disabled" if plan.off else "in force"
         if plan.file:
             say(f"would load {plan.file}; {plan.name} would begin in its initial state, {how}")
         elif plan.changed:
@@ -341,7 +351,13 @@ def _replay(appliance: Appliance, row: MonitorState, text: str, since: str) -> N
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / row.file
         path.write_text(text, encoding="utf-8")
-        replay_monitor.function(appliance, str(path), since=since)
+        try:
+            replay_monitor.function(appliance, str(path), since=since)
+        except typer.Exit as end:
+            if (
+                end.exit_code != 1
+            ):  # nothing is recorded, or the recorder is off, and this was said: the plan holds
+                raise
 
 
 def _say_preset(preset: Preset) -> None:

@@ -21,7 +21,7 @@ FENCE = Guard("fence", PRESETS["fence"], types=TYPES, values={"polygon": "0,0 1,
 class Manager:
     """A fence and a monitor that is not a guard; it keeps the orders that it gets."""
 
-    revision, tag, shadow = 2, "2.0", False
+    revision, tag, shadow, off = 2, "2.0", False, False
 
     def __init__(self) -> None:
         self.orders: list[Any] = []
@@ -31,7 +31,9 @@ class Manager:
         self.checked = SimpleNamespace(monitors={"fence": "fence.rv", "other": "other.rv"})
         self.rollout = SimpleNamespace(held=set(), why_held={}, rows={})
         self.switches = SimpleNamespace(
-            in_shadow=lambda _name: self.shadow, enabled=lambda _name: not self.shadow
+            in_shadow=lambda _name: self.shadow,
+            enabled=lambda _name: not (self.shadow or self.off),
+            starts_in_shadow=False,
         )
         self.givens = SimpleNamespace(states=lambda _checked, _name: [])
         self.returns = SimpleNamespace(until=lambda _name: None, confirm_by=lambda _name: None)
@@ -119,6 +121,18 @@ async def test_a_plan_says_what_a_change_would_do(
     plan = await orders.plan(guard_requests.GuardTry(**{"name": "fence", **request_}), "eve")
     assert plan.refused == ([] if not loads and "enforce" not in request_ else manager.objection)
     assert manager.orders == []
+
+
+async def test_a_plan_promises_no_force_that_the_settings_withhold(
+    manager: Manager, orders: GuardOrders
+) -> None:
+    manager.off = True
+    plan = await orders.plan(guard_requests.GuardTry(name="fence", values={"polygon": "0,0 2,0 2,2"}), "eve")
+    assert (plan.off, plan.shadow) == (True, False)
+    manager.switches.starts_in_shadow = True
+    topics = {"command": "/c", "by": "/o"}
+    plan = await orders.plan(guard_requests.GuardTry("fence", topics, TYPES, "yard"), "eve")
+    assert (plan.off, plan.shadow) == (False, True)
 
 
 async def test_values_are_set_in_one_change(manager: Manager, orders: GuardOrders) -> None:

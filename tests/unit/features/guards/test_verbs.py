@@ -1,3 +1,5 @@
+import contextlib
+import errno
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,9 +21,11 @@ from tests.unit.features.guards.test_suggestions import graph_of
 class Robot:
     as_json = False
     said = True
+    off = False
 
     def __init__(self, folder: Path | None, *guards: Guard, shadow: bool = False) -> None:
         self.orders: list[Any] = []
+        self.refused = ["it would hold /c"]
         self.files = {f"{one.name}.rv": text_of(one) for one in guards}
         self.folder = None if folder is None else str(folder)
         self.rows = [
@@ -47,7 +51,7 @@ class Robot:
             case GuardTry():
                 assert request.values == {"margin": "0.5"} and not request.enforce
                 return GuardPlan(2, "2", "fence", "", "", False, False, {"margin": ["0.2", "0.5"]},
-                                 {"command": "/c"}, 3, [], ["it would hold /c"])  # fmt: skip
+                                 {"command": "/c"}, 3, [], self.refused, self.off)  # fmt: skip
             case admin.MonitorsWanted():
                 return SimpleNamespace(monitors=self.rows, files=self.files, folder=self.folder)
         self.orders.append(request)
@@ -129,6 +133,65 @@ def test_json_changes_no_less(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert not (tmp_path / "fence.rv").exists()
     shown = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [one["revision"] for one in shown] == [2] * len(robot.orders) == [2] * 4
+
+
+@pytest.mark.parametrize("new", [True, False])
+def test_json_refuses_no_less(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, new: bool) -> None:
+    """A plan that would be refused ends with status 1, and is not replayed; one that would not is replayed."""
+    robot, replayed = Robot(tmp_path, FENCE), list[str]()
+    robot.as_json = True
+    monkeypatch.setattr(verbs, "_replay", lambda _robot, row, _text, _since: replayed.append(row.name))
+    verb, options = (verbs.new, ("fence", "/cmd_vel")) if new else (verbs.set_values, ("fence",))
+    with pytest.raises(typer.Exit) as ended:
+        run(verb, robot, *options, ["margin=0.5"], dry_run=True)
+    assert (ended.value.exit_code, replayed) == (1, [])
+    monkeypatch.setattr(robot, "refused", [])
+    run(verb, robot, *options, ["margin=0.5"], dry_run=True)
+    assert replayed == ([] if new else ["fence"])
+
+
+@pytest.mark.parametrize("status", [1, 2])
+def test_a_plan_holds_without_the_flight_recorder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, status: int
+) -> None:
+    """It is off in a new appliance; a mistake still ends the verb."""
+
+    def replay(*_given: Any, **_options: Any) -> None:
+        raise typer.Exit(status)
+
+    monkeypatch.setattr("appliance.cli.monitor.replay.replay_monitor", SimpleNamespace(function=replay))
+    robot = Robot(tmp_path, FENCE)
+    robot.refused = []
+    with pytest.raises(typer.Exit) if status == 2 else contextlib.nullcontext():
+        run(verbs.set_values, robot, "fence", ["margin=0.5"], dry_run=True)
+
+
+def test_a_disabled_guard_is_not_planned_in_force(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    robot = Robot(tmp_path, FENCE)
+    robot.off, robot.refused = True, []
+    run(verbs.new, robot, "fence", "/cmd_vel", ["margin=0.5"], dry_run=True)
+    assert "fence would keep its state, disabled" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("as_json", [True, False])
+def test_a_folder_that_cannot_be_changed_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], as_json: bool
+) -> None:
+    """As in compose.yaml: there even the removal of a missing file fails."""
+
+    def fails(_path: Path, missing_ok: bool = False) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(Path, "unlink", fails)
+    robot = Robot(tmp_path, FENCE)
+    robot.as_json = as_json
+    run(verbs.remove, robot, "fence")
+    shown = capsys.readouterr()
+    assert "not removed" not in shown.out + shown.err
+    (tmp_path / "fence.rv").write_text("x")
+    run(verbs.remove, robot, "fence")
+    shown = capsys.readouterr()
+    assert "fence.rv is not removed: Read-only file system" in (shown.err if as_json else shown.out)
 
 
 def test_a_constant_is_set_and_a_polygon_is_loaded(tmp_path: Path) -> None:
