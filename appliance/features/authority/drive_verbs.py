@@ -5,12 +5,14 @@ from typing import Annotated
 import typer
 
 from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.output import say_json
 from appliance.features.authority.drive_requests import (
     DriveAsk,
     DriveGive,
     DriveStatus,
     DriveTake,
     GroupState,
+    GroupStates,
 )
 from rosmop.tool.terminal import say
 
@@ -33,12 +35,15 @@ def status(
     appliance: Appliance,
     group: Annotated[str | None, typer.Argument(metavar="[GROUP]", help="Only this group")] = None,
 ) -> None:
-    """Show the holder of each group, and the hosts that wait for it.
+    """Show the holder of each group, and the hosts that wait for it. Exit status 1 if there is no such group.
 
     Example: rosrv drive status
     """
-    body = appliance.answer_or_exit(DriveStatus())
+    body = appliance.ask_or_exit(DriveStatus())
     rows = [one for one in body.groups if group in (None, one.group)]
+    if appliance.as_json:
+        say_json(GroupStates(rows))
+        raise typer.Exit(0 if rows else 1)
     if not rows:
         names = ", ".join(one.group for one in body.groups)
         say(f"[Authority] has no group {group!r}; its groups: {names}" if names else _NO_GROUPS)
