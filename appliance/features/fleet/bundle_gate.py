@@ -295,9 +295,12 @@ class BundleGate:
                 content=self._content(),
             )
         )
+        names, switches = self._monitors.checked.monitors, self._monitors.switches
+        off = [name for name in names if not (switches.enabled(name) or switches.in_shadow(name))]
+        without = f"; disabled on this robot: {', '.join(off)} (rosrv monitor enable)" if off else ""
         self._trail.happened(
             "bundle in force",
-            f"{trial.path} is in force, healthy for {self._fleet.bundles.confirm_seconds:g} s",
+            f"{trial.path} is in force, healthy for {self._fleet.bundles.confirm_seconds:g} s{without}",
             bundle=trial.path,
             sha256=trial.sha256,
             revision_of_specifications=monitors,
