@@ -236,8 +236,9 @@ def remove(appliance: Appliance, name: _Name, confirm_within: ConfirmWithin = No
     order = admin.MonitorRemove([name], confirm_within=seconds_within(confirm_within, "guard"))
     body = appliance.ask_or_exit(order)
     _say_changed(appliance, body)
-    if loaded.folder and body.confirm_by is None:
-        path = file_of(row.file.removesuffix(".rv"), Path(loaded.folder))
+    folder = _folder(appliance, loaded)
+    if folder and body.confirm_by is None:
+        path = file_of(row.file.removesuffix(".rv"), folder)
         try:
             if path.exists():  # on a read-only mount, the removal of a missing file also fails
                 path.unlink()
@@ -293,20 +294,26 @@ def _say_changed(appliance: Appliance, body: Replacement) -> None:
         say_replaced(body)
 
 
+def _folder(appliance: Appliance, loaded: Monitors) -> Path | None:
+    """Return the appliance's folder of specifications; over REST, a folder of this machine may be another's."""
+    if loaded.folder is None or appliance.place is not None:
+        return None
+    return Path(loaded.folder) if Path(loaded.folder).is_dir() else None
+
+
 def _write(appliance: Appliance, loaded: Monitors, file: str, text: str, *, temporary: bool = False) -> None:
     """Write a guard into the folder of specifications, if it is on this machine and the load is permanent."""
-    if loaded.folder is None or not Path(loaded.folder).is_dir():
+    folder = _folder(appliance, loaded)
+    if folder is None:
         obstacle = "the appliance keeps the text; it has no folder of specifications on this machine"
     elif temporary:
-        obstacle = f"{loaded.folder} is not changed while the load waits for rosrv monitor confirm"
+        obstacle = f"{folder} is not changed while the load waits for rosrv monitor confirm"
     else:
         try:
-            write_where_told(Path(loaded.folder) / file, text.encode())
+            write_where_told(folder / file, text.encode())
             return
         except OSError as error:
-            obstacle = (
-                f"the appliance keeps the text, but {loaded.folder}/{file} is not written: {error.strerror}"
-            )
+            obstacle = f"the appliance keeps the text, but {folder}/{file} is not written: {error.strerror}"
     _say_obstacle(appliance, obstacle)
 
 

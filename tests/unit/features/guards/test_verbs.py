@@ -20,6 +20,7 @@ from tests.unit.features.guards.test_suggestions import graph_of
 
 class Robot:
     as_json = False
+    place: str | None = None
     said = True
     off = False
 
@@ -192,6 +193,16 @@ def test_a_folder_that_cannot_be_changed_is_reported(
     run(verbs.remove, robot, "fence")
     shown = capsys.readouterr()
     assert "fence.rv is not removed: Read-only file system" in (shown.err if as_json else shown.out)
+
+
+def test_over_rest_no_folder_of_this_machine_changes(tmp_path: Path) -> None:
+    """Both machines of a pair have a folder of this name."""
+    robot = Robot(tmp_path, FENCE)
+    robot.place = "https://10.0.0.2:8443"
+    (tmp_path / "fence.rv").write_text("x")
+    run(verbs.new, robot, "speed", "/cmd_vel")
+    run(verbs.remove, robot, "fence")
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("fence.rv", "x")]
 
 
 def test_a_constant_is_set_and_a_polygon_is_loaded(tmp_path: Path) -> None:
