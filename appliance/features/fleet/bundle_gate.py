@@ -15,7 +15,7 @@ Invariants:
 """
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import msgspec
 import structlog
@@ -46,6 +46,7 @@ from appliance.policy.policy import Policy
 from appliance.signing.fingerprints import fingerprint
 from appliance.specifications.specification_files import Sources, SpecificationsRefusedError
 from appliance.specifications.specification_manager import SpecificationManager
+from appliance.specifications.switches import Switches
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
@@ -102,6 +103,12 @@ class BundleRecord(msgspec.Struct, frozen=True):
     interrupted: str = ""
     interruptions: int = 0
     content: str = ""
+
+
+def disabled_among(monitors: Iterable[str], switches: Switches) -> str:
+    """Return the end of a record that names the monitors which do nothing, or an empty text."""
+    off = [name for name in monitors if not (switches.enabled(name) or switches.in_shadow(name))]
+    return f"; disabled on this robot: {', '.join(off)} (rosrv monitor enable)" if off else ""
 
 
 class BundleGate:
@@ -295,9 +302,7 @@ class BundleGate:
                 content=self._content(),
             )
         )
-        names, switches = self._monitors.checked.monitors, self._monitors.switches
-        off = [name for name in names if not (switches.enabled(name) or switches.in_shadow(name))]
-        without = f"; disabled on this robot: {', '.join(off)} (rosrv monitor enable)" if off else ""
+        without = disabled_among(self._monitors.checked.monitors, self._monitors.switches)
         self._trail.happened(
             "bundle in force",
             f"{trial.path} is in force, healthy for {self._fleet.bundles.confirm_seconds:g} s{without}",
