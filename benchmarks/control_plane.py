@@ -103,7 +103,7 @@ class Client:
         self.sock: socket.socket | None = None
 
     def send(self) -> socket.socket:
-        """Opens a connection if there is none."""
+        """Open a connection unless one is open."""
         self._began = time.perf_counter()
         if self.sock is None:
             self.sock = socket.create_connection(("127.0.0.1", self._port), source_address=(self._host, 0))

@@ -27,7 +27,7 @@ class Appliances:
         """Wait a moment for the other appliance of two."""
 
     def certificate(self, key: str) -> bytes:
-        """Valid for the tunnel key, in PEM; empty if there is none."""
+        """Return the certificate of the tunnel key, in PEM, or an empty text."""
         del key
         return b""
 

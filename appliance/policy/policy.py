@@ -236,7 +236,7 @@ class Policy:
         return self._commanded.get(name)
 
     def may_command(self, name: str, host: Address) -> bool:
-        """Messages and calls of this host reach a topic or service: it holds the group, or there is none."""
+        """Whether this host may command a topic or service: no group has it, or the host holds the group."""
         group = self._commanded.get(name)
         if group is None:
             return True

@@ -25,7 +25,7 @@ HasSigned = Callable[[bytes, bytes, bytes], bool]
 
 
 class ProofFault(enum.Enum):
-    """Why a record or a checkpoint is not the one that the appliance wrote."""
+    """Why the appliance did not write a record or a checkpoint."""
 
     CHANGED = "a record does not have its hash"
     MOVED = "a record does not follow the one before it"

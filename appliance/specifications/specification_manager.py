@@ -83,7 +83,7 @@ _WORDS: dict[Switch, str] = {True: "enabled", False: "disabled", SHADOW: "in sha
 
 
 class UnknownMonitorError(Exception):
-    """The text lists the valid ones."""
+    """A monitor, file or revision does not exist; the text lists the valid names."""
 
 
 class DryRunUnderWayError(Exception):

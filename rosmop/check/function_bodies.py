@@ -201,7 +201,7 @@ def _calls(names: SpecificationNames) -> dict[str, set[str]]:
 
 
 def topics_of(names: SpecificationNames, function: str) -> list[str]:
-    """Return the topics that a function, or one that it calls, publishes."""
+    """Return the topics to which a function publishes, itself or through other functions."""
     reached = _reached({function}, _calls(names))
     found = (node for name in reached for node in tree.walk(names.functions[name].node.body))
     return sorted({node.topic for node in found if isinstance(node, tree.PublishStatement)})

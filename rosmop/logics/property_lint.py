@@ -21,7 +21,7 @@ TIME = "<time>"
 
 @dataclass(frozen=True)
 class PropertyFact:
-    """A certain fact. ``trace`` is a shortest one that shows it, if any."""
+    """A certain fact. ``trace`` is a shortest trace that shows it, or None."""
 
     kind: Literal["never runs", "never violated", "violated at once"]
     category: str

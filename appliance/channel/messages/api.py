@@ -45,7 +45,7 @@ class RequestWithdrawn(Message):
 
 
 class RequestAnswered(Message):
-    """The document is the one that the admin socket would send."""
+    """Carries the same document as the admin socket."""
 
     number: int
     answer: bytes

@@ -152,7 +152,7 @@ class RouteWanted(Message):
 
 
 class RouteFound(Message):
-    """`address` is None if the one that the peer used is correct."""
+    """`address` is None if the peer used the correct address."""
 
     host: str
     address: str | None

@@ -174,7 +174,7 @@ async def make_foundation(
         approved=lambda: features().approved(),
         live=lambda: enforcement().revocation.live(),  # noqa: PLW0108  it is assembled later
         changed=lambda _before, policy: enforcement().policy_changed(policy),
-        carried_out=lambda: enforcement().sinks.relay.carried_out(),  # noqa: PLW0108  same
+        carried_out=lambda: enforcement().sinks.relay.carried_out(),  # noqa: PLW0108  it is assembled later
         site_keys=settings.site_keys,
     )
     policies.start(restarted=restarted or role.paired)

@@ -80,7 +80,7 @@ class ProviderConnection:
             ) from error
 
     def _pool(self) -> Pool:
-        """All connections go to the one destination. Raises `OSError`."""
+        """Return a pool whose connections all go to one destination. Raises `OSError`."""
         context = _tls(self._wanted)
         network = _OneDestination(*self._wanted.destination)
         if self._wanted.proxy is not None:

@@ -68,7 +68,7 @@ class Site:
         ]
         self.checks = DriverChecks(
             manager, trail, lambda: Graph([], topics, []),  # type: ignore[arg-type]  # as much of them as checks need
-            lambda: [SimpleNamespace(role="relay", pid=self.pid), SimpleNamespace(role="api", pid=9)],  # type: ignore[list-item]  # the same
+            lambda: [SimpleNamespace(role="relay", pid=self.pid), SimpleNamespace(role="api", pid=9)],  # type: ignore[list-item]  # as much of them as checks need
         )  # fmt: skip
 
 
