@@ -81,7 +81,7 @@ class PolicyJudgement(NamedTuple):
 def judge(text: str, file: str, known: PolicyContext, signature: str = "") -> PolicyJudgement:
     """`file` is the name in findings and rules.
 
-    Raises `PolicyError` with all errors in the text, or if there are none, of the signature or the test cases.
+    Raises `PolicyError` with all errors of the text; if it has none, of the signature or the test cases.
     """
     policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot)
     try:

@@ -103,7 +103,7 @@ class HourlyLimit:
 
 
 class RecordingPlan:
-    """For each audit record that is a trigger, the recording, or the reason why there is none.
+    """Name the recording of each audit record that is a trigger, or the reason why none is made.
 
     `charged_to(host)` returns the name that is charged for a host's acts; `new_id` returns an id for a recording.
     """
