@@ -32,6 +32,7 @@ from appliance.control.assembly.policy_gate import (
     with_cases,
 )
 from appliance.control.errors import UnknownThingError
+from appliance.policy.host_names import HostNames, in_words
 from appliance.policy.host_sets import Network
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.live_rights import LiveRight, deprived
@@ -126,6 +127,11 @@ class Policies(Revisions[RevisionRow]):
 
     def named_as(self, host: Address) -> Network:
         return self.current.named_as(host)
+
+    def in_words(self, host: str) -> str:
+        """Return `tablet (10.0.0.7)` for a host that the policy in force names."""
+        policy = self.current
+        return in_words(host, HostNames.of(policy.text, policy.enrolled, policy.robot).labels())
 
     @property
     def differs_from_file(self) -> bool:

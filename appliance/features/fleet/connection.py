@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import httpcore
+import msgspec
 
+from appliance.audit.log.record_format import printable
 from appliance.base import clock
 from appliance.base.input_files import path_for_library, read_given
 from appliance.signing.own_certificate import untimely
@@ -28,6 +30,7 @@ _LARGEST_ANSWER = 65_536
 _LONGEST_TAG = 200
 _LONGEST_CERTIFICATE = 1 << 20
 _LONGEST_REASON = 500
+_LONGEST_REFUSAL = 16_384  # bytes of the answer that has the reason
 _NOT_MODIFIED = 304
 _EXPECTED = (200, 201, 204)
 _UNTIMELY = (9, 10)  # OpenSSL: a certificate is not yet valid, or has expired
@@ -44,6 +47,10 @@ class CollectorError(Exception):
         super().__init__(reason)
         self.status = status
         self.wait = wait
+
+
+class _Refusal(msgspec.Struct, frozen=True):
+    detail: str
 
 
 class ConditionalAnswer(NamedTuple):
@@ -250,18 +257,26 @@ def _checked(path: str, answer: httpcore.Response) -> httpcore.Response:
         raise CollectorError(f"{path}: the collector compresses its answer")
     if answer.status in _EXPECTED:
         return answer
-    reason = b""
+    refusal = b""
     for part in answer.iter_stream():
-        reason += part
-        if len(reason) > _LONGEST_REASON:
+        refusal += part
+        if len(refusal) > _LONGEST_REFUSAL:
             break
-    text = ascii(reason[:_LONGEST_REASON].decode("utf-8", "replace"))[1:-1]  # terminals print it
     wait = _header(answer, b"retry-after")
     raise CollectorError(
-        f"the collector answers {answer.status}: {text}",
+        f"the collector answers {answer.status}: {reason_in(refusal)}",
         answer.status,
         float(wait) if wait.isdigit() else 0.0,
     )
+
+
+def reason_in(refusal: bytes) -> str:
+    """Return the `detail` of a collector's refusal; the body of another server, in printable characters."""
+    try:
+        text = msgspec.json.decode(refusal[:_LONGEST_REFUSAL], type=_Refusal).detail
+    except (msgspec.DecodeError, UnicodeDecodeError):
+        text = refusal.decode("utf-8", "replace").strip() or "no reason"
+    return printable(text[:_LONGEST_REASON])
 
 
 def _header(answer: httpcore.Response, name: bytes) -> bytes:

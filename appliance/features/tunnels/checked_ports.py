@@ -10,6 +10,7 @@ from appliance.features.tunnels.certification import Certification
 from appliance.features.tunnels.host_answers import PortsReport
 from appliance.features.tunnels.host_view import HostView
 from appliance.hosts.host_table import HostRefusedError
+from appliance.policy.host_names import HostInWords
 from appliance.store.host_tables import PortsRow
 
 _CLOCKS_DIFFER = 86_400.0
@@ -20,7 +21,11 @@ class PortChecks:
     """`machines()` returns the number of nodes by address."""
 
     def __init__(
-        self, certification: Certification, view: HostView, machines: Callable[[], dict[str, int]]
+        self,
+        certification: Certification,
+        view: HostView,
+        machines: Callable[[], dict[str, int]],
+        in_words: HostInWords,
     ) -> None:
         self._certification = certification
         self._table = certification.table
@@ -28,6 +33,7 @@ class PortChecks:
         self._trail = certification.trail
         self._view = view
         self._machines = machines
+        self._in_words = in_words
 
     async def tell(self, request: host_requests.HostPorts, who: str) -> PortsReport:
         """Raises `HostRefusedError`, `HostsChangedError`."""
@@ -41,7 +47,7 @@ class PortChecks:
         self._table.keep_ports(row)
         self._trail.happened(
             "ports checked",
-            f"the ROS ports of {key} are {state}" + (f": {row.open}" if row.open else ""),
+            f"the ROS ports of {self._in_words(key)} are {state}" + (f": {row.open}" if row.open else ""),
             severity=Severity.WARNING if state == "open" else Severity.NOTICE,
             name=key,
             state=state,

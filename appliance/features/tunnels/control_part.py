@@ -40,6 +40,7 @@ async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
         expel=parts.endpoints.enforcement.expel,
         carried_out=parts.endpoints.relay.carried_out,
         machines=partial(machines, base, parts),
+        in_words=base.policies.in_words,
     )
     return FeaturePart(
         methods=(

@@ -31,6 +31,7 @@ from appliance.features.tunnels.self_service import HostSelfService
 from appliance.hosts.host_table import LONGEST_DAYS, HostRefusedError
 from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHostsError
 from appliance.hosts.tunnel_hosts import TunnelHosts
+from appliance.policy.host_names import HostInWords
 from appliance.policy.model import Address
 from appliance.store.host_tables import EnrolmentTokenRow
 
@@ -51,6 +52,7 @@ class HostEnrolment(TunnelHosts):
         expel: Callable[[Address, str], int],
         carried_out: Callable[[], Awaitable[None]],
         machines: Callable[[], dict[str, int]],
+        in_words: HostInWords,
     ) -> None:
         self._certification = certification
         self._store = certification.store
@@ -58,9 +60,9 @@ class HostEnrolment(TunnelHosts):
         self._table = certification.table
         self._tunnels = certification.tunnels
         self._awaited = certification.awaited
-        self._view = HostView(self._table, self._awaited, self._tunnels)
+        self._view = HostView(self._table, self._awaited, self._tunnels, in_words)
         self.itself = HostSelfService(certification)
-        self.ports = PortChecks(certification, self._view, machines)
+        self.ports = PortChecks(certification, self._view, machines, in_words)
         self._find_endpoint = find_endpoint
         self._expel = expel
         self._carried_out = carried_out

@@ -11,6 +11,7 @@ from appliance.features.tunnels.enrolment_tokens import EnrolmentTokens
 from appliance.features.tunnels.host_answers import Machine
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.tunnel_state import Tunnels
+from appliance.policy.host_names import HostInWords
 from appliance.store.host_tables import EnrolmentTokenRow, HostRow
 
 SOON_SECONDS = 14 * 86_400.0
@@ -27,10 +28,13 @@ def soon(table: HostTable, row: HostRow, now: float) -> bool:
 class HostView:
     """`machines` counts, by address, nodes that use no tunnel."""
 
-    def __init__(self, table: HostTable, awaited: EnrolmentTokens, tunnels: Tunnels) -> None:
+    def __init__(
+        self, table: HostTable, awaited: EnrolmentTokens, tunnels: Tunnels, in_words: HostInWords
+    ) -> None:
         self._table = table
         self._awaited = awaited
         self._tunnels = tunnels
+        self._in_words = in_words
 
     def rows(self) -> list[Host]:
         awaited = self._awaited.rows()
@@ -119,7 +123,7 @@ class HostView:
 
     def _open_ports(self) -> list[str]:
         return [
-            f"ROS ports of {name} are open to hosts other than the appliance (checked by {row.who}):"
+            f"ROS ports of {self._in_words(name)} are open to hosts other than the appliance (checked by {row.who}):"
             " run rosrv protect there"
             for name, row in self._table.ports.items()
             if row.state == "open" and not ((host := self._table.rows.get(name)) and host.revoked is not None)

@@ -6,6 +6,7 @@ import msgspec
 import pytest
 
 from appliance.features.fleet import fleet_verbs
+from appliance.features.fleet.connection import reason_in
 from appliance.formats.fleet_membership import JoinRequest
 
 _CERTIFICATE = "-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n"
@@ -45,3 +46,22 @@ def test_a_join_needs_no_checkpoint(
     monkeypatch.setattr(fleet_verbs, "prepare_membership", prepared)
     fleet_verbs.join(invitation, state)
     assert [request.key for request in posted] == [sent]
+
+
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [
+        (b'{"detail": "arm7 is enrolled with another key: rosrv-fleet robot remove arm7"}',
+         "arm7 is enrolled with another key: rosrv-fleet robot remove arm7"),
+        ('{"detail": "a robot Größe is enrolled"}'.encode(), "a robot Größe is enrolled"),
+        (b'{"detail": "clear\\u001b[2J"}', "clear\\x1b[2J"),
+        (b"<h1>Bad Gateway</h1>", "<h1>Bad Gateway</h1>"),
+        (b'{"detail": [{"loc": ["body"]}]}', '{"detail": [{"loc": ["body"]}]}'),
+        (b"\xff", "\N{REPLACEMENT CHARACTER}"),
+        (b"", "no reason"),
+        (b'{"detail": "' + b"x" * 9000 + b'"}', "x" * 500),
+    ],
+    ids=["detail", "unicode", "escape", "proxy", "other json", "not text", "empty", "long"],
+)  # fmt: skip
+def test_a_refusal_is_shown_as_a_sentence(body: bytes, reason: str) -> None:
+    assert reason_in(body) == reason

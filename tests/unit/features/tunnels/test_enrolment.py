@@ -121,6 +121,7 @@ class Bench:
             expel=self._expel,
             carried_out=self._carried_out,
             machines=lambda: self.machines,
+            in_words=lambda host: f"tablet ({host})" if host == "10.0.0.7" else host,
         )
 
     def close(self) -> None:
@@ -630,6 +631,14 @@ async def test_scanned_ports_of_a_host_are_kept(bench: Bench) -> None:
     assert [(one.address, one.nodes, one.ports.state) for one in overview.machines] == [
         ("10.0.0.7", 3, "closed")
     ]
+
+
+async def test_an_alarm_about_open_ports_names_the_host_as_the_policy_does(bench: Bench) -> None:
+    bench.machines = {"10.0.0.7": 3}
+    await bench.hosts.ports.tell(HostPorts("10.0.0.7", "open", [40001], 5.0), "eve")
+    (trouble,) = bench.hosts.status().troubles
+    assert trouble.startswith("ROS ports of tablet (10.0.0.7) are open to hosts other than the appliance")
+    assert "the ROS ports of tablet (10.0.0.7) are open: [40001]" in str(bench.recorded("ports checked"))
 
 
 @pytest.mark.parametrize("order", [HostRevoke("a"), HostsReload()], ids=["revoke", "reload"])
