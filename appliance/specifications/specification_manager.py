@@ -74,6 +74,7 @@ _NO_FOLDER = (
 )
 
 
+_NO_FILES: tuple[list[str], list[str], list[str]] = ([], [], [])
 _EVENTS: dict[Switch, str] = {
     True: "monitor enabled",
     False: "monitor disabled",
@@ -267,7 +268,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             sources = self.sources.with_files(new)
             shadow = frozenset(new.files) if request.shadow else frozenset()
             if self.in_force.who != DISK and sources == self.sources and not (shadow or request.given):
-                return self._replaced(self.revision, ([], [], []))  # same texts: no new revision
+                return self._replaced(
+                    self.revision, _NO_FILES, loaded=new.files
+                )  # same texts: no new revision
             note, within = request.note or "loaded", request.confirm_within
             how = _Consent(request.force, request.hold)
             return await self._change(
@@ -276,6 +279,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 who,
                 note,
                 within,
+                loaded=new.files,
                 shadow=shadow,
                 enable=frozenset(new.files) if enable else (),
                 consent=how,
@@ -349,7 +353,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         async with self._changing(None):
             sources = sources.with_topics(self.sources.topics)
             if self.in_force.who != DISK and sources == self.sources:
-                return self._replaced(self.revision, ([], [], []))  # same texts: no new revision
+                return self._replaced(self.revision, _NO_FILES)  # same texts: no new revision
             return await self._change(sources, who, who, note, consent=_Consent(hold=True))
 
     async def held_by_bundle(self, sources: Sources) -> list[str]:
@@ -708,6 +712,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         confirm_within: float | None = None,
         *,
         kept: Sequence[str] = (),
+        loaded: Collection[str] = (),
         switches: Mapping[str, Switch] = {},
         given: Given = NO_VALUES,
         shadow: Collection[str] = (),
@@ -716,7 +721,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         topics: Mapping[str, Mapping[str, str]] = MappingProxyType({}),
         constants: Given = NO_VALUES,
     ) -> Replacement:
-        """`kept` are files that are not in the folder.
+        """`kept` are files that are not in the folder, `loaded` those that the operator named.
 
         `switches`, and the values `given`, are for monitors that are not in force yet; monitors in the files `shadow`
         start in shadow mode, and those in the files `enable` are not disabled. `topics` and `constants` are new values
@@ -775,7 +780,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         await self.rollout.all_taken()
         self._published()
         began = self.rollout.began(checked.monitors)  # also on relays that took them only now
-        done = self._replaced(before, sources.difference(previous), moved, began, kept)
+        done = self._replaced(before, sources.difference(previous), moved, began, kept, loaded=loaded)
         return msgspec.structs.replace(done, warnings=[*done.warnings, *warnings])
 
     def _check_given(
@@ -838,11 +843,22 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         moved: Sequence[str] = (),
         began: Sequence[str] = (),
         kept: Sequence[str] = (),
+        *,
+        loaded: Collection[str] = (),
     ) -> Replacement:
-        warnings = list(self.checked.warnings)
+        warnings, (added, changed, _removed) = list(self.checked.warnings), files
+        touched = {*loaded, *added, *changed}
+        states = {
+            name: self.switches.states[name]
+            for name, file in self.checked.monitors.items()
+            if file in touched
+        }
         return Replacement(
-            self.revision, self.tag, before, *files, warnings, [*moved], [*began], [*kept], self.confirm_by
-        )
+            self.revision, self.tag, before, *files, warnings, [*moved], [*began], [*kept], self.confirm_by,
+            disabled=[name for name, state in states.items() if state is False],
+            shadow=[name for name, state in states.items() if state == SHADOW],
+            held={name: why for name, why in self.rollout.why_held.items() if name in states},
+        )  # fmt: skip
 
     def _keep(
         self,

@@ -142,6 +142,11 @@ class Replacement(msgspec.Struct, frozen=True):
     began: Annotated[list[str], doc("monitors that began in their initial state")]
     kept: Annotated[list[str], doc("files that a reload left in force although the folder lacks them")]
     confirm_by: Moment | None
+    disabled: Annotated[list[str], doc("loaded monitors that do nothing until they are enabled")] = []
+    shadow: Annotated[list[str], doc("loaded monitors in shadow mode")] = []
+    held: Annotated[
+        dict[str, str], doc("loaded monitors that hold their topics until they are resumed, and why")
+    ] = {}
 
 
 class MonitorsConfirmed(msgspec.Struct, frozen=True):

@@ -1,6 +1,6 @@
 """`rosrv monitor list|enable|promote|disable|load|remove|reload|resume`: monitors of the running appliance."""
 
-from collections.abc import Collection
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -67,7 +67,7 @@ def list_monitors(appliance: Appliance) -> None:
         say("no monitors; load some: rosrv monitor load FILE…")
     if any(row.shadow for row in body.monitors):
         say("(in brackets: messages that a monitor in shadow mode would have dropped or changed)", "dim")
-    _say_held(body.monitors)
+    _say_held({row.name: row.why_held for row in body.monitors if row.held})
     source = f" ({body.folder})" if body.folder else ""
     differs = (
         "; differs from the folder (load the folder's, removing no others: rosrv monitor reload)"
@@ -187,7 +187,6 @@ def load(
         given=_given_to_monitors(given or []),
     )
     say_replaced(appliance.answer_or_exit(order))
-    _say_idle(appliance, sent.files)
 
 
 @speaks
@@ -222,7 +221,6 @@ def reload(
     say_replaced(body)
     if body.kept:
         say(f"in force but not in the folder: {', '.join(body.kept)} (--prune removes them)", "yellow")
-    _say_idle(appliance, [*body.added, *body.changed])
 
 
 @speaks
@@ -344,7 +342,8 @@ def _state(row: MonitorState) -> str:
     return "disabled" if row.off_until is None else f"disabled until {moment(row.off_until)}"
 
 
-def say_replaced(body: Replacement) -> None:
+def say_replaced(body: Replacement, promote: str = "rosrv monitor promote") -> None:
+    """`promote` is the command that ends shadow mode."""
     for warning in body.warnings:
         say(warning, "yellow")
     parts = [
@@ -360,20 +359,16 @@ def say_replaced(body: Replacement) -> None:
     if body.warnings:
         say(counted(len(body.warnings), "warning"), "yellow")
     say_deadline(body.confirm_by, "monitor")
-
-
-def _say_idle(appliance: Appliance, files: Collection[str]) -> None:
-    rows = [row for row in appliance.ask_or_exit(admin.MonitorsWanted()).monitors if row.file in files]
-    for word, verb, names in (
-        ("disabled", "enable", [row.name for row in rows if not row.enabled and not row.shadow]),
-        ("in shadow mode", "promote", [row.name for row in rows if row.shadow]),
+    for word, idle, command in (
+        ("disabled", body.disabled, "rosrv monitor enable"),
+        ("in shadow mode", body.shadow, promote),
     ):
-        if names:
-            say(f"{word}: {', '.join(names)}; rosrv monitor {verb} {' '.join(names)}", "yellow")
-    _say_held(rows)
+        if idle:
+            say(f"{word}: {', '.join(idle)}; {command} {' '.join(idle)}", "yellow")
+    _say_held(body.held)
 
 
-def _say_held(rows: Collection[MonitorState]) -> None:
-    for row in (row for row in rows if row.held):
-        why = row.why_held or "its relay process was restarted"
-        say(f"{row.name} holds its topics: {why}; when it is safe: rosrv monitor resume {row.name}", "red")
+def _say_held(held: Mapping[str, str]) -> None:
+    for name, why in held.items():
+        because = why or "its relay process was restarted"
+        say(f"{name} holds its topics: {because}; when it is safe: rosrv monitor resume {name}", "red")

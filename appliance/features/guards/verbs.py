@@ -156,8 +156,6 @@ def new(
     )  # fmt: skip
     _say_changed(appliance, body)
     _write(appliance, loaded, file, text, temporary=body.confirm_by is not None)
-    if shadow and not appliance.as_json:
-        say(f"in shadow mode: {guard.name}; rosrv guard enforce {guard.name}", "yellow")
 
 
 @speaks
@@ -291,7 +289,7 @@ def _say_changed(appliance: Appliance, body: Replacement) -> None:
     if appliance.as_json:
         say_json(body)
     else:
-        say_replaced(body)
+        say_replaced(body, "rosrv guard enforce")
 
 
 def _folder(appliance: Appliance, loaded: Monitors) -> Path | None:

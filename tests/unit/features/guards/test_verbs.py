@@ -71,7 +71,9 @@ def _changed(order: Any) -> Any:
         return GivenSet(order.name, [*order.values], [], 2, "2.1")
     if isinstance(order, admin.MonitorShadow):
         return Switched(["fence"], 2, "2.1")
-    return Replacement(2, "2.0", 1, [], [], [], [], [], [], [], getattr(order, "confirm_within", None))
+    shadow = [order.name] if isinstance(order, GuardNew) and order.shadow else []
+    within = getattr(order, "confirm_within", None)
+    return Replacement(2, "2.0", 1, [], [], [], [], [], [], [], within, shadow=shadow)
 
 
 FENCE = Guard("fence", PRESETS["fence"], types={"command": "geometry_msgs/Twist", "by": "nav_msgs/Odometry"})
