@@ -99,6 +99,8 @@ def answer(wanted: _Question) -> messages.ContentsFound | messages.PartsMade | m
             return messages.PartsMade(wanted.number, checking.parts(wanted.compiled, wanted.parts))
         if wanted.at_start:
             found = checking.contents_at_start(wanted.files, wanted.definitions, wanted.topics)
+        elif wanted.broken:
+            found = checking.contents_beside(wanted.files, wanted.definitions, wanted.broken, wanted.topics)
         else:
             found = checking.contents(
                 wanted.files, wanted.definitions, load=wanted.dry_run, given_topics=wanted.topics

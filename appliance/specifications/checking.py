@@ -1,6 +1,6 @@
 """Compile whole sets of specifications; control has the process `compiler` for this."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cache
 from types import MappingProxyType
 
@@ -131,6 +131,24 @@ def contents_at_start(
     except SpecificationsRefusedError:
         raise refusal from None
     return msgspec.structs.replace(found, left_out=left_out)
+
+
+def contents_beside(
+    files: Mapping[str, str],
+    texts: Mapping[str, str],
+    broken: Collection[str],
+    given_topics: Topics = NO_TOPICS,
+) -> Contents:
+    """Like `contents_at_start`, for a change while files that had errors before, `broken`, are in force.
+
+    Raises `SpecificationsRefusedError` if another file has an error.
+    """
+    found = contents_at_start(files, texts, given_topics)
+    errors = found.left_out | {found.monitors[name]: error for name, error in found.unbuilt.items()}
+    fresh = [error for file, error in errors.items() if file not in broken]
+    if fresh:
+        raise SpecificationsRefusedError(fresh)
+    return found
 
 
 def check(

@@ -64,19 +64,24 @@ class SpecificationCompiler:
         self._called = False
         self._there.set()
 
-    async def check(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-        """For an order. Raises `SpecificationsRefusedError`, also if the compiler does not answer."""
-        return await self._checked(sources, site_keys, at_start=False)
+    async def check(
+        self, sources: Sources, site_keys: Sequence[str], broken: Sequence[str] = ()
+    ) -> CheckedSpecifications:
+        """For an order. Files in `broken` may have errors, as after a start.
+
+        Raises `SpecificationsRefusedError`, also if the compiler does not answer.
+        """
+        return await self._checked(sources, site_keys, broken, at_start=False)
 
     async def check_at_start(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
         """For a start: files with errors do not keep the others from coming into force (`Contents.unbuilt`).
 
         Raises the errors of `check`.
         """
-        return await self._checked(sources, site_keys, at_start=True)
+        return await self._checked(sources, site_keys, (), at_start=True)
 
     async def _checked(
-        self, sources: Sources, site_keys: Sequence[str], *, at_start: bool
+        self, sources: Sources, site_keys: Sequence[str], broken: Sequence[str], *, at_start: bool
     ) -> CheckedSpecifications:
         if not sources.files:
             return CheckedSpecifications()
@@ -84,12 +89,19 @@ class SpecificationCompiler:
         ask = self._asked_once if at_start else self._ordered
         answer = await ask(
             lambda number: messages.ContentsWanted(
-                number, sources.files, sources.definitions, at_start=at_start, topics=sources.topics
+                number,
+                sources.files,
+                sources.definitions,
+                at_start=at_start,
+                topics=sources.topics,
+                broken=[*broken],
             )
         )
         return checked(answer.contents, sources, site_keys)
 
-    async def try_out(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
+    async def try_out(
+        self, sources: Sources, site_keys: Sequence[str], broken: Sequence[str] = ()
+    ) -> CheckedSpecifications:
         """For a dry run. Raises the errors of `check`, also if an order ended the dry run."""
         if not sources.files:
             return CheckedSpecifications()
@@ -100,7 +112,12 @@ class SpecificationCompiler:
             try:
                 answer = await self._asked(
                     lambda number: messages.ContentsWanted(
-                        number, sources.files, sources.definitions, dry_run=True, topics=sources.topics
+                        number,
+                        sources.files,
+                        sources.definitions,
+                        dry_run=True,
+                        topics=sources.topics,
+                        broken=[*broken],
                     ),
                     goes_on=lambda: not self._orders,
                 )

@@ -21,7 +21,8 @@ Invariants:
 import asyncio
 import datetime
 import json
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
@@ -51,6 +52,7 @@ from appliance.specifications.specification_files import (
 from appliance.specifications.specification_revisions import (
     NOTHING,
     Check,
+    CheckBeside,
     StoredSpecifications,
     kept_in,
     sources_of,
@@ -137,9 +139,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         published: Callable[[], None],
         told: Collection[Callable[[messages.MonitorEvent], None]],
         site_keys: Sequence[str],
-        check: Check,
+        check: CheckBeside,
         check_at_start: Check,
-        try_out: Check,
+        try_out: CheckBeside,
         parts: Parts,
         live: Callable[[], Published],
     ) -> None:
@@ -267,7 +269,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             new = Sources(request.files, request.definitions, request.signatures, topics)
             sources = self.sources.with_files(new)
             shadow = frozenset(new.files) if request.shadow else frozenset()
-            if self.in_force.who != DISK and sources == self.sources and not (shadow or request.given):
+            asks = shadow or request.given or new.files.keys() & self._broken().keys()
+            if self.in_force.who != DISK and sources == self.sources and not asks:
                 return self._replaced(
                     self.revision, _NO_FILES, loaded=new.files
                 )  # same texts: no new revision
@@ -279,6 +282,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 who,
                 note,
                 within,
+                check=partial(self._beside_broken, self._check, loaded=new.files),
                 loaded=new.files,
                 shadow=shadow,
                 enable=frozenset(new.files) if enable else (),
@@ -301,7 +305,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             topics, constants = split(request.given)
             new = Sources(request.files, request.definitions, request.signatures, topics)
             following = present.with_files(new)
-            checked = await self._try_out(following, self.site_keys)
+            checked = await self._beside_broken(self._try_out, following, request.files)
             self._check_given(topics, constants, checked)
         finally:
             self._attempting.discard(who)
@@ -345,7 +349,15 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             within, note = request.confirm_within, reloaded_by(who)
             how = _Consent(request.force, request.hold)
             return await self._change(
-                sources, keeper, who, note, within, kept=kept, shadow=shadow, consent=how
+                sources,
+                keeper,
+                who,
+                note,
+                within,
+                check=self._strictly,
+                kept=kept,
+                shadow=shadow,
+                consent=how,
             )
 
     async def take_bundle(self, sources: Sources, who: str, note: str) -> Replacement:
@@ -354,14 +366,16 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             sources = sources.with_topics(self.sources.topics)
             if self.in_force.who != DISK and sources == self.sources:
                 return self._replaced(self.revision, _NO_FILES)  # same texts: no new revision
-            return await self._change(sources, who, who, note, consent=_Consent(hold=True))
+            return await self._change(
+                sources, who, who, note, check=self._strictly, consent=_Consent(hold=True)
+            )
 
     async def held_by_bundle(self, sources: Sources) -> list[str]:
         """Return why these sources would hold topics with traffic. Raises `SpecificationsRefusedError`."""
         sources = sources.with_topics(self.sources.topics)
         if sources == self.sources:
             return []
-        checked = await self._check(sources, self.site_keys)
+        checked = await self._strictly(sources)
         return self._held(checked, self._in_shadow(checked), hold=False).conflicts
 
     async def remove(self, request: admin.MonitorRemove, who: str) -> Replacement:
@@ -389,18 +403,28 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             keeper, within = who, request.confirm_within
             if within is None and self._is_folder(sources):
                 keeper = DISK  # the baseline again, so the next start reads the folder
-            return await self._change(sources, keeper, who, note, within, consent=_Consent())
+            check = partial(self._beside_broken, self._check)
+            return await self._change(sources, keeper, who, note, within, check=check, consent=_Consent())
 
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
         """None is the previous revision, 0 no specifications.
 
-        A monitor that returns gets the switch that it had when it was removed. Raises `SpecificationsRefusedError`.
+        A monitor that returns gets the switch that it had when it was removed. Raises `SpecificationsRefusedError`;
+        nobody would read it after an unconfirmed change, so there a file with an error does nothing, as after a start.
         """
+        check = self._as_at_start if who == UNCONFIRMED else self._strictly
         async with self._changing(request.expected):
             row = NOTHING if request.revision == 0 else await self._wanted(request.revision)
             note, last = f"rolled back to revision {row.revision}", kept_in(row)
             return await self._change(
-                sources_of(row), who, who, note, switches=last.switches, given=last.given, consent=_ALL
+                sources_of(row),
+                who,
+                who,
+                note,
+                check=check,
+                switches=last.switches,
+                given=last.given,
+                consent=_ALL,
             )
 
     async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.MonitorsConfirmed:
@@ -711,6 +735,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         note: str,
         confirm_within: float | None = None,
         *,
+        check: Callable[[Sources], Awaitable[CheckedSpecifications]],
         kept: Sequence[str] = (),
         loaded: Collection[str] = (),
         switches: Mapping[str, Switch] = {},
@@ -734,7 +759,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             **switched,
         }
         try:
-            checked = await self._check(sources, self.site_keys)
+            checked = await check(sources)
             sources = sources.with_topics(sources.topics, checked.givens)
             new = self._check_given(topics, constants, checked)
             back = {name: dict(values) for name, values in given.items() if name not in self.checked.monitors}
@@ -782,6 +807,40 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         began = self.rollout.began(checked.monitors)  # also on relays that took them only now
         done = self._replaced(before, sources.difference(previous), moved, began, kept, loaded=loaded)
         return msgspec.structs.replace(done, warnings=[*done.warnings, *warnings])
+
+    async def _strictly(self, sources: Sources) -> CheckedSpecifications:
+        return await self._check(sources, self.site_keys, ())
+
+    async def _as_at_start(self, sources: Sources) -> CheckedSpecifications:
+        return await self._check_at_start(sources, self.site_keys)
+
+    def _broken(self) -> dict[str, str]:
+        """Return the files that do nothing since the start, with their errors."""
+        unbuilt = {self.checked.monitors[name]: error for name, error in self.checked.unbuilt.items()}
+        return self.checked.left_out | unbuilt
+
+    async def _beside_broken(
+        self, check: CheckBeside, sources: Sources, loaded: Collection[str] = ()
+    ) -> CheckedSpecifications:
+        """Let files that have done nothing since the start, because of an error, do nothing still.
+
+        Raises `SpecificationsRefusedError` if another file has an error, or one that is `loaded`, or needs one of them.
+        """
+        present, following = self.sources.named(), sources.named()
+        errors = {
+            file: error
+            for file, error in self._broken().items()
+            if file not in loaded and following.get(file) == present.get(file)
+        }
+        try:
+            checked = await check(sources, self.site_keys, [file for file in errors if file in sources.files])
+        except SpecificationsRefusedError as error:
+            raise SpecificationsRefusedError([*error.findings, *map(_idle, errors)]) from error
+        unusable = {file: error for file, error in errors.items() if file not in following}
+        left_out = unusable | checked.left_out
+        idle = left_out.keys() | {checked.monitors[name] for name in checked.unbuilt}
+        warnings = [_idle(file) for file in errors if file in idle]
+        return msgspec.structs.replace(checked, left_out=left_out, warnings=(*checked.warnings, *warnings))
 
     def _check_given(
         self, topics: Mapping[str, Mapping[str, str]], constants: Given, checked: CheckedSpecifications
@@ -922,6 +981,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             )
         self.store.save_setting(SWITCHES, json.dumps(self.switches.said))
         self.store.save_setting(_GIVEN, json.dumps(self.givens.said))
+
+
+def _idle(file: str) -> str:
+    return f"{file}: warning: it does nothing, because it has an error; when it is corrected: rosrv monitor load {file}"
 
 
 def _moment(seconds: float) -> str:

@@ -20,6 +20,9 @@ from appliance.store.state_file import MonitorRevisionRow, StateStore
 Check = Callable[[Sources, Sequence[str]], Awaitable[CheckedSpecifications]]
 """Raises `SpecificationsRefusedError`."""
 
+CheckBeside = Callable[[Sources, Sequence[str], Sequence[str]], Awaitable[CheckedSpecifications]]
+"""The files named last had errors before, and may still have them. Raises `SpecificationsRefusedError`."""
+
 NOTHING = MonitorRevisionRow(0, "{}", 0.0, DISK, "")
 """The revision before the first."""
 

@@ -73,8 +73,8 @@ class ContentsWanted(Message):
     """Control asks for the contents of specifications (name to text) with these message definitions.
 
     A `dry_run` gets less processor time than an order, and builds the module too. `at_start`: files with errors do
-    not keep the others from being compiled (`Contents.unbuilt`). `topics` replace topics given in the texts, by
-    monitor and name.
+    not keep the others from being compiled (`Contents.unbuilt`); nor do the files `broken`, which had errors before.
+    `topics` replace topics given in the texts, by monitor and name.
     """
 
     number: int
@@ -83,6 +83,7 @@ class ContentsWanted(Message):
     dry_run: bool = False
     at_start: bool = False
     topics: dict[str, dict[str, str]] = msgspec.field(default_factory=dict)
+    broken: list[str] = msgspec.field(default_factory=list)
 
 
 class ContentsFound(Message):

@@ -46,9 +46,9 @@ def _type_of(
     if given in kinds:
         return kinds[given]
     close = get_close_matches(topic, [name for name, kind in known.items() if kind in rows], 1, 0.5)
-    hint = f"did you mean {close[0]}? " if close else ""
+    hint = f"; did you mean {close[0]}?" if close else "."
     raise GuardError(
-        f"no node has the topic {topic} now; {hint}If it comes later, give its type: --type {given}=TYPE, of"
+        f"no node has the topic {topic} now{hint} If it comes later, give its type: --type {given}=TYPE, of"
         f" {', '.join(rows)}"
     )
 

@@ -18,6 +18,7 @@ Effects follow: the answer (or refusal), what the relay is sent, the records, an
 import asyncio
 import shlex
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from appliance.base.actors import UNCONFIRMED
 from appliance.channel import admin, messages
 from appliance.channel.answers.monitor_answers import Replacement
 from appliance.specifications.allocation import Allocation, Move, Resource
-from appliance.specifications.checking import check, contents_at_start
+from appliance.specifications.checking import check, contents, contents_at_start, contents_beside
 from appliance.specifications.live_topics import LiveType, Published
 from appliance.specifications.rollout import Parts
 from appliance.specifications.specification_files import (
@@ -42,7 +43,7 @@ from appliance.specifications.specification_manager import (
     SpecificationManager,
     UnknownMonitorError,
 )
-from appliance.specifications.specification_revisions import Check
+from appliance.specifications.specification_revisions import Check, CheckBeside
 from appliance.store.state_file import StateStore
 from tests.support.audit import RecordingTrail
 from tests.support.engines import InlineDatabase, open_log
@@ -61,8 +62,11 @@ TEXTS = {
 }  # fmt: skip
 
 
-async def here(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-    return await asyncio.to_thread(check, sources, site_keys)
+async def here(
+    sources: Sources, site_keys: Sequence[str], broken: Sequence[str] = ()
+) -> CheckedSpecifications:
+    compiler = partial(contents_beside, broken=broken) if broken else contents
+    return await asyncio.to_thread(check, sources, site_keys, compiler=compiler)
 
 
 async def here_at_start(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
@@ -85,8 +89,8 @@ class Desk:
         self.carried_out.set()
         self.limit_ends, self.rolled_back = asyncio.Event(), asyncio.Event()
         self.limit_ends.set()
-        self.try_out: Check = here
-        self.check: Check = here
+        self.try_out: CheckBeside = here
+        self.check: CheckBeside = here
         self.check_at_start: Check = here_at_start
         self.parts: Parts = parts_here
         self.relays = 1
@@ -114,7 +118,7 @@ class Desk:
             published=lambda: None,
             told=[],
             site_keys=site_keys,
-            check=lambda sources, keys: self.check(sources, keys),  # noqa: PLW0108  of whatever it is then
+            check=lambda sources, keys, broken: self.check(sources, keys, broken),  # noqa: PLW0108  of whatever it is then
             check_at_start=self.check_at_start,
             try_out=self.try_out,
             parts=self.parts,

@@ -20,7 +20,7 @@ from appliance.specifications.specification_manager import (
     MonitorsChangedError,
 )
 from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
-from tests.unit.specifications.monitor_desk import A, B, Desk, Dialogue, here
+from tests.unit.specifications.monitor_desk import A, B, C, Desk, Dialogue, here
 from tests.unit.transcripts import played, transcripts
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
@@ -120,10 +120,12 @@ async def test_a_time_off_survives_restarts_and_ends_with_a_switch(desk: Desk) -
 async def test_a_load_whose_client_gave_up_never_takes_effect(desk: Desk) -> None:
     begun, goes_on, gone = asyncio.Event(), asyncio.Event(), False
 
-    async def slow(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
+    async def slow(
+        sources: Sources, site_keys: Sequence[str], broken: Sequence[str]
+    ) -> CheckedSpecifications:
         begun.set()
         await goes_on.wait()
-        return await here(sources, site_keys)
+        return await here(sources, site_keys, broken)
 
     monitors = await desk.monitors()
     desk.check = slow
@@ -155,10 +157,12 @@ async def test_a_load_whose_client_gave_up_never_takes_effect(desk: Desk) -> Non
 async def test_a_client_has_one_dry_run_at_a_time(desk: Desk) -> None:
     begun, goes_on = asyncio.Event(), asyncio.Event()
 
-    async def slow(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
+    async def slow(
+        sources: Sources, site_keys: Sequence[str], broken: Sequence[str]
+    ) -> CheckedSpecifications:
         begun.set()
         await goes_on.wait()
-        return await here(sources, site_keys)
+        return await here(sources, site_keys, broken)
 
     desk.try_out = slow
     monitors = await desk.monitors()
@@ -355,6 +359,57 @@ async def test_a_first_start_leaves_out_a_file_that_it_cannot_parse(desk: Desk) 
     (desk.folder / "a.rv").write_text(A)
     await monitors.reload(admin.MonitorReload(), "adam")
     assert (monitors.checked.left_out, monitors.names()) == ({}, ["a"])
+
+
+async def test_a_load_or_removal_of_others_leaves_a_broken_file_as_the_start_left_it(desk: Desk) -> None:
+    """A monitor with an error holds its topics still, the alarms of unusable files stay, and the answer names both."""
+    broken = {"code": "code() { event e() /x std_msgs/String '{}' { missing = 1; } }", "text": "nonsense"}
+    for name, text in broken.items():
+        (desk.folder / f"{name}.rv").write_text(text)
+    (desk.folder / "bytes.rv").write_bytes(b"\xff")
+    monitors = await desk.monitors()
+
+    def idle() -> tuple[list[str], list[str]]:
+        return [*monitors.checked.unbuilt], sorted(monitors.checked.left_out)
+
+    assert idle() == (["code"], ["bytes.rv", "text.rv"])
+    tried = await monitors.attempt(admin.MonitorTry({"b.rv": B}), "eve")
+    loaded = await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
+    for answer in (tried, loaded, await monitors.remove(admin.MonitorRemove(["b"]), "eve")):
+        named = [line.partition(":")[0] for line in answer.warnings if "does nothing" in line]
+        assert sorted(named) == ["bytes.rv", "code.rv", "text.rv"]
+        assert idle() == (["code"], ["bytes.rv", "text.rv"])
+    assert monitors.names() == ["a", "code"]
+    await monitors.load(admin.MonitorLoad({"text.rv": C, "code.rv": B}), "eve")
+    assert idle() == ([], ["bytes.rv"])
+
+
+async def test_no_load_brings_a_further_error_beside_a_broken_file(desk: Desk) -> None:
+    broken = "code() { int kept; event e() /x std_msgs/String '{}' { missing = 1; } }"
+    (desk.folder / "code.rv").write_text(broken)
+    monitors = await desk.monitors()
+    user = "u() { event e() /y std_msgs/String '{}' { kept = 1; } }"
+    for load in ({"b.rv": "nonsense"}, {"u.rv": user}, {"code.rv": broken + " "}, {"code.rv": broken}):
+        with pytest.raises(SpecificationsRefusedError) as refused:
+            await monitors.load(admin.MonitorLoad(load), "eve")
+        assert refused.value.findings[0].startswith(next(iter(load)))
+        assert ("code.rv" in load) != ("rosrv monitor load code.rv" in refused.value.findings[-1])
+    with pytest.raises(SpecificationsRefusedError, match=r"code\.rv:1:.*missing"):
+        await monitors.reload(admin.MonitorReload(), "eve")
+    assert (monitors.revision, [*monitors.checked.unbuilt]) == (1, ["code"])
+    await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
+    with pytest.raises(SpecificationsRefusedError, match=r"code\.rv:1:.*missing"):
+        await monitors.load(admin.MonitorLoad({"code.rv": broken}), "eve")
+
+
+async def test_an_unconfirmed_correction_of_a_broken_file_is_rolled_back(desk: Desk) -> None:
+    (desk.folder / "a.rv").write_text("nonsense")
+    monitors = await desk.monitors()
+    await monitors.load(admin.MonitorLoad({"a.rv": A}, confirm_within=0.05), "eve")
+    assert monitors.names() == ["a"]
+    async with asyncio.timeout(30):
+        await desk.rolled_back.wait()
+    assert (monitors.sources.files, [*monitors.checked.left_out]) == ({"a.rv": "nonsense"}, ["a.rv"])
 
 
 @pytest.mark.parametrize("others", [{}, {"a.rv": A}])
