@@ -18,8 +18,9 @@ from msgspec import Raw
 
 from appliance.base import clock
 from appliance.features.doors.door_memory import ClientMemory
+from appliance.features.doors.door_messages import DoorMessage, RecentEncodings
 from appliance.features.doors.door_parameters import DoorParameters, ParameterClient
-from appliance.features.doors.known_types import DoorMessage, KnownTypes
+from appliance.features.doors.known_types import KnownTypes
 from appliance.features.doors.message_writer import MessageWriter, Now
 from appliance.features.doors.requests import (
     AdvertiseTopic,
@@ -144,6 +145,7 @@ class DoorNode:
         self._most_topics = most_topics
         self._calls = calls
         self._types = types
+        self._encodings = RecentEncodings(types.learn)
         self._built_in = built_in
         self._publications: dict[str, _Publication] = {}
         self._heard: dict[str, dict[_Subscriber, SubscribeTopic]] = {}
@@ -310,7 +312,7 @@ class DoorNode:
         receivers: Iterable[_Subscriber] | None = None,
     ) -> None:
         """Give a message to the subscribers of its topic; a client that wants another type is refused."""
-        message = DoorMessage(topic, body, header, clock.wall_ns(), self._types.learn)
+        message = DoorMessage(topic, body, header, clock.wall_ns(), self._encodings)
         clients, kind = self._heard.get(topic, {}), header.get("type", ANY)
         wrong = []
         for client in clients if receivers is None else receivers:

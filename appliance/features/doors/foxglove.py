@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 from msgspec import UNSET, Raw
 
+from appliance.features.doors.door_messages import DoorMessage
 from appliance.features.doors.foxglove_frames import (
     FOXGLOVE_OPERATION,
     FoxgloveAdvertise,
@@ -29,7 +30,6 @@ from appliance.features.doors.foxglove_frames import (
     channel_fields,
     service_fields,
 )
-from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.requests import (
     AdvertiseTopic,
     CallOfService,

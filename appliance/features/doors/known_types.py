@@ -6,12 +6,7 @@ gave its file, beside the specifications.
 """
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any
-
-from msgspec import Raw
+from collections.abc import Mapping
 
 from appliance.features.doors.values import MessageCodec, ValueLimits
 from roswire.definitions import Definitions
@@ -19,29 +14,6 @@ from roswire.errors import DefinitionError
 
 _MOST_CHARACTERS = 500_000
 """The size of all kept definitions together. A codec takes up to 140 bytes for each character of its definition."""
-
-
-@dataclass(eq=False)  # a frozen one takes twice as long to make, for each message
-class DoorMessage:
-    """A message that came on a topic, with its publisher's header; its encodings are made at most once.
-
-    `received` is the system time in nanoseconds.
-    """
-
-    topic: str
-    body: bytes
-    header: Mapping[str, str]
-    received: int
-    codec_of: Callable[[Mapping[str, str]], MessageCodec] = field(repr=False)
-
-    @cached_property
-    def json(self) -> Raw:
-        """The message as JSON; raises `MessageValueError`, or `DefinitionError` if its definition cannot be used."""
-        return self.codec_of(self.header).json(self.body)
-
-    @cached_property
-    def cbor_values(self) -> dict[str, Any]:
-        return self.codec_of(self.header).cbor_values(self.body)
 
 
 class KnownTypes:

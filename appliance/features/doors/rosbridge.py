@@ -16,8 +16,8 @@ from typing import Any
 
 from msgspec import Raw
 
+from appliance.features.doors.door_messages import DoorMessage
 from appliance.features.doors.fragments import FragmentStore
-from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.requests import (
     AdvertiseTopic,
     AnswerCall,

@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Meta, Raw, Struct
 
 from appliance.features.doors.cbor_frames import json_of_cbor
-from appliance.features.doors.known_types import DoorMessage
+from appliance.features.doors.door_messages import DoorMessage
 from appliance.features.doors.message_reader import MessageValueError
 from appliance.features.doors.requests import ClientId, Frame, Pieces
 from appliance.features.doors.values import cbor
@@ -28,6 +28,8 @@ Id = (
 Compression = Literal["none", "png", "cbor", "cbor-raw"]
 _Count = Annotated[int, Meta(ge=0, le=1_000_000)]
 _NOTHING = Raw(b"{}")
+_PUBLISH = b"\xa3\x62op\x67publish\x65topic"
+"""The CBOR of a publication up to its topic: the first of three fields."""
 
 
 class _Operation(Struct, tag_field="op", kw_only=True):
@@ -155,7 +157,7 @@ def publish_frame(topic: str, message: DoorMessage, compression: Compression) ->
     if compression == "cbor-raw":
         return _raw_head(topic, message), message.body
     if compression == "cbor":
-        return cbor({"op": "publish", "topic": topic, "msg": message.cbor_values})
+        return b"".join((_PUBLISH, cbor(topic), b"\x63msg")), message.cbor
     text = msgspec.json.encode({"op": "publish", "topic": topic, "msg": message.json})
     if compression == "png":
         return json_frame({"op": "png", "data": base64.b64encode(as_png(text)).decode("ascii")})
@@ -167,7 +169,7 @@ def _raw_head(topic: str, message: DoorMessage) -> bytes:
     secs, nsecs = divmod(message.received, 1_000_000_000)
     return b"".join(
         (
-            b"\xa3\x62op\x67publish\x65topic",
+            _PUBLISH,
             cbor(topic),
             b"\x63msg\xa3\x64secs\x1a",
             secs.to_bytes(4, "big"),

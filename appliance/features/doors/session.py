@@ -30,8 +30,8 @@ from websockets.server import ServerProtocol
 from websockets.typing import Subprotocol
 
 from appliance.features.doors.door_memory import ClientMemory, DoorMemory
+from appliance.features.doors.door_messages import DoorMessage
 from appliance.features.doors.door_node import DoorNode
-from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.lookout import Lookout
 from appliance.features.doors.origins import rejection
 from appliance.features.doors.requests import (

@@ -8,7 +8,7 @@ from typing import Any
 import cbor2
 import pytest
 
-from appliance.features.doors.known_types import DoorMessage
+from appliance.features.doors.door_messages import DoorMessage, RecentEncodings
 from appliance.features.doors.requests import (
     AdvertiseTopic,
     AnswerCall,
@@ -30,6 +30,7 @@ from roswire.definitions import Definitions
 STRING = MessageCodec(
     Definitions.from_files({"std_msgs/String.msg": "string data"}), "std_msgs/String", ValueLimits()
 )
+ENCODINGS = RecentEncodings(lambda _header: STRING)
 
 
 class Client:
@@ -56,7 +57,7 @@ class Client:
 
     def hears(self, text: str, topic: str = "/chatter") -> None:
         body = struct.pack("<I", len(text)) + text.encode()
-        self.rosbridge.message(DoorMessage(topic, body, {}, 7_000_000_005, lambda _header: STRING), self.now)
+        self.rosbridge.message(DoorMessage(topic, body, {}, 7_000_000_005, ENCODINGS), self.now)
 
 
 @pytest.fixture
