@@ -6,6 +6,7 @@ the robot. The door has none, does not announce this capability, and answers eac
 """
 
 import struct
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -129,9 +130,9 @@ class Foxglove:
 
     # --- frames of the client ---
 
-    def receive(self, frame: Frame) -> list[DoorRequest]:
+    def receive(self, frame: bytes, *, is_text: bool) -> list[DoorRequest]:
         try:
-            if isinstance(frame, bytes):
+            if not is_text:
                 return self._binary(frame)
             operation = FOXGLOVE_OPERATION.decode(frame)
             return self._carry_out[type(operation)](operation)
@@ -321,7 +322,7 @@ class Foxglove:
         """Queue a new value, for which the client may wait as for a message; a deleted parameter has none."""
         row = {"name": name} if value == {} else {"name": name, "value": value}
         frame = msgspec.json.encode({"op": "parameterValues", "parameters": [row]}).decode()
-        self.queue.put(subscribed, frame, len(frame), now)
+        self.queue.put(subscribed, frame, sys.getsizeof(frame), now)
 
     def ask(self, service: str, _values: Raw) -> str:
         """Refuse a call: a client of this protocol offers no services."""

@@ -13,7 +13,7 @@ _FRAME_OVERHEAD = 600  # bytes that a frame takes besides its id and its fragmen
 @dataclass(slots=True)
 class _Incomplete:
     total: int
-    parts: dict[int, str] = field(default_factory=dict)
+    parts: dict[int, bytes] = field(default_factory=dict)
     bytes: int = 0
 
 
@@ -37,8 +37,8 @@ class FragmentStore:
             raise OperationError(
                 f"fragment {fragment.num} of {fragment.total} does not fit its frame of {frame.total}; send it again"
             )
-        frame.parts[fragment.num] = fragment.data
-        self._charge(frame, len(fragment.data) + _OVERHEAD)
+        data = frame.parts[fragment.num] = fragment.data.encode()
+        self._charge(frame, len(data) + _OVERHEAD)
         if self._bytes > self._most_bytes or self._memory.refusal(0):
             self._frames.clear()
             self._memory.add(-self._bytes)
@@ -50,7 +50,7 @@ class FragmentStore:
         if len(frame.parts) < frame.total:
             return None
         self._remove(fragment.id)
-        return "".join(frame.parts[number] for number in range(frame.total)).encode()
+        return b"".join(frame.parts[number] for number in range(frame.total))
 
     def _charge(self, frame: _Incomplete, size: int) -> None:
         frame.bytes += size

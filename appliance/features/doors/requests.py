@@ -150,7 +150,7 @@ DoorRequest: TypeAlias = (
     | UnsubscribeParameter
 )
 Frame: TypeAlias = str | bytes
-"""A WebSocket message: text or binary."""
+"""A WebSocket message to a client: text or binary."""
 
 Pieces: TypeAlias = tuple[bytes, bytes]
 """The head and the body of a binary WebSocket message to a client: a body is large, and not copied."""

@@ -49,9 +49,9 @@ from appliance.features.doors.rosbridge_frames import (
     UnadvertiseServiceOp,
     UnsubscribeOp,
     decode_operation,
-    frame_as_json,
     id_of,
     json_frame,
+    json_of_binary,
     publish_frame,
     type_name,
 )
@@ -136,14 +136,16 @@ class Rosbridge:
 
     # --- frames of the client ---
 
-    def receive(self, frame: Frame) -> list[DoorRequest]:
+    def receive(self, frame: bytes, *, is_text: bool) -> list[DoorRequest]:
         reply_to: ClientId = None
+        text = b""
         try:
-            operation = decode_operation(frame_as_json(frame))
+            text = frame if is_text else json_of_binary(frame)
+            operation = decode_operation(text)
             reply_to = operation.id
             return self._carry_out[type(operation)](operation)
         except PeerError as error:
-            self.status("error", str(error), reply_to if reply_to is not None else id_of(frame))
+            self.status("error", str(error), reply_to if reply_to is not None else id_of(text))
             return []
 
     def _advertise(self, operation: AdvertiseOp) -> list[DoorRequest]:

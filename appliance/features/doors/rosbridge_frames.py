@@ -11,7 +11,6 @@ from msgspec import Meta, Raw, Struct
 
 from appliance.features.doors.cbor_frames import json_of_cbor
 from appliance.features.doors.door_messages import DoorMessage
-from appliance.features.doors.message_reader import MessageValueError
 from appliance.features.doors.requests import ClientId, Frame, Pieces
 from appliance.features.doors.values import cbor
 from roswire.errors import PeerError, quoted
@@ -216,13 +215,11 @@ _OPERATION: msgspec.json.Decoder[Operation] = msgspec.json.Decoder(Operation)
 _ENVELOPE = msgspec.json.Decoder(Envelope)
 
 
-def frame_as_json(frame: Frame) -> bytes:
-    """Return a frame of a client as JSON. A binary frame is CBOR, unless it begins like a JSON object.
+def json_of_binary(frame: bytes) -> bytes:
+    """Return a binary frame of a client as JSON. It is CBOR, unless it begins like a JSON object.
 
     Raises `MessageValueError`.
     """
-    if isinstance(frame, str):
-        return frame.encode("utf-8", "replace")
     return frame if frame.lstrip()[:1] == b"{" else json_of_cbor(frame)
 
 
@@ -246,12 +243,12 @@ def _complaint(text: bytes, error: Exception) -> str:
     return f"{envelope.op}: {error}"
 
 
-def id_of(frame: Frame) -> ClientId:
+def id_of(text: bytes) -> ClientId:
     """Return the id of an operation that cannot be carried out, if it has a short one."""
     try:
-        envelope = _envelope(frame_as_json(frame))
+        envelope = _envelope(text)
         return None if envelope is None else msgspec.convert(envelope.id, Id)
-    except (MessageValueError, ValueError):
+    except ValueError:
         return None
 
 

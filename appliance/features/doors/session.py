@@ -51,7 +51,7 @@ from roswire.xmlrpc import Value
 _READ_BYTES = 1 << 16
 _READ_DEFLATED_BYTES = 1 << 12  # the frames that are read at once take up to 1000 times as much inflated
 _BATCH_BYTES = 1 << 15
-_COPIES = 2  # of a frame while it is carried out: its text, and its operation
+_COPIES = 2  # of a frame while it is carried out: itself, and its operation
 _TURN = 64  # frames after which frames for clients are sent, although more have come
 _CLOSING_SECONDS = 2.0
 _WATCH_SECONDS = 2.0  # between two looks at the surroundings
@@ -79,8 +79,8 @@ class ClientProtocol(Protocol):
     def wants_surroundings(self) -> bool:
         """Whether the client gets the topics and services that the door sees."""
 
-    def receive(self, frame: Frame) -> Sequence[DoorRequest]:
-        """Return the requests of a frame."""
+    def receive(self, frame: bytes, *, is_text: bool) -> Sequence[DoorRequest]:
+        """Return the requests of a frame, whose text is UTF-8."""
 
     def failed(self, request: DoorRequest, reason: str) -> None:
         """Refuse a request in words."""
@@ -304,9 +304,9 @@ class DoorSession:
             # A small frame, such as a stop, is always carried out.
             try:
                 with self.memory.holding(_COPIES * size) if size > _READ_BYTES else contextlib.nullcontext():
-                    whole = data.decode() if self._is_text else data
-                    del data
-                    await self._carry_out(whole)
+                    if self._is_text and not data.isascii():
+                        data.decode()  # raises; a text is kept as bytes: one letter can make it four times as large
+                    await self._carry_out(data)
             except LimitExceededError as error:
                 self._disconnect(CloseCode.MESSAGE_TOO_BIG, str(error))
             except UnicodeDecodeError:
@@ -314,10 +314,10 @@ class DoorSession:
             except ViewerStalledError as error:
                 self._disconnect(CloseCode.POLICY_VIOLATION, str(error))
 
-    async def _carry_out(self, frame: Frame) -> None:
+    async def _carry_out(self, frame: bytes) -> None:
         """Carry out the requests of a frame; after a refused advertisement, drop the messages of its topic."""
         self.received += 1
-        requests = self._protocol.receive(frame)
+        requests = self._protocol.receive(frame, is_text=self._is_text)
         self._wake.set()
         refused: set[str] = set()
         for request in requests:

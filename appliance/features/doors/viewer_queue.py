@@ -9,6 +9,7 @@ A client that reads slowly loses the oldest messages of its topics, never a repl
 4. Topics take turns, so that a large topic delays a small one by one message.
 """
 
+import sys
 from collections import OrderedDict, deque
 from collections.abc import Hashable
 from dataclasses import dataclass, field
@@ -68,10 +69,11 @@ class ViewerQueue(Generic[Key]):
         """Add a reply. Raises `ViewerStalledError`."""
         if self.memory.closed:
             return
-        if reason := self.memory.refusal(len(frame) + _OVERHEAD):
+        size = sys.getsizeof(frame)  # one letter can make a text four times as large
+        if reason := self.memory.refusal(size + _OVERHEAD):
             raise ViewerStalledError(reason)
-        self.memory.add(len(frame) + _OVERHEAD)
-        self._reply_bytes += len(frame)
+        self.memory.add(size + _OVERHEAD)
+        self._reply_bytes += size
         if self._reply_bytes > self._most_reply_bytes and self._replies:
             raise ViewerStalledError(
                 f"more than {self._most_reply_bytes} bytes of replies wait for this client"
@@ -133,8 +135,9 @@ class ViewerQueue(Generic[Key]):
         """Return the next reply (with the key None) or message; None if nothing may be sent now."""
         if self._replies:
             frame = self._replies.popleft()
-            self._reply_bytes -= len(frame)
-            self.memory.add(-len(frame) - _OVERHEAD)
+            size = sys.getsizeof(frame)
+            self._reply_bytes -= size
+            self.memory.add(-size - _OVERHEAD)
             return None, frame
         for key in self._turns:
             topic = self._topics[key]

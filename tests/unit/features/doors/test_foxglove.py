@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
-from appliance.features.doors.requests import PublishMessage, SubscribeTopic, UnsubscribeTopic
+from appliance.features.doors.requests import DoorRequest, PublishMessage, SubscribeTopic, UnsubscribeTopic
 from appliance.features.doors.surroundings import DoorSurroundings, SeenTopic, VisibleGraph
 from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.definitions import Definitions
@@ -202,6 +202,11 @@ async def test_a_denied_look_is_one_status_in_words() -> None:
         assert frames[1]["level"] == 2 and "site.ini:4" in frames[1]["message"]
 
 
+def received(foxglove: Foxglove, frame: str | bytes) -> list[DoorRequest]:
+    data = frame if isinstance(frame, bytes) else frame.encode()
+    return foxglove.receive(data, is_text=isinstance(frame, str))
+
+
 def text_frame(foxglove: Foxglove) -> str | None:
     frame = foxglove.next_frame(0.0)
     assert frame is None or isinstance(frame, str)
@@ -247,7 +252,7 @@ def viewer(**limits: int) -> tuple[Foxglove, ViewerQueue[int | str]]:
 )
 def test_a_frame_that_breaks_the_protocol_is_refused(frame: str | bytes, words: str) -> None:
     foxglove, _queue = viewer()
-    assert foxglove.receive(frame) == []
+    assert received(foxglove, frame) == []
     answer = json.loads(text_frame(foxglove) or "")
     assert answer["op"] == "status" and answer["level"] == 2 and words in answer["message"]
 
@@ -255,7 +260,7 @@ def test_a_frame_that_breaks_the_protocol_is_refused(frame: str | bytes, words: 
 @pytest.mark.parametrize("service", [1, 4_294_967_295])
 def test_a_call_of_an_unknown_service_fails_in_words(service: int) -> None:
     foxglove, _queue = viewer()
-    assert foxglove.receive(struct.pack("<BIII", 2, service, 3, 0xFFFFFFFF)) == []
+    assert received(foxglove, struct.pack("<BIII", 2, service, 3, 0xFFFFFFFF)) == []
     answer = json.loads(text_frame(foxglove) or "")
     assert (
         answer["op"] == "serviceCallFailure"
@@ -266,18 +271,18 @@ def test_a_call_of_an_unknown_service_fails_in_words(service: int) -> None:
 
 def test_an_asset_is_an_error_at_once() -> None:
     foxglove, _queue = viewer()
-    foxglove.receive('{"op":"fetchAsset","uri":"package://x/y.stl","requestId":5}')
+    received(foxglove, '{"op":"fetchAsset","uri":"package://x/y.stl","requestId":5}')
     assert foxglove.next_frame(0.0) == struct.pack("<BIBI", 4, 5, 1, 23) + b"this door has no assets"
 
 
 def test_a_subscription_ends_with_its_channel() -> None:
     foxglove, _queue = viewer()
     subscribe = '{"op":"subscribe","subscriptions":[{"id":5,"channelId":%d}]}'
-    assert foxglove.receive(subscribe % 1) == [SubscribeTopic("/t", "a/B")]
+    assert received(foxglove, subscribe % 1) == [SubscribeTopic("/t", "a/B")]
     gone = DoorSurroundings(VisibleGraph({}, {}, {}, {}), [SeenTopic("/t", "a/C", "int8 y")], [])
     assert foxglove.surroundings(gone) == [UnsubscribeTopic("/t")]
-    assert foxglove.receive('{"op":"unsubscribe","subscriptionIds":[5]}') == []
-    assert foxglove.receive(subscribe % 2) == [SubscribeTopic("/t", "a/C")]
+    assert received(foxglove, '{"op":"unsubscribe","subscriptionIds":[5]}') == []
+    assert received(foxglove, subscribe % 2) == [SubscribeTopic("/t", "a/C")]
 
 
 def test_a_channel_that_comes_back_has_a_new_number() -> None:
@@ -294,13 +299,13 @@ def test_a_channel_that_comes_back_has_a_new_number() -> None:
 def test_subscriptions_and_channels_are_bounded() -> None:
     foxglove, queue = viewer(subscriptions=3, channels=2)
     many = [{"id": number, "channelId": 1} for number in range(1000)]
-    assert len(foxglove.receive(json.dumps({"op": "subscribe", "subscriptions": many}))) == 3
+    assert len(received(foxglove, json.dumps({"op": "subscribe", "subscriptions": many}))) == 3
     channels = [
         {"id": one, "topic": f"/c{one}", "encoding": "ros1", "schemaName": "a/B"} for one in range(1000)
     ]
-    assert len(foxglove.receive(json.dumps({"op": "advertise", "channels": channels}))) == 2
-    (publish,) = foxglove.receive(b"\x01\x01\0\0\0abc")
+    assert len(received(foxglove, json.dumps({"op": "advertise", "channels": channels}))) == 2
+    (publish,) = received(foxglove, b"\x01\x01\0\0\0abc")
     assert publish == PublishMessage("/c1", b"abc")
     foxglove.failed(SubscribeTopic("/t", "a/B"), "denied by [Subscribers] /t (site.ini:7)")
-    assert len(foxglove.receive(json.dumps({"op": "subscribe", "subscriptions": many[:3]}))) == 3
+    assert len(received(foxglove, json.dumps({"op": "subscribe", "subscriptions": many[:3]}))) == 3
     assert queue.dropped == 0

@@ -40,7 +40,10 @@ class Client:
         self.now = 100.0
 
     def sends(self, frame: Frame | dict[str, Any]) -> list[DoorRequest]:
-        return self.rosbridge.receive(json.dumps(frame) if isinstance(frame, dict) else frame)
+        if isinstance(frame, bytes):
+            return self.rosbridge.receive(frame, is_text=False)
+        text = json.dumps(frame) if isinstance(frame, dict) else frame
+        return self.rosbridge.receive(text.encode(), is_text=True)
 
     def refusal(self, frame: Frame | dict[str, Any]) -> dict[str, Any]:
         assert self.sends(frame) == []

@@ -2,6 +2,7 @@
 
 import asyncio
 import base64
+import json
 import struct
 import tracemalloc
 from typing import Any
@@ -150,6 +151,24 @@ async def test_wills_and_arguments_of_waiting_calls_are_bounded() -> None:
         assert client.frames.qsize() < 5
         world.calls.add(-taken)
         await asyncio.sleep(100)
+
+
+async def test_one_letter_makes_no_frame_take_more_than_is_charged() -> None:
+    async with door_world() as world:
+        clients = [await world.client() for _number in range(4)]
+        world.master.before_answer = lambda _call: asyncio.sleep(5)
+        tracemalloc.start()
+        for number, client in enumerate(clients):
+            more = f"{'x' * (4 << 20)}{number}\N{GRINNING FACE}"
+            frame = {"op": "advertise", "topic": f"/t{number}", "type": "std_msgs/String", "more": more}
+            client.send(json.dumps(frame, ensure_ascii=False))
+            del frame, more
+        await asyncio.sleep(1)
+        taken, _peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert 16 << 20 < taken < sum(memory.held for memory in world.memories)
+        world.master.before_answer = None
+        await asyncio.sleep(10)
 
 
 async def test_a_frame_of_few_bytes_that_takes_much_memory_is_refused_in_words() -> None:
