@@ -4,8 +4,9 @@ Invariants:
 
 1. A process gets only sockets with the address of its door. It connects to RVMaster's port and to ports of proxy
    endpoints and relays, and to no other port.
-2. A process of a door that was removed, or that another door replaced, gets `DoorEnded`. A door that was added again is
-   another door, because its tickets and its agent's address are others.
+2. A process of a door that was removed, or that another door replaced, gets `DoorEnded`, and nothing after it: the next
+   door of the slot has a process of its own. A door that was added again is another door, because its tickets and its
+   agent's address are others.
 3. A process outlives control. It gets the valid tickets on each link, and ends the connections of all others.
 4. A process knows the operator's definitions that are in force.
 5. A process has at most `_MOST_PENDING` requests for sockets at once; further ones are refused.
@@ -21,7 +22,7 @@ from typing import Any
 
 from appliance.base import clock
 from appliance.channel import messages
-from appliance.channel.channel import ChannelFullError
+from appliance.channel.channel import Channel, ChannelFullError
 from appliance.channel.link import Link
 from appliance.control.assembly.foundation import RVMASTER, Foundation
 from appliance.features.doors import door_link
@@ -46,6 +47,8 @@ class _Slot:
     clients: list[door_link.ClientShown] = field(default_factory=list)
     trouble: str = ""
     started: bool = False
+    ending: Channel | None = None
+    """To a process that got `DoorEnded`."""
     pending: int = 0
     definitions: Mapping[str, str] = field(default_factory=dict)
     restarts: int = 0
@@ -135,7 +138,11 @@ class DoorProcesses:
         slot.clear()
         slot.trouble, slot.restarts = "", 0
         slot.deaths.clear()
-        self._send(slot, door_link.DoorEnded())
+        self._end_process(slot)
+
+    def _end_process(self, slot: _Slot) -> None:
+        if self._send(slot, door_link.DoorEnded()):
+            slot.ending = slot.link.channel
 
     def end_ticket(self, row: DoorRow, ticket: str) -> None:
         self._send(self._slots[row.slot or 0], door_link.TicketEnded(ticket))
@@ -156,8 +163,10 @@ class DoorProcesses:
 
     def _heard(self, number: int, message: Any) -> None:
         slot, row = self._slots[number], self._table.in_slot(number)
+        if slot.ending is not None and slot.ending is slot.link.channel:
+            return
         if row is None or self._table.problem:
-            self._send(slot, door_link.DoorEnded())
+            self._end_process(slot)
             return
         match message:
             case door_link.DoorStarted():
@@ -178,15 +187,17 @@ class DoorProcesses:
     def _lost(self, number: int, _reason: str) -> None:
         slot, row = self._slots[number], self._table.in_slot(number)
         slot.clear()
-        if row is not None and not self._table.problem:
+        ended, slot.ending = slot.ending is not None, None
+        if ended:
+            self.start()  # the next door of the slot
+        elif row is not None and not self._table.problem:
             slot.restarts += 1
             slot.deaths.append(clock.now())
             self._failed(row, f"the process of the door {row.name} ended; its connections ended with it")
 
     def _begin(self, slot: _Slot, row: DoorRow, process: door_link.DoorStarted) -> None:
         if process.name and (process.name, process.added) != (row.name, row.added):
-            self._send(slot, door_link.DoorEnded())  # it served another door of this slot
-            self._base.lifeline.say(messages.ProcessWanted(ROLE, row.slot or 0))
+            self._end_process(slot)  # it served another door of this slot
             return
         slot.started, slot.trouble = True, ""
         given = door_link.DoorGiven(

@@ -1,3 +1,4 @@
+import asyncio
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -66,6 +67,11 @@ class Bench:
         assert row == ALICE
         self.made.append(port)
 
+    def ends(self) -> None:
+        self.link.channel = None
+        self.link.lost("")
+        self.link.channel = object()
+
     def hears(self, message: messages.Message) -> None:
         self.link.heard(message)
 
@@ -90,13 +96,35 @@ async def test_a_door_that_asks_for_many_sockets_at_once_waits(bench: Bench) -> 
     assert [one.number for one in bench.sent] == [*range(64, 70)]
 
 
-def test_the_process_of_a_removed_or_replaced_door_ends(bench: Bench) -> None:
+@pytest.mark.parametrize(
+    "message", [door_link.DoorStarted("bob", 1.0, True), door_link.DoorStarted("alice", 0.5, True)]
+)
+def test_the_process_of_another_door_ends_and_its_successor_serves(
+    bench: Bench, message: messages.Message
+) -> None:
+    bench.hears(message)
+    assert [type(one) for one in bench.sent] == [door_link.DoorEnded]
+    bench.ends()
+    assert (bench.records, bench.asked) == ([], [messages.ProcessWanted("door", 0)])
     bench.hears(NEW)
-    assert [type(one) for one in bench.sent] == [door_link.DoorGiven]
-    for name, added in (("bob", 1.0), ("alice", 0.5)):
-        bench.hears(door_link.DoorStarted(name, added, True))
-        assert type(bench.sent[-1]) is door_link.DoorEnded
-        assert bench.asked.pop() == messages.ProcessWanted("door", 0)
+    assert type(bench.sent[-1]) is door_link.DoorGiven
+
+
+@pytest.mark.anyio
+async def test_the_process_of_a_removed_door_gets_nothing_of_the_next_one(bench: Bench) -> None:
+    """Whatever it asks for, and although the next door has its slot."""
+    bench.hears(NEW)
+    bench.processes.end(bench.rows.pop())
+    bench.rows.append(ALICE._replace(name="bob", added=2.0))
+    bench.sent.clear()
+    for message in (door_link.SocketWanted(1, 0), NEW, door_link.DoorStarted("bob", 2.0, False)):
+        bench.hears(message)
+    await asyncio.sleep(0)
+    assert (bench.sent, bench.made) == ([], [])
+    assert bench.processes.state(bench.rows[0])[1] == "its process is starting"
+
+
+def test_a_process_without_a_door_ends(bench: Bench) -> None:
     bench.rows.clear()
     bench.hears(door_link.SocketWanted(1, 11311))
     assert type(bench.sent[-1]) is door_link.DoorEnded
