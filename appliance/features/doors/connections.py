@@ -6,6 +6,7 @@ An agent that makes a connection for each call is normal; a client that connects
 import asyncio
 import socket
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from http import HTTPStatus
 
@@ -24,7 +25,10 @@ class ConnectionLimits:
 
 
 class DoorConnections:
-    """Serves connections, each in a task of its own; `refused` counts those that came in excess."""
+    """Serves connections, each in a task of its own; `refused` counts those that came in excess.
+
+    The callback `refused(reason)` is called for such a connection.
+    """
 
     def __init__(self, limits: ConnectionLimits) -> None:
         self.refused = 0
@@ -34,20 +38,28 @@ class DoorConnections:
         self._recent: deque[float] = deque()
         self._tasks = OwnedTasks()
 
-    def adopt(self, descriptor: int, serve: Serve) -> None:
-        self._tasks.start(self._adopt(socket.socket(fileno=descriptor), serve))
+    def adopt(self, descriptor: int, serve: Serve, refused: Callable[[str], None]) -> None:
+        self._tasks.start(self._adopt(socket.socket(fileno=descriptor), serve, refused))
 
-    async def _adopt(self, connection: socket.socket, serve: Serve) -> None:
+    async def _adopt(self, connection: socket.socket, serve: Serve, refused: Callable[[str], None]) -> None:
         connection.setblocking(False)
         local = connection.family == socket.AF_UNIX
         opening = asyncio.open_unix_connection if local else asyncio.open_connection
         reader, writer = await opening(sock=connection, limit=BUFFER_BYTES)
-        await self.serve(serve, reader, writer)
+        await self.serve(serve, reader, writer, refused=refused)
 
-    async def serve(self, serve: Serve, reader: asyncio.StreamReader, writer: ByteWriter) -> None:
+    async def serve(
+        self,
+        serve: Serve,
+        reader: asyncio.StreamReader,
+        writer: ByteWriter,
+        *,
+        refused: Callable[[str], None],
+    ) -> None:
         """Serve a connection, or refuse it with HTTP 503 and the reason."""
         reason = self._excess()
         if reason:
+            refused(reason)
             await self._refuse(reader, writer, reason)
             return
         self._open += 1

@@ -7,6 +7,7 @@ present connections go on, and no new one of the node can be made. The process e
 import asyncio
 import ipaddress
 import socket
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -109,7 +110,7 @@ class _Process:
         self._failure = ""
         self._listens = False
         self._clients: set[CountedClient] = set()
-        self._tickets: set[str] = set()  # of connections that control passed on, until they end
+        self._tickets: Counter[str] = Counter()  # connections that control passed on, until they end
         self._shown: list[door_link.ClientShown] = []
         self._changes: dict[tuple[str, str], _Change] = {}
         self._totals = _Totals()
@@ -162,7 +163,7 @@ class _Process:
                     self._network.refused(number, reason)
 
     def _end_tickets(self, ended: Callable[[str], bool]) -> None:
-        self._tickets = {one for one in self._tickets if not ended(one)}
+        self._tickets = Counter({one: count for one, count in self._tickets.items() if not ended(one)})
         for client in [one for one in self._clients if one.ticket and ended(one.ticket)]:
             client.session.disconnect("the ticket is over; ask the operator for a new one")
 
@@ -174,7 +175,7 @@ class _Process:
                 self._listens = True
                 self._tasks.start(self._accept(socket.socket(fileno=descriptors[0]), source))
             case door_link.ViewerGiven(peer, ticket):
-                self._tickets.add(ticket)
+                self._tickets[ticket] += 1
                 self._tasks.start(self._view(descriptors[0], peer, ticket))
 
     def _define(self, texts: dict[str, str]) -> None:
@@ -238,20 +239,25 @@ class _Process:
                 peer = _plain(address[0])
                 if allowed is not None and peer not in allowed:
                     connection.close()
-                    self._changed(str(peer), "", ended=1, reason=f"the agent's address is {source}")
+                    self._ended(str(peer), "", f"the agent's address is {source}")
                 else:
-                    self._door.connections.adopt(connection.detach(), partial(self._serve, str(peer), ""))
+                    self._admit(self._door, connection, str(peer), "")
 
     async def _view(self, descriptor: int, peer: str, ticket: str) -> None:
         connection = socket.socket(fileno=descriptor)
         await self._started.wait()
         if self._door is not None:
-            self._door.connections.adopt(connection.detach(), partial(self._serve, peer, ticket))
+            self._admit(self._door, connection, peer, ticket)
+
+    def _admit(self, door: _Door, connection: socket.socket, peer: str, ticket: str) -> None:
+        serve, refused = partial(self._serve, peer, ticket), partial(self._ended, peer, ticket)
+        door.connections.adopt(connection.detach(), serve, refused)
 
     async def _serve(self, peer: str, ticket: str, reader: asyncio.StreamReader, writer: ByteWriter) -> None:
         door, given = self._door, self._given
         if door is None or given is None or (ticket and ticket not in self._tickets):
-            writer.close()  # the ticket was over before the door could serve
+            writer.close()
+            self._ended(peer, ticket, "the ticket was over before the door could serve")
             return
         queues: list[ViewerQueue[Any]] = []
         memory = door.memory.client()
@@ -273,9 +279,15 @@ class _Process:
         finally:
             self._clients.discard(client)
             self._totals.add(client)
-            self._changed(peer, ticket, ended=1, reason=session.end)
+            self._ended(peer, ticket, session.end)
 
     # --- reports ---
+
+    def _ended(self, peer: str, ticket: str, reason: str) -> None:
+        """Report the end or the refusal of a connection; control forgets a visit then."""
+        self._changed(peer, ticket, ended=1, reason=reason)
+        self._tickets[ticket] -= 1
+        self._tickets = +self._tickets
 
     def _changed(self, peer: str, ticket: str, *, began: int = 0, ended: int = 0, reason: str = "") -> None:
         key = (peer, ticket)

@@ -92,6 +92,7 @@ class DoorWorld:
         self.network = MemoryNetwork()
         self.master = ScriptedMaster(self.network)
         self.limits = ConnectionLimits()
+        self.refusals: list[str] = []
         self.memory = DoorMemory()
         self.waiting, self.calls = self.memory.client(), self.memory.client()
         self.memories = [self.waiting, self.calls]
@@ -111,7 +112,9 @@ class DoorWorld:
         self.door = DoorNode(self.node, self.types, built_in, most_topics=50, calls=self.calls)
         self.lookout = Lookout(sight, self.types, self.door.learn)
         connections = DoorConnections(self.limits)
-        self.network.listen(DOOR[0], partial(connections.serve, self.serve), DOOR[1])
+        self.network.listen(
+            DOOR[0], partial(connections.serve, self.serve, refused=self.refusals.append), DOOR[1]
+        )
 
     async def robot(self, address: str, name: str, memory: QueueMemory | None = None) -> RosNode:
         node = RosNode(

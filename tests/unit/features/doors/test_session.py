@@ -638,6 +638,7 @@ async def test_connections_of_a_door_are_bounded_in_number_and_rate() -> None:
         answers = [(await world.client()).response for _ in range(world.limits.connections + 5)]
         statuses = [answer.status_code for answer in answers if answer is not None]
         assert statuses == [101] * world.limits.connections + [503] * 5
+        assert len(world.refusals) == 5
         assert answers[-1] is not None and b"at most 32 are allowed" in (answers[-1].body or b"")
         world.network.break_off(DOOR)
         await asyncio.sleep(20)
