@@ -63,7 +63,9 @@ class _Queued(NamedTuple):
 
 
 class _Waiter(NamedTuple):
-    tell: Callable[[], None]
+    """`tell(problem)` is called once the changes before it are written; `problem` is why they are not on the disk."""
+
+    tell: Callable[[str], None]
     synced: bool
 
 
@@ -129,7 +131,7 @@ class Database:
         """
         if not self._ended and not self._failing:
             written = threading.Event()
-            self._queue.append(_Waiter(written.set, synced=False))
+            self._queue.append(_Waiter(lambda _problem: written.set(), synced=False))
             self._driver.hurry()
             written.wait(_CATCH_UP_SECONDS)
         try:
@@ -247,15 +249,15 @@ class Database:
     async def settled(self) -> None:
         """Wait until all changes queued so far are on the disk. Raises `StoreError` if they cannot be written."""
         loop = asyncio.get_running_loop()
-        done = loop.create_future()
+        done: asyncio.Future[str] = loop.create_future()
 
-        def tell() -> None:
+        def tell(problem: str) -> None:
             if not done.done():
-                done.set_result(None)
+                done.set_result(problem)
 
-        def call_back() -> None:
+        def call_back(problem: str) -> None:
             with contextlib.suppress(RuntimeError):  # the loop has ended, so no caller waits
-                loop.call_soon_threadsafe(tell)
+                loop.call_soon_threadsafe(tell, problem)
 
         with self._order:
             self._require_open()
@@ -264,6 +266,8 @@ class Database:
         while not (await asyncio.wait([done], timeout=_SETTLE_SECONDS))[0]:
             if self._failing:
                 raise StoreError(f"{self._failing}; free space: until then a restart undoes recent changes")
+        if problem := done.result():
+            raise StoreError(f"{problem}; a power failure may undo recent changes: check the disk")
 
     def close(self, seconds: float | None = None) -> None:
         """Write the queue within `seconds` (None: no limit), and close the file.
@@ -309,10 +313,9 @@ class Database:
             self._fail(f"{self._failing}; {_LEFT}")
             return None
         waiters = [item for item in group if isinstance(item, _Waiter)]
-        if any(waiter.synced for waiter in waiters):
-            self._sync()
+        problem = self._sync() if any(waiter.synced for waiter in waiters) else ""
         for waiter in waiters:
-            waiter.tell()
+            waiter.tell(problem)
         group.clear()
         if self._queue:
             return now
@@ -340,13 +343,17 @@ class Database:
             self._told.clear()
         return True
 
-    def _sync(self) -> None:
+    def _sync(self) -> str:
+        """Flush to the disk; return why it failed. The kernel may have dropped what it could not write."""
         try:
             with self._path.with_name(f"{self._path.name}-wal").open("rb") as log:
                 os.fsync(log.fileno())
             self._ahead.sync()  # else a power failure could leave a part of it
         except OSError as error:
-            self._fail(f"{self._path}: {error}")
+            problem = f"{self._path}: {error}"
+            self._fail(problem)
+            return problem
+        return ""
 
     def _fail(self, reason: str) -> None:
         if reason not in self._told:

@@ -224,6 +224,22 @@ async def test_settled_statements_survive_a_power_failure(
     assert synced == [(str(log), log.stat().st_size), (str(ahead), 0)]
 
 
+async def test_statements_that_a_power_failure_may_undo_are_not_settled(
+    database: Database, tmp_path: Path, failures: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(_descriptor: int) -> NoReturn:
+        raise OSError(errno.EIO, "Input/output error")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "fsync", broken)
+        database.put("thing", "revoked", 1)
+        with pytest.raises(StoreError, match=r"state\.db: .*Input/output error; a power failure"):
+            await database.settled()
+        assert failures == [f"{tmp_path / 'state.db'}: [Errno 5] Input/output error"]
+        assert database.query("SELECT name FROM thing") == [("revoked",)]
+    await database.settled()
+
+
 def test_a_file_that_is_not_a_database_is_an_error_with_a_remedy(tmp_path: Path) -> None:
     file = tmp_path / "state.db"
     file.write_bytes(b"this is not a database" * 100)
