@@ -9,6 +9,7 @@ Invariants:
 3. While the provider serves no keys, the last ones are used until `keys_seconds` after they were fetched.
 """
 
+import asyncio
 import json
 from collections.abc import Sequence
 from typing import Any
@@ -49,6 +50,7 @@ class Provider:
         self._endpoints: tuple[float, ProviderEndpoints] | None = None
         self._keys: tuple[float, list[dict[str, Any]]] | None = None
         self._tried = float("-inf")
+        self._fetching = asyncio.Lock()
 
     async def endpoints(self) -> ProviderEndpoints:
         """The endpoints are at most an hour old. Raises `ProviderError`."""
@@ -71,7 +73,14 @@ class Provider:
         return self._endpoints[1]
 
     async def keys(self, kid: str | None) -> Sequence[dict[str, Any]]:
-        """Fetch the keys again if none has this id. Raises `ProviderError`."""
+        """Fetch the keys again if none has this id. Raises `ProviderError`.
+
+        Sign-ons at the same time wait for one fetch.
+        """
+        async with self._fetching:
+            return await self._fresh_keys(kid)
+
+    async def _fresh_keys(self, kid: str | None) -> Sequence[dict[str, Any]]:
         now = clock.now()
         known = self._keys
         age = float("inf") if known is None else now - known[0]

@@ -1,3 +1,4 @@
+import asyncio
 import base64
 from typing import Any
 
@@ -5,6 +6,7 @@ import pytest
 
 from appliance.base import clock
 from appliance.features.sso.errors import ProviderError, SignOnRefusedError
+from appliance.features.sso.provider import Provider
 from appliance.features.sso.provider_connection import ProviderAnswer
 from appliance.features.sso.sign_on import PENDING_SECONDS
 from tests.support.virtual_clock import let_time_pass
@@ -154,6 +156,18 @@ async def test_keys_rotate_and_an_unknown_key_is_looked_up_once_a_minute() -> No
     with pytest.raises(SignOnRefusedError):
         await _sign_on(provider)
     assert provider.requests.count("keys") == 3
+
+
+async def test_people_who_sign_in_at_the_same_time_share_one_fetch_of_the_keys() -> None:
+    provider = ScriptedProvider()
+
+    async def exchange(*request: Any) -> ProviderAnswer:
+        await asyncio.sleep(1)
+        return await provider.exchange(*request)
+
+    slow = Provider(ISSUER, exchange, HOUR)
+    first, second = await asyncio.gather(slow.keys("one"), slow.keys("one"))
+    assert first == second and provider.requests.count("keys") == 1
 
 
 async def test_the_last_keys_serve_while_the_provider_gives_none_but_not_for_ever() -> None:
