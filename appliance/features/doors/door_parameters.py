@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import msgspec
 
 from appliance.features.doors.requests import SubscribeParameter, UnsubscribeParameter, WriteParameter
-from roswire.errors import LimitExceededError
+from roswire.errors import LimitExceededError, ProtocolError, quoted
 from roswire.node import RosNode
 from roswire.node.network import OwnedTasks
 from roswire.xmlrpc import Value
@@ -54,10 +54,15 @@ class DoorParameters:
         }
 
     async def write(self, request: WriteParameter) -> None:
+        """Set or delete a parameter. Raises `RosError`."""
         if request.value is None:
             await self._node.master("deleteParam", request.name)
-        else:
-            await self._node.set_parameter(request.name, msgspec.json.decode(request.value))
+            return
+        try:
+            value = msgspec.json.decode(request.value)
+        except (ValueError, RecursionError) as error:  # such as 1e999
+            raise ProtocolError(f"the value of {quoted(request.name)}: {error}") from None
+        await self._node.set_parameter(request.name, value)
 
     async def carry_out(
         self, request: SubscribeParameter | UnsubscribeParameter, client: ParameterClient

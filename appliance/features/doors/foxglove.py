@@ -18,6 +18,7 @@ from appliance.features.doors.door_messages import DoorMessage
 from appliance.features.doors.foxglove_frames import (
     FOXGLOVE_OPERATION,
     FoxgloveAdvertise,
+    FoxgloveChannel,
     FoxgloveFetchAsset,
     FoxgloveGetParameters,
     FoxgloveSetParameters,
@@ -177,19 +178,24 @@ class Foxglove:
     def _advertise(self, operation: FoxgloveAdvertise) -> list[DoorRequest]:
         requests: list[DoorRequest] = []
         for one in operation.channels:
-            if one.encoding not in _ENCODINGS:
-                self._refuse(f"the encoding {quoted(one.encoding)}; use {' or '.join(_ENCODINGS)}")
-            elif one.id in self._channels:
-                self._refuse(f"the channel {one.id} exists; unadvertise it first")
-            elif len(self._channels) >= self._limits.channels:
-                self._refuse(
-                    f"{len(self._channels)} channels of this client; at most {self._limits.channels}"
-                )
-            else:
-                topic = resolve(one.topic, self._node)
-                self._channels[one.id] = topic, one.encoding
-                requests.append(AdvertiseTopic(topic, one.schemaName.replace("/msg/", "/"), reply_to=one.id))
+            try:
+                requests.append(self._advertise_channel(one))
+            except PeerError as error:
+                self._refuse(str(error))
         return requests
+
+    def _advertise_channel(self, one: FoxgloveChannel) -> DoorRequest:
+        if one.encoding not in _ENCODINGS:
+            raise _FoxgloveError(f"the encoding {quoted(one.encoding)}; use {' or '.join(_ENCODINGS)}")
+        if one.id in self._channels:
+            raise _FoxgloveError(f"the channel {one.id} exists; unadvertise it first")
+        if len(self._channels) >= self._limits.channels:
+            raise _FoxgloveError(
+                f"{len(self._channels)} channels of this client; at most {self._limits.channels}"
+            )
+        topic = resolve(one.topic, self._node)
+        self._channels[one.id] = topic, one.encoding
+        return AdvertiseTopic(topic, one.schemaName.replace("/msg/", "/"), reply_to=one.id)
 
     def _unadvertise(self, operation: FoxgloveUnadvertise) -> list[DoorRequest]:
         topics = {self._channels.pop(one)[0] for one in operation.channelIds if one in self._channels}

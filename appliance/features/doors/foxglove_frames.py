@@ -33,7 +33,9 @@ class FoxgloveUnsubscribe(_Operation, tag="unsubscribe"):
     subscriptionIds: list[_Number]  # noqa: N815  the protocol's name
 
 
-class _Channel(Struct):
+class FoxgloveChannel(Struct):
+    """A channel of the client."""
+
     id: _Number
     topic: _Name
     encoding: _Name
@@ -43,7 +45,7 @@ class _Channel(Struct):
 class FoxgloveAdvertise(_Operation, tag="advertise"):
     """Advertise channels of the client."""
 
-    channels: list[_Channel]
+    channels: list[FoxgloveChannel]
 
 
 class FoxgloveUnadvertise(_Operation, tag="unadvertise"):

@@ -44,7 +44,7 @@ from appliance.features.doors.requests import (
 )
 from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerStalledError
-from roswire.errors import LimitExceededError, RosError
+from roswire.errors import LimitExceededError, ProtocolError, RosError
 from roswire.node.network import ByteWriter
 from roswire.xmlrpc import Value
 
@@ -429,9 +429,13 @@ class DoorSession:
 
     def ask(self, service: str, values: Raw) -> str:
         """Queue a call for the client, and return its id. Raises `PeerError`."""
-        call = self._protocol.ask(service, values)
-        self._wake.set()
-        return call
+        try:
+            return self._protocol.ask(service, values)
+        except ViewerStalledError as error:
+            self._disconnect(CloseCode.POLICY_VIOLATION, str(error))
+            raise ProtocolError(f"the client that offers {service} does not read: {error}") from None
+        finally:
+            self._wake.set()
 
     def give_up(self, call: str) -> None:
         self._protocol.give_up(call)

@@ -98,15 +98,25 @@ async def test_a_refusal_drops_no_other_topic_of_the_frame() -> None:
     async with door_world() as world:
         sees(world, topics={})
         client = await world.client(subprotocols=SUBPROTOCOLS)
-        types = {"/a": "own/Unknown", "/b": "std_msgs/String"}
+        types = {"/a": "own/Unknown", "/b": "std_msgs/String", "/not a name": "std_msgs/String"}
         channels = [
             {"id": number, "topic": topic, "encoding": "ros1", "schemaName": kind}
             for number, (topic, kind) in enumerate(types.items())
         ]
         client.send({"op": "advertise", "channels": channels})
+        assert "character 5 is ' '" in (await next_op(client, "status"))["message"]
         assert "does not know this message type" in (await next_op(client, "status"))["message"]
         await asyncio.sleep(1)
         assert [*world.master.publishers] == ["/b"]
+
+
+@pytest.mark.parametrize("value", ["1e999", "12345678901", "null"])
+async def test_a_value_that_no_parameter_has_is_refused_in_words(value: str) -> None:
+    async with door_world() as world:
+        client = await world.client(subprotocols=["foxglove.sdk.v1"])
+        client.send('{"op":"setParameters","parameters":[{"name":"/a","value":' + value + "}]}")
+        assert (await next_op(client, "status"))["level"] == 2
+        assert client.is_open and "setParam" not in world.master.calls
 
 
 async def test_a_viewer_calls_services_and_reads_parameters() -> None:

@@ -326,6 +326,22 @@ async def test_values_that_do_not_fit_are_refused_in_words(sent: dict[str, Any],
         assert words in (await client.next())["msg"]
 
 
+async def test_a_client_that_does_not_read_the_calls_of_its_service_is_disconnected() -> None:
+    async with door_world() as world:
+        robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
+        client.send({"op": "advertise_service", "service": "/log", "type": "roscpp/SetLoggerLevel"})
+        await asyncio.sleep(1)
+        client.stop_reading()
+        kind = ServiceType.defined(standard_definitions(), "roscpp/SetLoggerLevel")
+        request = string("x" * 50_000) + string("info")
+        calls = (robot.call_service("/log", kind.md5sum, request, 100.0) for _number in range(40))
+        failures = await asyncio.gather(*calls, return_exceptions=True)
+        assert sum("does not read" in str(failure) for failure in failures) >= 1
+        assert all(isinstance(failure, ServiceFailedError) for failure in failures)
+        await asyncio.sleep(10)
+        assert "bytes of replies wait" in world.sessions[0].end
+
+
 async def test_a_service_of_the_robot_is_called_by_name_or_in_order() -> None:
     async with door_world() as world:
         robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
