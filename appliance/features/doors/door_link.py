@@ -41,6 +41,10 @@ class TypesGiven(Message, frozen=True):
     definitions: dict[str, str]
 
 
+class PolicyChanged(Message, frozen=True):
+    """Another policy is in force, which may allow what the earlier one denied."""
+
+
 class DoorEnded(Message, frozen=True):
     """The door was removed, and its process ends."""
 
@@ -136,8 +140,8 @@ class ClientsShown(Message, frozen=True):
 
 
 DoorLink = (
-    DoorStarted | DoorGiven | TypesGiven | DoorEnded | AgentListener | ViewerGiven | TicketEnded | SocketWanted
-    | SocketGiven | SocketRefused | ConnectionsChanged | DoorCounted | ClientsShown
+    DoorStarted | DoorGiven | TypesGiven | PolicyChanged | DoorEnded | AgentListener | ViewerGiven | TicketEnded
+    | SocketWanted | SocketGiven | SocketRefused | ConnectionsChanged | DoorCounted | ClientsShown
 )  # fmt: skip
 
 

@@ -48,7 +48,7 @@ from roswire.node import (
     ServiceFailedError,
     ServiceType,
 )
-from roswire.node.network import OwnedTasks
+from roswire.node.network import OwnedTasks, PeerUnreachableError
 from roswire.node.tcpros_streams import ANY
 
 _SMALL_BYTES = 1 << 16
@@ -434,7 +434,7 @@ class DoorNode:
                 for header in await self.node.subscribers[topic].headers():
                     self._types.learn(header)
         except TimeoutError:
-            return  # no publisher answers: the topic stays without a definition
+            raise PeerUnreachableError(f"no publisher of {topic} answers") from None
         finally:
             self._unsubscribe(topic, learner)
 

@@ -83,6 +83,7 @@ class DoorProcesses:
         self._definitions = definitions
         self._settings = base.settings.of(Doors)
         self._tasks: set[asyncio.Task[None]] = set()
+        self._revision = base.policies.revision
         self._slots = [
             _Slot(Link(partial(self._heard, number), partial(self._lost, number)))
             for number in range(MOST_DOORS)
@@ -216,10 +217,13 @@ class DoorProcesses:
             self._listen(slot, row, row.port)
 
     def define(self) -> None:
-        """Give the definitions in force to the processes that have others."""
+        """Give the definitions in force to the processes that have others, and tell them of another policy."""
+        changed, self._revision = self._revision != self._base.policies.revision, self._base.policies.revision
         for slot in self._slots:
             if slot.started:
                 self._define(slot)
+                if changed:
+                    self._send(slot, door_link.PolicyChanged())
 
     def _define(self, slot: _Slot) -> None:
         now = self._definitions()

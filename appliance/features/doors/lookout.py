@@ -2,23 +2,35 @@
 
 Viewers list topics before they subscribe, and need the definitions first. A definition that the door does not know
 comes with the header of a publisher, so the door subscribes to the topic for a moment. A topic that the policy denies
-stays without a definition. The result, or the denial, is kept until the publishers or the providers change.
+stays without a definition. The result is kept until the publishers or the providers change. A denial is kept also until
+the policy changes, and a node that did not answer is asked again.
 """
 
 import asyncio
-from collections.abc import Awaitable, Callable, Sequence
+import math
+from collections.abc import Awaitable, Callable
+from typing import Literal, NamedTuple
 
 from appliance.features.doors.known_types import KnownTypes
 from appliance.features.doors.rosapi import Sight
 from appliance.features.doors.surroundings import DoorSurroundings, SeenService, SeenTopic, VisibleGraph
 from roswire.errors import DefinitionError, RosError
+from roswire.node import MasterDenialError
+from roswire.node.network import PeerUnreachableError
 
 _FRESH_SECONDS = 1.0
 _MOST_PROBES = 50  # topics and services that one look asks about
+_AGAIN_SECONDS = 10.0  # after which a node that did not answer is asked again
+
+_Thing = tuple[Literal["topic", "service"], str]
 
 
-_Question = tuple[str, Sequence[str], Callable[[str], Awaitable[None]]]
-"""A topic or service, its publishers or providers, and the function that asks about it."""
+class _Asked(NamedTuple):
+    """The publishers or providers that were asked; at the time `again`, they are asked again."""
+
+    nodes: tuple[str, ...]
+    again: float = math.inf
+    denied: bool = False
 
 
 class Lookout:
@@ -28,7 +40,7 @@ class Lookout:
         self._sight = sight
         self._types = types
         self._learn = learn
-        self._asked: dict[str, tuple[str, ...]] = {}  # publishers or providers, when it was asked about
+        self._asked: dict[_Thing, _Asked] = {}
         self._service_types: dict[str, str] = {}
         self._lock = asyncio.Lock()
         self._last: tuple[float, DoorSurroundings] | None = None
@@ -40,6 +52,10 @@ class Lookout:
             if self._last is None or now - self._last[0] > _FRESH_SECONDS:
                 self._last = now, await self._look()
             return self._last[1]
+
+    def policy_changed(self) -> None:
+        """Ask again about what was denied."""
+        self._asked = {thing: asked for thing, asked in self._asked.items() if not asked.denied}
 
     async def _look(self) -> DoorSurroundings:
         try:
@@ -58,23 +74,31 @@ class Lookout:
         return DoorSurroundings(graph, topics, services)
 
     async def _ask(self, graph: VisibleGraph) -> None:
-        unknown = [
-            topic for topic in sorted(graph.publishers) if self._text(graph.types.get(topic, "")) is None
-        ]
-        rows: list[_Question] = [(topic, graph.publishers[topic], self._learn) for topic in unknown]
-        rows += [(service, graph.services[service], self._probe) for service in sorted(graph.services)]
-        new = [row for row in rows if self._asked.get(row[0]) != tuple(row[1])][:_MOST_PROBES]
+        now = asyncio.get_running_loop().time()
+        nodes: dict[_Thing, tuple[str, ...]] = {
+            ("topic", topic): tuple(graph.publishers[topic])
+            for topic in sorted(graph.publishers)
+            if self._text(graph.types.get(topic, "")) is None
+        }
+        nodes |= {("service", service): tuple(graph.services[service]) for service in sorted(graph.services)}
         self._asked = {
-            name: nodes
-            for name, nodes in self._asked.items()
-            if name in graph.publishers or name in graph.services
+            thing: asked for thing, asked in self._asked.items() if nodes.get(thing) == asked.nodes
         }
         self._service_types = {
             name: kind for name, kind in self._service_types.items() if name in graph.services
         }
-        for name, nodes, _ask in new:
-            self._asked[name] = tuple(nodes)
-        await asyncio.gather(*(_quietly(ask(name)) for name, _nodes, ask in new))
+        due = [one for one in nodes if one not in self._asked or self._asked[one].again <= now]
+        await asyncio.gather(*(self._ask_one(thing, nodes[thing]) for thing in due[:_MOST_PROBES]))
+
+    async def _ask_one(self, thing: _Thing, nodes: tuple[str, ...]) -> None:
+        kind, name = thing
+        try:
+            await (self._learn if kind == "topic" else self._probe)(name)
+            self._asked[thing] = _Asked(nodes)
+        except PeerUnreachableError:
+            self._asked[thing] = _Asked(nodes, again=asyncio.get_running_loop().time() + _AGAIN_SECONDS)
+        except RosError as error:
+            self._asked[thing] = _Asked(nodes, denied=isinstance(error, MasterDenialError))
 
     async def _probe(self, service: str) -> None:
         self._service_types.pop(service, None)
@@ -95,11 +119,3 @@ class Lookout:
         found = definitions.service(kind)
         texts = [definitions.full_text(one.name) for one in (found.request, found.response)]
         return SeenService(service, kind, *texts)
-
-
-async def _quietly(asking: Awaitable[None]) -> None:
-    """Await an answer; a denial, or a node that does not answer, leaves the name unknown."""
-    try:
-        await asking
-    except RosError:
-        return

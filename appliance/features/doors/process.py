@@ -154,6 +154,9 @@ class _Process:
                 self._end_tickets(lambda ticket: ticket not in message.tickets)
             case door_link.TypesGiven(definitions):
                 self._define(definitions)
+            case door_link.PolicyChanged():
+                if self._door is not None:
+                    self._door.lookout.policy_changed()
             case door_link.DoorEnded():
                 self._over.set()
             case door_link.TicketEnded(ticket):

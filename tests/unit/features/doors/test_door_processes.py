@@ -34,10 +34,11 @@ class Bench:
         base = SimpleNamespace(
             settings=settings,
             port=lambda _name: 11311,
-            policies=SimpleNamespace(current=SimpleNamespace(ports=range(19001, 20001))),
+            policies=SimpleNamespace(current=SimpleNamespace(ports=range(19001, 20001)), revision=7),
             lifeline=SimpleNamespace(say=self.asked.append),
             trail=SimpleNamespace(happened=lambda event, *_words, **_more: self.records.append(event)),
         )
+        self.policies = base.policies
         self.rows = [ALICE]
         table = SimpleNamespace(
             problem="",
@@ -148,6 +149,15 @@ def test_a_process_gets_the_definitions_in_force_before_its_door_and_each_change
     bench.definitions = {}
     bench.processes.define()
     assert [getattr(one, "definitions", None) for one in bench.sent] == [{"own/Add.srv": "---"}, None, {}]
+
+
+def test_a_process_learns_of_another_policy_once(bench: Bench) -> None:
+    bench.hears(NEW)
+    bench.sent.clear()
+    for revision in (7, 8, 8):
+        bench.policies.revision = revision
+        bench.processes.define()
+    assert bench.sent == [door_link.PolicyChanged()]
 
 
 def test_a_process_gets_the_valid_tickets_and_reports_ended_connections(bench: Bench) -> None:

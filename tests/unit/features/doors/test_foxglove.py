@@ -110,6 +110,23 @@ async def test_a_refusal_drops_no_other_topic_of_the_frame() -> None:
         assert [*world.master.publishers] == ["/b"]
 
 
+async def test_a_topic_appears_once_the_policy_allows_it_and_its_publisher_answers() -> None:
+    async with door_world() as world:
+        definitions = standard_definitions().extended(OWN)
+        sees(world, topics={"/load": ("own/Load", "/robot")})
+        world.master.denials["registerSubscriber"] = "denied by [Subscribers]"
+        client = await world.client(subprotocols=SUBPROTOCOLS)
+        assert (await next_op(client, "advertise"))["channels"] == []
+        await asyncio.sleep(60)
+        assert world.master.calls.count("registerSubscriber") == 1
+        del world.master.denials["registerSubscriber"]
+        world.lookout.policy_changed()
+        await asyncio.sleep(30)
+        assert client.frames.empty()  # no publisher answers
+        await publishes(await world.robot("10.0.0.3", "/robot"), "/load", "own/Load", definitions)
+        assert [one["topic"] for one in (await next_op(client, "advertise"))["channels"]] == ["/load"]
+
+
 @pytest.mark.parametrize("value", ["1e999", "12345678901", "null"])
 async def test_a_value_that_no_parameter_has_is_refused_in_words(value: str) -> None:
     async with door_world() as world:
