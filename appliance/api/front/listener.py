@@ -124,6 +124,8 @@ class _Connection(Front, asyncio.Protocol):
         self.connection_table.file(self, Stage.SERVED)
         if self._is_first and self._listener.opens_websocket(self._target) and self.parser.should_upgrade():
             self._websocket = WebSocketPassage(self.transport, self._target)
+        elif self._is_first:
+            self._head.clear()  # it may have a large part of the body
         self._is_first = False
 
     def answered(self) -> None:
