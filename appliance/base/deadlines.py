@@ -33,6 +33,11 @@ class Deadlines:
     def retain(self, names: Collection[str]) -> None:
         self._deadlines = {name: known for name, known in self._deadlines.items() if name in names}
 
+    def forget(self, name: str) -> None:
+        """The name is never used again."""
+        self._deadlines.pop(name, None)
+        self._limits.pop(name, None)
+
     def left(self) -> dict[str, float]:
         """Seconds until each end that was seen, by the time since the boot; 0: it has passed."""
         now = clock.since_boot()

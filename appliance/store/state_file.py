@@ -333,6 +333,9 @@ class StateStore:
             for token, seconds in left.items():
                 self.database.put("token_left", token, seconds)
 
+    def forget_time_left(self, token: str) -> None:
+        self.database.delete("token_left", id=token)
+
     def time_left(self) -> dict[str, float]:
         """Return the stored seconds until the ends of tokens, by id."""
         return dict(self.database.query("SELECT id, seconds FROM token_left"))

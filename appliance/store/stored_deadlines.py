@@ -27,6 +27,11 @@ class StoredDeadlines(Deadlines):
             self._store.save_time_left(changed)
             self._stored |= changed
 
+    def forget(self, name: str) -> None:
+        super().forget(name)
+        if self._stored.pop(name, None) is not None:
+            self._store.forget_time_left(name)
+
     async def watch(self) -> None:
         """Store the remaining times every half a minute."""
         while True:

@@ -66,6 +66,7 @@ class DoorTickets:
     def _forget(self, ticket: str) -> None:
         del self._rows[ticket]
         self._store.doors.forget_ticket(ticket)
+        self._ends.forget(ticket)
 
 
 def new_ticket(door: str, seconds: float, who: str) -> tuple[TicketRow, str]:

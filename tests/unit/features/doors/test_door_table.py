@@ -108,4 +108,4 @@ def test_a_ticket_opens_one_door_until_its_end(tmp_path: Path) -> None:
         machine.advance(601.0)
         assert tickets.find("alice", text) is None
         assert tickets.valid() == []
-        assert store.doors.tickets() == []
+        assert store.doors.tickets() == [] and store.time_left() == {}
