@@ -90,9 +90,6 @@ class DoorClient(_Subscriber, ParameterClient, Protocol):
     def answered(self, call: int, values: Raw | bytes) -> None:
         """Take the answer to a call."""
 
-    def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
-        """Take the values of parameters."""
-
     def ask(self, service: str, values: Raw) -> str:
         """Take a call of an offered service, and return its id. Raises `PeerError`."""
 
@@ -181,7 +178,7 @@ class DoorNode:
             case AnswerCall():
                 self._answer(request, client)
             case ReadParameters():
-                client.parameters(await self._parameters.read(request.names), request.reply_to)
+                self._parameters.begin_read(request, client)
             case WriteParameter():
                 await self._parameters.write(request)
             case SubscribeParameter() | UnsubscribeParameter():

@@ -2,27 +2,43 @@
 
 The master sees one subscription for each parameter, however many connections use it, and decides each call. A
 subscription ends with its last connection. Connections get the values in the order in which the master set them.
+
+A read takes two calls for each parameter, of which a robot has hundreds, and viewers read all of them again and again.
+So a connection's further requests, such as a stop, do not wait for its reads.
 """
 
 import asyncio
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, Protocol
 
 import msgspec
 
-from appliance.features.doors.requests import SubscribeParameter, UnsubscribeParameter, WriteParameter
-from roswire.errors import LimitExceededError, ProtocolError, quoted
+from appliance.features.doors.requests import (
+    ReadParameters,
+    SubscribeParameter,
+    UnsubscribeParameter,
+    WriteParameter,
+)
+from roswire.errors import LimitExceededError, ProtocolError, RosError, quoted
 from roswire.node import RosNode
 from roswire.node.network import OwnedTasks
 from roswire.xmlrpc import Value
 
 _MOST_READ = 1000  # of one request
+_MOST_READS = 8  # of one connection that wait
 _MOST_SUBSCRIBED = 2000  # of all connections
 
 
 class ParameterClient(Protocol):
-    """A connection that subscribes to parameters."""
+    """A connection that reads parameters or subscribes to them."""
+
+    def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
+        """Take the values of parameters."""
+
+    def failed(self, request: ReadParameters, reason: str) -> None:
+        """Take the refusal of a read."""
 
     def parameter_changed(self, subscribed: str, name: str, value: Value) -> None:
         """Take the new value of a parameter, which is the subscribed one or below it; `{}` if it was deleted."""
@@ -35,10 +51,32 @@ class DoorParameters:
         self._node = node
         self._clients: dict[str, set[ParameterClient]] = {}
         self._lock = asyncio.Lock()  # for registrations
+        self._reads: Counter[ParameterClient] = Counter()  # that wait
+        self._reading = asyncio.Lock()
         self._tasks = OwnedTasks()
 
     async def close(self) -> None:
         await self._tasks.close()
+
+    def begin_read(self, request: ReadParameters, client: ParameterClient) -> None:
+        """Read parameters, one request after another. Raises `LimitExceededError`."""
+        if self._reads[client] >= _MOST_READS:
+            raise LimitExceededError(
+                f"{_MOST_READS} reads of parameters wait for this client; repeat it later"
+            )
+        self._reads[client] += 1
+        self._tasks.start(self._read_for(request, client))
+
+    async def _read_for(self, request: ReadParameters, client: ParameterClient) -> None:
+        async with self._reading:
+            if client not in self._reads:  # it left
+                return
+            try:
+                client.parameters(await self.read(request.names), request.reply_to)
+            except RosError as error:
+                client.failed(request, str(error))
+            if client in self._reads:
+                self._reads[client] -= 1
 
     async def read(self, names: Sequence[str]) -> dict[str, Any]:
         """Return the values of parameters; those that do not exist are left out."""
@@ -102,6 +140,7 @@ class DoorParameters:
             self._tasks.start(self._end(ended))
 
     def forget(self, client: ParameterClient) -> None:
+        del self._reads[client]
         self._unsubscribe([*self._clients], client)
 
     async def _end(self, names: Sequence[str]) -> None:

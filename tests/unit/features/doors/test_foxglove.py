@@ -169,6 +169,33 @@ async def test_a_viewer_calls_services_and_reads_parameters() -> None:
         assert (await next_op(client, "status"))["message"] == "denied by [Parameters] /a (site.ini:9)"
 
 
+async def test_a_stop_does_not_wait_for_reads_of_parameters() -> None:
+    async with door_world() as world:
+        sees(world, topics={})
+        robot, client = await world.robot("10.0.0.3", "/robot"), await world.client(subprotocols=SUBPROTOCOLS)
+        heard: list[bytes] = []
+        await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
+        channel = {"id": 7, "topic": "/cmd", "encoding": "ros1", "schemaName": "std_msgs/Bool"}
+        client.send({"op": "advertise", "channels": [channel]})
+        await asyncio.sleep(1)
+        names: list[Any] = [f"/p{number}" for number in range(300)]
+        world.master.answers |= {"getParamNames": names, "hasParam": True, "getParam": 1}
+        world.master.before_answer = lambda _call: asyncio.sleep(0.01)
+        for number in range(9):
+            client.send({"op": "getParameters", "parameterNames": [], "id": str(number)})
+        client.send(struct.pack("<BI", 1, 7) + b"\0")
+        await asyncio.sleep(0.1)
+        assert heard == [b"\0"]
+        assert "8 reads of parameters wait" in (await next_op(client, "status"))["message"]
+        for number in range(8):
+            assert (await next_op(client, "parameterValues"))["id"] == str(number)
+        client.send({"op": "getParameters", "parameterNames": [], "id": "left"})
+        await asyncio.sleep(0.1)
+        client.writer.close()
+        await asyncio.sleep(20)
+        world.master.before_answer = None
+
+
 async def test_a_viewer_follows_parameters_until_it_leaves() -> None:
     async with door_world() as world:
         sees(world, topics={})
