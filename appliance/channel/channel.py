@@ -8,9 +8,14 @@ The channel has no event loop. Its owner waits on `fileno()`, calls `receive()` 
 when it is writable. So the same class works with asyncio (`attach`) and with the relay's epoll loop.
 
 If the peer does not read, `send` raises `ChannelFullError` beyond `limit` bytes of backlog: a defect, because both
-ends belong to the appliance.
+ends belong to the appliance. A sender that can wait does so while the channel is `crowded`.
+
+The kernel may refuse a write for a while though the socket is writable: too many descriptors are on their way, or it
+has no memory. Then nothing is lost, and the channel is `delayed`: its owner calls `flush()` after `AGAIN_SECONDS`.
 """
 
+import contextlib
+import errno
 import os
 import socket
 import struct
@@ -31,6 +36,8 @@ _MAX_DESCRIPTORS = 64
 _TOGETHER = 65_536  # the bytes of frames that are joined for one write
 _MAX_UNCLAIMED = 65_536
 SOON_SECONDS = 0.005  # `soon` frames wait for this time to be joined, because each wakeup is expensive
+AGAIN_SECONDS = 0.1
+_TEMPORARY = frozenset({errno.EAGAIN, errno.ETOOMANYREFS, errno.ENOBUFS, errno.ENOMEM})
 _MAX_READS = 64  # the most reads in one `receive()`, so that an endless writer does not block other work
 
 
@@ -61,6 +68,8 @@ class Channel:
         self._backlog = 0
         self._loop: asyncio.AbstractEventLoop | None = None
         self._writing = False
+        self._again: asyncio.TimerHandle | None = None
+        self.delayed = False
 
     def fileno(self) -> int:
         return self._socket.fileno()
@@ -68,6 +77,11 @@ class Channel:
     @property
     def pending(self) -> bool:
         return bool(self._outgoing)
+
+    @property
+    def crowded(self) -> bool:
+        """Whether more than half of the backlog is in use."""
+        return self._backlog > self._limit // 2
 
     def send(self, message: Message, descriptors: tuple[int, ...] = (), *, soon: bool = False) -> None:
         """Raises `ChannelFullError`.
@@ -79,7 +93,9 @@ class Channel:
             raise ValueError(f"{type(message).__name__} travels with {message.descriptors} descriptors")
         body = self._encoder.encode(message)
         if self._backlog + len(body) > self._limit:
-            raise ChannelFullError(f"{self._backlog} bytes wait for the other end of the link")
+            raise ChannelFullError(
+                f"a process of the appliance does not read: {self._backlog} bytes wait for it"
+            )
         self._outgoing.append(
             (_LENGTH.pack(len(body)) + body, [os.dup(descriptor) for descriptor in descriptors])
         )
@@ -92,7 +108,8 @@ class Channel:
             self._loop.call_later(SOON_SECONDS, self._flush_attached)
 
     def flush(self) -> None:
-        """Write as much as the socket accepts now. Raises `ChannelClosedError` if the other end is gone."""
+        """Write as much as the kernel accepts now. Raises `ChannelClosedError` if the other end is gone."""
+        self.delayed = False
         while self._outgoing:
             data, descriptors = self._next()
             try:
@@ -101,10 +118,11 @@ class Channel:
                     if descriptors
                     else self._socket.send(data)
                 )
-            except BlockingIOError:
-                break
             except OSError as error:
-                raise ChannelClosedError(str(error)) from error
+                if error.errno not in _TEMPORARY:
+                    raise ChannelClosedError(str(error)) from error
+                self.delayed = error.errno != errno.EAGAIN
+                break
             for descriptor in descriptors:
                 os.close(descriptor)
             self._backlog -= sent
@@ -214,13 +232,22 @@ class Channel:
             self._loop, self._writing = None, False
 
     def _watch_writable(self) -> None:
-        if self._loop is None or self._writing == self.pending:
+        if self._loop is None:
             return
-        self._writing = self.pending
-        if self._writing:
+        if self.delayed and self._again is None:
+            self._again = self._loop.call_later(AGAIN_SECONDS, self._write_again)
+        wanted = self.pending and not self.delayed
+        if self._writing == wanted:
+            return
+        self._writing = wanted
+        if wanted:
             self._loop.add_writer(self.fileno(), self._flush_attached)
         else:
             self._loop.remove_writer(self.fileno())
+
+    def _write_again(self) -> None:
+        self._again = None
+        self._flush_attached()
 
     def _flush_attached(self) -> None:
         if not self._outgoing:  # written or closed in the meantime
@@ -232,6 +259,10 @@ class Channel:
             self._discard_outgoing()
             if self._socket.fileno() >= 0:
                 self._watch_writable()
+                with contextlib.suppress(
+                    OSError
+                ):  # end the stream also after an error that does not mean its end
+                    self._socket.shutdown(socket.SHUT_RDWR)
 
     def _discard_outgoing(self) -> None:
         for _data, descriptors in self._outgoing:

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
+from appliance.channel.channel import AGAIN_SECONDS, Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.messages import Message
 from appliance.relay.loop import READ, WRITE, EventLoop, LoopTimer
 
@@ -37,6 +37,7 @@ class LoopLink:
         self._end_of_link: str | None = None  # the reason, once the link has ended
         self._arrived: deque[tuple[Any, tuple[int, ...]]] = deque()
         self._slice: LoopTimer | None = None
+        self._again: LoopTimer | None = None  # the next attempt of a write that the kernel refused
         loop.watch(channel.fileno(), READ, self._ready)
 
     def send(self, message: Message) -> None:
@@ -69,8 +70,8 @@ class LoopLink:
             self._live = False
             self._loop.unwatch(self._channel.fileno())
             self._channel.close()
-            if self._slice is not None:
-                self._slice.cancel()
+            for timer in filter(None, (self._slice, self._again)):
+                timer.cancel()
             for _message, descriptors in self._arrived:
                 for descriptor in descriptors:
                     os.close(descriptor)
@@ -78,15 +79,19 @@ class LoopLink:
 
     def _ready(self, events: int) -> None:
         if events & WRITE:
-            try:
-                self._channel.flush()
-            except ChannelClosedError as error:
-                self._end(str(error))
-                return
-            self._watch()
-        if events & ~WRITE:
+            self._flush()
+        if events & ~WRITE and self._live:
             self._take_in()
             self._carry_out()
+
+    def _flush(self) -> None:
+        self._again = None
+        try:
+            self._channel.flush()
+        except ChannelClosedError as error:
+            self._end(str(error))
+        else:
+            self._watch()
 
     def _take_in(self) -> None:
         """Read the arrived messages. If the link has ended, carry them out before reporting the end."""
@@ -118,7 +123,10 @@ class LoopLink:
             self._end(self._end_of_link)
 
     def _watch(self) -> None:
-        events = (0 if self._waits else READ) | (WRITE if self._channel.pending else 0)
+        if self._channel.delayed and self._again is None:
+            self._again = self._loop.after(AGAIN_SECONDS, self._flush)
+        writes = self._channel.pending and not self._channel.delayed
+        events = (0 if self._waits else READ) | (WRITE if writes else 0)
         if events != self._events and self._end_of_link is None:
             self._events = events
             self._loop.change(self._channel.fileno(), events)
