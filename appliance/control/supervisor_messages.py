@@ -21,6 +21,8 @@ from appliance.master.graph.registry import Kind
 from appliance.specifications.allocation import TOPIC
 from appliance.store.writer_thread import StoreError
 
+_RELAY_BACKLOG = 128 << 20  # bytes; changes of the graph use half of it
+
 _log = structlog.get_logger()
 
 
@@ -75,7 +77,7 @@ class SupervisorMessages:
     def _link(self, role: str, index: int, sock: socket.socket) -> None:
         match role:
             case "relay":
-                self._relay_link(index, Channel(sock, messages.RelayLink))
+                self._relay_link(index, Channel(sock, messages.RelayLink, limit=_RELAY_BACKLOG))
             case "signer":
                 self._base.signing.attach(Channel(sock, messages.SignerLink))
             case "api":

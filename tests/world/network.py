@@ -127,6 +127,7 @@ class LinkEnd:
     process: Process
     other: "LinkEnd" = field(init=False)
     closed: bool = False
+    crowded: bool = False  # its other end always reads
     last: float = 0.0
     _waiting: list[tuple[Any, tuple[Any, ...]]] = field(default_factory=list)
     _received: Callable[[Any, tuple[Any, ...]], None] | None = None

@@ -9,6 +9,7 @@ from typing import Any
 from appliance.base.withdrawal import WithdrawnError, require_awaited
 from appliance.channel import admin
 from appliance.channel.admin import A
+from appliance.channel.channel import ChannelFullError
 from appliance.channel.operations import ORDERS
 from appliance.control.assembly.policies import RevisionChangedError
 from appliance.control.assembly.policy_gate import PolicyRefusedError
@@ -46,6 +47,7 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     TokenRefusedError: "refused",
     UnavailableError: "failed",
     StoreError: "failed",
+    ChannelFullError: "failed",
 }
 # Requests that are rejected if the store cannot be written, except rows with `full_disk`: a block or revocation takes
 # effect at once, and its answer reports if it was not stored. The recorder checks its own disk space. A full disk is a

@@ -6,7 +6,8 @@ sent to the relay that carries it (`allocation`). A node is sent to all relays t
 For each relay, control keeps the facts that it has stated. A change names what may differ; `_state_fact` compares the
 wanted fact with the stated one, and sends the difference. A new relay has no facts, so it gets all of them, between
 `StateBegan` and `StateEnded`; it removes everything else. A change that cannot be sent (the relay does not read, or
-control has no descriptor for a port) is tried again every `_AGAIN_SECONDS`. Until then, `carried_out` waits.
+control has no descriptor for a port) is tried again every `_AGAIN_SECONDS`. Until then, `carried_out` waits. Changes
+use half of a link's backlog, so all other messages can still be sent; the supervisor ends a relay that reads nothing.
 """
 
 import asyncio
@@ -19,7 +20,7 @@ from typing import Any
 import structlog
 
 from appliance.channel import messages
-from appliance.channel.channel import Channel, ChannelFullError
+from appliance.channel.channel import Channel
 from appliance.channel.link import Link
 from appliance.master.endpoints.node_api import NodeApiClient
 from appliance.master.endpoints.node_ports import NodePorts
@@ -81,7 +82,6 @@ class RelayOutbox(Link):
 RELAY_NAME = "/rosrv"
 OwnCall = messages.OwnServiceCalled | messages.MonitorCallWanted | messages.ApprovalWanted
 OwnAnswer = messages.OwnServiceAnswered | messages.MonitorCallAnswered | messages.ApprovalAnswered
-_STOP_SECONDS = 5.0
 _AGAIN_SECONDS = 0.1
 _KINDS = {TOPIC: Kind.PUBLICATION, SERVICE: Kind.SERVICE}
 _WORDS = {kind: word for word, kind in _KINDS.items()}
@@ -113,8 +113,6 @@ class RelayControl:
     _asking: set[asyncio.Task[None]] = field(default_factory=set)
     _moving: set[Resource] = field(default_factory=set)
     _taps: TapRequests = field(default_factory=TapRequests)
-    _stops: dict[int, asyncio.Future[list[str]]] = field(default_factory=dict)
-    _stop: int = 0
 
     def __post_init__(self) -> None:
         self._posts = tuple(
@@ -174,25 +172,11 @@ class RelayControl:
 
     async def stop(self, topic: str) -> list[str]:
         """Have monitors of a topic send their safe messages; return the names of those that have one."""
-        return await self._ask_guards(topic, begin=True) or []
+        return await self._taps.stop(topic, self._post(TOPIC, topic).send, begin=True) or []
 
     async def guards(self, topic: str) -> list[str] | None:
         """Return the names of monitors with a safe message for a topic; None if its relay does not answer."""
-        return await self._ask_guards(topic, begin=False)
-
-    async def _ask_guards(self, topic: str, *, begin: bool) -> list[str] | None:
-        self._stop = number = self._stop + 1
-        begun: asyncio.Future[list[str]] = asyncio.get_running_loop().create_future()
-        self._stops[number] = begun
-        try:
-            if not self._post(TOPIC, topic).send(messages.StopWanted(number, topic, begin)):
-                return None
-            async with asyncio.timeout(_STOP_SECONDS):
-                return await begun
-        except TimeoutError:
-            return None
-        finally:
-            del self._stops[number]
+        return await self._taps.stop(topic, self._post(TOPIC, topic).send, begin=False)
 
     async def look(
         self, topic: str, count: int, seconds: float, *, latched: bool
@@ -247,19 +231,20 @@ class RelayControl:
     def _state_all(self, post: RelayOutbox, changes: Iterable[Change] = ()) -> None:
         """State these changes after those that could not be sent; try again soon what cannot be sent now."""
         post.unstated |= dict.fromkeys(changes)
-        why: Exception | None = None
+        why = ""
         for change in list(post.unstated):
-            if isinstance(why, ChannelFullError):
+            if post.channel is not None and post.channel.crowded:
+                why = "it does not read"
                 break
             try:
                 self._state(post, change)
                 del post.unstated[change]
-            except (ChannelFullError, OSError) as error:  # OSError: no descriptor for the port of this node
-                why = error
+            except OSError as error:  # no descriptor for the port of this node
+                why = str(error)
         if post.again is not None:
             post.again.cancel()
-        elif why is not None:
-            _log.error("a relay cannot be sent all changes", relay=post.index, error=str(why))
+        elif why:
+            _log.error("a relay cannot be sent all changes", relay=post.index, error=why)
         loop = asyncio.get_running_loop()
         post.again = loop.call_later(_AGAIN_SECONDS, self._state_all, post) if post.unstated else None
 
@@ -371,17 +356,11 @@ class RelayControl:
             case messages.OrdersCarriedOut():
                 post.carried_out()
             case messages.MessageSeen() | messages.StopBegun():
-                self._seen(message)
+                self._taps.seen(message)
             case messages.PublicationRefused():
                 self.carried.publication_refused(message)
             case _:
                 self.monitors().received(message, post.index)
-
-    def _seen(self, message: messages.MessageSeen | messages.StopBegun) -> None:
-        if isinstance(message, messages.MessageSeen):
-            self._taps.seen(message)
-        elif (begun := self._stops.get(message.number)) is not None and not begun.done():
-            begun.set_result(message.monitors)
 
     async def _answer(self, post: RelayOutbox, asked: messages.UpstreamWanted | OwnCall) -> None:
         if isinstance(asked, OwnCall):

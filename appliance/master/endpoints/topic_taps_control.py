@@ -1,4 +1,4 @@
-"""Tap topics at the relays that carry them, for a limited time and only a few at once."""
+"""Tap topics at the relays that carry them, for a limited time and only a few at once; stop what they move."""
 
 import asyncio
 from collections.abc import Callable
@@ -8,17 +8,20 @@ from appliance.channel import messages
 MOST = 8
 """The most taps at once; relays have the same limit."""
 
+_STOP_SECONDS = 5.0
+
 
 class TooManyTapsError(Exception):
     """The maximum number of taps is already open."""
 
 
 class TapRequests:
-    """The open taps, which collect messages of topics."""
+    """The open taps, which collect messages of topics, and the open requests for the safe messages of monitors."""
 
     def __init__(self) -> None:
         self._number = 0
         self._open: dict[int, tuple[int, list[messages.MessageSeen], asyncio.Event]] = {}
+        self._stops: dict[int, asyncio.Future[list[str]]] = {}
 
     async def look(
         self,
@@ -46,7 +49,33 @@ class TapRequests:
             send(messages.LookEnded(number))
         return seen
 
-    def seen(self, message: messages.MessageSeen) -> None:
+    async def stop(
+        self, topic: str, send: Callable[[messages.Message], bool], *, begin: bool
+    ) -> list[str] | None:
+        """Return the names of a topic's monitors that have a safe message; `begin`: they send it.
+
+        Return None if the relay does not answer.
+        """
+        self._number += 1
+        number = self._number
+        begun: asyncio.Future[list[str]] = asyncio.get_running_loop().create_future()
+        self._stops[number] = begun
+        try:
+            if not send(messages.StopWanted(number, topic, begin)):
+                return None
+            async with asyncio.timeout(_STOP_SECONDS):
+                return await begun
+        except TimeoutError:
+            return None
+        finally:
+            del self._stops[number]
+
+    def seen(self, message: messages.MessageSeen | messages.StopBegun) -> None:
+        if isinstance(message, messages.StopBegun):
+            begun = self._stops.get(message.number)
+            if begun is not None and not begun.done():
+                begun.set_result(message.monitors)
+            return
         count, seen, enough = self._open.get(message.number, (0, [], None))
         if len(seen) < count:
             seen.append(message)

@@ -8,11 +8,13 @@ import pytest
 from appliance.channel import admin, messages
 from appliance.channel.admin import answer_to
 from appliance.channel.answers.graph_answers import TopicMessage
+from appliance.channel.channel import ChannelFullError
 from appliance.channel.messages import api
 from appliance.channel.operations import AnyRequest, RestRequest
 from appliance.control.assembly.policies import Policies
 from appliance.control.operators.administration import Administration
 from appliance.control.operators.queries import Queries
+from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.specifications.specification_manager import SpecificationManager
@@ -78,6 +80,20 @@ async def test_a_request_without_its_feature_is_unknown() -> None:
     administration = Administration(cast(Any, None), (), durable=cast(Any, None), require_room=lambda: None)
     answer = await administration.carry_out(admin.StatusWanted(), who="operator")
     assert (answer.ok, answer.trouble) == (False, "unknown")
+
+
+@pytest.mark.anyio
+async def test_an_order_to_a_process_that_does_not_read_is_answered() -> None:
+    async def answer(_request: admin.StatusWanted) -> Any:
+        raise ChannelFullError("a process of the appliance does not read: 9 bytes wait for it")
+
+    async def durable() -> None: ...
+
+    method = RequestMethod(admin.StatusWanted, answer)
+    administration = Administration(cast(Any, None), [method], durable=durable, require_room=lambda: None)
+    given = await administration.carry_out(admin.StatusWanted(), who="operator")
+    assert (given.ok, given.trouble) == (False, "failed")
+    assert given.error == "a process of the appliance does not read: 9 bytes wait for it"
 
 
 def test_every_field_between_processes_has_a_type() -> None:

@@ -42,6 +42,8 @@ class NoDelivery:
 
 
 class Link:
+    crowded = False
+
     def __init__(self) -> None:
         self.told: list[tuple[messages.Message, tuple[int, ...]]] = []
         self.end: Callable[[], None] = lambda: None

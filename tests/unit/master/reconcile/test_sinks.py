@@ -234,6 +234,7 @@ async def test_a_relay_gets_what_it_could_not_take_as_soon_as_it_reads() -> None
     order = asyncio.ensure_future(world.relay.carried_out())
     await asyncio.sleep(3)
     assert not order.done()
+    assert not {type(seen) for seen in world.seen} & {messages.NodeWithdrawn, messages.GrantRevoked}
     world.seen.clear()
     world.full = False
     await asyncio.sleep(0.2)
@@ -248,6 +249,20 @@ async def test_a_relay_gets_what_it_could_not_take_as_soon_as_it_reads() -> None
     ] == [(node.key, "/new")]
     assert world.seen[-1] == messages.OrdersAsked()
     order.cancel()
+
+
+@pytest.mark.anyio
+async def test_an_order_reaches_a_relay_that_does_not_read() -> None:
+    """Its answer comes when the relay reads again, or has ended."""
+    world = await ControlParts.begun()
+    world.full = True
+    order = asyncio.ensure_future(world.relay.carried_out())
+    stop = asyncio.ensure_future(world.relay.stop("/t"))
+    await asyncio.sleep(1)
+    assert {messages.OrdersAsked, messages.StopWanted} <= {type(seen) for seen in world.seen}
+    world.relay._posts[0].close()
+    await asyncio.wait_for(order, 1)
+    stop.cancel()
 
 
 @pytest.mark.anyio
