@@ -11,6 +11,7 @@ from appliance.quotas.table import GRANTS
 from appliance.store.state_file import PermissionRow
 
 _CLEARED_AT_ONCE = 1000
+_Index = dict[str, dict[PermissionRow, None]]  # the oldest grant first
 
 
 class Grants:
@@ -25,8 +26,9 @@ class Grants:
         self._mark = mark
         self.used = used
         self._bounds = bounds
-        self._of_node: dict[str, set[PermissionRow]] = {}  # by key of the publisher or provider
-        self._of_host: dict[str, dict[PermissionRow, None]] = {}  # by client host, oldest grant first
+        self._of_node: _Index = {}  # by key of the publisher or provider
+        self._of_host: _Index = {}  # by client host
+        self._of_name: _Index = {}  # by name of the client
         self._count = 0
 
     def restore(self, rows: Iterable[PermissionRow]) -> None:
@@ -46,9 +48,13 @@ class Grants:
     def of(self, key: str) -> Collection[PermissionRow]:
         return self._of_node.get(key, ())
 
+    def of_client(self, name: str) -> list[PermissionRow]:
+        """Return the grants of all clients with this name."""
+        return list(self._of_name.get(name, ()))
+
     def give(self, row: PermissionRow) -> None:
         """Give a grant, which becomes the newest of its host even if it existed before."""
-        new = row not in self._of_node.get(row.key, ())
+        new = row not in self.of(row.key)
         self._add(row)
         if not new:
             return
@@ -60,28 +66,27 @@ class Grants:
 
     def take(self, row: PermissionRow) -> None:
         """Revoke a grant if it exists; its connection is cut."""
-        rows = self._of_node.get(row.key, set())
-        if row in rows:
-            rows.discard(row)
-            self._drop(row)
+        if row not in self.of(row.key):
+            return
+        for index, key in self._places(row):
+            del index[key][row]
+            if not index[key]:
+                del index[key]
+        self._count -= 1
+        self._mark(row)
 
     def forget(self, key: str) -> None:
-        for row in self._of_node.pop(key, ()):
-            self._drop(row)
+        for row in list(self.of(key)):
+            self.take(row)
 
     def _add(self, row: PermissionRow) -> None:
-        rows, mine = self._of_node.setdefault(row.key, set()), self._of_host.setdefault(row.host, {})
-        self._count += row not in rows
-        rows.add(row)
-        mine[row] = mine.pop(row, None)
+        self._count += row not in self.of(row.key)
+        for index, key in self._places(row):
+            rows = index.setdefault(key, {})
+            rows[row] = rows.pop(row, None)
 
-    def _drop(self, row: PermissionRow) -> None:
-        mine = self._of_host[row.host]
-        del mine[row]
-        self._count -= 1
-        if not mine:
-            del self._of_host[row.host]
-        self._mark(row)
+    def _places(self, row: PermissionRow) -> tuple[tuple[_Index, str], ...]:
+        return (self._of_node, row.key), (self._of_host, row.host), (self._of_name, row.caller_id)
 
     def _clear_unused(self, host: str, newest: PermissionRow) -> None:
         used = self.used()

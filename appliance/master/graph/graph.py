@@ -5,6 +5,7 @@ the relays, the subscribers, the ROS master and the store agree with the tables.
 because a record is of one change, not of a state.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from appliance.audit.log.record import Severity
@@ -73,20 +74,29 @@ class RosGraph:
         return any(holder is not incarnation for holder in self.registry.registered(Kind.SERVICE, service))
 
     def _take_name(self, incarnation: Incarnation) -> None:
-        """Take the name from its holder, and forget the holder's withdrawn registrations."""
+        """Take the name from its holder, and from all clients of other hosts.
+
+        The holder's withdrawn registrations are forgotten. Other hosts can no longer make calls under this name, so
+        their grants end.
+        """
         other = self.registry.occupant(incarnation.name)
-        if other is None or other is incarnation:
+        if other is incarnation:
             return
-        if other.registrations:
-            self.replaced(other, incarnation)
-        for kind, resource in list(other.shelf):
-            self.registry.unshelve(other, kind, resource)
+        if other is not None:
+            if other.registrations:
+                self.replaced(other, incarnation)
+            for kind, resource in list(other.shelf):
+                self.registry.unshelve(other, kind, resource)
+        for row in self.grants.of_client(incarnation.name):
+            if row.host != str(incarnation.host):
+                self.grants.take(row)
 
     def replaced(self, incarnation: Incarnation, by: Incarnation) -> None:
         """End an incarnation whose name another incarnation took."""
         other = by.host != incarnation.host
+        subscribed = incarnation.resources(Kind.SUBSCRIPTION)
         self.registry.replace(incarnation, clock.now())
-        self.grants.forget(incarnation.key)
+        self._end_grants(incarnation, subscribed)
         self._record(
             "takeover" if other else "replaced",
             f"{by.name} of {by.host} replaced the node of this name of {incarnation.host}",
@@ -113,37 +123,43 @@ class RosGraph:
 
     def forgotten(self, incarnation: Incarnation) -> None:
         self.registry.forget(incarnation)
-        if self.registry.holder(incarnation.name) is None:
-            for topic in incarnation.resources(Kind.SUBSCRIPTION):
-                self._give_up(incarnation, topic)
-        self.grants.forget(incarnation.key)
+        self._end_grants(incarnation, incarnation.resources(Kind.SUBSCRIPTION))
 
     # --- grants ---
 
     def topic_granted(self, publisher: Incarnation, topic: str, host: Address, caller_id: str) -> None:
-        self.grants.give(PermissionRow(publisher.key, TOPIC, topic, str(host), caller_id))
+        self._grant(PermissionRow(publisher.key, TOPIC, topic, str(host), caller_id))
 
     def service_granted(self, provider: Incarnation, service: str, host: Address, caller_id: str) -> None:
         """Let a client call a service of a provider, unless the client has no name."""
         if caller_id:
-            self.grants.give(PermissionRow(provider.key, SERVICE, service, str(host), caller_id))
+            self._grant(PermissionRow(provider.key, SERVICE, service, str(host), caller_id))
+
+    def _grant(self, row: PermissionRow) -> None:
+        """Give a grant, unless a node of another host took the client's name after the decision."""
+        holder = self.registry.holder(row.caller_id)
+        if holder is None or holder.own or str(holder.host) == row.host:
+            self.grants.give(row)
+
+    def _end_grants(self, node: Incarnation, subscribed: Iterable[str]) -> None:
+        """Remove the grants of a node that ended: those of its clients, and its own for the topics it subscribed to."""
+        self.grants.forget(node.key)
+        for topic in subscribed:
+            self._give_up(node, topic)
 
     def _give_up(self, subscriber: Incarnation, topic: str) -> None:
-        """Remove the grants of a subscriber that gave up a topic, for all publishers of the topic.
+        """Remove the grants of a subscriber that gave up a topic, for all publishers of the topic, also lost ones.
 
-        Grants are for a name and a host, so a later subscriber with the same two keeps them.
+        Grants are for a name and a host, so another subscriber with the same two keeps them.
         """
         other = self.registry.holder(subscriber.name)
-        if (
-            other is not None
-            and other is not subscriber
-            and other.host == subscriber.host
-            and (Kind.SUBSCRIPTION, topic) in other.registrations
-        ):
+        subscribed = other is not None and (Kind.SUBSCRIPTION, topic) in other.registrations
+        if other is not None and subscribed and other.host == subscriber.host:
             return
-        host, name = str(subscriber.host), subscriber.name
-        for publisher in self.registry.registered(Kind.PUBLICATION, topic):
-            self.grants.take(PermissionRow(publisher.key, TOPIC, topic, host, name))
+        about = TOPIC, topic, str(subscriber.host)
+        for row in self.grants.of_client(subscriber.name):
+            if (row.kind, row.resource, row.host) == about:
+                self.grants.take(row)
 
     # --- records ---
 

@@ -61,7 +61,7 @@ class Revocation:
         """Revoke denied rights of a caller, if its call was decided before a policy change and carried out after it."""
         return self._redecide(
             [pair for pair in self._registrations() if (pair[0].host, pair[0].name) == (host, caller_id)],
-            [row for row in self.grants.all() if (row.host, row.caller_id) == (str(host), caller_id)],
+            [row for row in self.grants.of_client(caller_id) if row.host == str(host)],
         )
 
     def _redecide(
