@@ -318,6 +318,12 @@ class Registry:
         self._known[incarnation.name, incarnation.host, incarnation.api_text] = incarnation
         self._nodes_of[incarnation.host] += 1
 
+    def reached_at(self, incarnation: Incarnation, told: str) -> None:
+        """Note the address at which a node reaches the appliance now, which all URIs for the node use."""
+        if incarnation.told != told:
+            incarnation.told = told
+            self.mark(incarnation)
+
     def restore(self, incarnation: Incarnation) -> None:
         self._know(incarnation)
         self._registrations_of[incarnation.host] += len(incarnation.registrations)

@@ -51,16 +51,15 @@ class Arrivals:
         """
         identity = (caller.caller_id, caller.peer.host, api.text)
         incarnation = self.registry.find(*identity)
-        if incarnation is not None and incarnation.life is Life.LIVE:
-            incarnation.touched = clock.now()
-            incarnation.told = self.addresses.address_for(caller.peer)
-            return incarnation
         if incarnation is not None and incarnation.life is Life.SHADOW:
             if self.registry.holder(incarnation.name) is None:
                 self.liveness.revive(incarnation)  # before a check has found that the node is back
-                return incarnation
-            # Another incarnation took the name in the meantime, so this node starts as a new incarnation.
-            self.graph.forgotten(incarnation)
+            else:  # another incarnation took the name in the meantime, so this node starts as a new incarnation
+                self.graph.forgotten(incarnation)
+        if incarnation is not None and incarnation.life is Life.LIVE:
+            incarnation.touched = clock.now()
+            self.registry.reached_at(incarnation, self.addresses.address_for(caller.peer))
+            return incarnation
         incarnation = self._make(caller, api)
         try:
             with EvictionGuard(incarnation):

@@ -108,6 +108,32 @@ async def test_a_node_of_another_machine_is_refused() -> None:
         assert (await world.ask("registerPublisher", node, *call, uri))[0] == 1  # type: ignore[index]  # an answer is a list
 
 
+@pytest.mark.parametrize("lost", [False, True])
+async def test_a_node_that_reaches_another_address_gets_its_lists_with_it(
+    monkeypatch: pytest.MonkeyPatch, lost: bool
+) -> None:
+    """The address is also stored, since the lists after a restart of control have it too."""
+    world = await world_with(SlowFaces())
+    stored = list[str]()
+    monkeypatch.setattr(world.store, "save_incarnation", lambda row: stored.append(row.told))
+    call, uri = ("std_msgs/String", "http://10.0.0.5:4000/"), "http://10.0.0.5:4001/"
+    await world.ask("registerPublisher", "/talker", "/t", call[0], uri)
+    await world.ask("registerSubscriber", "/ear", "/t", *call)
+    await world.settle()
+    if lost:
+        world.graph.lost(world.registry.all()[-1], "away")
+        await world.settle()
+    world.deliveries.told.clear()
+    stored.clear()
+    monkeypatch.setattr(world.addresses, "address_for", lambda _peer: "10.0.0.2")
+    await world.ask("registerPublisher", "/ear", "/more", *call)
+    port = world.registry.all()[0].outer_port
+    assert [given for name, _method, given in world.deliveries.told if name == "/ear"] == [
+        ("/t", [f"http://10.0.0.2:{port}/"])
+    ]
+    assert set(stored) == {"10.0.0.2"}
+
+
 class Listening:
     """A listening socket, and the server of a proxy endpoint on it."""
 
