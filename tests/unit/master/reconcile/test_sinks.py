@@ -2,9 +2,11 @@
 
 import asyncio
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -13,6 +15,8 @@ from appliance.channel import messages
 from appliance.master.endpoints.delivery import NodeCall
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.master.reconcile.sinks import restore
+from appliance.store.ahead import Encoded, WriteAhead
+from appliance.store.changes import Change as StoredChange
 from appliance.store.state_file import PermissionRow, StateStore
 from roswire.xmlrpc import Value
 from tests.support import autojump
@@ -200,6 +204,37 @@ async def test_a_change_without_a_flush_is_stated_in_the_same_turn() -> None:
     assert messages.PublicationPlaced not in {type(seen) for seen in world.seen}
     await asyncio.sleep(0)
     assert messages.PublicationPlaced in {type(seen) for seen in world.seen}
+
+
+@pytest.mark.anyio
+async def test_the_changes_of_a_turn_are_stored_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A crash loses all of them or none. A turn with thousands of changes is written in parts, in order."""
+    world = History(tmp_path)
+    await world.round()
+    written = list[int]()
+    append = WriteAhead.append
+
+    def noted(ahead: WriteAhead, changes: Sequence[Encoded]) -> None:
+        written.append(sum(len(getattr(decoded(one.body), "rows", [one])) for one in changes))
+        append(ahead, changes)
+
+    decoded = msgspec.msgpack.Decoder(StoredChange).decode
+    monkeypatch.setattr(WriteAhead, "append", noted)
+    for name in ("/a", "/b"):
+        node = world.node(name)
+        world.graph.registered(node, Kind.PUBLICATION, "/t", "t")
+        world.graph.topic_granted(node, "/t", HOST, "/c")
+    world.sinks.flush()
+    assert len(written) == 1
+    written.clear()
+    for number in range(2500):
+        world.graph.topic_granted(node, "/t", HOST, f"/c{number}")
+    world.sinks.flush()
+    assert written == [1000, 1000, 500]
+    assert set(world.store.permissions()) == set(world.grants.all())
+    world.store.close()
 
 
 @pytest.mark.anyio
