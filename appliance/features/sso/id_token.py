@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from joserfc import jwt
-from joserfc.errors import JoseError
+from joserfc.errors import ClaimError, JoseError
 from joserfc.jwk import ECKey, RSAKey
 from joserfc.jws import JWSRegistry
 
@@ -27,6 +27,13 @@ _LEAST_RSA_BITS = 2048
 _LONGEST_SUBJECT = 255
 _LATEST = 1e11  # seconds since the epoch
 _CURVES = {"ES256": "P-256", "ES384": "P-384", "ES512": "P-521"}
+_CLOCKS = ": compare the clocks"
+_ADVICE = {
+    "aud": ": compare sso.client_id with the client at the provider",
+    "exp": _CLOCKS,
+    "iat": _CLOCKS,
+    "nbf": _CLOCKS,
+}
 _PUBLIC = ("kty", "crv", "n", "e", "x", "y")
 
 
@@ -39,11 +46,6 @@ class Expected:
     nonce: str
     algorithms: Sequence[str]
     skew: float
-
-
-def key_id_of(token: str, algorithms: Sequence[str]) -> str | None:
-    """The token may name no key. Raises `SignOnRefusedError` for an unusable token."""
-    return _header_of(token, algorithms).get("kid")
 
 
 def verify(token: str, keys: Sequence[dict[str, Any]], expected: Expected, now: float) -> dict[str, Any]:
@@ -64,6 +66,8 @@ def verify(token: str, keys: Sequence[dict[str, Any]], expected: Expected, now: 
             exp={"essential": True},
             iat={"essential": True},
         ).validate(claims)
+    except ClaimError as error:
+        raise _refused(f"{error}{_ADVICE.get(error.claim, '')}") from None
     except (JoseError, ValueError, TypeError, RecursionError) as error:
         raise _refused(f"{error}") from None
     _check_rest(claims, expected, now)
@@ -81,7 +85,7 @@ def _check_rest(claims: dict[str, Any], expected: Expected, now: float) -> None:
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < _LATEST:
             raise _refused(f"{name} is not a time")
     if now - claims["iat"] > _OLDEST_SECONDS + expected.skew:
-        raise _refused(f"it was issued more than {_OLDEST_SECONDS:g} s ago: compare the clocks")
+        raise _refused(f"it was issued more than {_OLDEST_SECONDS:g} s ago{_CLOCKS}")
     subject = claims["sub"]
     if not 0 < len(subject) <= _LONGEST_SUBJECT or not subject.isascii() or not subject.isprintable():
         raise _refused("sub is not 1 to 255 printable ASCII characters")

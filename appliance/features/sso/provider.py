@@ -4,12 +4,11 @@ Invariants:
 
 1. The discovery document has the configured issuer, so a document of another issuer is not used (OpenID Connect
    Discovery 1.0, 4.3).
-2. Keys are fetched when they are older than `_FRESH_SECONDS`, and for an unknown key at most once in
-   `_AGAIN_SECONDS`. So an unknown host's tokens cannot make the appliance flood the provider.
+2. Keys are fetched for each ID token, so a key that the provider adds or withdraws counts at once, with or without an
+   id. Only the provider's token endpoint sends tokens, for a code of its own: this is one request more for each.
 3. While the provider serves no keys, the last ones are used until `keys_seconds` after they were fetched.
 """
 
-import asyncio
 import json
 from collections.abc import Sequence
 from typing import Any
@@ -22,7 +21,6 @@ from appliance.features.sso.provider_connection import Exchange
 from appliance.features.sso.settings import origin_of
 
 _FRESH_SECONDS = 3600.0
-_AGAIN_SECONDS = 60.0
 _MOST_KEYS = 100
 _DISCOVERY = "/.well-known/openid-configuration"
 _OK = 200
@@ -49,8 +47,6 @@ class Provider:
         self._keys_seconds = keys_seconds
         self._endpoints: tuple[float, ProviderEndpoints] | None = None
         self._keys: tuple[float, list[dict[str, Any]]] | None = None
-        self._tried = float("-inf")
-        self._fetching = asyncio.Lock()
 
     async def endpoints(self) -> ProviderEndpoints:
         """The endpoints are at most an hour old. Raises `ProviderError`."""
@@ -72,30 +68,17 @@ class Provider:
             self._endpoints = clock.now(), found
         return self._endpoints[1]
 
-    async def keys(self, kid: str | None) -> Sequence[dict[str, Any]]:
-        """Fetch the keys again if none has this id. Raises `ProviderError`.
+    async def keys(self) -> Sequence[dict[str, Any]]:
+        """Return the keys that the provider serves now, or its last ones while it serves none.
 
-        Sign-ons at the same time wait for one fetch.
+        Raises `ProviderError`.
         """
-        async with self._fetching:
-            return await self._fresh_keys(kid)
-
-    async def _fresh_keys(self, kid: str | None) -> Sequence[dict[str, Any]]:
         now = clock.now()
-        known = self._keys
-        age = float("inf") if known is None else now - known[0]
-        lacking = known is None or (kid is not None and all(key.get("kid") != kid for key in known[1]))
-        if (age >= _FRESH_SECONDS or lacking) and now - self._tried >= _AGAIN_SECONDS:
-            self._tried = now
-            try:
-                self._keys = now, await self._fetch_keys()
-            except ProviderError:
-                if age >= self._keys_seconds:
-                    raise
-        if self._keys is None or clock.now() - self._keys[0] >= self._keys_seconds:
-            raise ProviderError(
-                f"{self.issuer}: the provider's keys could not be fetched: try again in a minute"
-            )
+        try:
+            self._keys = now, await self._fetch_keys()
+        except ProviderError:
+            if self._keys is None or now - self._keys[0] >= self._keys_seconds:
+                raise
         return self._keys[1]
 
     async def post(self, url: str, headers: Sequence[tuple[str, str]], body: bytes) -> tuple[int, bytes]:

@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, get_args
 from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, Field
@@ -159,7 +159,7 @@ class Sso(FeatureSection):
         default=60.0, description="by which the clocks of the provider and of this machine may differ"
     )
     algorithms: Annotated[list[Algorithm], Field(min_length=1)] = key(
-        default=["RS256", "ES256"], description="signatures of ID tokens that are accepted"
+        default=[*get_args(Algorithm)], description="signatures of ID tokens that are accepted"
     )
     keys_hours: Annotated[float, Field(ge=1, le=168, allow_inf_nan=False)] = key(
         default=24.0, description="for which the provider's last keys are used while it does not serve keys"

@@ -22,7 +22,7 @@ from urllib.parse import quote, urlencode
 from appliance.api.front.rates import peer_key
 from appliance.base import clock
 from appliance.features.sso.errors import ProviderError, SignOnRefusedError
-from appliance.features.sso.id_token import Expected, key_id_of, verify
+from appliance.features.sso.id_token import Expected, verify
 from appliance.features.sso.identity import identity_of
 from appliance.features.sso.link import SessionKeys, SignedInPerson
 from appliance.features.sso.provider import Provider, ProviderEndpoints
@@ -92,7 +92,7 @@ class SignOns:
         if not 0 < len(code) <= _LONGEST_CODE:
             raise SignOnRefusedError("the provider sent the browser back without a code: sign in again")
         token = await self._token(endpoints, code, pending.verifier)
-        keys = await self._provider.keys(key_id_of(token, self._wanted.algorithms))
+        keys = await self._provider.keys()
         expected = Expected(
             self._provider.issuer,
             self._wanted.client_id,

@@ -72,13 +72,14 @@ def part(value: Any) -> str:
 
 
 class ScriptedProvider:
-    """`payload` and `key` make the next ID token; `down` names the endpoints that do not answer."""
+    """`payload`, `header` and `key` make the next ID token; `down` names the endpoints that do not answer."""
 
     def __init__(self, wanted: Sso | None = None, secret: str | None = "s3:cret") -> None:  # noqa: S107  of a test
         self.wanted = wanted or sso()
         self.key: Key = rsa("one")
         self.served = [self.key]
         self.payload: dict[str, Any] = {}
+        self.header: dict[str, Any] = {}
         self.metadata: dict[str, Any] = {
             "issuer": ISSUER,
             "authorization_endpoint": f"{ISSUER}/authorize",
@@ -110,7 +111,7 @@ class ScriptedProvider:
         challenge = part(hashlib.sha256(self.form["code_verifier"].encode()).digest())
         if challenge != self.asked["code_challenge"]:
             return ProviderAnswer(400, b'{"error": "invalid_grant"}')
-        signed = token(claims(nonce=self.asked["nonce"], **self.payload), self.key)
+        signed = token(claims(nonce=self.asked["nonce"], **self.payload), self.key, self.header)
         return ProviderAnswer(200, json.dumps({"id_token": signed}).encode())
 
     async def begin(self, address: str = "10.0.0.9", *, again: bool = False) -> str:
