@@ -178,7 +178,7 @@ class Hunt:
         known = sorted(range(len(self._loader.described)), key=self._loader.described.__getitem__)
         sampled = known if self._everything else reached
         chosen = random.Random(self._seed).sample(sampled, min(self._number, len(sampled)))  # noqa: S311  a sample
-        print(
+        _say(
             f"{len(self._loader.described)} mutants, {len(reached)} reached by {len(items)} tests; {len(chosen)} chosen"
         )
         for count, number in enumerate(chosen, 1):
@@ -188,10 +188,10 @@ class Hunt:
             outcome = self._fork(session, reaching, self._seconds) if wanted else {"failed": []}
             found = ", ".join(outcome["failed"]) or "SURVIVED"
             self.survivors += [] if outcome["failed"] else [number]
-            print(f"{count}/{len(chosen)} {self._loader.described[number]}: {found[:120]}", flush=True)
-        print(f"{len(chosen) - len(self.survivors)} of {len(chosen)} mutants were found; not found:")
+            _say(f"{count}/{len(chosen)} {self._loader.described[number]}: {found[:120]}")
+        _say(f"{len(chosen) - len(self.survivors)} of {len(chosen)} mutants were found; not found:")
         for number in self.survivors:
-            print(f"  {self._loader.described[number]}")
+            _say(f"  {self._loader.described[number]}")
         return True
 
     def _fork(self, session: pytest.Session, items: list[pytest.Item], seconds: int) -> dict[str, Any]:
@@ -234,6 +234,10 @@ class _Failures:
             self._failed.append(report.nodeid)
 
 
+def _say(line: str) -> None:
+    print(line, file=sys.__stdout__, flush=True)  # pytest captures the other one, as tests expect
+
+
 def main() -> int:
     """Hunt, and return 0: survivors are for people to judge."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
@@ -256,7 +260,7 @@ def main() -> int:
     if given.module:
         for name in loader.modules:
             importlib.import_module(name)
-    options = ["-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--tb=no", "-s"]
+    options = ["-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--tb=no", "--capture=sys"]
     options += [] if given.all else ["-m", "not nightly and not real"]
     return int(pytest.main([*options, *given.tests], plugins=[hunt]))
 
