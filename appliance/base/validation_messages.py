@@ -31,7 +31,7 @@ _MUST_BE = {
     "path": "the path of a file or folder",
     "str": "a text",
     "string": "a string; put a number or true in quotes",
-    "string_pattern_mismatch": "a string that matches {pattern}",
+    "string_pattern_mismatch": "{pattern}",
     "string_too_long": "at most {max_length} characters",
     "string_too_short": "at least {min_length} characters",
     "too_long": "{max_length} at most in number",
@@ -46,9 +46,7 @@ _BODY: dict[str, Callable[..., str]] = {
         lambda what, bound, many: f"must have {_BOUNDS[bound]} {many} {_PARTS.get(what, 'parts')}"
     ),
     r"Expected `.*` ([<>]=?) (\S+)": lambda bound, limit: f"must be {_BOUNDS[bound]} {_plain(float(limit))}",
-    r"(?s)Expected `.*` matching regex '(.*?)(?:\(\?!.*)?'": lambda pattern: (
-        f"must be a string that matches {pattern}"
-    ),
+    r"(?s)Expected `.*` matching regex '(.*?)(?:\(\?!.*)?'": lambda pattern: f"must be {_shape(pattern)}",
     r"(?s)Object missing required field `(.*)`": lambda name: f"the field `{name}` must be given",
     r"(?s)Object contains unknown field `(.*)`": lambda name: f"there is no field `{name}`",
     r"Number out of range": lambda: "must be a smaller number",
@@ -56,6 +54,7 @@ _BODY: dict[str, Callable[..., str]] = {
 """msgspec's messages, and those for users."""
 
 
+_NAME = re.compile(r"\^\(?\[([\w.-]+)\]\[([\w.-]+)\]\{0,(\d+)\}(?:\)\?)?(?:\$|\\Z)")
 _YAML = {
     r"'\\t'": "indent with spaces, not tabs",
     "mapping values are not allowed": "put a string with `: ` in quotes, and indent the keys of a section equally",
@@ -93,7 +92,10 @@ def must_be(error: Mapping[str, Any]) -> str:
     """`error` is one of pydantic's `errors()`."""
     kind, context = str(error["type"]), error.get("ctx") or {}
     wanted = _MUST_BE.get(kind) or _MUST_BE.get(kind.partition("_")[0]) or f"of another type ({kind})"
-    return wanted.format(**{name: _plain(value) for name, value in context.items()})
+    shown = {name: _plain(value) for name, value in context.items()}
+    if "pattern" in shown:
+        shown["pattern"] = _shape(shown["pattern"])
+    return wanted.format(**shown)
 
 
 def refusal(error: Mapping[str, Any]) -> str:
@@ -121,6 +123,22 @@ def body_refusal(text: str, choices: Collection[str] = ()) -> str:
 
 def _cut(text: str) -> str:
     return text if len(text) <= _LONGEST_SHOWN else text[:_LONGEST_SHOWN] + "…"
+
+
+def _shape(pattern: str) -> str:
+    """Describe the regular expression of a name in words; others are given as they are."""
+    found = _NAME.fullmatch(pattern)
+    if found is None:
+        return f"a string that matches {pattern}"
+    first, rest, most = found.groups()
+    begin = " or ".join(word.removesuffix("s") for word in _characters(first))
+    return f"a name of {', '.join(_characters(rest))}, at most {int(most) + 1}, that begins with a {begin}"
+
+
+def _characters(members: str) -> list[str]:
+    words = ["letters" if "A-Z" in members else "small letters"] if "a-z" in members else []
+    words += ["digits"] if "0-9" in members else []
+    return [*words, *map(repr, re.sub("A-Z|a-z|0-9", "", members))]
 
 
 def _typed(types: str) -> str:

@@ -25,8 +25,11 @@ def certificate(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
             " certificate at its first start, unless `api` is off",
             "rosrv certificate",
         ) from None
+    except PermissionError as error:
+        raise usage_error(f"{file}: {error.strerror}; run this as root", "rosrv certificate") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise usage_error(f"{file} cannot be read: {error}", "rosrv certificate") from None
+        why = error.strerror if isinstance(error, OSError) else error.reason
+        raise usage_error(f"{file} cannot be read: {why}", "rosrv certificate") from None
     if as_json:
         say_json({"certificate": text})
     else:

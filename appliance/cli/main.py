@@ -14,6 +14,10 @@ from appliance.base.user_errors import UserError
 from appliance.cli.lazy import application
 from appliance.cli.verb_table import Group, Verb, Verbs, joined
 from rosmop.tool.options import SUMMARIES
+from rosmop.tool.terminal import printable
+
+_OF_THE_MACHINE = (errno.EACCES, errno.EPERM, errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+"""Errors that an operator can remove, also where a verb does not expect them."""
 
 _CONFIRM = "Keep a change loaded with --confirm-within. Exit status 1 if there is nothing to confirm."
 
@@ -138,8 +142,11 @@ def main() -> None:
         if isinstance(error, UserError):
             sys.stderr.write(f"rosrv: {error}\n")
             sys.exit(1)
-        if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
-            sys.stderr.write(f"rosrv: output: {error.strerror}\n")
+        if isinstance(error, OSError) and error.errno in _OF_THE_MACHINE:
+            advice = "; run this as root" if isinstance(error, PermissionError) else ""
+            sys.stderr.write(
+                f"rosrv: {printable(str(error.filename or 'output'))}: {error.strerror}{advice}\n"
+            )
             sys.exit(2)
         last = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{last.filename}:{last.lineno}"

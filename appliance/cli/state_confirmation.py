@@ -18,6 +18,14 @@ def confirm_state(state: Path, given: str | None, consequence: str) -> None:
 
     `consequence` is what the order does, as a sentence.
     """
+    try:
+        found = state.is_dir()
+    except PermissionError as error:
+        raise refused([f"rosrv: {error.filename}: {error.strerror}; run this as root"]) from None
+    if not found:
+        raise refused(
+            [f"rosrv: {state}: no such directory; give the appliance's state directory with --state"]
+        )
     if given is None:
         given = str(typer.prompt(f"{consequence}. Type {printable(str(state))} to continue", err=True))
     if Path(given).absolute() != state.absolute():

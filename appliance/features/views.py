@@ -11,13 +11,14 @@ from appliance.channel.answers.field_docs import doc
 from appliance.features.approvals.view import APPROVALS_VIEW
 from appliance.features.doors.view import DOORS_VIEW
 from appliance.features.fleet.view import FLEET_VIEW
+from appliance.features.guards.view import GUARDS_VIEW
 from appliance.features.recorder.view import RECORDER_VIEW
 from appliance.features.standby.view import STANDBY_VIEW
 from appliance.features.syslog.view import SYSLOG_VIEW
 from appliance.features.view import FeatureView, PairView, StateView
 
 VIEWS: tuple[FeatureView, ...] = (
-    SYSLOG_VIEW, STANDBY_VIEW, FLEET_VIEW, RECORDER_VIEW, DOORS_VIEW, APPROVALS_VIEW,
+    SYSLOG_VIEW, STANDBY_VIEW, FLEET_VIEW, RECORDER_VIEW, DOORS_VIEW, APPROVALS_VIEW, GUARDS_VIEW,
 )  # fmt: skip
 STATES: tuple[StateView[Any], ...] = tuple(state for view in VIEWS for state in view.states)
 

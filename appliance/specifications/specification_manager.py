@@ -409,8 +409,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
         """None is the previous revision, 0 no specifications.
 
-        A monitor that returns gets the switch that it had when it was removed. Raises `SpecificationsRefusedError`;
-        nobody would read it after an unconfirmed change, so there a file with an error does nothing, as after a start.
+        A monitor that returns gets the switch that it had when it was removed. Raises `SpecificationsRefusedError`.
+
+        The rollback of an unconfirmed change must succeed, so there a file with an error does nothing, as after a start.
         """
         check = self._as_at_start if who == UNCONFIRMED else self._strictly
         async with self._changing(request.expected):

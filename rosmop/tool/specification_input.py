@@ -1,6 +1,7 @@
 """Read specifications and folders of message definitions."""
 
 import os
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -47,7 +48,9 @@ def read_specifications(program: CommandContext, files: Sequence[Path]) -> dict[
         except OSError as error:
             raise program.usage_error(f"cannot read {file}: {error.strerror}") from error
         if raw.startswith(_RECORDINGS):
-            raise program.usage_error(f"{file} is a recording, not a specification: use --bag {file}")
+            raise program.usage_error(
+                f"{file} is a recording, not a specification: use --bag {shlex.quote(str(file))}"
+            )
         name = os.fsencode(file).decode("utf-8", "backslashreplace")
         texts[name] = raw.decode("utf-8-sig", "surrogateescape")
     return texts

@@ -277,7 +277,7 @@ WALL_CLOCK = {
         "control/assembly/policies.py", "control/operators/queries.py", "features/standby/replication.py",
         "features/recorder/recording_orders.py",
         "features/evidence/bundle.py",
-        "features/doors/client_counts.py",
+        "features/doors/client_counts.py", "features/guards/guard_orders.py",
         "features/doors/door_node.py", "features/doors/door_table.py", "features/doors/door_tickets.py",
         "features/syslog/log_forwarder.py",
         "features/fleet/segment_pusher.py",

@@ -68,13 +68,23 @@ def search(
 
     Example: rosrv audit search --deny --since 1h --topic '/cmd_*'
     """
-    page = appliance.audit().search(_filter_of(appliance), cursor, limit, newest_first=not oldest_first)
+    wanted = _filter_of(appliance)
+    page = appliance.audit().search(wanted, cursor, limit, newest_first=not oldest_first)
     if appliance.as_json:
         _print_lines(page.entries, appliance)
     else:
         print_entries(page.entries, appliance.host_in_words, each=each)
+        if not page.entries:
+            note(f"no record matches{_slash_missing(wanted)}")
     if page.cursor is not None:
         note(f"more records match: --cursor {page.cursor}, or a larger --limit")
+
+
+def _slash_missing(wanted: Filter) -> str:
+    """The records have resolved names of nodes, topics, services and parameters."""
+    given = (("--topic", wanted.resource), ("--caller", wanted.caller_id))
+    bare = [f"{option} /{name}" for option, name in given if name and name[0] not in "/*?["]
+    return f"; names in ROS begin with a slash: {' '.join(bare)}" if bare else ""
 
 
 @speaks_with(_JSON_HELP, FILTER)

@@ -9,6 +9,7 @@ import msgspec
 
 import appliance
 from appliance.base.clock import now, wall
+from appliance.base.validation_messages import meant
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import (
     Graph,
@@ -108,9 +109,11 @@ class Queries:
         """Return the next messages of a topic. Raises `UnknownThingError`, `SenselessError` and `TooManyTapsError`."""
         if not 1 <= request.messages <= MOST_MESSAGES or not 0 < request.seconds <= LONGEST_LOOK:
             raise SenselessError(f"ask for 1 to {MOST_MESSAGES} messages, within {LONGEST_LOOK:g} seconds")
-        topic = next((topic for topic in graph_of(self.parts).topics if topic.name == request.topic), None)
+        topics = {topic.name: topic for topic in graph_of(self.parts).topics}
+        topic = topics.get(request.topic)
         if topic is None:
-            raise UnknownThingError(f"no node publishes or subscribes to {request.topic[:200]}")
+            near = meant(request.topic, topics)
+            raise UnknownThingError(f"no node publishes or subscribes to {request.topic[:200]}{near}")
         if not topic.mediated:
             raise SenselessError(
                 f"the messages of {topic.name} do not pass the appliance (relaying: monitored), so it cannot show them"

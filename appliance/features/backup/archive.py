@@ -55,6 +55,8 @@ def checked_archive(file: Path, room: int) -> Iterator[tuple[tarfile.TarFile, li
         raise _strange(file, str(error)) from None
     except (OSError, tarfile.TarError, EOFError, ValueError, zlib.error) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        if isinstance(error, gzip.BadGzipFile):
+            reason = "it is not a file of rosrv backup"
         raise BackupError(f"{file} cannot be restored: {reason}") from error
 
 

@@ -1,5 +1,6 @@
 """`rosrv backup`, `restore` and `purge`: save, restore and erase the state directory."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -61,7 +62,9 @@ def restore(
     if as_json:
         say_json({"state": str(state), "files": len(names)})
     else:
-        say(f"{state}: {len(names)} files; verify the log: rosrv audit verify --state {state}")
+        say(
+            f"{state}: {len(names)} files; verify the log: rosrv audit verify --state {shlex.quote(str(state))}"
+        )
 
 
 def purge(

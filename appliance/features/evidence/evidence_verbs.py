@@ -2,8 +2,10 @@
 
 import errno
 import os
+import shlex
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 from urllib.parse import quote
@@ -68,11 +70,14 @@ def export_evidence(
         size, part = 0, name_to_make(output)
         if os.path.lexists(output):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(output))
-        descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with _naming(output):
+            descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         try:
             with os.fdopen(descriptor, "wb") as file:
                 for piece in _bundle(appliance, recording or span):
-                    size += file.write(piece)
+                    with _naming(output):
+                        size += file.write(piece)
+                        file.flush()
             part.rename(output)
         except BaseException as error:
             part.unlink()
@@ -82,7 +87,18 @@ def export_evidence(
     if appliance.as_json:
         say_json({"file": str(output), "bytes": size})
     else:
-        say(f"{output}: {size} bytes; verify it: python3 verify.py {output.name} --key audit.pub")
+        say(
+            f"{output}: {size} bytes; verify it: python3 verify.py {shlex.quote(output.name)} --key audit.pub"
+        )
+
+
+@contextmanager
+def _naming(output: Path) -> Iterator[None]:
+    """Errors name the file that the operator named, not the unfinished one. Raises `OSError`."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(output)) from error
 
 
 def _bundle(appliance: Appliance, wanted: str | TimeSpan) -> Iterator[bytes]:

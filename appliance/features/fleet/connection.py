@@ -274,7 +274,7 @@ def reason_in(refusal: bytes) -> str:
     """Return the `detail` of a collector's refusal; the body of another server, in printable characters."""
     try:
         text = msgspec.json.decode(refusal[:_LONGEST_REFUSAL], type=_Refusal).detail
-    except (msgspec.DecodeError, UnicodeDecodeError):
+    except ValueError:
         text = refusal.decode("utf-8", "replace").strip() or "no reason"
     return printable(text[:_LONGEST_REASON])
 

@@ -25,6 +25,7 @@ def _operate(context: OperatorContext) -> FeaturePart:
     checks = DriverChecks(context.monitors, context.core.trail, context.graph, context.processes)
     return FeaturePart(
         methods=(*orders.methods(), *checks.methods()),
+        status_fields=lambda: {"guards": orders.state()},
         work={"the guards": orders.watch, "the check of a driver": checks.watch},
     )
 

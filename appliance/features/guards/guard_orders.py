@@ -38,6 +38,7 @@ from appliance.features.guards.presets import (
     with_values,
 )
 from appliance.features.guards.suggestions import proposals
+from appliance.features.guards.view import ActingGuard, GuardsState
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from appliance.specifications.specification_manager import SpecificationManager
 
@@ -73,6 +74,7 @@ class GuardOrders:
         self._monitors, self._graph = monitors, graph
         self._acts: dict[str, int] = {}
         self._acted_at: dict[str, float] = {}
+        self._acting_since: dict[str, float] = {}
 
     def methods(self) -> tuple[RequestMethod[Any], ...]:
         return (
@@ -98,6 +100,14 @@ class GuardOrders:
                 self._acted_at[name] = clock.now()
             self._acts[name] = acts
         self._acts = {name: acts for name, acts in self._acts.items() if name in guards}
+        acting, now = [name for name in guards if self._state(name) == "stopping"], clock.wall()
+        self._acting_since = {name: self._acting_since.get(name, now) for name in acting}
+
+    def state(self) -> GuardsState | None:
+        """Return the state of all guards for the status; None if there is no guard."""
+        loaded = len(self._guards())
+        acting = [ActingGuard(name, since) for name, since in self._acting_since.items()]
+        return GuardsState(loaded, acting) if loaded else None
 
     async def guards(self, _request: guard_requests.GuardsWanted) -> GuardList:
         rows = [self._row(name, preset) for name, preset in self._guards().items()]

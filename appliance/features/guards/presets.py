@@ -70,7 +70,7 @@ class Parameter:
             return " ".join(value.split())
         if not (_WHOLE if self.kind == "int" else _DECIMAL).fullmatch(value):
             noun = "a whole number" if self.kind == "int" else "a number"
-            raise GuardError(f"{self.name}={value}: give {noun}{f' of {self.unit}' if self.unit else ''}")
+            raise GuardError(f"{self.name}={value}: give {noun}{f', in {self.unit}' if self.unit else ''}")
         if not float(self.least) <= float(value) <= float(self.most):
             unit = f" {self.unit}" if self.unit else ""
             raise GuardError(

@@ -103,6 +103,8 @@ def grant(
             write_told(write, _with_ends_of(write, found.text))
         except OSError as error:
             raise usage_error(f"cannot write {write}: {error.strerror}") from None
+        if not appliance.as_json and not load:
+            say(f"written to {write}; the policy in force is unchanged until it is loaded")
     if load:
         order = PolicyLoad(found.text, f"grants record {record[:100]}", within, found.revision)
         body = appliance.ask_or_exit(order)

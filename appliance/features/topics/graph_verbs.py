@@ -53,6 +53,8 @@ def list_topics(appliance: Appliance) -> None:
             f"{counted(len(topic.publishers), 'publisher')}, {counted(len(topic.subscribers), 'subscriber')}"
         )
         past = "" if topic.mediated else "  bypasses the appliance"
-        say_row([f"{topic.name:<{name}}", f"{topic.type:<{kind}}", f"{ends}, {rate:.1f} Hz{past}"])
+        unused = topic.mediated and not topic.subscribers and not rate
+        flow = "not relayed without a subscriber" if unused else f"{rate:.1f} Hz"
+        say_row([f"{topic.name:<{name}}", f"{topic.type:<{kind}}", f"{ends}, {flow}{past}"])
     if not topics and not appliance.as_json:
         say("no topic is registered")

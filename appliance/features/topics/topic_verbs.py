@@ -13,6 +13,7 @@ from appliance.audit.log.record_format import rfc3339
 from appliance.audit.search.query import Filter
 from appliance.base import clock
 from appliance.base.timestamps import parse_timestamp
+from appliance.base.validation_messages import meant
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Topic, TopicMessage
 from appliance.cli import completion
@@ -22,11 +23,25 @@ from appliance.cli.message_lines import lines_of
 from appliance.cli.output import say_json, usage_error
 from appliance.features.topics.publishers import publishers_at
 from rosmop.tool.terminal import printable, refused, say
+from roswire.errors import InvalidNameError
 from roswire.message_view import CUT
-from roswire.names import is_global_name
+from roswire.names import resolve
 
 _AT_ONCE = 20  # messages in one request
-_Topic = Annotated[str, typer.Argument(metavar="TOPIC", show_default=False, autocompletion=completion.topics)]
+
+
+def _resolved(topic: str) -> str:
+    """Like the stock tools: `odom` is /odom."""
+    try:
+        return resolve(topic, "")
+    except InvalidNameError as error:
+        raise usage_error(f"{error}; a topic's name is such as /cmd_vel", "rosrv topic") from None
+
+
+_Topic = Annotated[
+    str,
+    typer.Argument(metavar="TOPIC", show_default=False, autocompletion=completion.topics, callback=_resolved),
+]
 
 
 @speaks
@@ -69,7 +84,8 @@ def info(appliance: Appliance, topic: _Topic) -> None:
     body = appliance.ask_or_exit(admin.GraphWanted())
     found = next((row for row in body.topics if row.name == topic), None)
     if found is None:
-        raise usage_error(f"no node publishes or subscribes to {topic}")
+        known = [row.name for row in body.topics]
+        raise usage_error(f"no node publishes or subscribes to {topic}{meant(topic, known)}", "rosrv topic")
     if appliance.as_json:
         say_json(found)
     else:
@@ -93,8 +109,6 @@ def publishers(
 
     Example: rosrv topic publishers /cmd_vel --at 10:32
     """
-    if not is_global_name(topic):
-        raise usage_error(f"{topic!r} is not a resolved ROS name, such as /cmd_vel")
     with Errors():
         now = clock.wall_ns()
         then = now if at == "now" else parse_timestamp(at, now)
@@ -141,6 +155,8 @@ def _described(topic: Topic) -> Iterator[str]:
             yield f"  received by {printable(node)}"
         else:
             yield f"  subscribed by {printable(node)}, which is not connected to a publisher"
+    if topic.mediated and not topic.subscribers:
+        yield "  no node subscribes, so publishers send no messages to the relay"
     if not topic.mediated:
         yield "  its messages bypass the appliance"
 

@@ -11,7 +11,7 @@ from fastapi import FastAPI, Request
 from fastapi.routing import iter_route_contexts
 
 from appliance.api.front.problems import ProblemError
-from appliance.base.validation_messages import refusal
+from appliance.base.validation_messages import body_refusal, refusal
 from appliance.configuration.config_sources import ConfigError, resolve
 from appliance.configuration.settings import Settings
 from tests.support.command import commands, rosrv
@@ -24,6 +24,22 @@ WRONG: list[Any] = [
 LIBRARY = re.compile(
     r"Value error|\b[A-Z][a-z]+ should|unable to|Invalid enum|Expected `|Object [mc]|of another form|out of range"
 )
+
+
+@pytest.mark.parametrize(
+    ("pattern", "words"),
+    [
+        (r"^([A-Za-z0-9][A-Za-z0-9.-]{0,62})?$",
+         "a name of letters, digits, '.', '-', at most 63, that begins with a letter or digit"),
+        (r"^[a-z][a-z0-9_-]{0,30}\Z",
+         "a name of small letters, digits, '_', '-', at most 31, that begins with a small letter"),
+        ("^[0-9a-f]{64}$", "a string that matches ^[0-9a-f]{64}$"),
+    ],
+)  # fmt: skip
+def test_the_form_of_a_name_is_described_in_words(pattern: str, words: str) -> None:
+    assert body_refusal(f"Expected `str` matching regex '{pattern}'") == f"must be {words}"
+    told = refusal({"type": "string_pattern_mismatch", "ctx": {"pattern": pattern}, "input": "ü"})
+    assert told == f"must be {words}, not 'ü'"
 
 
 def test_the_command_line_explains_valid_values() -> None:

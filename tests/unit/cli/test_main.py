@@ -1,3 +1,5 @@
+import errno
+
 import pytest
 
 from appliance.cli import main
@@ -22,6 +24,22 @@ def test_a_users_error_is_one_line(
     assert said.startswith("rosrv: ")
     assert said.endswith("port 1 is in use\n")
     assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (PermissionError(errno.EACCES, "Permission denied", "/var/lib/rosrv/x"),
+         "rosrv: /var/lib/rosrv/x: Permission denied; run this as root\n"),
+        (OSError(errno.ENOSPC, "No space left on device", "/a b"), "rosrv: /a b: No space left on device\n"),
+        (OSError(errno.ENOSPC, "No space left on device"), "rosrv: output: No space left on device\n"),
+    ],
+)  # fmt: skip
+def test_a_lack_of_rights_or_space_is_not_called_a_defect(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: OSError, said: str
+) -> None:
+    assert outcome(monkeypatch, error) == 2
+    assert capsys.readouterr().err == said
 
 
 def test_a_defect_is_reported_with_its_position(

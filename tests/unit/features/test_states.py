@@ -12,7 +12,7 @@ AUDIT = "lag_records lag_seconds failed on_failure degraded forwarding collector
 STATUS = (
     "version since master processes isolation relaying mediation firewall probe policy ipsec monitors rosmaster relay"
     " nodes shadows topics services connections messages dropped audit clock recorder switched_off blocks last_minute"
-    " name standby bundles doors handled_alarms approvals"
+    " name standby bundles doors handled_alarms approvals guards"
 )
 TO: dict[str, Any] = {"to": "tls://log:6514", "behind": 7}
 DOOR = {
@@ -35,6 +35,10 @@ BAD: dict[str, tuple[dict[str, Any], list[tuple[str, str]]]] = {
     "approvals": (
         {"waiting": 1, "oldest_seconds": 2.5, "leases": 3, "unanswered": 4},
         [("approval-unanswered", "warning")],
+    ),
+    "guards": (
+        {"loaded": 2, "acting": [{"name": "fence", "since": 1.5}]},
+        [("guard-acts:fence", "notice")],
     ),
     "bundles": (
         {"refused": "a/b/2.tar", "reason": "no", "trouble": "bad", "rejected": True, "changed": True},

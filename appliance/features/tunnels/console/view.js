@@ -68,17 +68,17 @@ function HostTable(/** @type {{hosts: any[], open: (what: any) => void}} */ { ho
       <td data-label="Tunnel"><div><${Badge} word=${one.state} tone=${TONES[/** @type {keyof typeof TONES} */ (one.state)]} />${one.state === "up" && html`<div class="muted small nowrap">for ${lasting(one.seconds)}</div>`}${one.token_expires && html`<div class="muted small">token until <${Moment} at=${one.token_expires} /></div>`}</div></td>
       <td data-label="Address"><${Given} value=${one.address} mono /></td><td data-label="From"><div><${Given} value=${one.remote} mono />${one.remote && html`<div class="muted small nowrap">${bytes(one.bytes_in)} in, ${bytes(one.bytes_out)} out</div>`}</div></td>
       <td class="nowrap" data-label="Certificate"><div>${one.expires === null ? html`<span class="muted">–</span>` : html`<${Moment} at=${one.expires} always="day" />`}${one.expires_soon && html`<div><${Badge} word="expires soon" tone="warn" /></div>`}${one.renewing && html`<div class="muted small">a renewed certificate waits for the host</div>`}</div></td>
-      <td class="nowrap" data-label="Last seen"><${Moment} at=${one.last_seen} /></td><td data-label="Ports"><${Ports} ports=${one.ports} /></td>
+      <td class="nowrap" data-label="Last seen"><${Moment} at=${one.last_seen} /></td><td data-label="Ports"><${Ports} ports=${one.ports} address=${one.address} /></td>
       <td><div class="row row-end"><${Block} small host=${one.name}>Block…</${Block}>${one.state !== "revoked" && html`<${Button} small role="admin" onClick=${() => open({ what: "again", host: one })}>${one.enrolled === null ? "Token" : "New kit"}</${Button}>`}${one.enrolled !== null && one.revoked === null && html`<${Button} small role="admin" tone="danger" onClick=${() => open({ what: "revoke", host: one })}>Revoke</${Button}>`}</div></td></tr>`)}</tbody></table></div>`;
 }
 
 function MachineTable(/** @type {{machines: any[]}} */ { machines }) {
-  return html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>Machine</th><th class="number">Nodes</th><th>Ports of its nodes</th><th><span class="sr-only">Actions</span></th></tr></thead><tbody>${machines.map((one) => html`<tr key=${one.address}><td class="first"><${Host} value=${one.address} /></td><td class="number" data-label="Nodes">${one.nodes}</td><td data-label="Ports"><${Ports} ports=${one.ports} /></td><td><div class="row row-end"><${Block} small host=${one.address}>Block…</${Block}></div></td></tr>`)}</tbody></table></div>`;
+  return html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>Machine</th><th class="number">Nodes</th><th>Ports of its nodes</th><th><span class="sr-only">Actions</span></th></tr></thead><tbody>${machines.map((one) => html`<tr key=${one.address}><td class="first"><${Host} value=${one.address} /></td><td class="number" data-label="Nodes">${one.nodes}</td><td data-label="Ports"><${Ports} ports=${one.ports} address=${one.address} /></td><td><div class="row row-end"><${Block} small host=${one.address}>Block…</${Block}></div></td></tr>`)}</tbody></table></div>`;
 }
 
 /** The last check's result: whether other machines can reach the ports of the host's nodes. */
-function Ports(/** @type {{ports: any}} */ { ports }) {
+function Ports(/** @type {{ports: any, address: string}} */ { ports, address }) {
   const tone = { closed: "allow", open: "deny", unknown: "" }[/** @type {string} */ (ports.state)];
-  return html`<div><${Badge} word=${ports.state} tone=${tone} />${ports.state === "unknown" ? html`<div class="muted small">try: rosrv protect --check</div>` : html`<div class="muted small">seen <${Moment} at=${ports.checked} /></div>`}
+  return html`<div><${Badge} word=${ports.state} tone=${tone} />${ports.state === "unknown" ? html`<div class="muted small">on another machine: <code>rosrv protect --check ${address}</code></div>` : html`<div class="muted small">seen <${Moment} at=${ports.checked} /></div>`}
     ${ports.open.length > 0 && html`<div class="small mono">${ports.open.slice(0, 8).join(", ")}${ports.open.length > 8 ? " …" : ""}</div>`}</div>`;
 }

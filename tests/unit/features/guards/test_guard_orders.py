@@ -4,12 +4,14 @@ from typing import Any
 
 import pytest
 
+from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Graph
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.guards import guard_requests
 from appliance.features.guards.guard_orders import GuardOrders
 from appliance.features.guards.presets import PRESETS, Guard, text_of
+from appliance.features.guards.view import ActingGuard, GuardsState
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from tests.support.virtual_clock import let_time_pass
 
@@ -68,6 +70,24 @@ def orders(manager: Manager) -> GuardOrders:
 async def row(orders: GuardOrders) -> Any:
     [found] = (await orders.guards(guard_requests.GuardsWanted())).guards
     return found
+
+
+async def test_the_status_names_the_guards_that_act_and_since_when(
+    manager: Manager, orders: GuardOrders
+) -> None:
+    orders.look()
+    assert orders.state() == GuardsState(1, [])
+    began = clock.wall()
+    for _second in range(3):  # the pauses are shorter than two seconds
+        manager.records.counts["change", "fence"] += 1
+        orders.look()
+        assert orders.state() == GuardsState(1, [ActingGuard("fence", began)])
+        let_time_pass(1.5)
+    let_time_pass(2.0)
+    orders.look()
+    assert orders.state() == GuardsState(1, [])
+    manager.sources.files.clear()
+    assert orders.state() is None
 
 
 async def test_a_guard_is_stopping_while_it_acts(manager: Manager, orders: GuardOrders) -> None:

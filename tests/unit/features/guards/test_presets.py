@@ -76,7 +76,7 @@ def test_a_guard_is_an_ordinary_text_with_its_topics_types_and_values() -> None:
 
 WRONG = [
     ("speed", "base", {}, {}, {"vMax": "51"}, "outside of 0..50 m/s"),
-    ("speed", "base", {}, {}, {"vMax": "nan"}, "give a number of m/s"),
+    ("speed", "base", {}, {}, {"vMax": "nan"}, "give a number, in m/s"),
     ("speed", "base", {}, {}, {"vMax": "1;}"}, "give a number"),
     ("speed", "base", {}, {}, {"vmax": "1"}, "use one of: vMax"),
     ("estop", "base", {}, {}, {"twoHands": "1"}, "twoHands=true or twoHands=false"),
