@@ -13,7 +13,7 @@ Node = tuple[object, ...]
 DEEPEST = 120
 
 _TOKEN = re.compile(
-    r"(?:\s+|//[^\n]*|/\*.*?\*/)*(?:([A-Za-z_]\w*|\d+(?:\.\d+)?|\.\d+)|(.))?", re.DOTALL | re.ASCII
+    r"(?:\s++|//[^\n]*+|/\*.*?\*/)*+(?:([A-Za-z_]\w*|\d+(?:\.\d+)?|\.\d+)|(.))?", re.DOTALL | re.ASCII
 )
 
 

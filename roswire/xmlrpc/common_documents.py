@@ -20,7 +20,7 @@ _SMALLEST = len("<value></value>")
 # Every repeat of a set is possessive (`*+`), so time is linear in the document.
 _SPACE = rb"[ \t\r\n]*+"
 _TEXT = rb"[ -%'-;=?-~]*+"
-_INTEGER = rb"-?[0-9]{1,9}"
+_INTEGER = rb"-?[0-9]{1,9}+"
 _DOUBLE = rb"-?[0-9]++(?:\.[0-9]++)?(?:e[-+]?[0-9]++)?"
 
 

@@ -24,18 +24,20 @@ _GIVEN = re.compile(
 )
 _HEAD = re.compile(r"^((?:begin |hold )?)(\w+)\(", re.MULTILINE)
 _FIRST_LINE = re.compile(r"// preset (?P<preset>\w+) (?P<version>\d+):.*\n")
-_NAME = re.compile(r"[A-Za-z_]\w{0,63}")
+_NAME = re.compile(r"[A-Za-z_]\w{0,63}", re.ASCII)
 _VALUE = re.compile(r"(\b(\w+) (\w+) = )[^ ;]+")
 _TABLE = re.compile(r"(\b(\w+)\[\] = \{)[^}]*")
-_TOPIC = re.compile(r"/[A-Za-z]\w*(?:/[A-Za-z]\w*)*")
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_WHOLE = re.compile(r"[-+]?\d+")
-_DECIMAL = re.compile(_NUMBER)
-_CORNERS = re.compile(rf"\s*{_NUMBER}\s*,\s*{_NUMBER}(?:\s+{_NUMBER}\s*,\s*{_NUMBER}){{2,99}}\s*")
-_JOINTS = re.compile(rf"\s*[\w/]+:{_NUMBER}\.\.{_NUMBER}(?:\s+[\w/]+:{_NUMBER}\.\.{_NUMBER})*\s*")
+_TOPIC = re.compile(r"/[A-Za-z]\w*+(?:/[A-Za-z]\w*+)*+", re.ASCII)
+_NUMBER = r"[-+]?(?:\d++(?:\.\d*+)?|\.\d++)(?:[eE][-+]?\d++)?"
+_WHOLE = re.compile(r"[-+]?\d++", re.ASCII)
+_DECIMAL = re.compile(_NUMBER, re.ASCII)
+_CORNER = rf"{_NUMBER}\s*+,\s*+{_NUMBER}"
+_CORNERS = re.compile(rf"\s*+{_CORNER}(?:\s++{_CORNER}){{2,99}}+\s*+", re.ASCII)
+_JOINT = rf"[\w/]++:{_NUMBER}\.\.{_NUMBER}"
+_JOINTS = re.compile(rf"\s*+{_JOINT}(?:\s++{_JOINT})*+\s*+", re.ASCII)
 _TIMEOUT = re.compile(r"(timeout )(\d+(?:\.\d+)?m?s)")
 _HOSTS = re.compile(r"(\bwithhold \w+ from )([^;]+?)(?= while )")
-_SPAN = re.compile(r"(\d+(?:\.\d+)?)(ms|s)")
+_SPAN = re.compile(r"(\d++(?:\.\d++)?)(ms|s)", re.ASCII)
 
 
 class GuardError(UserError):
