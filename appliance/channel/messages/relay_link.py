@@ -493,7 +493,8 @@ class OwnServiceAnswered(Message):
 class ApprovalWanted(Message):
     """The request waits for `ApprovalAnswered`.
 
-    `digest` is the SHA-256 of the request, and `shown` its first bytes. `type` is the service's type.
+    `digest` is the SHA-256 of the request, `shown` its first bytes, and `size` the number of all. `type` is the
+    service's type.
     """
 
     number: int
@@ -503,6 +504,7 @@ class ApprovalWanted(Message):
     type: str
     digest: str
     shown: bytes
+    size: int
 
 
 class ApprovalAnswered(Message):

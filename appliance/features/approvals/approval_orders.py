@@ -83,7 +83,7 @@ class ApprovalOrders:
 
     def hold_call(self, request: Request) -> str:
         call = HeldCall(request.host, request.category, request.resource)
-        return self._held(call, request.caller_id, "", b"")
+        return self._held(call, request.caller_id)
 
     async def approve_call(self, wanted: ApprovalWanted) -> ApprovalAnswered:
         """Decide about a request to a service. An approval of one call is used up."""
@@ -106,14 +106,16 @@ class ApprovalOrders:
         call = HeldCall(host, Category.CALL, wanted.service, wanted.digest)
         entry = self._table.find(call)
         if entry is None or entry.state is not ApprovalState.APPROVED or entry.until <= clock.now():
-            told = self._held(call, wanted.caller_id, wanted.type, wanted.shown)
+            told = self._held(call, wanted.caller_id, wanted.type, wanted.shown, wanted.size)
             return replace(decision, allowed=False, reason=f"{told}: {decision.reason}")
         if entry.once:
             self._table.end(entry)
             self._record("approval used", entry, f"used approval {entry.number}")
         return replace(decision, reason=f"{decision.reason}; approval {entry.number} by {entry.who}")
 
-    def _held(self, call: HeldCall, caller_id: str, type_: str, arguments: bytes) -> str:
+    def _held(
+        self, call: HeldCall, caller_id: str, type_: str = "", arguments: bytes = b"", size: int = 0
+    ) -> str:
         now = clock.now()
         entry = self._table.find(call)
         if entry is None:
@@ -124,6 +126,7 @@ class ApprovalOrders:
                 caller_id=caller_id,
                 type_=type_,
                 arguments=arguments,
+                size=size,
             )
             if isinstance(held, str):
                 return f"not held: {held}; ask the operator about those first"
@@ -330,6 +333,7 @@ def _shown(entry: ApprovalEntry) -> requests.Approval:
         entry.type,
         call.digest,
         entry.arguments.hex(),
+        entry.size,
         round(max(0.0, entry.until - clock.now()), 1),
         entry.who,
     )

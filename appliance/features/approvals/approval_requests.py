@@ -41,6 +41,9 @@ class Approval(msgspec.Struct, frozen=True):
     arguments: Annotated[
         str, doc("first 4096 bytes of the arguments as the service would get them, in hexadecimal")
     ]
+    size: Annotated[
+        int, doc("bytes of all arguments; if they are more, an approval is for bytes that are not shown")
+    ]
     left_seconds: Annotated[float, doc("until it ends")]
     who: Annotated[str, doc("the operator who approved or refused it")]
 

@@ -58,7 +58,7 @@ class ChargedHost(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ApprovalEntry:
-    """A call, and the operators' decision. `arguments` are its first bytes, `type` its service type.
+    """A call, and the operators' decision. `arguments` are its first bytes, of `size`; `type` is its service type.
 
     It ends at `until`. `once`: the approval is for one call; otherwise it is a lease for all calls of the key, which
     began at `since`.
@@ -70,6 +70,7 @@ class ApprovalEntry:
     caller_id: str
     type: str
     arguments: bytes
+    size: int
     since: float
     until: float
     state: ApprovalState = ApprovalState.WAITS
@@ -116,11 +117,14 @@ class ApprovalTable:
         caller_id: str,
         type_: str,
         arguments: bytes,
+        size: int,
     ) -> ApprovalEntry | str:
         """Return the entry of a waiting call, or why its host may have no more."""
         if refusal := self.pool.take(charged):
             return refusal
-        entry = ApprovalEntry(self._next, call, charged, caller_id, type_, arguments, now, now + WAIT_SECONDS)
+        entry = ApprovalEntry(
+            self._next, call, charged, caller_id, type_, arguments, size, now, now + WAIT_SECONDS
+        )
         self._next += 1
         self._put(entry)
         return entry

@@ -73,7 +73,8 @@ def _arguments(one: Approval) -> str:
     data = bytes.fromhex(one.arguments)
     fields = _fields(one.type, data) if data else {}
     shown = f"{data!r} ({one.type}, sha256 {one.sha256[:12]})" if fields is None else str(fields)
-    return f" {shown}"
+    hidden = one.size - len(data)
+    return f" {shown}{f', and {hidden} more bytes, which are not shown' if hidden else ''}"
 
 
 def _fields(service: str, data: bytes) -> dict[str, Any] | None:

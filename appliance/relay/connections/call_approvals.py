@@ -42,7 +42,7 @@ class CallApprovals:
         number, host, digest = self._number, caller[1], hashlib.sha256(body).hexdigest()
         self._open[number] = host, answered
         if self._connected:
-            wanted = ApprovalWanted(number, *caller, type_, digest, body[:_SHOWN])
+            wanted = ApprovalWanted(number, *caller, type_, digest, body[:_SHOWN], len(body))
             self._unsent.setdefault(host, {})[number] = wanted
             self._send_next(host)
         else:

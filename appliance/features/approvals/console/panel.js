@@ -14,6 +14,7 @@ import { ask, get } from "#console/rest.js";
 const EVERY = 2000; // milliseconds
 const DOES = /** @type {Record<string, string>} */ ({ publish: "publishes", call: "calls", write: "writes" });
 const LEASES = [30, 300]; // seconds
+const SHOWN = 160; // characters; the number of bytes tells that the arguments have more
 
 /** The table; nothing while nothing waits and no approval lasts. */
 export function Approvals() {
@@ -44,7 +45,7 @@ function Row(/** @type {{one: any, again: () => void}} */ { one, again }) {
   const once = waits && one.category === "call";
   return html`<tr data-approval=${one.number}>
     <td class="first"><${Host} value=${one.host} /><div class="muted small"><${Given} value=${one.caller_id} mono most=${64} /></div></td>
-    <td data-label="Wants to"><div>${DOES[one.category]} <${Given} value=${one.resource} mono most=${80} />${one.category === "call" && html`<div class="muted small">${one.sha256 ? html`<${Given} value=${`${one.type} ${printable(one.arguments)}`} mono most=${160} />` : "with any arguments"}</div>`}</div></td>
+    <td data-label="Wants to"><div>${DOES[one.category]} <${Given} value=${one.resource} mono most=${80} />${one.category === "call" && html`<div class="muted small">${one.sha256 ? html`<${Given} value=${`${one.type} ${printable(one.arguments)}`} mono most=${160} />${one.size > SHOWN && html` of ${one.size} bytes`}` : "with any arguments"}</div>`}</div></td>
     <td data-label="State"><div><${Badge} word=${one.state} tone=${waits ? "warn" : one.state === "refused" ? "deny" : "allow"} /><div class="muted small">approval ${one.number}, ${lasting(one.left_seconds)} left${one.who && ` (${one.who})`}</div></div></td>
     <td><div class="row row-end">${once && html`<${Button} small role="operator" tone="primary" onClick=${() => go("approve", {})}>Approve once</${Button}>`}
       ${waits && LEASES.map((seconds) => html`<${Button} key=${seconds} small role="operator" onClick=${() => go("approve", { seconds })}>For ${lasting(seconds)}</${Button}>`)}

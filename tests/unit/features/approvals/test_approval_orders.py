@@ -108,7 +108,7 @@ class Site:
 
     async def call(self, body: bytes = b"", host: Address = AGENT, service: str = "/home") -> str:
         digest = hashlib.sha256(body).hexdigest()
-        wanted = ApprovalWanted(1, service, str(host), "/it", "std_srvs/SetBool", digest, body)
+        wanted = ApprovalWanted(1, service, str(host), "/it", "std_srvs/SetBool", digest, body, len(body))
         return (await self.orders.approve_call(wanted)).refused
 
     def publish(self, topic: str, category: Category = Category.PUBLISH) -> str:
@@ -364,6 +364,7 @@ async def test_no_call_passes_without_an_approval_of_its_own(site: Site) -> None
                     one, seconds = chance.choice(waiting), chance.choice((None, 3.0))
                     await site.orders.approve(ApproveCall(one.number, seconds), "ann")
                     if seconds is None:
+                        assert one.size == 1
                         once.append((address_of(one.host), bytes.fromhex(one.arguments)))
                     else:
                         leases[address_of(one.host)] = clock.now() + seconds
