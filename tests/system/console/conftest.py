@@ -51,10 +51,10 @@ def browser(chromium: str, playwright: Playwright) -> Iterator[Browser]:
     started.close()
 
 
-def launch(playwright: Playwright, program: str) -> Browser:
+def launch(playwright: Playwright, program: str, *options: str) -> Browser:
     """As root it cannot have its own sandbox."""
     arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
-    return playwright.chromium.launch(executable_path=program, args=arguments)
+    return playwright.chromium.launch(executable_path=program, args=[*arguments, *options])
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,121 @@
+"""People sign in to the console at a provider that is not ours: canaille, with an authority of its own."""
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from examples.landshark.lab import Host, Lab
+from tests.support.appliance import Appliance
+from tests.support.canaille import CLIENT, ISSUER, NAME, PORT, SECRET, Canaille, sign_in
+from tests.support.certificates import make_certificates
+from tests.support.waiting import eventually
+from tests.system.console.conftest import launch
+
+APPLIANCE, PROVIDER = "10.77.0.2", "10.77.0.5"
+URL = f"https://{APPLIANCE}:8443"
+POLICY = """
+[Groups]
+site = 10.77.0.0/24 door:floor
+[Nodes]
+default = site
+[Publishers]
+default = site
+[Subscribers]
+default = site
+[Commands]
+default = site
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("provider")
+
+
+@pytest.fixture(scope="module")
+def provider(common_lab: Lab, folder: Path) -> Canaille:
+    host = common_lab.host("provider", f"{PROVIDER}/24")
+    canaille = Canaille(host, folder, make_certificates(folder / "tls"), f"{URL}/console")
+    canaille.add({"crew": ["alice"], "strangers": ["mallory"]})
+    return canaille
+
+
+@pytest.fixture(scope="module")
+def appliance(common_lab: Lab, provider: Canaille, folder: Path) -> Iterator[Appliance]:
+    (folder / "secret").write_text(f"{SECRET}\n")
+    settings = f"""
+api_networks: [10.77.0.0/24]
+sso:
+  issuer: {ISSUER}
+  address: {PROVIDER}:{PORT}
+  ca: {folder}/tls/ca.pem
+  client_id: {CLIENT}
+  client_secret_file: {folder}/secret
+  url: {URL}
+  scopes: [openid, profile, groups]
+  name_claim: preferred_username
+  roles: {{operator: [crew], viewer: [staff]}}
+  doors: {{floor: [crew]}}
+"""
+    host = common_lab.host("appliance", f"{APPLIANCE}/24")
+    with Appliance(host, policy=POLICY, settings=settings, options=("--api", f"{APPLIANCE}:8443")) as running:
+        running.rosrv("door", "add", "floor")
+        yield running
+
+
+@pytest.fixture(scope="module")
+def browser(common_lab: Lab, chromium: str) -> Iterator[Browser]:
+    desk: Host = common_lab.host("desk", "10.77.0.20/24")
+    with ExitStack() as stack:
+        with desk.entered():
+            playwright = stack.enter_context(sync_playwright())
+        started = launch(playwright, chromium, f"--host-resolver-rules=MAP {NAME} {PROVIDER}")
+        stack.callback(started.close)
+        yield started
+
+
+@pytest.fixture
+def signed_in(appliance: Appliance, browser: Browser) -> Iterator[Callable[[str], Page]]:
+    with ExitStack() as stack:
+
+        def open_window(person: str) -> Page:
+            context = browser.new_context(ignore_https_errors=True)  # both certificates are of the test
+            stack.callback(context.close)
+            page = context.new_page()
+            page.goto(f"{URL}/console")
+            page.get_by_role("button", name="Sign in with").click()
+            sign_in(page, person)
+            return page
+
+        yield open_window
+
+
+def test_a_group_of_the_provider_opens_console_and_door_until_it_is_taken_away(
+    provider: Canaille, appliance: Appliance, signed_in: Callable[[str], Page]
+) -> None:
+    """The provider has another key after each start."""
+    with provider.running():
+        page = signed_in("alice")
+        expect(page.locator(".who-name")).to_have_text("sso:alice")
+        expect(page.locator("[data-role]")).to_have_text("operator")
+        page.get_by_role("link", name=re.compile("^Robot")).click()
+        page.get_by_role("region", name="Your door").get_by_role("button", name="Open").click()
+        [client] = eventually(lambda: appliance.row("door", "list")["clients"], appliance.story)
+        assert client["who"] == "sso:alice"
+        refused = signed_in("mallory")
+        expect(refused.get_by_text("mallory has no role here: the claim groups has strangers")).to_be_visible()
+    provider.rename_group("crew", "staff")
+    expect(page.locator("[data-role]")).to_have_text("operator")  # until the next sign-on
+    with provider.running():
+        again = signed_in("alice")
+        expect(again.locator("[data-role]")).to_have_text("viewer")
+        expect(page.get_by_text("Signed out")).to_be_visible()
+        eventually(lambda: not appliance.row("door", "list")["clients"], appliance.story)
+        again.get_by_role("button", name="Sign out").click()
+        again.get_by_role("button", name="Sign in with").click()
+        sign_in(again, "alice")  # the provider asks again
+        expect(again.locator(".who-name")).to_have_text("sso:alice")
