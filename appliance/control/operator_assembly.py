@@ -6,7 +6,8 @@ from typing import Any
 
 from appliance.channel.answers.status import AuditState
 from appliance.control.assembly.assembly import Parts
-from appliance.control.assembly.foundation import Current, Foundation
+from appliance.control.assembly.current import Current
+from appliance.control.assembly.foundation import Foundation
 from appliance.control.operators.administration import Administration
 from appliance.control.operators.clock_check import ClockCheck
 from appliance.control.operators.handled_alarms import HandledAlarms

@@ -25,7 +25,8 @@ from appliance.channel import messages
 from appliance.configuration.settings import Settings, load_resolved
 from appliance.control.assembly.active_role import STATE_ERRORS, ActiveRole, StartGate
 from appliance.control.assembly.assembly import Parts, assemble
-from appliance.control.assembly.foundation import INNER, OWN, RVMASTER, Current, Foundation, make_foundation
+from appliance.control.assembly.current import Current
+from appliance.control.assembly.foundation import INNER, OWN, RVMASTER, Foundation, make_foundation
 from appliance.control.assembly.robot import master_address
 from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.control.operator_assembly import Operators, make_operators
@@ -122,13 +123,15 @@ class _Control:
     async def serve(self) -> None:
         base, parts, operators = self._base, self._parts, self._operators
         listener_limits, sockets, inner = base.listener_limits, base.sockets, parts.endpoints.inner
-        calls = base.role.answering(parts.pipeline.handler(parts.table))
-        await listener_limits.open(sockets[RVMASTER], calls, guarded=True)
-        await listener_limits.open(sockets[OWN], parts.pipeline.handler(parts.table, own=True), guarded=False)
+        calls, own = parts.pipeline.handler(parts.table), parts.pipeline.handler(parts.table, own=True)
+        listen = listener_limits.server
+        await listener_limits.open(listen(sockets[RVMASTER].dup(), calls))
+        await listener_limits.open(listen(sockets[OWN].dup(), own, guarded=False))
         # Do not keep connections alive: at each call, the ROS master queries the kernel about every open connection.
-        await listener_limits.open(
-            sockets[INNER], inner.handle, guarded=False, at_once=inner.acknowledge, keep=False
+        inside = listen(
+            sockets[INNER].dup(), inner.handle, guarded=False, at_once=inner.acknowledge, keep=False
         )
+        await listener_limits.open(inside)
         if base.lifeline.announced:
             operators.tokens.first_token_shown()
         if _ADMIN in sockets:

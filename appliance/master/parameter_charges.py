@@ -18,7 +18,7 @@ from typing import Protocol, cast
 
 from appliance.policy.model import Address, address_of
 from appliance.quotas.pool import Pool
-from appliance.rpc.bulk import text_weight
+from appliance.rpc.fair_queue import text_weight
 from roswire.errors import ProtocolError
 from roswire.parameter_tree import Tree, parts_of
 from roswire.xmlrpc import Value

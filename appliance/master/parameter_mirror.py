@@ -18,7 +18,7 @@ from appliance.master.parameter_charges import (
 )
 from appliance.policy.model import Address
 from appliance.quotas.pool import Pool
-from appliance.rpc.bulk import text_weight
+from appliance.rpc.fair_queue import text_weight
 from roswire.errors import ProtocolError
 from roswire.parameter_tree import Tree, parts_of, standing_at
 from roswire.xmlrpc import Value

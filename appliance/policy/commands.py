@@ -37,57 +37,65 @@ class PolicyCall(NamedTuple):
     wire: str = ""
 
 
+class _Calls(dict[str, PolicyCall]):
+    def __missing__(self, name: str) -> PolicyCall:
+        """An unknown call has the row of a command."""
+        return _COMMAND
+
+
 _COMMAND = PolicyCall()
-CALLS: dict[str, PolicyCall] = {
-    # Master API: the graph
-    "registerPublisher": PolicyCall(Category.PUBLISH, _PUBLISHERS, node=True, gives="publication"),
-    "unregisterPublisher": PolicyCall(Category.PUBLISH, _PUBLISHERS, node=True),
-    "registerSubscriber": PolicyCall(Category.SUBSCRIBE, _SUBSCRIBERS, node=True, gives="subscription"),
-    "unregisterSubscriber": PolicyCall(Category.SUBSCRIBE, _SUBSCRIBERS, node=True),
-    "registerService": PolicyCall(Category.OFFER, _SERVICES, node=True, gives="service"),
-    "unregisterService": PolicyCall(Category.OFFER, _SERVICES, node=True),
-    "lookupService": PolicyCall(Category.CALL, gives="call"),
-    "lookupNode": _COMMAND,
-    "getSystemState": _COMMAND,
-    "getPublishedTopics": _COMMAND,
-    "getTopicTypes": _COMMAND,
-    "getUri": _COMMAND,
-    "getPid": _COMMAND,
-    # parameters
-    "getParam": PolicyCall(
-        touches=Category.READ, at_start="rospy and roscpp read /use_sim_time with it when they start"
-    ),
-    "setParam": PolicyCall(touches=Category.WRITE),
-    "hasParam": PolicyCall(
-        touches=Category.READ, at_start="roscpp looks for /use_sim_time with it when it starts"
-    ),
-    "deleteParam": PolicyCall(touches=Category.WRITE),
-    "searchParam": _COMMAND,
-    "getParamNames": _COMMAND,
-    "subscribeParam": PolicyCall(touches=Category.READ, node=True, gives="parameter"),
-    "unsubscribeParam": PolicyCall(touches=Category.READ, node=True, silent=True),
-    # node API; a node that calls requestTopic has subscribed to the topic
-    "requestTopic": PolicyCall(Category.SUBSCRIBE, _SUBSCRIBERS, node=True, gives="subscription"),
-    "getBusInfo": _COMMAND,
-    "getBusStats": _COMMAND,
-    "getMasterUri": _COMMAND,
-    "getSubscriptions": _COMMAND,
-    "getPublications": _COMMAND,
-    "getName": _COMMAND,
-    "shutdown": _COMMAND,
-    "publisherUpdate": PolicyCall(elsewhere="no rule: only the master sends it"),
-    "paramUpdate": PolicyCall(elsewhere="no rule: only the master sends it"),
-    # the XML-RPC server
-    "system.multicall": PolicyCall(elsewhere="the rules of each of its parts"),
-    "listMethods": PolicyCall(wire="system.listMethods"),
-    "methodHelp": PolicyCall(wire="system.methodHelp"),
-    "methodSignature": PolicyCall(wire="system.methodSignature"),
-    # RVMaster's own
-    "getMonitors": _COMMAND,
-    "monitorControl": _COMMAND,
-    "getRVState": PolicyCall(named_only=True),
-    "shutdownMaster": PolicyCall(named_only=True),
-}
+CALLS = _Calls(
+    {
+        # Master API: the graph
+        "registerPublisher": PolicyCall(Category.PUBLISH, _PUBLISHERS, node=True, gives="publication"),
+        "unregisterPublisher": PolicyCall(Category.PUBLISH, _PUBLISHERS, node=True),
+        "registerSubscriber": PolicyCall(Category.SUBSCRIBE, _SUBSCRIBERS, node=True, gives="subscription"),
+        "unregisterSubscriber": PolicyCall(Category.SUBSCRIBE, _SUBSCRIBERS, node=True),
+        "registerService": PolicyCall(Category.OFFER, _SERVICES, node=True, gives="service"),
+        "unregisterService": PolicyCall(Category.OFFER, _SERVICES, node=True),
+        "lookupService": PolicyCall(Category.CALL, gives="call"),
+        "lookupNode": _COMMAND,
+        "getSystemState": _COMMAND,
+        "getPublishedTopics": _COMMAND,
+        "getTopicTypes": _COMMAND,
+        "getUri": _COMMAND,
+        "getPid": _COMMAND,
+        # parameters
+        "getParam": PolicyCall(
+            touches=Category.READ, at_start="rospy and roscpp read /use_sim_time with it when they start"
+        ),
+        "setParam": PolicyCall(touches=Category.WRITE),
+        "hasParam": PolicyCall(
+            touches=Category.READ, at_start="roscpp looks for /use_sim_time with it when it starts"
+        ),
+        "deleteParam": PolicyCall(touches=Category.WRITE),
+        "searchParam": _COMMAND,
+        "getParamNames": _COMMAND,
+        "subscribeParam": PolicyCall(touches=Category.READ, node=True, gives="parameter"),
+        "unsubscribeParam": PolicyCall(touches=Category.READ, node=True, silent=True),
+        # node API; a node that calls requestTopic has subscribed to the topic
+        "requestTopic": PolicyCall(Category.SUBSCRIBE, _SUBSCRIBERS, node=True, gives="subscription"),
+        "getBusInfo": _COMMAND,
+        "getBusStats": _COMMAND,
+        "getMasterUri": _COMMAND,
+        "getSubscriptions": _COMMAND,
+        "getPublications": _COMMAND,
+        "getName": _COMMAND,
+        "shutdown": _COMMAND,
+        "publisherUpdate": PolicyCall(elsewhere="no rule: only the master sends it"),
+        "paramUpdate": PolicyCall(elsewhere="no rule: only the master sends it"),
+        # the XML-RPC server
+        "system.multicall": PolicyCall(elsewhere="the rules of each of its parts"),
+        "listMethods": PolicyCall(wire="system.listMethods"),
+        "methodHelp": PolicyCall(wire="system.methodHelp"),
+        "methodSignature": PolicyCall(wire="system.methodSignature"),
+        # RVMaster's own
+        "getMonitors": _COMMAND,
+        "monitorControl": _COMMAND,
+        "getRVState": PolicyCall(named_only=True),
+        "shutdownMaster": PolicyCall(named_only=True),
+    }
+)
 
 COMMANDS = frozenset(name for name, call in CALLS.items() if not call.elsewhere)
 """Calls that `[Commands]` may grant."""
@@ -95,8 +103,3 @@ COMMANDS = frozenset(name for name, call in CALLS.items() if not call.elsewhere)
 NAMED_ONLY = frozenset(name for name, call in CALLS.items() if call.named_only)
 DECIDED_ELSEWHERE = {name: call.elsewhere for name, call in CALLS.items() if call.elsewhere}
 ALIASES = {call.wire: name for name, call in CALLS.items() if call.wire}
-
-
-def policy_call(name: str) -> PolicyCall:
-    """An unknown call has the row of a command."""
-    return CALLS.get(name, _COMMAND)

@@ -97,7 +97,7 @@ def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> 
 
 
 def _granted(policy: Policy, right: Right) -> bool:
-    if right.request.category in PARAMETERS and not policy.has_section(right.request.category):
+    if right.request.category in PARAMETERS and right.request.category not in policy.present:
         return True
     decision = decide_right(policy, right)
     return decision.allowed and not decision.would_deny

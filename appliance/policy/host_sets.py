@@ -4,9 +4,7 @@ Every network and every group has a number (an *atom*). A rule has the atoms of 
 networks that contain its address, and of all groups that contain these networks. A rule includes a host if they share
 an atom, so memory and time do not grow with the number of rules times the size of groups.
 
-Invariants:
-1. An IPv4-mapped IPv6 address (::ffff:a.b.c.d) equals the IPv4 address.
-2. The atoms of a host are computed once, and kept for at most `_KEPT_HOSTS` hosts.
+An IPv4-mapped IPv6 address (::ffff:a.b.c.d) equals the IPv4 address.
 """
 
 import ipaddress
@@ -21,7 +19,6 @@ Atom = int
 EVERYONE: Final[Atom] = 0
 """Every host has the atom of `*`."""
 
-_KEPT_HOSTS = 1024
 _BITS = {4: 32, 6: 128}
 
 
@@ -44,7 +41,7 @@ def canonical_network(network: Network) -> Network:
 class HostSets:
     """The networks and groups of a policy do not change after it is compiled."""
 
-    __slots__ = ("_lengths", "_named", "_networks", "_parents", "_tables", "kept")
+    __slots__ = ("_lengths", "_networks", "_parents", "_tables")
 
     def __init__(self) -> None:
         self._parents: list[list[Atom]] = [[]]  # the groups of each atom; atom 0 is EVERYONE
@@ -52,8 +49,6 @@ class HostSets:
         # version -> prefix length -> leading bits -> atom of the network
         self._tables: dict[int, dict[int, dict[int, Atom]]] = {4: {}, 6: {}}
         self._lengths: dict[int, list[tuple[int, dict[int, Atom]]]] = {4: [], 6: []}
-        self.kept: dict[tuple[int, int], frozenset[Atom]] = {}
-        self._named: dict[Address, tuple[Network, str, bool]] = {}
 
     def network(self, network: Network) -> Atom:
         """Add the network if it is new."""
@@ -84,15 +79,7 @@ class HostSets:
 
     def atoms_of(self, address: Address) -> frozenset[Atom]:
         """`EVERYONE` is always included."""
-        key = (address.version, int(address))
-        kept = self.kept.get(key)
-        if kept is None:
-            if len(self.kept) >= _KEPT_HOSTS:
-                self.kept.clear()
-            kept = self.kept[key] = self._find(canonical_address(address))
-        return kept
-
-    def _find(self, address: Address) -> frozenset[Atom]:
+        address = canonical_address(address)
         number = int(address)
         waiting = [EVERYONE]
         for shift, table in self._lengths[address.version]:
@@ -101,36 +88,15 @@ class HostSets:
                 waiting.append(atom)
         return self.above(waiting)
 
-    def narrowest(self, address: Address) -> Network:
-        """The address itself counts as a network."""
-        return self._named_as(address)[0]
-
-    def alike(self, address: Address) -> str:
-        """The text of `narrowest`: the same for all addresses that the policy names as one network."""
-        return self._named_as(address)[1]
-
-    def names(self, address: Address) -> bool:
-        """`*` does not count."""
-        return self._named_as(address)[2]
-
-    def _named_as(self, address: Address) -> tuple[Network, str, bool]:
-        named = self._named.get(address)
-        if named is None:
-            if len(self._named) >= _KEPT_HOSTS:
-                self._named.clear()
-            plain = canonical_address(address)
-            network, number = self._narrowest(plain), int(plain)
-            held = any(number >> shift in table for shift, table in self._lengths[plain.version])
-            named = self._named[address] = network, str(network), held
-        return named
-
-    def _narrowest(self, plain: Address) -> Network:
+    def narrowest(self, address: Address) -> Network | None:
+        """Return the narrowest network that contains the address; None if only `*` does."""
+        plain = canonical_address(address)
         bits, number = _BITS[plain.version], int(plain)
-        shift = min(
-            (shift for shift, table in self._lengths[plain.version] if number >> shift in table), default=0
-        )
+        shifts = [shift for shift, table in self._lengths[plain.version] if number >> shift in table]
+        if not shifts:
+            return None
         network = ipaddress.IPv4Network if plain.version == 4 else ipaddress.IPv6Network
-        return network((number >> shift << shift, bits - shift))
+        return network((number >> min(shifts) << min(shifts), bits - min(shifts)))
 
     def above(self, atoms: Iterable[Atom]) -> frozenset[Atom]:
         """Include every group that contains one of the atoms, at any depth."""

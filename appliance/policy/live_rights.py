@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
-from appliance.policy.commands import policy_call
+from appliance.policy.commands import CALLS
 from appliance.policy.model import Address, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, request_of, rights_to_keep
@@ -38,7 +38,7 @@ class LiveRight(NamedTuple):
     def requests(self) -> list[Request]:
         """Explain access to the parameter, if there is one, and the call."""
         asked = [request_of(self.call, self.host, self.caller_id, self.resource)]
-        touch = policy_call(self.call).touches
+        touch = CALLS[self.call].touches
         return asked if touch is None else [Request(self.host, self.caller_id, touch, self.resource), *asked]
 
 
@@ -55,7 +55,7 @@ class Ending:
 
 def live_by(call: str, host: Address, caller_id: str, resource: str, tree: Tree) -> LiveRight:
     """`tree` is the present parameter tree."""
-    namespace = policy_call(call).touches is not None and holds_others(standing_at(tree, resource)[0])
+    namespace = CALLS[call].touches is not None and holds_others(standing_at(tree, resource)[0])
     return LiveRight(host, caller_id, call, resource, namespace)
 
 
@@ -82,7 +82,7 @@ def deprived(policy: Policy, things: Iterable[LiveRight]) -> dict[Address, set[s
 def endings(policy: Policy, things: Iterable[LiveRight]) -> list[Ending]:
     decided = ((live, may_keep(policy, live)) for live in things)
     found = (
-        Ending(str(live.host), live.caller_id, policy_call(live.call).gives, live.resource, decision.reason)
+        Ending(str(live.host), live.caller_id, CALLS[live.call].gives, live.resource, decision.reason)
         for live, decision in decided
         if not decision.allowed
     )

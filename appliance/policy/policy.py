@@ -10,6 +10,7 @@ Invariants:
 4. Memory does not grow with requests: answers are kept for at most `_KEPT_DECISIONS` short resource names, and hosts.
 """
 
+import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -17,9 +18,8 @@ from typing import NamedTuple
 from appliance.policy import commands
 from appliance.policy.authority import AuthorityGroup
 from appliance.policy.host_sets import Atom, HostSets, Network, canonical_address
-from appliance.policy.keys import Key, is_parameter_key
+from appliance.policy.keys import Key, KeyTree, is_parameter_key
 from appliance.policy.model import Address, Category, Decision, Request, Rule
-from appliance.policy.name_tree import KeyTree
 from appliance.policy.policy_findings import PolicyFinding, quoted
 from appliance.policy.rate_limits import NO_LIMIT, LimitRule, LimitScope, LimitTable, Rate
 from appliance.policy.sections import BY_CATEGORY, PARAMETERS
@@ -29,7 +29,7 @@ DEFAULT_PORTS = range(19001, 26001)
 
 _LIMITED = {Category.PUBLISH: LimitScope.PUBLISHER, Category.SUBSCRIBE: LimitScope.SUBSCRIBER}
 _COMMANDING = frozenset({Category.PUBLISH, Category.CALL})
-_KEPT_DECISIONS = 8192
+_KEPT_DECISIONS, _KEPT_HOSTS = 8192, 1024
 _KEPT_NAME = 256
 _LONGEST_REASON = 299
 
@@ -79,11 +79,14 @@ class RuleTable:
 
 
 class HostStanding(NamedTuple):
-    """The answers of `Policy.knows`, `names` and `alike`."""
+    """The answers of `Policy.atoms_of`, `knows`, `names`, `named_as` and `alike`, and the canonical address as text."""
 
+    atoms: frozenset[Atom]
     known: bool
     named: bool
+    named_as: Network
     alike: str
+    text: str
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -124,7 +127,7 @@ class Policy:
         default_factory=dict, init=False
     )
 
-    _standings: dict[Address, HostStanding] = field(default_factory=dict, init=False)
+    standings: dict[Address, HostStanding] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
         self._any_audit_only = any(table.audit_only for table in self.tables.values())
@@ -169,12 +172,12 @@ class Policy:
     def _decide_below(self, request: Request, namespace: bool) -> Decision | None:
         """Return None if all keys below grant the host."""
         table = self.tables[request.category]
-        atoms = self.hosts.atoms_of(request.host)
+        atoms = self.atoms_of(request.host)
         deciding = table.tree.below(request.resource)
         if namespace:
             inherited = table.tree.inherited(request.resource) or table.default
             if inherited is None:
-                reason = f"{_what(request, 'may not')}: no key of [Parameters] matches what is below it"
+                reason = f"{self._what(request, 'may not')}: no key of [Parameters] matches what is below it"
                 return _decided(False, None, reason, table.audit_only)
             deciding.append(inherited)
         denying = [rule for rule in deciding if not rule.grants(atoms)]
@@ -182,20 +185,20 @@ class Policy:
             denying, key=lambda rule: rule.asks(atoms)
         ):  # an approval cannot help against a denial
             if not rule.asks(atoms):
-                what = f"{_what(request, 'may not')} with what is below it"
+                what = f"{self._what(request, 'may not')} with what is below it"
                 return _by_rule(what, rule, table.audit_only)
             return self._asking(request, rule, table.audit_only)
         return None
 
     def limit_rule(self, topic: str) -> LimitRule | None:
-        return self.limits.find(topic)
+        return self.limits.find(topic) if self.limits.rules else None
 
     def limit(self, part: LimitScope, topic: str, host: Address | None = None) -> Rate:
-        """Without `host`, the limit is that of all publishers of a topic together."""
-        rule = self.limits.find(topic)
+        """Without `host`, the limit is that of all publishers of a topic together. No limit is `NO_LIMIT` itself."""
+        rule = self.limit_rule(topic)
         if rule is None:
             return NO_LIMIT
-        return rule.rate(part, self.hosts.atoms_of(host) if host is not None else frozenset())
+        return rule.rate(part, self.atoms_of(host) if host is not None else frozenset())
 
     def limit_on(self, request: Request) -> Rate:
         """Other requests than to publish or subscribe have no limit."""
@@ -204,23 +207,26 @@ class Policy:
 
     def standing(self, address: Address) -> HostStanding:
         """Every call of a host needs these answers; they are kept, because a policy never changes."""
-        standing = self._standings.get(address)
+        standing = self.standings.get(address)
         if standing is None:
-            if len(self._standings) >= _KEPT_DECISIONS:
-                self._standings.clear()
-            standing = HostStanding(self.knows(address), self.names(address), self.alike(address))
-            self._standings[address] = standing
+            if len(self.standings) >= _KEPT_HOSTS:
+                self.standings.clear()
+            standing = self.standings[address] = self._standing(address)
         return standing
+
+    def _standing(self, address: Address) -> HostStanding:
+        text, network = str(canonical_address(address)), self.hosts.narrowest(address)
+        atoms, named_as = self.hosts.atoms_of(address), network or ipaddress.ip_network(text)
+        free, learned = self.blocked(address) is None, self._any_audit_only and not self.named
+        known = free and (learned or not self.named.isdisjoint(atoms))
+        return HostStanding(atoms, known, free and network is not None, named_as, str(named_as), text)
 
     def knows(self, address: Address) -> bool:
         """A rule includes this address, and the host is not blocked. Other hosts are unknown hosts.
 
         In audit-only mode without a rule that names a host, every host is known, because a robot is being learned.
         """
-        if self.blocked(address) is not None:
-            return False
-        learned = self._any_audit_only and not self.named
-        return learned or not self.named.isdisjoint(self.hosts.atoms_of(address))
+        return self.standing(address).known
 
     def serves(self, address: Address) -> bool:
         """Requests of this address are read: it is known, or a section in audit-only mode lets them pass."""
@@ -257,10 +263,12 @@ class Policy:
         return rule is not None and bool(rule.asked)
 
     def named_as(self, address: Address) -> Network:
-        return self.hosts.narrowest(address)
+        """The address itself counts as a network."""
+        return self.standing(address).named_as
 
     def alike(self, address: Address) -> str:
-        return self.hosts.alike(address)
+        """The text of `named_as`: the same for all addresses that the policy names as one network."""
+        return self.standing(address).alike
 
     def counted_as(self, address: Address) -> str:
         """`alike`, or one empty string for all unknown hosts."""
@@ -268,17 +276,14 @@ class Policy:
 
     def names(self, address: Address) -> bool:
         """The policy names this address or a network that contains it; `*` and blocked hosts do not count."""
-        return self.hosts.names(address) and self.blocked(address) is None
-
-    def has_section(self, category: Category) -> bool:
-        return category in self.present
+        return self.standing(address).named
 
     def audit_only(self, category: Category) -> bool:
         """Requests of this category pass although the rules deny them."""
         return self.tables[category].audit_only
 
     def atoms_of(self, address: Address) -> frozenset[Atom]:
-        return self.hosts.atoms_of(address)
+        return self.standing(address).atoms
 
     def rules(self, category: Category) -> tuple[CompiledRule, ...]:
         return tuple(self.tables[category].rules)
@@ -315,20 +320,23 @@ class Policy:
         """
         if not decision.allowed and decision.asks is None:
             return decision
+        may_not = self._what(request, "may not")
         if group.claim(self.atoms_of(request.host)) is None:
-            reason = f"{_what(request, 'may not')}: no line of {place_of(group.rule)} lets it take, override or ask"
+            reason = f"{may_not}: no line of {place_of(group.rule)} lets it take, override or ask"
             return Decision(False, group.rule, reason)
         holder = self.holder(group)
         now = "" if self.holders is None else f"; now {holder or 'nobody'} holds it"
         if request.category is Category.CALL and not self.may_command(request.resource, request.host):
-            told = f"{_what(request, 'may not')} while it does not hold {group.name}: rosrv drive take {group.name}"
+            told = f"{may_not} while it does not hold {group.name}: rosrv drive take {group.name}"
             return Decision(False, group.rule, told + now, told=told)
         reason = f"{decision.reason}, while it holds {group.name}{now}"
         return replace(decision, reason=reason if len(reason) <= _LONGEST_REASON else decision.reason)
 
     def _decide_named_only(self, request: Request, table: RuleTable, found: CompiledRule | None) -> Decision:
         if found is None:
-            reason = f"{_what(request, 'may not')}: only its own key in [Commands] grants it, never default"
+            reason = (
+                f"{self._what(request, 'may not')}: only its own key in [Commands] grants it, never default"
+            )
             return Decision(False, None, reason)
         decision = self._apply(request, table, found)
         # audit-only is for learning the needs of a robot. No robot needs these calls, so they stay denied.
@@ -337,14 +345,14 @@ class Policy:
     def _apply(self, request: Request, table: RuleTable, found: CompiledRule | None) -> Decision:
         if found is None:
             section = BY_CATEGORY[request.category].name
-            reason = f"{_what(request, 'may not')}: no key of [{section}] matches and it has no default"
+            reason = f"{self._what(request, 'may not')}: no key of [{section}] matches and it has no default"
             return _decided(False, None, reason, table.audit_only)
-        atoms = self.hosts.atoms_of(request.host)
+        atoms = self.atoms_of(request.host)
         if found.grants(atoms):
-            return Decision(True, found.rule, f"{_what(request, 'may')} by {found.place}")
+            return Decision(True, found.rule, f"{self._what(request, 'may')} by {found.place}")
         if found.asks(atoms):
             return self._asking(request, found, table.audit_only)
-        what = _what(request, "is not among the hosts that may")
+        what = self._what(request, "is not among the hosts that may")
         return _by_rule(what, found, table.audit_only)
 
     def _asking(self, request: Request, rule: CompiledRule, audit_only: bool) -> Decision:
@@ -352,9 +360,9 @@ class Policy:
         requests.
         """
         if self._is_approved(request):
-            reason = f"{_what(request, 'may')} by {rule.place}, while an approval lasts"
+            reason = f"{self._what(request, 'may')} by {rule.place}, while an approval lasts"
             return Decision(True, rule.rule, reason, asks=request)
-        reason = f"{_what(request, 'needs an approval to')}, by {rule.place}"
+        reason = f"{self._what(request, 'needs an approval to')}, by {rule.place}"
         if audit_only:
             return _decided(False, rule.rule, reason, audit_only)
         held = self.approved is not None and request.category is Category.CALL
@@ -364,12 +372,18 @@ class Policy:
         approval = canonical_address(request.host), request.category, request.resource
         return self.approved is not None and approval in self.approved
 
+    def _what(self, request: Request, may: str) -> str:
+        phrase = BY_CATEGORY[request.category].phrases[request.category]
+        return f"{self.standing(request.host).text} {may} {phrase} {_shortened(request.resource)}"
+
     def _without_section(self, request: Request, table: RuleTable) -> Decision:
         decider = BY_CATEGORY[request.category]
         if decider.extension:
             deed = f"{decider.phrases[request.category]} {_shortened(request.resource)}"
             return Decision(True, None, f"no [{decider.name}] section: every host may {deed}")
-        reason = f"{_what(request, 'may not')}: the policy has no [{decider.name}] section, so no host may"
+        reason = (
+            f"{self._what(request, 'may not')}: the policy has no [{decider.name}] section, so no host may"
+        )
         return _decided(False, None, reason, table.audit_only)
 
 
@@ -384,11 +398,6 @@ def _decided(allowed: bool, rule: Rule | None, reason: str, audit_only: bool) ->
     if audit_only and not allowed:
         return Decision(True, rule, reason, would_deny=True)
     return Decision(allowed, rule, reason)
-
-
-def _what(request: Request, may: str) -> str:
-    phrase = BY_CATEGORY[request.category].phrases[request.category]
-    return f"{canonical_address(request.host)} {may} {phrase} {_shortened(request.resource)}"
 
 
 def _by_rule(what: str, rule: CompiledRule, audit_only: bool) -> Decision:

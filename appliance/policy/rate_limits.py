@@ -20,9 +20,8 @@ from appliance.base.validation_messages import meant
 from appliance.policy.groups import HostGroups
 from appliance.policy.host_sets import Atom
 from appliance.policy.ini_reader import Entry, SectionText, Word
-from appliance.policy.keys import BadKeyError, Key, parse_key
+from appliance.policy.keys import BadKeyError, Key, KeyTree, parse_key
 from appliance.policy.model import Rule
-from appliance.policy.name_tree import KeyTree
 from appliance.policy.policy_findings import Findings, quoted
 from appliance.policy.sections import DEFAULT, LIMITS
 
@@ -109,7 +108,7 @@ class LimitTable:
             self._tree.add(rule.key, rule)
 
     def find(self, topic: str) -> LimitRule | None:
-        return (self._tree.find(topic) or self._default) if self.rules else None
+        return self._tree.find(topic) or self._default
 
 
 def read_limits(section: SectionText | None, file: str, groups: HostGroups, findings: Findings) -> LimitTable:

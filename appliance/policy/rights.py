@@ -17,7 +17,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
-from appliance.policy.commands import CALLS, policy_call
+from appliance.policy.commands import CALLS
 from appliance.policy.model import Address, Category, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.sections import PARAMETERS
@@ -48,7 +48,7 @@ class Right(NamedTuple):
 
 def request_of(call: str, host: Address, caller_id: str, resource: str) -> Request:
     """The request is about the topic or service, or otherwise about the command."""
-    category = policy_call(call).category
+    category = CALLS[call].category
     return Request(host, caller_id, category, call if category is Category.COMMAND else resource)
 
 
@@ -59,7 +59,7 @@ def rights_of_call(
 
     `key` and `value` are those of its parameter, and `tree` is the present parameter tree.
     """
-    row = policy_call(call)
+    row = CALLS[call]
     if key is None or row.touches is None:
         return rights_of(request)
     there, in_the_way = standing_at(tree or {}, key)
@@ -75,7 +75,7 @@ def rights_to_keep(request: Request, call: str, resource: str, *, namespace: boo
 
     `namespace`: the resource is a parameter that contains other parameters.
     """
-    touch = policy_call(call).touches
+    touch = CALLS[call].touches
     return rights_of(request, [] if touch is None else [Right(_of(request, touch, resource), namespace)])
 
 
@@ -101,7 +101,7 @@ def right_to_find(request: Request) -> Right:
 
 def needs_node(request: Request) -> bool:
     if request.category is Category.COMMAND:
-        return policy_call(request.resource).node
+        return CALLS[request.resource].node
     return request.category in _NODE_CATEGORIES
 
 
@@ -116,7 +116,7 @@ def decide(policy: Policy, rights: Iterable[Right]) -> Decision:
         if verdict.rank == 0:
             break
         category = right.request.category
-        if category in PARAMETERS and not policy.has_section(category):
+        if category in PARAMETERS and category not in policy.present:
             continue  # without the section, all access to parameters is allowed
         decision = decide_right(policy, right)
         if (decision.allowed, decision.rank) < (verdict.allowed, verdict.rank):

@@ -1,22 +1,36 @@
-"""Accept the connections of a listening socket, several in one turn of the event loop.
+"""Accept connections, from two accept queues of the kernel, by source address.
 
-The kernel queues connections in order of arrival, and the acceptor empties this queue quickly. `accepted` then decides
-by host whether a connection may wait. So a host that connects without end does not fill the queues of other hosts.
+The kernel has one queue for each listening socket, in order of arrival, and an acceptor empties it quickly, several
+connections in one turn of the event loop. `accepted` then decides by host whether a connection may wait. So a host that
+connects without end does not fill the queues of other hosts.
 
-A queue with `paced` is for hosts that no policy rule names: accepting from it waits for the turn of unknown hosts.
+A flood still delays all later connections of its queue. Two sockets of one port (`SO_REUSEPORT`) have two queues. A BPF
+program picks the queue of a connection by its address. Accepting from the second queue, of hosts that no policy rule
+names, waits for the turn of unknown hosts (`paced`).
+
+The queue affects only the order. After it is accepted, every connection is judged by its address. While the second
+socket does not exist (control restarts), the first socket gets all connections.
 """
 
+import array
 import asyncio
 import errno
+import ipaddress
 import socket
+import struct
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 
 import structlog
 
 from appliance.policy.model import Address, address_of
+from appliance.policy.policy import Policy
 from appliance.rpc.front import plain_address
 from appliance.rpc.processor_time import ProcessorTime
+
+Network = ipaddress.IPv4Network | ipaddress.IPv6Network
+Program = Callable[[], bytes]
+"""For the policy in force; the same object until the policy changes."""
 
 BACKLOG = 4096
 _CLOSING_SECONDS = 15e-6  # the processor time to accept and close a connection
@@ -26,7 +40,130 @@ _UNKNOWN = address_of("0.0.0.0")  # noqa: S104 - stands for all unknown hosts, w
 _GONE = frozenset({errno.ECONNABORTED, errno.EINTR, errno.EPROTO})
 _PAUSE_SECONDS = 0.2  # the pause after the process ran out of descriptors
 
+FIRST, SECOND = 0, 1  # the sockets of a port, as the kernel numbers them
+_MOST_INSTRUCTIONS = 1024  # the most instructions of a program; each listener has a copy
+
+_ATTACH = 51  # SO_ATTACH_REUSEPORT_CBPF
+# Classic BPF, as in linux/bpf_common.h and linux/filter.h.
+_LOAD, _LOAD_STORED, _STORE, _AND, _JUMP, _JUMP_EQUAL, _RETURN = 0x20, 0x60, 0x02, 0x54, 0x05, 0x15, 0x06
+_PROTOCOL = -0x1000  # SKF_AD_OFF + SKF_AD_PROTOCOL
+_SOURCE = {4: 12 - 0x100000, 6: 8 - 0x100000}  # the source address, from SKF_NET_OFF
+_WORD = 0xFFFFFFFF
+
+_LOOPBACK = (ipaddress.ip_network("127.0.0.0/8"), ipaddress.ip_network("::1"))
+
 _log = structlog.get_logger()
+
+
+class NamedFirst:
+    """This machine and hosts that the policy names are first, blocked hosts second."""
+
+    def __init__(self, policy: Callable[[], Policy]) -> None:
+        self._policy = policy
+        self._of: Policy | None = None
+        self._program = b""
+
+    def __call__(self) -> bytes:
+        policy = self._policy()
+        if policy is not self._of:
+            blocked = [address for address in policy.blocks if policy.hosts.narrowest(address) is not None]
+            self._of = policy
+            self._program = first_for([*_LOOPBACK, *policy.hosts.networks()], blocked)
+        return self._program
+
+
+class SourceQueues:
+    """`program` sends connections to it.
+
+    Raises `OSError` if the kernel does not support such programs.
+    """
+
+    def __init__(self, first: socket.socket, program: Program, backlog: int) -> None:
+        self._program = program
+        self._attached: bytes | None = None
+        self._first = first
+        first.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        self.second = socket.socket(first.family, socket.SOCK_STREAM)
+        try:
+            for option in (socket.SO_REUSEADDR, socket.SO_REUSEPORT):
+                self.second.setsockopt(socket.SOL_SOCKET, option, 1)
+            if first.family == socket.AF_INET6:
+                only = first.getsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY)
+                self.second.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, only)
+            self.second.bind(first.getsockname())
+            self.second.listen(backlog)
+            self._attach(program())
+        except OSError:
+            self.second.close()
+            raise
+
+    def update(self) -> None:
+        program = self._program()
+        if program is self._attached:
+            return
+        try:
+            self._attach(program)
+        except OSError as error:
+            _log.error("connections are sorted by an earlier policy", reason=str(error))
+            self._attached = program  # do not try this program again
+
+    def _attach(self, program: bytes) -> None:
+        code = array.array("B", program)
+        address, size = code.buffer_info()
+        self._first.setsockopt(socket.SOL_SOCKET, _ATTACH, struct.pack("HP", size // 8, address))
+        self._attached = program
+
+
+def first_for(networks: Iterable[Network], blocked: Iterable[Address] = ()) -> bytes:
+    """Return the program that sends these sources, except blocked ones, to the first socket.
+
+    If there are too many addresses for a program, it ignores the blocks. If there are still too many, it sends all
+    sources to the first socket.
+    """
+    networks = list(networks)
+    tests = [(network, FIRST) for network in networks]
+    code = _program([*((ipaddress.ip_network(address), SECOND) for address in blocked), *tests])
+    if len(code) > _MOST_INSTRUCTIONS:
+        code = _program(tests)
+    if len(code) > _MOST_INSTRUCTIONS:
+        _log.warning("the policy names too many networks to sort connections", networks=len(networks))
+        code = [_instruction(_RETURN, FIRST)]
+    return b"".join(code)
+
+
+def _program(tests: Sequence[tuple[Network, int]]) -> list[bytes]:
+    """The first network that contains the source decides."""
+    code = [_instruction(_LOAD, _PROTOCOL)]
+    for version, ethertype in ((4, 0x0800), (6, 0x86DD)):
+        own = _tests(version, [test for test in tests if test[0].version == version])
+        code += [_instruction(_JUMP_EQUAL, ethertype, 1, 0), _instruction(_JUMP, len(own)), *own]
+    code.append(_instruction(_RETURN, SECOND))
+    return code
+
+
+def _tests(version: int, networks: list[tuple[Network, int]]) -> list[bytes]:
+    """Addresses are compared word by word."""
+    words = 4 if version == 6 else 1
+    code = []
+    for word in range(words):
+        code += [_instruction(_LOAD, _SOURCE[version] + 4 * word), _instruction(_STORE, word)]
+    for network, socket_number in networks:
+        test = [_instruction(_RETURN, socket_number)]
+        for word in reversed(range(words)):
+            shift = 32 * (words - 1 - word)
+            mask, wanted = (
+                int(network.netmask) >> shift & _WORD,
+                int(network.network_address) >> shift & _WORD,
+            )
+            if mask:
+                differs = _instruction(_JUMP_EQUAL, wanted, 0, len(test))
+                test = [_instruction(_LOAD_STORED, word), _instruction(_AND, mask), differs, *test]
+        code += test
+    return [*code, _instruction(_RETURN, SECOND)]
+
+
+def _instruction(operation: int, operand: int, if_true: int = 0, if_false: int = 0) -> bytes:
+    return struct.pack("HBBI", operation, if_true, if_false, operand & _WORD)
 
 
 class Acceptor:

@@ -21,8 +21,7 @@ from enum import StrEnum
 from typing import Generic, Protocol
 
 from appliance.base import clock
-from appliance.quotas.pool import Bounds, Holder, Pool, QuotaClass
-from appliance.quotas.queue import Queue
+from appliance.quotas.pool import Bounds, Holder, Pool, Queue, QuotaClass
 from appliance.quotas.table import RVMASTER_ARRIVALS, RVMASTER_BYTES, RVMASTER_CONNECTIONS, RVMASTER_FAREWELLS
 
 

@@ -26,13 +26,11 @@ import structlog
 
 from appliance.base import clock
 from appliance.policy.model import Address
-from appliance.rpc.acceptor import BACKLOG, Acceptor
+from appliance.rpc.acceptor import BACKLOG, Acceptor, Program, SourceQueues
 from appliance.rpc.connection_table import ConnectionTable, Stage
 from appliance.rpc.fair_queue import Turns
 from appliance.rpc.front import Front, HttpLimits, plain_address
-from appliance.rpc.host_task import HostTask
-from appliance.rpc.processor_time import ProcessorTime
-from appliance.rpc.source_queues import Program, SourceQueues
+from appliance.rpc.processor_time import HostTask, ProcessorTime
 from roswire.xmlrpc import build_fault
 
 _log = structlog.get_logger()

@@ -12,7 +12,7 @@ from typing import cast
 
 import httptools
 
-from appliance.rpc.bulk import weigh
+from appliance.rpc.fair_queue import weigh
 from roswire.errors import PeerError
 from roswire.uris import NodeUri, node_uri
 from roswire.xmlrpc import FaultReceived, Value, XmlRpcLimits, build_call, parse_response

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from itertools import islice
 
-from appliance.store.ahead import Encoded
+from appliance.store.changes import Encoded
 
 
 class ChangeFeed:

@@ -1,13 +1,36 @@
-"""The changes of the state file as typed rows, and the SQL that carries them out. No SQL text is stored or sent.
+"""The changes of the state file as typed rows, the SQL that carries them out, and the file that keeps them before.
 
+No SQL text is stored or sent.
 `Tables` is the only place that makes SQL of changes. It checks each change against the schema, so a change from a file
 or from another appliance can only put or delete rows of known tables, with values of the columns' types.
+
+`WriteAhead` keeps changes in a file until the database has stored them, so that a killed process loses none. A change
+is appended before any answer that depends on it. The append is one small write to the page cache: it takes microseconds
+and does not wait for the disk. When the database has stored all changes, the file is emptied. After a crash, the
+database applies the changes in the file that it does not have.
+
+The alternative is to commit each change (`python -m benchmarks.state_writes` compares both). With this file, a
+registration blocks the thread that answers nodes for 20 µs instead of 45 µs. That thread never waits for SQLite's one
+writer, which needs a third of a second for a parameter tree of 16 MiB. With commits while a tree is written and both
+cores are busy, one registration in a hundred would wait 3 to 17 ms. With this file, the wait is 0.06 ms.
+
+The file survives the death of the process and, after `sync`, a power failure, as the database's own WAL does. A power
+failure before `sync` may leave any part of the file, so each change has a checksum and the number of the change before
+it. Reading ends at the first change that is torn, damaged, or follows a missing one. No caller has awaited such a
+change.
 """
 
 import contextlib
+import errno
+import os
 import sqlite3
+import struct
+import threading
+import zlib
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import groupby
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import msgspec
@@ -25,6 +48,11 @@ _TYPES: dict[str, tuple[type, ...]] = {
     "BLOB": (bytes,),
 }
 _INTEGERS = 1 << 63
+
+_HEAD = struct.Struct(">II")  # length with the mark, checksum
+_NUMBERS = struct.Struct(">QQ")  # number of the change, number of the change before it in this file
+_MARK = 1 << 31
+_EARLIER_LENGTH = struct.Struct(">I")  # of a statement that version 0.2.0 left; without the mark
 
 
 class ChangeError(ValueError):
@@ -138,3 +166,128 @@ def joined(changes: Sequence[tuple[Change, bool]]) -> Iterator[tuple[Change, boo
 def _table_of_rows(pair: tuple[Change, bool]) -> tuple[str | None, bool]:
     change, ahead = pair
     return change.table if isinstance(change, Put) else None, ahead
+
+
+class Encoded(NamedTuple):
+    """A change with its number, as MessagePack."""
+
+    number: int
+    body: bytes
+
+
+class LeftBehind(NamedTuple):
+    """The content of the file after a crash: changes, or statements (SQL) of an earlier release."""
+
+    changes: list[tuple[int, Change]]
+    statements: list[tuple[str, list[Any]]]
+
+
+class WriteAheadClosedError(OSError):
+    """The file was used after `close`."""
+
+
+class WriteAhead:
+    """The write-ahead file at `path`. Raises `OSError` if the file cannot be opened.
+
+    Any thread may use this class. The descriptor's number is read only under the lock. So `close` waits for a write in
+    progress, every later use raises `WriteAheadClosedError`, and no write goes to another file that reuses the number.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._open_descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
+        self._lock = threading.Lock()
+        self._last = 0  # the number of the last change that was appended
+
+    @contextmanager
+    def _descriptor(self) -> Iterator[int]:
+        with self._lock:
+            if self._open_descriptor < 0:
+                raise WriteAheadClosedError(errno.EBADF, "the state is already closed", str(self._path))
+            yield self._open_descriptor
+
+    def left(self, stored: int) -> LeftBehind:
+        """Return what an earlier process did not write to the database, which has all changes up to `stored`.
+
+        Raises `ValueError` for an intact change that this release does not know.
+        """
+        with self._descriptor() as descriptor:
+            data = os.pread(descriptor, os.fstat(descriptor).st_size, 0)
+        if data[:1] < b"\x80":
+            return LeftBehind([], list(_earlier_statements(data)))
+        decoder = msgspec.msgpack.Decoder(Change)
+        return LeftBehind([(number, decoder.decode(body)) for number, body in _after(stored, data)], [])
+
+    def append(self, changes: Sequence[Encoded]) -> None:
+        """Append changes with one write. Raises `OSError` when the disk is full."""
+        with self._descriptor() as descriptor:
+            parts: list[bytes] = []
+            last = self._last
+            for number, body in changes:
+                numbers = _NUMBERS.pack(number, last)
+                checksum = zlib.crc32(body, zlib.crc32(numbers))
+                parts += (_HEAD.pack(len(body) | _MARK, checksum), numbers, body)
+                last = number
+            data = b"".join(parts)
+            written = os.write(descriptor, data)
+            if written < len(data):
+                os.ftruncate(descriptor, os.fstat(descriptor).st_size - written)
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            self._last = last
+
+    def stored(self, number: int) -> None:
+        """Note that the database has all changes up to this number; empty the file when it has no others."""
+        with self._descriptor() as descriptor:
+            if number >= self._last:
+                os.ftruncate(descriptor, 0)
+
+    def clear(self) -> None:
+        """Empty the file: the database has everything."""
+        with self._descriptor() as descriptor:
+            os.ftruncate(descriptor, 0)
+
+    def sync(self) -> None:
+        """Flush the file to the disk, while other threads may append. Raises `OSError`."""
+        with self._descriptor() as descriptor:
+            own = os.dup(descriptor)
+        try:
+            os.fsync(own)
+        finally:
+            os.close(own)
+
+    def close(self) -> None:
+        """Close the file after any use in progress; do nothing if it is already closed."""
+        with self._lock:
+            if self._open_descriptor >= 0:
+                os.close(self._open_descriptor)
+                self._open_descriptor = -1
+
+
+def _after(stored: int, data: bytes) -> Iterator[Encoded]:
+    """Yield the changes after the number `stored`, up to the first that is damaged or follows a missing one."""
+    position = 0
+    while position + _HEAD.size + _NUMBERS.size <= len(data):
+        marked, checksum = _HEAD.unpack_from(data, position)
+        begin = position + _HEAD.size
+        position = begin + _NUMBERS.size + (marked ^ _MARK)
+        if position > len(data) or zlib.crc32(data[begin:position]) != checksum:
+            return
+        number, previous = _NUMBERS.unpack_from(data, begin)
+        if previous > stored:
+            return
+        if number > stored:
+            stored = number
+            yield Encoded(number, data[begin + _NUMBERS.size : position])
+
+
+def _earlier_statements(data: bytes) -> Iterator[tuple[str, list[Any]]]:
+    """Yield the statements that version 0.2.0 left; omit a torn last one."""
+    decoder = msgspec.msgpack.Decoder(tuple[str, list[Any]])
+    position = 0
+    while position + _EARLIER_LENGTH.size <= len(data):
+        (length,) = _EARLIER_LENGTH.unpack_from(data, position)
+        begin = position + _EARLIER_LENGTH.size
+        position = begin + length
+        if not length or position > len(data):
+            return
+        yield decoder.decode(data[begin:position])

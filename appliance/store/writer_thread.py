@@ -27,9 +27,19 @@ import msgspec
 import structlog
 
 from appliance.base.engine_thread import Drive, EngineThread
-from appliance.store.ahead import Encoded, WriteAhead
 from appliance.store.change_feed import ChangeFeed
-from appliance.store.changes import Change, ChangeError, Condition, Delete, Put, Tables, Value, joined
+from appliance.store.changes import (
+    Change,
+    ChangeError,
+    Condition,
+    Delete,
+    Encoded,
+    Put,
+    Tables,
+    Value,
+    WriteAhead,
+    joined,
+)
 
 _GROUP = 2_000
 _GATHER_SECONDS = 0.2  # time to gather changes that are not awaited: they are safe in `ahead`

@@ -1,4 +1,4 @@
-"""Read common documents fast: names, numbers, and lists of names and numbers, as ROS clients write them.
+"""Parse requests and answers; common ones fast: names, numbers, and lists of both, as ROS clients write them.
 
 One pattern matches the whole document, or each part of a multicall, whereas `xmlrpc_reader` visits each element. This
 module accepts a subset of the documents that `xmlrpc_reader` accepts, with the same values. All other documents, and
@@ -8,11 +8,11 @@ it does not slow the other parts. Strings are printable ASCII without characters
 
 import re
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-from roswire.errors import PeerError, ProtocolError
+from roswire.errors import LimitExceededError, PeerError, ProtocolError
 from roswire.xmlrpc.xmlrpc_reader import XmlRpcDocument
-from roswire.xmlrpc.xmlrpc_values import Value, XmlRpcLimits
+from roswire.xmlrpc.xmlrpc_values import DEFAULT_LIMITS, Value, XmlRpcLimits
 
 _LONGEST = 32 << 10  # the maximum number of bytes for one pattern
 _MOST_ALONE = 256  # the maximum number of parts left to `xmlrpc_reader`, which take twice as long
@@ -180,3 +180,54 @@ def _values(text: bytes) -> list[Value]:
         else boolean == b"1"
         for string, whole, four, boolean, double, untyped in _VALUE.findall(text)
     ]
+
+
+@dataclass(frozen=True, slots=True)
+class MethodCall:
+    """`method` is as received."""
+
+    method: str
+    params: tuple[Value, ...]
+
+
+class FaultReceived(PeerError):  # noqa: N818 - named as the event it is: the answer was a fault
+    """The method failed."""
+
+    def __init__(self, code: int, text: str) -> None:
+        super().__init__(f"fault {code}: {text}")
+        self.code = code
+        self.text = text
+
+
+def parse_call(body: bytes, limits: XmlRpcLimits = DEFAULT_LIMITS) -> MethodCall:
+    """Raises `ProtocolError` or `LimitExceededError`."""
+    parsed = read_common_call(body, limits)
+    if parsed is None:
+        document = XmlRpcDocument(body, limits, "methodCall")
+        parsed = document.method, document.values
+    method, params = parsed
+    if method == "system.multicall" and params:
+        parts = params[0]
+        if isinstance(parts, list) and len(parts) > limits.parts:
+            raise LimitExceededError(
+                f"system.multicall of {len(parts)} calls; at most {limits.parts} are allowed"
+            )
+    return MethodCall(method, tuple(params))
+
+
+def parse_response(body: bytes, limits: XmlRpcLimits = DEFAULT_LIMITS) -> Value:
+    """Raises `FaultReceived` if the answer is a fault, `ProtocolError` or `LimitExceededError`."""
+    parsed = read_common_answer(body, limits)
+    if parsed is not None:
+        return parsed
+    document = XmlRpcDocument(body, limits, "methodResponse")
+    if len(document.values) != 1:
+        raise ProtocolError(f"answer with {len(document.values)} values; it has one")
+    value = document.values[0]
+    if not document.is_fault:
+        return value
+    if isinstance(value, dict):
+        code, text = value.get("faultCode"), value.get("faultString")
+        if type(code) is int and isinstance(text, str):
+            raise FaultReceived(code, text)
+    raise ProtocolError("fault without an integer faultCode and a string faultString")

@@ -18,12 +18,12 @@ from appliance.quotas.table import (
     RVMASTER_FAREWELLS,
     RVMASTER_REQUESTS,
 )
+from appliance.rpc.acceptor import Program
 from appliance.rpc.connection_table import ConnectionTable, Patience
 from appliance.rpc.fair_queue import Turns
 from appliance.rpc.front import HttpLimits
 from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import AtOnce, Handler, HttpRequest, HttpServer, Peer, listen, not_at_once
-from appliance.rpc.source_queues import Program
 from roswire.xmlrpc import FaultReceived, parse_response
 
 LIMITS = HttpLimits()

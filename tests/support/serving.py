@@ -16,7 +16,7 @@ from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.policy.policy import Policy
 from appliance.quotas.pool import QuotaClass
-from appliance.rpc.bulk import LargeWrites, bulk_turns
+from appliance.rpc.fair_queue import LargeWrites, bulk_turns
 from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import Handler
 from roswire.xmlrpc import XmlRpcLimits

@@ -9,28 +9,30 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "dev" / "architecture.md").read_text()
 SECTION = PAGE.split("\n## The kernel", 1)[1].split("\n## ", 1)[0]
 SIZES = {path: int(lines) for path, lines in re.findall(r"`([\w/]+\.pyx?)` (\d+)", SECTION)}
-BUDGET = 11_887  # lines of code: lower this number with the kernel, and never raise it
+BUDGET = 11_883  # lines of code: lower this number with the kernel, and never raise it
 
 # The modules outside the kernel that the kernel may import.
 OUTSIDE = frozenset(
     """
-    audit.proof.copies audit.log.disk_space audit.log.events audit.log.ids audit.log.lock_holders
-    base.atomic_files base.clock base.engine_thread base.input_files base.validation_messages channel.channel
-    channel.link channel.messages channel.messages.relay_link channel.rosout_address configuration.settings
-    master.calls.monitor_calls master.calls.request_peek master.endpoints.delivery master.endpoints.node_ports
-    master.endpoints.node_api master.endpoints.topic_taps_control master.endpoints.traffic
-    master.parameter_charges master.reconcile.arrivals master.reconcile.entries master.reconcile.liveness
-    master.rosmaster policy.policy_lint quotas.descriptors quotas.pool quotas.queue quotas.table
-    relay.connections.introductions relay.connections.latched_message relay.connections.message_sink
-    relay.connections.monitor_calls relay.connections.named_subscribers
-    relay.context relay.loop relay.monitors.fast_path_counts relay.monitors.holds relay.monitors.monitor_sets
-    relay.monitors.observation_points relay.monitors.observations relay.monitors.observer
-    relay.monitors.shadow relay.monitors.state_keeper relay.monitors.state_memory relay.monitors.time_budget
+    audit.log.disk_space audit.log.events audit.log.ids audit.log.lock_holders audit.proof.copies
+    base.atomic_files base.clock base.engine_thread base.input_files base.validation_messages
+    channel.channel channel.link channel.messages channel.messages.relay_link channel.rosout_address
+    configuration.settings control.assembly.current master.calls.monitor_calls
+    master.calls.request_peek master.endpoints.delivery master.endpoints.node_api
+    master.endpoints.node_ports master.endpoints.topic_taps_control master.endpoints.traffic
+    master.parameter_charges master.reconcile.arrivals master.reconcile.entries
+    master.reconcile.liveness master.rosmaster policy.policy_lint quotas.descriptors quotas.pool
+    quotas.table relay.connections.introductions relay.connections.latched_message
+    relay.connections.message_sink relay.connections.monitor_calls
+    relay.connections.named_subscribers relay.context relay.loop relay.monitors.fast_path_counts
+    relay.monitors.holds relay.monitors.monitor_sets relay.monitors.observation_points
+    relay.monitors.observations relay.monitors.observer relay.monitors.shadow
+    relay.monitors.state_keeper relay.monitors.state_memory relay.monitors.time_budget
     relay.relay_limits relay.report relay.topic_taps relay.transport.loop_channel
-    relay.transport.memory relay.transport.sockets rpc.bulk rpc.connection_table rpc.fair_queue rpc.front
-    rpc.method_name rpc.processor_time rpc.server rpc.source_queues rpc.xmlrpc_client
-    specifications.allocation specifications.specification_files specifications.specification_manager
-    store.state_file telemetry.metrics
+    relay.transport.memory relay.transport.sockets rpc.acceptor rpc.connection_table rpc.fair_queue
+    rpc.front rpc.method_name rpc.processor_time rpc.server rpc.xmlrpc_client
+    specifications.allocation specifications.specification_files
+    specifications.specification_manager store.state_file telemetry.metrics
     """.split()  # noqa: SIM905  a list would need a line for each
 )
 

@@ -30,7 +30,7 @@ from appliance.master import rosmaster
 from appliance.master.endpoints import node_ports
 from appliance.rpc.server import Handler, HttpRequest, Peer, Refusal
 from appliance.rpc.xmlrpc_client import XmlRpcClient
-from appliance.store import ahead, writer_thread
+from appliance.store import changes, writer_thread
 from appliance.store.state_file import StateStore
 from tests.world import disk
 from tests.world.loop import present_process
@@ -147,7 +147,7 @@ def joined(network: Network, streams: Streams, random: Random) -> Iterator[None]
         (rosmaster, "uuid", SimpleNamespace(uuid1=lambda: "run")),
         (foundation, "StateStore", partial(StateStore, kind=disk.WorldDatabase)),
         (open_audit, "AuditLog", partial(AuditLog, drive=disk.EngineSteps)),
-        (ahead, "os", files),
+        (changes, "os", files),
         (log_writer, "os", files),
         (writer_thread, "sqlite3", databases),
         (log_database, "sqlite3", databases),

@@ -18,17 +18,15 @@ class DiskSpace:
         self._folder = path.parent
         self._reserve = reserve
         self._tell = tell
-        self._looked = float("-inf")
+        self.due = float("-inf")
         self.left: int | None = None
 
     def look(self, now: float) -> bool | None:
-        """Check the disk if a check is due; return True if space just became scarce, False if scarcity just ended.
+        """Check the disk, which is due then; return True if space just became scarce, False if scarcity just ended.
 
         Return None if nothing changed. Raises `OSError`.
         """
-        if now - self._looked < _LOOK_SECONDS:
-            return None
-        self._looked = now
+        self.due = now + _LOOK_SECONDS
         disk = os.statvfs(self._folder)
         free, before = disk.f_bavail * disk.f_frsize, self.left
         enough = self._reserve if before is None else self._reserve * _AGAIN

@@ -6,8 +6,11 @@
 3. Records about a step are passed to `hold`, or appended together with it.
 """
 
+import asyncio
+import contextlib
+import itertools
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +20,6 @@ from appliance.audit.log.log_writer import ChainWriter
 from appliance.audit.log.record import AuditRecord, Severity
 from appliance.audit.log.removal import Remover
 from appliance.audit.log.signatures import Signatures
-from appliance.audit.log.waiters import Waiter, answer
 from appliance.signing.log_proof import parse_checkpoint
 
 WRITE_ERRORS = (sqlite3.Error, OSError, LogUnreadableError)
@@ -27,6 +29,24 @@ _LARGEST_SLICE = 2048
 _IDLE_SECONDS = 1.0
 _HOUSE_SECONDS = 10.0
 _ASK_AGAIN_SECONDS = 30.0
+
+
+Waiter = asyncio.Future[str | None]
+"""Gets None once the records are on disk or sealed, or the reason why they are not."""
+
+
+def answer(waiting: Iterable[Waiter], result: str | None) -> None:
+    """Answer all waiters, with one call for each run of waiters of the same event loop."""
+    for loop, group in itertools.groupby(waiting, Waiter.get_loop):
+        # A closed loop raises RuntimeError; its coroutines no longer wait.
+        with contextlib.suppress(RuntimeError):
+            loop.call_soon_threadsafe(_settle, list(group), result)
+
+
+def _settle(futures: list[Waiter], result: str | None) -> None:
+    for future in futures:
+        if not future.done():
+            future.set_result(result)
 
 
 MakeRecord = Callable[[str, Severity, str, dict[str, Any]], AuditRecord]
@@ -134,7 +154,7 @@ class Housekeeping:
 
     def seal_now(self, waiter: Waiter) -> None:
         """Seal after the next batch; answer the waiter when the checkpoint is signed."""
-        self._waiting = [pending for pending in self._waiting if not pending.future.done()] + [waiter]
+        self._waiting = [pending for pending in self._waiting if not pending.done()] + [waiter]
 
     def _answer_sealed(self) -> None:
         """Let waiters for a checkpoint now wait for its signature; answer them if the checkpoint is already signed."""
@@ -142,7 +162,7 @@ class Housekeeping:
             return
         number = self.writer.checkpoint_number
         pending = [*self.unsigned, *((number, waiter) for waiter in self._waiting)]
-        self.unsigned, self._waiting = [one for one in pending if not one[1].future.done()], []
+        self.unsigned, self._waiting = [one for one in pending if not one[1].done()], []
         if (newest := self.writer.newest_signed()) and parse_checkpoint(newest).number >= number:
             self._answer(lambda awaited: awaited <= number, None)
 

@@ -25,7 +25,7 @@ import structlog
 from appliance.audit.log.budget import Budget
 from appliance.audit.log.disk_space import DiskSpace
 from appliance.audit.log.folding import FoldSettings, RecordFolder
-from appliance.audit.log.housekeeping import WRITE_ERRORS, CheckpointSchedule, Housekeeping
+from appliance.audit.log.housekeeping import WRITE_ERRORS, CheckpointSchedule, Housekeeping, Waiter, answer
 from appliance.audit.log.ids import IdSource
 from appliance.audit.log.lock_holders import holders
 from appliance.audit.log.log_database import LogUnreadableError
@@ -35,7 +35,6 @@ from appliance.audit.log.removal import Remover
 from appliance.audit.log.repetition import summary
 from appliance.audit.log.retention import Retention
 from appliance.audit.log.signatures import RemovalSigner, Signatures, Signer
-from appliance.audit.log.waiters import Waiter, answer
 from appliance.base.clock import now, wall_ns
 from appliance.base.engine_thread import Drive, EngineThread
 from appliance.quotas.pool import QuotaClass
@@ -169,19 +168,17 @@ class AuditLog:
 
     async def wait_durable(self) -> str | None:
         """Wait until all records so far are on disk; return None, or the reason why they cannot be written."""
-        loop = asyncio.get_running_loop()
-        future: asyncio.Future[str | None] = loop.create_future()
-        self._put(Waiter(loop, future))
+        waiter: Waiter = asyncio.get_running_loop().create_future()
+        self._put(waiter)
         self._driver.hurry()
-        return await future
+        return await waiter
 
     async def wait_signed(self) -> str | None:
         """Wait until a signed checkpoint seals all records so far; return None, or why its signature is refused."""
-        loop = asyncio.get_running_loop()
-        future: asyncio.Future[str | None] = loop.create_future()
-        self._put(partial(self.housekeeping.seal_now, Waiter(loop, future)))
+        waiter: Waiter = asyncio.get_running_loop().create_future()
+        self._put(partial(self.housekeeping.seal_now, waiter))
         self._driver.hurry()
-        return await future
+        return await waiter
 
     @property
     def failed(self) -> str | None:
@@ -260,7 +257,7 @@ class AuditLog:
         with contextlib.suppress(IndexError):
             while True:
                 item = self._queue.popleft()
-                if isinstance(item, Waiter):
+                if isinstance(item, asyncio.Future):
                     answer([item], self._failed)
 
     def _turn(self, now: float) -> float | None:
@@ -272,7 +269,8 @@ class AuditLog:
         for due in self._folder.expire(now):
             self._held.append(due)
             self.budget.summarised(due)
-        self._look_for_room(now)
+        if now >= self._room.due:
+            self._look_for_room(now)
         written = self._attempt(self._write)
         self._answer_waiting()
         self.housekeeping.after_batch(written=written)
@@ -315,7 +313,7 @@ class AuditLog:
                 self._held.extend(written)
                 if not written or written[-1] is not item:
                     self.budget.folded(item)
-            elif isinstance(item, Waiter):
+            elif isinstance(item, asyncio.Future):
                 self._waiting.append(item)
             else:
                 item()

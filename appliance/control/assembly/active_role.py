@@ -18,7 +18,6 @@ from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.features.feature import FeaturePart
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.tunnel_state import Tunnels
-from appliance.rpc.server import Handler, HttpRequest
 from appliance.specifications.compiler_link import SpecificationCompiler
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from appliance.store.state_file import StateStore
@@ -68,19 +67,6 @@ class ActiveRole:
 
     def on_end_of_gap(self, ended: Callable[[], None]) -> None:
         """Call this when computers of the robot stop refusing connections."""
-
-    def answering(self, handler: Handler) -> Handler:
-        """Return a handler whose answers wait for `before_answer`."""
-        wait = self.before_answer
-        if wait is None:
-            return handler
-
-        async def handle(request: HttpRequest) -> bytes:
-            answer = await handler(request)
-            await wait()
-            return answer
-
-        return handle
 
     def close(self) -> None:
         """End the role: a change that is not answered yet gets no answer."""

@@ -1,6 +1,7 @@
 """Assemble RVMaster from its core, its endpoints, the specifications and the calls."""
 
 from dataclasses import dataclass
+from functools import partial
 
 from appliance.channel import messages
 from appliance.control.assembly.core import Core, make_core
@@ -24,7 +25,7 @@ from appliance.master.reconcile.publisher import OwnPublisher
 from appliance.master.reconcile.reconciler import Reconciler
 from appliance.master.reconcile.reminders import RelayMoves, Reminders
 from appliance.master.rosmaster import own_parameters
-from appliance.rpc.bulk import LargeWrites, bulk_turns
+from appliance.rpc.fair_queue import LargeWrites, bulk_turns
 from appliance.specifications.specification_manager import SpecificationManager
 
 
@@ -104,10 +105,7 @@ def assemble(base: Foundation) -> Parts:
         core.gate,
         port,
     )
-    node_table = served(NODE_CALLS.values(), node_calls)
-    ends.handler.set(
-        lambda incarnation: base.role.answering(pipeline.handler(node_table, target=incarnation))
-    )
+    ends.handler.set(partial(pipeline.handler, served(NODE_CALLS.values(), node_calls)))
     return Parts(
         core=core,
         endpoints=ends,
@@ -198,5 +196,6 @@ def _make_calls(
         offload=offload,
         bulk=bulk_turns(base.quota_class),
         processor=base.listener_limits.time,
+        before_answer=base.role.before_answer,
     )
     return pipeline, master_table(registration, lookups, registration.parameters, monitor_calls)

@@ -3,7 +3,8 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from appliance.control.assembly.foundation import Current, Foundation
+from appliance.control.assembly.current import Current
+from appliance.control.assembly.foundation import Foundation
 from appliance.master.calls.gate import CallGate, HostLimits
 from appliance.master.calls.parameter_rights import ParameterRights
 from appliance.master.endpoints.traffic import RelayTraffic

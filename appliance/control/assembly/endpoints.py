@@ -6,7 +6,8 @@ from ipaddress import ip_address, ip_network
 
 from appliance.channel import messages
 from appliance.control.assembly.core import Core
-from appliance.control.assembly.foundation import INNER, RVMASTER, Current, Foundation
+from appliance.control.assembly.current import Current
+from appliance.control.assembly.foundation import INNER, RVMASTER, Foundation
 from appliance.control.assembly.listener_limits import value_limits
 from appliance.control.monitor_call_gate import MonitorCallGate, own_host
 from appliance.master import rosout
@@ -56,7 +57,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         policies.current.ports,
         keep=base.lifeline.keep,
         drop=base.lifeline.drop,
-        named_as=policies.named_as,
+        policy=core.policy,
         relays=settings.relays,
     )
     nodes = NodeApiClient(core.registry, timeout=settings.limits.node_call_seconds)
@@ -104,7 +105,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         may_read_value=core.rights.may_read_value,
     )
     sinks = Sinks(core.registry, core.grants, base.store, subscribers, entries, relay, faces)
-    base.sinks.set(sinks)
+    base.woken.set(sinks.soon)
     gate.set(
         MonitorCallGate(
             core.registry,

@@ -2,9 +2,8 @@
 
 import asyncio
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Generic, TypeVar
 
 import structlog
 
@@ -12,13 +11,13 @@ from appliance.audit.log.log import AuditLog
 from appliance.base.age_clock import AgeClock
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.active_role import ActiveRole
+from appliance.control.assembly.current import Current, Later
 from appliance.control.assembly.host_authority import HostAuthority
 from appliance.control.assembly.host_blocks import BlockTable
-from appliance.control.assembly.listener_limits import ListenerLimits
+from appliance.control.assembly.listener_limits import HostQuotaClass, ListenerLimits
 from appliance.control.assembly.open_audit import open_audit
 from appliance.control.assembly.policies import Policies
-from appliance.control.assembly.quota_class import HostQuotaClass, charged_to
-from appliance.control.assembly.robot import robot_addresses
+from appliance.control.assembly.robot import charged_to, robot_addresses
 from appliance.control.links.signer_requests import ReceiptFloor, SignerRequests
 from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.features.feature import FeatureContext
@@ -27,45 +26,25 @@ from appliance.hosts.host_table import HostTable
 from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHosts
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.graph.registry import Registry
-from appliance.master.reconcile.sinks import Enforcement, Sinks
-from appliance.quotas.pool import QuotaClass
+from appliance.master.reconcile.sinks import Enforcement
+from appliance.policy.policy import Policy
 from appliance.rpc.server import listen
 from appliance.specifications.compiler_link import SpecificationCompiler
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
-T = TypeVar("T")
 RVMASTER, INNER, OWN = "rvmaster", "inner", "own"
 """The names of the listeners for nodes, for the ROS master, and for the appliance's own nodes."""
 
 _log = structlog.get_logger()
 
 
-class Current(Generic[T]):
-    """A value that is set after its readers are made. Call this object to get the value."""
-
-    def __init__(self) -> None:
-        self._values: list[T] = []
-
-    def set(self, value: T) -> None:
-        self._values = [value]
-
-    def __bool__(self) -> bool:
-        return bool(self._values)
-
-    def __call__(self) -> T:
-        """Return the value. Raises `RuntimeError` before it is set."""
-        if not self._values:
-            raise RuntimeError("this part of control is used before it is created")
-        return self._values[0]
-
-
 @dataclass(frozen=True, slots=True)
 class Foundation:
     """The durable state, the policy and the listeners.
 
-    `enforcement` and `sinks` get their values later. So does `in_force`, which returns the revisions of policy and
-    specifications.
+    `enforcement` gets its value later. So does `in_force`, which returns the revisions of policy and specifications,
+    and `woken`, which the registry calls after a change.
     `parameters_dirty` is set whenever the mirror of the parameters changes.
     """
 
@@ -78,7 +57,7 @@ class Foundation:
     receipts: ReceiptFloor
     trail: AuditTrail
     features: FeatureParts
-    in_force: Current[Callable[[], tuple[int, int]]]
+    in_force: Later[[], tuple[int, int]]
     store: StateStore
     blocks: BlockTable
     table: HostTable
@@ -89,7 +68,7 @@ class Foundation:
     listener_limits: ListenerLimits
     sockets: Mapping[str, socket.socket]
     enforcement: Current[Enforcement]
-    sinks: Current[Sinks]
+    woken: Later[[], None]
     parameters_dirty: asyncio.Event
     role: ActiveRole
 
@@ -112,7 +91,10 @@ async def make_foundation(
 
     Raises `PolicyRefusedError`, `StoreError`, and `OSError` if an address is in use.
     """
-    audit, quota_class, enforcement = Current[AuditLog](), Current[HostQuotaClass](), Current[Enforcement]()
+    policy, woken = Current[Policy](), Later[[], None]()
+    registry = Registry(settings.limits.nodes_per_host, woken=woken)
+    quota_class = HostQuotaClass(policy, registry.registrations_of)
+    audit, enforcement = Current[AuditLog](), Current[Enforcement]()
     signing = SignerRequests(audit)
     receipts = ReceiptFloor(
         settings.state,
@@ -125,37 +107,37 @@ async def make_foundation(
             settings,
             signing,
             held_by,
-            class_of=lambda host: _class_of(quota_class, host),
-            kept_for=lambda host: bool(quota_class) and quota_class().has_reserve(host),
+            class_of=quota_class.of_text,
+            kept_for=quota_class.has_reserve,
             receipts=receipts,
         )
     )
-    features, in_force = Current[FeatureParts](), Current[Callable[[], tuple[int, int]]]()
+    in_force = Later[[], tuple[int, int]]()
+    details = Later[..., dict[str, str]]()
     trail = AuditTrail(
         audit(),
         strict=settings.audit.durability == "strict",
         deny_when_failed=settings.audit.on_audit_failure == "deny",
-        details=lambda *event: features().details(*event),
+        details=details,
     )
-    features.set(
-        FeatureParts(
-            FeatureContext(
-                settings.sections,
-                trail,
-                audit(),
-                settings.name,
-                charged_to=lambda host: charged_to(policies.current, host),
-                in_force=lambda: in_force()(),  # noqa: PLW0108  it has no value yet
-            )
+    features = FeatureParts(
+        FeatureContext(
+            settings.sections,
+            trail,
+            audit(),
+            settings.name,
+            charged_to=lambda host: charged_to(policy(), host),
+            in_force=in_force,
         )
     )
+    details.set(features.details)
     store = StateStore(
         settings.state / "control", failed=lambda reason: _log.error("state is not written", reason=reason)
     )
     age = AgeClock(settings.state / "control" / "age")
     role.inherit(store, age)
     blocks = BlockTable(store, age)
-    await features().keep(store, lifeline)
+    await features.keep(store, lifeline)
     # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
     # start the tunnels before the policy.
     table = make_host_table(settings, store)
@@ -167,20 +149,18 @@ async def make_foundation(
         settings.policy,
         store,
         trail,
+        policy,
         robot=robot_addresses(settings, role.robot),
-        hosts=lambda: {**tunnels().addresses, **features().addresses()},
+        hosts=lambda: {**tunnels().addresses, **features.addresses()},
         blocks=lambda: blocks.reasons,
-        holders=lambda: features().holders(),
-        approved=lambda: features().approved(),
+        holders=features.holders,
+        approved=features.approved,
         live=lambda: enforcement().revocation.live(),  # noqa: PLW0108  it is assembled later
         changed=lambda _before, policy: enforcement().policy_changed(policy),
         carried_out=lambda: enforcement().sinks.relay.carried_out(),  # noqa: PLW0108  it is assembled later
         site_keys=settings.site_keys,
     )
     policies.start(restarted=restarted or role.paired)
-    sinks = Current[Sinks]()
-    registry = Registry(settings.limits.nodes_per_host, woken=lambda: sinks().soon())
-    quota_class.set(HostQuotaClass(policies.policy, registry.registrations_of))
     return Foundation(
         settings=settings,
         lifeline=lifeline,
@@ -190,7 +170,7 @@ async def make_foundation(
         audit=audit(),
         receipts=receipts,
         trail=trail,
-        features=features(),
+        features=features,
         in_force=in_force,
         store=store,
         blocks=blocks,
@@ -198,11 +178,11 @@ async def make_foundation(
         tunnels=tunnels(),
         policies=policies,
         registry=registry,
-        quota_class=quota_class(),
-        listener_limits=ListenerLimits(settings, trail, policies.policy, quota_class()),
+        quota_class=quota_class,
+        listener_limits=ListenerLimits(settings, trail, policy, quota_class),
         sockets=_open_listeners(settings, lifeline),
         enforcement=enforcement,
-        sinks=sinks,
+        woken=woken,
         parameters_dirty=asyncio.Event(),
         role=role,
     )
@@ -234,8 +214,3 @@ def open_listener(host: str, port: int) -> socket.socket:
             f"{host}:{port} cannot be listened on: {error.strerror}; "
             "is a ROS master running there? Stop it, or choose another --listen"
         ) from error
-
-
-def _class_of(quota_class: Current[HostQuotaClass], host: str) -> QuotaClass:
-    # Before the policy is read, all hosts count as named.
-    return quota_class().of_text(host) if quota_class else QuotaClass.NAMED

@@ -1,4 +1,5 @@
-"""Limit the listeners of control: RVMaster, and the peer-side and master-side proxy endpoints.
+"""Limit the listeners of control: RVMaster, and the peer-side and master-side proxy endpoints. Find the quota class of
+a host, from the policy and the registry (`appliance/quotas`).
 
 An unknown host (an address that no rule of the policy names, or that an operator blocks) is refused. If a section of
 the policy is audit-only, only a blocked host is. The beginning of the body is read first, to record the name of the
@@ -11,19 +12,21 @@ from functools import partial
 
 from appliance.audit.log.record import Severity
 from appliance.configuration.settings import Settings
+from appliance.control.assembly.current import Current
 from appliance.master.calls.call import with_record
 from appliance.master.calls.request_peek import asked_for
-from appliance.policy.model import Address, text_for_caller
+from appliance.policy.host_sets import EVERYONE
+from appliance.policy.model import Address, address_of, text_for_caller
 from appliance.policy.policy import Policy
 from appliance.quotas.descriptors import connections_within
 from appliance.quotas.pool import Bounds, QuotaClass
 from appliance.quotas.table import RVMASTER_BYTES, RVMASTER_CONNECTIONS, RVMASTER_REQUESTS
+from appliance.rpc.acceptor import NamedFirst
 from appliance.rpc.connection_table import ConnectionTable
 from appliance.rpc.fair_queue import Turns
 from appliance.rpc.front import HttpLimits
 from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import AtOnce, Handler, HttpServer, Peer, Refusal, not_at_once
-from appliance.rpc.source_queues import NamedFirst
 from appliance.telemetry.audit_trail import AuditTrail
 from roswire.xmlrpc import XmlRpcLimits, build_fault
 
@@ -66,17 +69,8 @@ class ListenerLimits:
         self._unhidden = ""
         self._servers: list[HttpServer] = []
 
-    async def open(
-        self,
-        sock: socket.socket,
-        handler: Handler,
-        *,
-        guarded: bool,
-        at_once: AtOnce = not_at_once,
-        keep: bool = True,
-    ) -> None:
-        """Serve a listener. `guarded` is false for a listener that only the appliance's own processes can reach."""
-        server = self.server(sock.dup(), handler, guarded=guarded, at_once=at_once, keep=keep)
+    async def open(self, server: HttpServer) -> None:
+        """Start a server; `close` closes it."""
         self._servers.append(server)
         await server.start()
 
@@ -89,7 +83,10 @@ class ListenerLimits:
         at_once: AtOnce = not_at_once,
         keep: bool = True,
     ) -> HttpServer:
-        """Return a server that shares the limits of all listeners. The caller must start and close the server."""
+        """Return a server that shares the limits of all listeners.
+
+        `guarded` is false for a listener that only the appliance's own processes can reach.
+        """
         return HttpServer(
             sock,
             handler,
@@ -162,11 +159,12 @@ def value_limits(settings: Settings) -> XmlRpcLimits:
     )
 
 
-ClassOf = Callable[[Address], QuotaClass]
 _UNKNOWN, _ANYBODY = "unknown hosts", "hosts with a registration, by *"
 
 
-def class_of(policy: Callable[[], Policy], quota_class: ClassOf, host: Address) -> str:
+def class_of(
+    policy: Callable[[], Policy], quota_class: Callable[[Address], QuotaClass], host: Address
+) -> str:
     """Return the class that is charged for a host's processor time, and that shares turns.
 
     The class is the address or network that the policy names. A host can have many addresses, so all hosts that only
@@ -178,7 +176,9 @@ def class_of(policy: Callable[[], Policy], quota_class: ClassOf, host: Address) 
     return _ANYBODY if quota_class(host) is QuotaClass.REGISTERED else _UNKNOWN
 
 
-def connection_class_of(policy: Callable[[], Policy], quota_class: ClassOf, host: Address) -> QuotaClass:
+def connection_class_of(
+    policy: Callable[[], Policy], quota_class: Callable[[Address], QuotaClass], host: Address
+) -> QuotaClass:
     """Return a host's quota class for connections.
 
     Hosts that only `*` names share processor time as one host. So their connections must not use up the quotas of hosts
@@ -200,3 +200,47 @@ _FOR_ONE, _BYTES_FOR_ONE, _SLOTS_FOR_ONE = (
 
 def _own_node(_host: Address) -> QuotaClass:
     return QuotaClass.REGISTERED
+
+
+class HostQuotaClass:
+    """The quota class of hosts, by the policy in force and by their registrations.
+
+    `policy()` returns the policy in force. Before there is one, the hosts of records count as named, and none has a
+    reserve. `registrations(host)` returns the number of a host's registrations.
+    """
+
+    def __init__(self, policy: Current[Policy], registrations: Callable[[Address], int]) -> None:
+        self._policy = policy
+        self._registrations = registrations
+
+    def __call__(self, host: Address) -> QuotaClass:
+        """Return the present quota class of a host. In audit-only mode, also an unknown host can have registrations."""
+        # The policy need not name loopback, from which the appliance's own nodes call.
+        if not (host.is_loopback or self._policy().standing(host).known):
+            return QuotaClass.UNKNOWN
+        return QuotaClass.REGISTERED if self._registrations(host) else QuotaClass.NAMED
+
+    def of_text(self, host: str) -> QuotaClass:
+        """Return the quota class of a host in an audit record. A text that is not an address counts as named."""
+        try:
+            return self(address_of(host)) if self._policy else QuotaClass.NAMED
+        except ValueError:
+            return QuotaClass.NAMED
+
+    def has_reserve(self, host: str) -> bool:
+        """Return whether the last part of the audit log's reserve is for this host: the robot, or one the policy names.
+
+        A policy that names only `*` keeps it for hosts with a registration.
+        """
+        try:
+            address = address_of(host)
+        except ValueError:
+            return False
+        if not self._policy:
+            return False
+        policy = self._policy()
+        if address.is_loopback or any(address in network for network in policy.robot):
+            return policy.blocked(address) is None
+        if policy.named <= {EVERYONE}:
+            return self(address) is QuotaClass.REGISTERED
+        return policy.names(address)

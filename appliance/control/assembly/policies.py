@@ -23,6 +23,7 @@ from appliance.base.withdrawal import take_effect
 from appliance.channel import admin
 from appliance.channel.answers import policy_answers as answers
 from appliance.channel.answers.policy_answers import Loaded
+from appliance.control.assembly.current import Current
 from appliance.control.assembly.policy_gate import (
     KeptPolicy,
     PolicyRefusedError,
@@ -78,6 +79,7 @@ class Policies(Revisions[RevisionRow]):
         file: Path,
         store: StateStore,
         trail: AuditTrail,
+        policy: Current[Policy],
         *,
         robot: Collection[Address | Network],
         hosts: Callable[[], Mapping[str, Address]],
@@ -89,7 +91,7 @@ class Policies(Revisions[RevisionRow]):
         carried_out: Callable[[], Awaitable[None]],
         site_keys: Sequence[str],
     ) -> None:
-        """Prepare; `start` brings a policy into force.
+        """Prepare; `start` brings a policy into force, and sets it in `policy`.
 
         `hosts()` returns the addresses for `host:NAME`; the owner calls `hosts_changed` when they change. `blocks()`
         returns the blocked hosts (`Policy.blocks`), `holders()` the hosts that hold groups (`Policy.holders`), and
@@ -111,22 +113,13 @@ class Policies(Revisions[RevisionRow]):
         self._changed = changed
         self._carried_out = carried_out
         self._site_keys = site_keys
-        self._current: Policy | None = None
+        self.policy = policy
         self.file_refused = store.settings().get(_REFUSED, "")
         """Why the file was refused at the last start or reload, in a line; empty: it was not."""
 
     @property
     def current(self) -> Policy:
         return self.policy()
-
-    def policy(self) -> Policy:
-        """Return the policy in force to the parts that decide by it."""
-        if self._current is None:
-            raise RuntimeError("no policy is loaded yet")
-        return self._current
-
-    def named_as(self, host: Address) -> Network:
-        return self.current.named_as(host)
 
     def in_words(self, host: str) -> str:
         """Return `tablet (10.0.0.7)` for a host that the policy in force names."""
@@ -369,7 +362,7 @@ class Policies(Revisions[RevisionRow]):
         self._note_refused("")
         before = self.revision
         row = RevisionRow(before + 1, policy.text, policy.file, clock.wall(), who, note, signature)
-        lost = [] if self._current is None else _losses(policy, self._live())
+        lost = _losses(policy, self._live()) if self.policy else []
         self._put_in_force(row, within)
         revoked = self._enforce(policy)
         self._trail.happened(
@@ -385,17 +378,17 @@ class Policies(Revisions[RevisionRow]):
         return self._loaded(before, revoked, lost)
 
     def _enforce(self, policy: Policy) -> int:
-        before, self._current = (
-            self._current,
+        before = self.policy() if self.policy else None
+        self.policy.set(
             replace(
                 policy,
                 blocks=dict(self._blocks()),
                 holders=dict(self._holders()),
                 approved=self._approved(),
-            ),
+            )
         )
         self._trail.revision = self.revision
-        return 0 if before is None else self._changed(before, self._current)
+        return 0 if before is None else self._changed(before, self.policy())
 
     def _loaded(self, before: int, revoked: int, lost: Sequence[str] = ()) -> Loaded:
         warnings = [*lost, *map(str, self.current.warnings)]

@@ -1,12 +1,16 @@
-"""Find the addresses of the group `robot`: the robot's machine, as seen from inside the appliance's isolation."""
+"""Find the addresses of the group `robot` (the robot's machine, as seen from inside the appliance's isolation), and the
+name to which a host's acts are charged.
+"""
 
 import ipaddress
 import socket
 import struct
 from pathlib import Path
 
+from appliance.base.actors import APPLIANCE, ROBOT, UNKNOWN
 from appliance.configuration.settings import Settings
-from appliance.policy.model import Address
+from appliance.policy.model import Address, address_of
+from appliance.policy.policy import Policy
 
 _ROUTES = Path("/proc/net/route")
 
@@ -22,6 +26,17 @@ def robot_addresses(settings: Settings, robot: str | None = None) -> list[Addres
         return [ipaddress.ip_address(robot)]
     gateway = _default_gateway()
     return [gateway] if gateway is not None else []
+
+
+def charged_to(policy: Policy, host: str) -> str:
+    """Return the name to which a host's acts are charged."""
+    try:
+        address = address_of(host)
+    except ValueError:
+        return APPLIANCE
+    if address.is_loopback or any(address in network for network in policy.robot):
+        return ROBOT
+    return policy.counted_as(address).removesuffix("/32").removesuffix("/128") or UNKNOWN
 
 
 def own_address(settings: Settings) -> str:

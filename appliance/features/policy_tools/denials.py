@@ -12,7 +12,7 @@ from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import rule_text
 from appliance.audit.log.repetition import KIND
 from appliance.channel.messages.relay_link import NO_GRANT
-from appliance.policy.commands import policy_call
+from appliance.policy.commands import CALLS
 from appliance.policy.grant import DecidedRequest, UngrantableError, asked
 from appliance.policy.model import Category
 from appliance.policy.policy_settings import AT_ONCE
@@ -75,7 +75,7 @@ def _of_connection(record: AuditRecord) -> DecidedRequest:
 
 
 def _of_call(record: AuditRecord, call: str) -> DecidedRequest:
-    category, detail = policy_call(call).category, {**record.detail, "call": call}
+    category, detail = CALLS[call].category, {**record.detail, "call": call}
     resource = record.resource
     if category is Category.COMMAND:
         resource, detail["key"] = call, record.resource

@@ -15,7 +15,7 @@ from typing import Any, Generic, NamedTuple, TypeVar, cast, overload
 
 from appliance.master.caller import ApiUri, Caller
 from appliance.master.graph.registry import Kind
-from appliance.policy.commands import ALIASES, policy_call
+from appliance.policy.commands import ALIASES, CALLS
 from appliance.policy.model import Category, Decision, Request, text_for_caller
 from appliance.policy.rights import request_of
 from roswire import names
@@ -253,7 +253,7 @@ class RosCall(Generic[S]):
     def __post_init__(self) -> None:
         parameters = self.method.parameters
         name = self.command or ALIASES.get(self.name, self.name)
-        row = policy_call(name)
+        row = CALLS[name]
         derived = {
             "identity": Identity.NOBODY if row.wire else Identity.NODE if row.node else Identity.FREE,
             "resource": None

@@ -10,10 +10,18 @@
    revocation by the new policy could not see the result of the call yet.
 
 An error becomes a record and a well-formed answer, never an exception.
+
+Why calls wait for each other (`KeyTurns`): a registering call may wait after its decision, for its record, for its
+ports, or for earlier changes that the ROS master gets. If two hosts registered a free name at the same time, both would
+be allowed, and the later host would take the name away. The decision on a write depends on the present tree, because
+the write may overwrite a plain value above its key. Another write could set such a value after the decision and before
+the ROS master's answer. Also, two writes of one key could reach the ROS master and the mirror in different orders. A
+call that need not wait enters its turn without a switch of tasks, so its decision is still valid.
 """
 
+import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -30,7 +38,6 @@ from appliance.master.calls.call import (
     denial_text,
     with_record,
 )
-from appliance.master.calls.call_order import KeyTurns
 from appliance.master.calls.gate import CallGate, NameConflict, contested
 from appliance.master.calls.parameter_calls import ParameterCalls, ParameterWrite
 from appliance.master.calls.registration import given_up
@@ -41,7 +48,7 @@ from appliance.master.reconcile.arrivals import NodeElsewhereError
 from appliance.master.reconcile.liveness import Liveness, Probe
 from appliance.policy.model import Address, Category, Decision, Request
 from appliance.policy.policy import Policy
-from appliance.rpc.bulk import Bulk, LargeWrites, weigh
+from appliance.rpc.fair_queue import Bulk, LargeWrites, weigh
 from appliance.rpc.xmlrpc_client import CallFailedError
 from appliance.telemetry.audit_trail import NOT_RECORDED, AuditTrail
 from roswire.errors import EncodingError, PeerError, ProtocolError
@@ -52,6 +59,74 @@ _REGISTERS = (CallVerb.REGISTER, CallVerb.UNREGISTER)
 _FAILURES = (
     HostFullError, NoPortError, NodeElsewhereError, LimitReachedError, PeerError, EncodingError, CallFailedError,
 )  # fmt: skip
+
+
+class KeyTurns:
+    """The turns of running and waiting calls, in order of arrival."""
+
+    def __init__(self) -> None:
+        self._turns: dict[KeyTurn, None] = {}
+
+    def __len__(self) -> int:
+        return len(self._turns)
+
+    def alone(self, keys: Collection[str]) -> "KeyTurn":
+        """Return a context manager that waits for earlier calls with equal or overlapping keys (canonical)."""
+        return KeyTurn(self._turns, _ended(keys))
+
+    def of_name(self, name: str) -> "KeyTurn":
+        """Return a context manager that waits for earlier calls with exactly this name."""
+        return self.alone([name.replace("/", ".")])
+
+
+class KeyTurn:
+    """The turn of a call, an async context manager that is entered when earlier overlapping calls are done."""
+
+    __slots__ = ("_done", "_keys", "_turns")
+
+    def __init__(self, turns: "dict[KeyTurn, None]", keys: tuple[str, ...]) -> None:
+        self._turns = turns
+        self._keys = keys
+        self._done: asyncio.Event | None = None  # made when another call waits for this call
+
+    async def __aenter__(self) -> bool:
+        """Wait for the turn; return whether there was another call to wait for."""
+        before = [turn for turn in self._turns if _meet(self._keys, turn._keys)]
+        self._turns[self] = None
+        try:
+            for turn in before:
+                await turn.done().wait()
+        except BaseException:
+            self._end()
+            raise
+        return bool(before)
+
+    async def __aexit__(self, *_error: object) -> None:
+        self._end()
+
+    def done(self) -> asyncio.Event:
+        if self._done is None:
+            self._done = asyncio.Event()
+            if self not in self._turns:
+                self._done.set()
+        return self._done
+
+    def _end(self) -> None:
+        del self._turns[self]
+        if self._done is not None:
+            self._done.set()
+
+
+def touch(keys: Collection[str], others: Collection[str]) -> bool:
+    return _meet(_ended(keys), _ended(others))
+
+
+def _ended(keys: Collection[str]) -> tuple[str, ...]:
+    return tuple({key if key == "/" else f"{key}/" for key in keys})
+
+
+def _meet(mine: tuple[str, ...], others: tuple[str, ...]) -> bool:
+    return any(key.startswith(others) for key in mine) or any(other.startswith(mine) for other in others)
 
 
 class ServedRequest(NamedTuple):
@@ -100,7 +175,7 @@ class Execution:
 
     async def answer(self, visit: ServedRequest, attempt: Attempt) -> Value:
         """Decide one call and carry it out."""
-        if self.parameters.weight_of_answer(attempt) >= self.large:
+        if attempt.call.tells and self.parameters.weight_of_answer(attempt) >= self.large:
             await visit.bulk.take()
         call, probe = attempt.call, None
         registers, writes = call.verb in _REGISTERS, call.verb is CallVerb.WRITE

@@ -13,11 +13,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from appliance.master.calls.call import Attempt, CallVerb, with_record
-from appliance.master.calls.call_execution import Execution, ServedRequest
-from appliance.master.calls.call_order import touch
+from appliance.master.calls.call_execution import Execution, ServedRequest, touch
 from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.policy.model import Category
-from appliance.rpc.bulk import weigh
+from appliance.rpc.fair_queue import weigh
 from appliance.telemetry.audit_trail import AuditTrail
 from roswire.xmlrpc import Value
 

@@ -25,7 +25,7 @@ from appliance.master.parameter_mirror import ParameterMirror, Reservation
 from appliance.master.reconcile.subscribers import Subscribers
 from appliance.master.rosmaster import RosMaster, Wanted
 from appliance.policy.model import Address, Decision
-from appliance.rpc.bulk import weigh
+from appliance.rpc.fair_queue import weigh
 from appliance.rpc.xmlrpc_client import CallFailedError
 from roswire.errors import EncodingError, ProtocolError
 from roswire.names import searched

@@ -3,6 +3,7 @@
 The Master API and the proxy endpoints are served in the same way, with different tables of calls.
 """
 
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 import structlog
@@ -15,8 +16,7 @@ from appliance.master.calls.multicall import LIMIT_FAULT, MULTICALL, PARSE_FAULT
 from appliance.master.endpoints.node_ports import AdvertisedAddresses
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.model import Address, Category
-from appliance.rpc.bulk import Bulk, weigh
-from appliance.rpc.fair_queue import Turns
+from appliance.rpc.fair_queue import Bulk, Turns, weigh
 from appliance.rpc.method_name import method_named
 from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import Handler, HttpRequest
@@ -33,6 +33,7 @@ class Pipeline:
     """Serve requests by a table of calls.
 
     Bodies and answers over `offload` bytes are parsed and written in threads. Hosts take turns for this (`bulk`).
+    Answers to other hosts wait for `before_answer`, if there is one.
     """
 
     execution: Execution
@@ -43,6 +44,7 @@ class Pipeline:
     offload: int
     bulk: Turns[Address]
     processor: ProcessorTime
+    before_answer: Callable[[], Awaitable[None]] | None = None
 
     def handler(self, table: Table, target: Incarnation | None = None, *, own: bool = False) -> Handler:
         """Return the handler of a listener with this table. `own`: the listener is for the appliance's own nodes."""
@@ -51,7 +53,10 @@ class Pipeline:
             await self.addresses.learn(request.peer)
             caller = Caller(request.peer, "", request.arrived, own=own, target=target)
             with Bulk(self.bulk, caller.peer.host, self.processor) as bulk:
-                return await self._serve(ServedRequest(table, caller, bulk), request.body)
+                answer = await self._serve(ServedRequest(table, caller, bulk), request.body)
+            if self.before_answer is not None and not own:
+                await self.before_answer()
+            return answer
 
         return handle
 

@@ -21,6 +21,7 @@ import structlog
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.host_sets import Network
 from appliance.policy.model import Address
+from appliance.policy.policy import Policy
 from appliance.quotas.pool import Pool, QuotaClass
 from appliance.quotas.table import NODE_PORTS
 from appliance.rpc.front import plain_address
@@ -37,7 +38,7 @@ class NodePorts:
     """The listening sockets of all incarnations.
 
     `keep(name, socket)` and `drop(name)` notify the supervisor. `host` is the address that RVMaster listens on.
-    `named_as(address)` returns the address or network by which the policy in force names a host.
+    `policy()` returns the policy in force, which names the owner of a port by an address or network.
     """
 
     def __init__(
@@ -47,7 +48,7 @@ class NodePorts:
         *,
         keep: Callable[[str, sockets.socket], None],
         drop: Callable[[str], None],
-        named_as: Callable[[Address], Network],
+        policy: Callable[[], Policy],
         relays: int = 1,
     ) -> None:
         self._each = 1 + relays
@@ -57,7 +58,7 @@ class NodePorts:
         self._range = ports
         self.unused = deque(ports)
         self._sockets: dict[str, sockets.socket] = {}
-        self._named_as = named_as
+        self._policy = policy
         self._owners: dict[int, tuple[Address, Network]] = {}  # each port's host and charged network
         self.taken = self._counted()
 
@@ -72,13 +73,15 @@ class NodePorts:
         whole = len(self._range)
         bounds = NODE_PORTS.bounds.sized(whole, whole * _TIMES_THE_REST // (_TIMES_THE_REST + 1))
         pool: Pool[Network] = Pool("ports", bounds, lambda _named: QuotaClass.REGISTERED)
-        self._owners = {port: (host, self._named_as(host)) for port, (host, _named) in self._owners.items()}
+        self._owners = {
+            port: (host, self._policy().named_as(host)) for port, (host, _named) in self._owners.items()
+        }
         for _host, named in self._owners.values():
             pool.charge(named)
         return pool
 
     def _own(self, ports: Iterable[int], host: Address) -> None:
-        named = self._named_as(host)
+        named = self._policy().named_as(host)
         for port in ports:
             self._owners[port] = host, named
             self.taken.charge(named)
@@ -88,7 +91,7 @@ class NodePorts:
 
         Raises `NoPortError`.
         """
-        named = self._named_as(host)
+        named = self._policy().named_as(host)
         held, left = self.taken.held(named), len(self.unused)
         if left and held >= _TIMES_THE_REST * left:
             who = named if named.num_addresses > 1 else host

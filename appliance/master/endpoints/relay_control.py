@@ -30,7 +30,7 @@ from appliance.master.graph.grants import Grants
 from appliance.master.graph.registry import Change, Incarnation, Kind, Life, RegistrationKey, Registry
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
-from appliance.policy.rate_limits import LimitScope, Rate
+from appliance.policy.rate_limits import NO_LIMIT, LimitScope, Rate
 from appliance.policy.rights import asks_to_call
 from appliance.rpc.xmlrpc_client import CallFailedError
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Resource
@@ -312,7 +312,7 @@ class RelayControl:
             registration.detail,
             _flow(policy.limit(LimitScope.PUBLISHER, resource, node.host)),
             _flow(together),
-            policy.counted_as(node.host) if together else "",
+            policy.counted_as(node.host) if together is not NO_LIMIT else "",
             _names(policy, node.host),
             not (node.own or policy.may_command(resource, node.host)),
         )

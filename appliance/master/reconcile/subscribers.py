@@ -20,7 +20,7 @@ from appliance.master.graph.grants import Grants
 from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.parameter_updates import settled, updates_of
 from appliance.master.graph.registry import Change, Incarnation, Kind, Life, RegistrationKey, Registry
-from appliance.rpc.bulk import weigh
+from appliance.rpc.fair_queue import weigh
 from appliance.specifications.allocation import TOPIC
 from appliance.store.state_file import PermissionRow
 from roswire.parameter_tree import Tree, standing_at

@@ -10,8 +10,7 @@ Invariants:
 from collections.abc import Callable
 from typing import Protocol
 
-from appliance.quotas.pool import QuotaClass
-from appliance.quotas.queue import Queue
+from appliance.quotas.pool import Queue, QuotaClass
 from appliance.relay.transport.memory import MemoryPool
 
 _FREE = 4096

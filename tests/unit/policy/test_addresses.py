@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from appliance.policy.host_sets import HostSets
 from appliance.policy.model import address_of
+from appliance.policy.policy_compiler import compile_policy
 
 
 @given(address=st.ip_addresses())
@@ -25,11 +26,21 @@ def test_an_invalid_address_is_refused(text: str) -> None:
             address_of(text)
 
 
-def test_hosts_that_are_named_alike() -> None:
+HOSTS = ("10.1.2.3", "10.1.9.9", "::ffff:10.1.2.3", "10.2.0.1", "10.2.0.2")
+
+
+def test_the_narrowest_network_names_a_host() -> None:
     table = HostSets()
-    table.network(ipaddress.ip_network("10.1.0.0/16"))
-    for _ in range(2):
-        assert table.alike(address_of("10.1.2.3")) == table.alike(address_of("10.1.9.9")) == "10.1.0.0/16"
-        assert table.alike(address_of("10.2.0.1")) != table.alike(address_of("10.2.0.2"))
-        assert table.alike(address_of("::ffff:10.1.2.3")) == "10.1.0.0/16"
-        assert (table.names(address_of("10.1.2.3")), table.names(address_of("10.2.0.1"))) == (True, False)
+    for text in ("10.1.0.0/16", "10.1.2.0/24"):
+        table.network(ipaddress.ip_network(text))
+    hosts = ("10.1.2.3", "10.1.9.9", "::ffff:10.1.2.3", "10.2.0.1")
+    assert [str(table.narrowest(address_of(host))) for host in hosts] == [
+        "10.1.2.0/24", "10.1.0.0/16", "10.1.2.0/24", "None",
+    ]  # fmt: skip
+
+
+def test_hosts_that_are_named_alike() -> None:
+    policy = compile_policy("[Nodes]\n/** = 10.1.0.0/16\ndefault = *\n", file="a.ini")
+    alike, names = ({host: ask(address_of(host)) for host in HOSTS} for ask in (policy.alike, policy.names))
+    assert list(alike.values()) == ["10.1.0.0/16", "10.1.0.0/16", "10.1.0.0/16", "10.2.0.1/32", "10.2.0.2/32"]
+    assert list(names.values()) == [True, True, True, False, False]

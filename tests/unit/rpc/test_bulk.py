@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from appliance.master.parameter_charges import measure
 from appliance.quotas.pool import QuotaClass
-from appliance.rpc.bulk import AT_ONCE, Bulk, LargeWrites, bulk_turns, weigh
+from appliance.rpc.fair_queue import AT_ONCE, Bulk, LargeWrites, bulk_turns, weigh
 from appliance.rpc.processor_time import ProcessorTime
 from roswire.xmlrpc import Value, build_response
 

@@ -4,8 +4,7 @@ from functools import partial
 
 import pytest
 
-from appliance.rpc.host_task import HostTask
-from appliance.rpc.processor_time import TURN_SECONDS, ProcessorTime
+from appliance.rpc.processor_time import TURN_SECONDS, HostTask, ProcessorTime
 
 pytestmark = pytest.mark.anyio
 

@@ -5,8 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from appliance.policy.model import Address
-from appliance.rpc.host_task import HostTask
-from appliance.rpc.processor_time import TURN_SECONDS, Line, ProcessorTime
+from appliance.rpc.processor_time import TURN_SECONDS, HostTask, Line, ProcessorTime
 
 pytestmark = pytest.mark.anyio
 

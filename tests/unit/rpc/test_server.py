@@ -6,10 +6,10 @@ import socket
 import pytest
 
 from appliance.quotas.pool import Bounds, QuotaClass
+from appliance.rpc.acceptor import first_for
 from appliance.rpc.connection_table import Stage
 from appliance.rpc.processor_time import TURN_SECONDS
 from appliance.rpc.server import HttpRequest, NoAnswerError
-from appliance.rpc.source_queues import first_for
 from tests.support.http_server import WAIT, Client, Server, Shares, post, serving, until
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 
 from appliance.policy.model import address_of
 from appliance.policy.policy_compiler import compile_policy
-from appliance.rpc.acceptor import BACKLOG
+from appliance.rpc.acceptor import BACKLOG, FIRST, SECOND, NamedFirst, Network, SourceQueues, first_for
 from appliance.rpc.server import listen
-from appliance.rpc.source_queues import FIRST, SECOND, NamedFirst, Network, SourceQueues, first_for
 from tests.support.classic_bpf import choose
 
 WAIT = 20.0

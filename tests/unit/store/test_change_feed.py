@@ -1,5 +1,5 @@
-from appliance.store.ahead import Encoded
 from appliance.store.change_feed import ChangeFeed
+from appliance.store.changes import Encoded
 
 
 def change(number: int, size: int = 10) -> Encoded:

@@ -10,7 +10,7 @@ import pytest
 
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.policy.model import address_of
-from appliance.store.ahead import Encoded, WriteAhead
+from appliance.store.changes import Encoded, WriteAhead
 from appliance.store.state_file import (
     LARGEST_CHANGE,
     IncarnationRow,

@@ -18,11 +18,20 @@ import msgspec
 import pytest
 
 from appliance.base import clock
-from appliance.store import ahead as ahead_module
+from appliance.store import changes as ahead_module
 from appliance.store import writer_thread
-from appliance.store.ahead import Encoded, WriteAhead, WriteAheadClosedError
 from appliance.store.change_feed import ChangeFeed
-from appliance.store.changes import Change, ChangeError, Delete, Put, Tables, joined
+from appliance.store.changes import (
+    Change,
+    ChangeError,
+    Delete,
+    Encoded,
+    Put,
+    Tables,
+    WriteAhead,
+    WriteAheadClosedError,
+    joined,
+)
 from appliance.store.writer_thread import Database, StoreError
 from tests.support.engines import ByHand, let_pass
 from tests.support.small_disk import small_disk

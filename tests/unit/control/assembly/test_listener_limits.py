@@ -42,7 +42,7 @@ async def test_an_idle_connection_is_closed_at_every_listener(tmp_path: Path, *,
         return b"!"
 
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        await listener_limits.open(listener, answer, guarded=guarded)
+        await listener_limits.open(listener_limits.server(listener.dup(), answer, guarded=guarded))
         table = listener_limits.connection_table if guarded else listener_limits.own_connection_table
         sweep = asyncio.get_running_loop().create_task(table.sweep())
         reader, writer = await asyncio.open_connection(*listener.getsockname())

@@ -18,6 +18,7 @@ from appliance.channel.admin import (
     PolicyRollback,
     PolicyWanted,
 )
+from appliance.control.assembly.current import Current
 from appliance.control.assembly.policies import Policies, RevisionChangedError
 from appliance.control.assembly.policy_gate import PolicyRefusedError
 from appliance.policy import judgement
@@ -64,7 +65,7 @@ class Appliance:
         store = StateStore(self.state, failed=fail, kind=InlineDatabase)
         self.records = Records()
         policies = Policies(
-            self.file, store, cast(Any, self.records), robot=(), hosts=hosts, blocks=blocks, holders=dict,
+            self.file, store, cast(Any, self.records), Current(), robot=(), hosts=hosts, blocks=blocks, holders=dict,
             approved=frozenset, live=live, changed=changed, carried_out=at_once, site_keys=site_keys,
         )  # fmt: skip
         policies.start(restarted=restarted)

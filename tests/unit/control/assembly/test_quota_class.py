@@ -3,11 +3,20 @@ from dataclasses import replace
 
 from appliance.audit.log.budget import Budget
 from appliance.base.actors import APPLIANCE, ROBOT, UNKNOWN
-from appliance.control.assembly.quota_class import HostQuotaClass, charged_to
+from appliance.control.assembly.current import Current
+from appliance.control.assembly.listener_limits import HostQuotaClass
+from appliance.control.assembly.robot import charged_to
+from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass
 
 NAMED, OTHER = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")
+
+
+def in_force(policy: Policy) -> Current[Policy]:
+    current = Current[Policy]()
+    current.set(policy)
+    return current
 
 
 def test_the_class_follows_reloads_and_registrations() -> None:
@@ -16,11 +25,12 @@ def test_the_class_follows_reloads_and_registrations() -> None:
         compile_policy("[Nodes]\n/a = 10.0.0.2\n", file="b.ini"),
     ]
     registered = dict[object, int]()
-    quota_class = HostQuotaClass(lambda: policies[0], lambda host: registered.get(host, 0))
+    current = in_force(policies[0])
+    quota_class = HostQuotaClass(current, lambda host: registered.get(host, 0))
     assert (quota_class(NAMED), quota_class(OTHER)) == (QuotaClass.NAMED, QuotaClass.UNKNOWN)
     registered[OTHER] = 1
     assert quota_class(OTHER) is QuotaClass.UNKNOWN  # in audit-only mode any host can register
-    policies.reverse()
+    current.set(policies[1])
     assert (quota_class(NAMED), quota_class(OTHER)) == (QuotaClass.UNKNOWN, QuotaClass.REGISTERED)
     registered.clear()
     assert quota_class(OTHER) is QuotaClass.NAMED
@@ -41,7 +51,7 @@ def test_a_blocked_host_is_unknown() -> None:
     policy = replace(
         compile_policy("[Nodes]\n/a = 10.0.0.1 10.0.0.2\n", file="a.ini"), blocks={NAMED: "blocked"}
     )
-    quota_class = HostQuotaClass(lambda: policy, lambda _host: 0)
+    quota_class = HostQuotaClass(in_force(policy), lambda _host: 0)
     assert (quota_class(NAMED), quota_class(OTHER)) == (QuotaClass.UNKNOWN, QuotaClass.NAMED)
     assert (quota_class.of_text("10.0.0.1"), charged_to(policy, "10.0.0.1")) == (QuotaClass.UNKNOWN, UNKNOWN)
 
@@ -50,14 +60,17 @@ def test_the_last_of_the_disk_is_for_named_hosts_also_after_a_restart() -> None:
     rules = "[Groups]\nocus = 10.2.0.0/24\n[Nodes]\n/a = 10.0.0.1 ocus\ndefault = *\n"
     policy = compile_policy(rules, file="a.ini", robot=[ipaddress.ip_address("172.17.0.1")])
     registered: dict[object, int] = {ipaddress.ip_address("10.0.0.66"): 1}
-    policies = [policy]
-    quota_class = HostQuotaClass(lambda: policies[0], lambda host: registered.get(host, 0))
+    current = Current[Policy]()
+    quota_class = HostQuotaClass(current, lambda host: registered.get(host, 0))
     budget = Budget(quota_class.of_text, kept_for=quota_class.has_reserve)
     budget.room(1)
+    assert budget.shut_out("127.0.0.1")
+    assert quota_class.of_text("10.0.0.67") is QuotaClass.NAMED
+    current.set(policy)
     hosts = ("172.17.0.1", "127.0.0.1", "10.0.0.1", "10.2.0.7", "10.0.0.66", "10.0.0.67", "")
     assert [not budget.shut_out(host) for host in hosts] == [True] * 4 + [False] * 3
-    policies[0] = compile_policy("[Nodes]\ndefault = *\n", file="b.ini", robot=policy.robot)
+    current.set(compile_policy("[Nodes]\ndefault = *\n", file="b.ini", robot=policy.robot))
     assert [not budget.shut_out(host) for host in hosts] == [True, True, False, False, True, False, False]
-    policies[0] = replace(policy, blocks={NAMED: "blocked", ipaddress.ip_address("172.17.0.1"): "blocked"})
+    current.set(replace(policy, blocks={NAMED: "blocked", ipaddress.ip_address("172.17.0.1"): "blocked"}))
     assert budget.shut_out("10.0.0.1")
     assert budget.shut_out("172.17.0.1")

@@ -12,6 +12,7 @@ from appliance.base.clock import using
 from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel.admin import PolicyReload
 from appliance.control.assembly import host_blocks
+from appliance.control.assembly.current import Current
 from appliance.control.assembly.policies import Policies
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.features.blocks import block_orders
@@ -75,7 +76,7 @@ class Control(ControlParts):
         self.blocks = host_blocks.BlockTable(self.state, clock)
         self.remotes: dict[str, str] = {}
         self.policies = Policies(
-            state / "policy.ini", self.state, cast(Any, self.records), robot=[ipaddress.ip_network(ROBOT)],
+            state / "policy.ini", self.state, cast(Any, self.records), Current(), robot=[ipaddress.ip_network(ROBOT)],
             hosts=dict, blocks=lambda: self.blocks.reasons, holders=dict, approved=frozenset, live=list,
             changed=self.changed, carried_out=at_once, site_keys=(),
         )  # fmt: skip

@@ -18,8 +18,7 @@ from appliance.features.standby.replication_frames import (
     SnapshotRows,
     Stored,
 )
-from appliance.store.ahead import Encoded, WriteAhead
-from appliance.store.changes import Change, Delete, Put
+from appliance.store.changes import Change, Delete, Encoded, Put, WriteAhead
 from appliance.store.state_file import SCHEMA as WHOLE_SCHEMA
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError

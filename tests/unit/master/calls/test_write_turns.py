@@ -3,7 +3,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from appliance.master.calls.call_order import KeyTurns
+from appliance.master.calls.call_execution import KeyTurns
 
 pytestmark = pytest.mark.anyio
 

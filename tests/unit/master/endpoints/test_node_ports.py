@@ -37,7 +37,7 @@ def places(
     relays: int = 1, first: int = FIRST, count: int = 8, drop: Callable[[str], None] = lambda _name: None
 ) -> NodePorts:
     return NodePorts(
-        "127.0.0.1", range(first, first + count), keep=lambda *_: None, drop=drop, named_as=NAMING.named_as,
+        "127.0.0.1", range(first, first + count), keep=lambda *_: None, drop=drop, policy=lambda: NAMING,
         relays=relays,
     )  # fmt: skip
 

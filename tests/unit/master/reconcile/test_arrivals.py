@@ -1,5 +1,4 @@
 import asyncio
-from ipaddress import ip_network
 from typing import Any, cast
 
 import pytest
@@ -10,6 +9,7 @@ from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
 from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.reconcile.arrivals import Arrivals
 from appliance.policy.model import Address
+from appliance.policy.policy_compiler import compile_policy
 from tests.support.control_parts import ControlParts
 
 pytestmark = pytest.mark.anyio
@@ -152,13 +152,16 @@ class Listening:
     def close(self) -> None: ...
 
 
+NAMING = compile_policy("", file="a.ini")
+
+
 async def world_with_ports(monkeypatch: pytest.MonkeyPatch) -> tuple[ControlParts, NodePorts]:
     """Return a world whose nodes have ports in a range for `_NODES` nodes."""
     monkeypatch.setattr(node_ports, "listen", Listening)
     world = await ControlParts.begun()
     places = NodePorts(
         "10.0.0.1", range(1, 1 + 2 * _NODES), keep=lambda *_: None, drop=lambda _: None,
-        named_as=ip_network,
+        policy=lambda: NAMING,
     )  # fmt: skip
     faces = ProxyEndpoints(
         world.registry, places, 9, lambda: cast(Any, lambda _node: None), lambda sock, _: cast(Any, sock)
