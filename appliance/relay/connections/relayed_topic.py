@@ -147,7 +147,6 @@ class RelayedTopic:
         self.upstream: Upstream | None = None
         self._grace = grace
         self._clock = clock
-        self._share = share
         self._sink = sink
         self.flow = PublicationRateLimit(share, limited)
         self.plain = Version()
@@ -161,8 +160,7 @@ class RelayedTopic:
         self._monitoring = _Monitoring()
         self._taps: tuple[Callable[[Batch], None], ...] = ()
         self._stream: MessageStream | None = None
-        self._fresh_until = clock() + (APPEARED if fresh else -1)
-        self._startup_replay: StartupReplay | None = None
+        self._startup_replay = StartupReplay(share, clock() + (APPEARED if fresh else -1))
         self._reported = True
 
     @property
@@ -221,7 +219,7 @@ class RelayedTopic:
             return None
         if self._served.masked:
             return None
-        if self._stream is not None or self._startup_replay is not None or self._served.undelivered:
+        if self._stream is not None or self._startup_replay.keeps or self._served.undelivered:
             return None
         call = None
         if self._monitoring.through is not None:
@@ -285,7 +283,8 @@ class RelayedTopic:
         self._end_stream()
         if self._sink is not None:
             self._stream = self._sink.open(self.topic, self.host, header)
-        self._listen()
+        alone = self._monitoring.wanted and not (self._latch.is_latching or self._waiting or self._served)
+        self._startup_replay.opened(self._clock(), alone=alone)
         if before is not None and _identity(before) != _identity(header):
             for member in self._served.row:
                 member.cut("the publisher returned with a different type")
@@ -307,7 +306,7 @@ class RelayedTopic:
         self._latch.forget()
         self.flow.forget()
         self._state = TopicState.LOST
-        self._forget_startup_replay()
+        self._startup_replay.forget()
         self._forget_header()
 
     def _end_stream(self) -> None:
@@ -400,10 +399,8 @@ class RelayedTopic:
             tap(batch)
         if self._latch.is_latching:
             self._latch.keep(batch)
-        if self._startup_replay is not None:
-            now = self._clock()
-            if self._startup_replay.over(now) or not self._startup_replay.add(batch, now):
-                self._forget_startup_replay()
+        if self._startup_replay.keeps:
+            self._startup_replay.add(batch, self._clock())
         if self._served.send(batch, divided=divided and not self._served.masked):
             self._pause_or_trim()
 
@@ -436,8 +433,7 @@ class RelayedTopic:
         waiting = self.flow.later(now)
         if waiting is not None:
             self._admit(waiting, now, divided=False)
-        if self._startup_replay is not None and self._startup_replay.over(now):
-            self._forget_startup_replay()
+        self._startup_replay.expire(now)
         if self._latch.batch is not None:
             for member in self._served.row:
                 if member.missed:
@@ -487,27 +483,10 @@ class RelayedTopic:
         elif self._latch.is_refused:
             if self.upstream is not None and self._latch.is_asked_again:
                 self.upstream.request_latched()
-        elif self._startup_replay is not None and not self._startup_replay.over(self._clock()):
-            for batch in self._startup_replay.give(member.caller_id):
+        elif self._startup_replay.keeps:
+            for batch in self._startup_replay.give(member.caller_id, self._clock()):
                 self._served.deliver(batch, member)
         self.relieve()
-
-    def _listen(self) -> None:
-        """Begin to keep the first messages of a new publisher if only monitors subscribe to it."""
-        now = self._clock()
-        if (
-            now <= self._fresh_until
-            and self._monitoring.wanted
-            and not self._latch.is_latching
-            and not (self._waiting or self._served)
-        ):
-            self._startup_replay = StartupReplay(self._share, now)
-        self._fresh_until = now - 1  # the next connection is not its first
-
-    def _forget_startup_replay(self) -> None:
-        if self._startup_replay is not None:
-            self._startup_replay.forget()
-            self._startup_replay = None
 
     def _forget_header(self) -> None:
         if self._state is TopicState.LOST and not self._served:

@@ -25,22 +25,35 @@ _BYTES = 1 << 20
 
 
 class StartupReplay:
-    """The first messages of one topic, kept from `began` on; times are seconds of the relay's clock."""
+    """The first messages of one topic, whose publisher is new until `fresh_until`, in seconds of the relay's clock."""
 
-    def __init__(self, share: HostMemory, began: float) -> None:
+    def __init__(self, share: HostMemory, fresh_until: float) -> None:
         self._share = share
-        self._until = began + APPEARED
+        self._fresh_until = fresh_until
+        self.keeps = False
+        """Whether messages are kept, as of the last call of a method with `now`."""
+        self._until = 0.0
         self._first: float | None = None
         self._batches: list[Batch] = []
         self._messages = 0
         self._bytes = 0
         self._given: set[str] = set()
 
-    def over(self, now: float) -> bool:
-        return now > self._until
+    def opened(self, now: float, *, alone: bool) -> None:
+        """Begin to keep messages if this is the first connection to a new publisher, and only monitors use it."""
+        self.keeps = alone and now <= self._fresh_until
+        self._fresh_until = now - 1  # the next connection is not its first
+        self._until = now + APPEARED
 
-    def add(self, batch: Batch, now: float) -> bool:
-        """Keep messages; return False if there are too many, they come too late, or memory is short."""
+    def expire(self, now: float) -> None:
+        if self.keeps and now > self._until:
+            self.forget()
+
+    def add(self, batch: Batch, now: float) -> None:
+        """Keep messages; forget all if there are too many, they come too late, or memory is short."""
+        self.expire(now)
+        if not self.keeps:
+            return
         if self._first is None:
             self._first, self._until = now, now + SECONDS
         self._messages += batch.messages
@@ -51,18 +64,20 @@ class StartupReplay:
             or self._bytes + size > _BYTES
             or self._share.refusal(size)
         ):
-            return False
+            self.forget()
+            return
         self._batches.append(Batch(batch.keep(), batch.messages, batch.last, owned=True))
         self._bytes += size
         self._share.add(size)
-        return True
 
-    def give(self, caller_id: str) -> list[Batch]:
+    def give(self, caller_id: str, now: float) -> list[Batch]:
         """Return the messages for a new subscriber, the oldest first."""
+        self.expire(now)
         again = caller_id in self._given
-        self._given.add(caller_id)
+        if self.keeps:
+            self._given.add(caller_id)
         return [] if again else self._batches
 
     def forget(self) -> None:
         self._share.add(-self._bytes)
-        self._batches, self._bytes = [], 0
+        self.keeps, self._batches, self._bytes = False, [], 0

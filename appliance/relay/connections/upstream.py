@@ -88,7 +88,6 @@ class PublisherConnection(Upstream):
         self._timer: LoopTimer | None = None  # of the state
         self._linger: LoopTimer | None = None
         self._attempt: _Attempt | None = None
-        self._header: dict[str, str] = {}
         self._reader: UpstreamReader | None = None
 
     def connect(self) -> None:
@@ -181,7 +180,7 @@ class PublisherConnection(Upstream):
         """
         if self._reader is not None:
             self._reader.disarm()
-            reason = self._objection(self._header)
+            reason = self._objection(self._reader.header)
             if reason:
                 self._object(reason)
         elif self._objected and self.state is UpstreamState.WAITING:
@@ -238,7 +237,6 @@ class PublisherConnection(Upstream):
 
     def _flow(self, header: dict[str, str], attempt: _Attempt) -> None:
         self._attempt = None
-        self._header = header
         self._objected = ""
         self._introductions.accepted()
         self._enter(UpstreamState.FLOWING)
@@ -248,7 +246,7 @@ class PublisherConnection(Upstream):
             self._topic,
             attempt.stream.take(),
             payer=attempt.payer,
-            header_size=size_of(header),
+            header=header,
             lost=self._lose,
         )
         self._topic.upstream_opened(header)

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from enum import Enum, auto
 
 from appliance.channel.messages.relay_link import Violation
+from appliance.relay.connections.headers import size_of
 from appliance.relay.connections.relayed_topic import RelayedTopic
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import READ, LoopTimer
@@ -32,7 +33,7 @@ class _State(Enum):
 
 
 class UpstreamReader:
-    """The open connection to a publisher, behind its header of `header_size` bytes. `lost` is called once.
+    """The open connection to a publisher, behind its `header`. `lost` is called once.
 
     `since`: when the connection opened.
     """
@@ -44,10 +45,11 @@ class UpstreamReader:
         sock: socket.socket,
         *,
         payer: str,
-        header_size: int,
+        header: dict[str, str],
         lost: Lost,
     ) -> None:
         memory = context.memory.frames.of(topic.host)
+        self.header = header
         self.since = context.loop.clock()
         self._context = context
         self._loop = context.loop
@@ -65,8 +67,8 @@ class UpstreamReader:
         self._rest: Batch | None = None
         self._early = b""  # data that arrived with the header
         self._held = HeldBytes(memory)
-        self._header = HeldBytes(memory)
-        self._header.set(header_size)
+        self._held_header = HeldBytes(memory)
+        self._held_header.set(size_of(header))
         self._watch()
 
     def start(self, early: bytes) -> None:
@@ -112,7 +114,7 @@ class UpstreamReader:
         self._loop.discard(self._socket)
         self._rest, self._early = None, b""
         self._held.set(0)
-        self._header.set(0)
+        self._held_header.set(0)
         self._pumped.disarm()
         self._receiver.abandon()
 
