@@ -22,7 +22,7 @@ from appliance.relay.connections.monitor_calls import OwnAnswer, ServiceCalls
 from appliance.relay.connections.named_subscribers import ActionServers
 from appliance.relay.connections.own_topic import OwnTopicPublisher
 from appliance.relay.connections.pending_connections import PendingConnections
-from appliance.relay.connections.relayed_topic import RelayedTopic, Upstream
+from appliance.relay.connections.relayed_topic import RelayedTopic
 from appliance.relay.connections.service_client import ServiceClient, ServiceTraffic
 from appliance.relay.connections.subscriber import Subscriber
 from appliance.relay.connections.upstream import PublisherConnection
@@ -70,7 +70,7 @@ class DataPlane:
             turned_away=lambda key, host, reason: self._reporter.refused(key, NOTHING, host, "", reason),
             make_room=self._make_connection_room,
         )
-        self.topics: dict[tuple[str, str], tuple[RelayedTopic, Upstream]] = {}
+        self.topics: dict[tuple[str, str], RelayedTopic] = {}
         self._servers = ActionServers()
         self._own: dict[str, OwnTopicPublisher] = {}
         self._own_headers: dict[str, dict[str, str]] = {}
@@ -137,9 +137,9 @@ class DataPlane:
     def close(self) -> None:
         self.interceptor.close()
         self.ports.close_all()
-        for topic, publisher in self.topics.values():
+        for topic in self.topics.values():
             topic.cut_all("the relay ends")
-            publisher.close()
+            topic.upstream.close()
         for client in list(self.clients):
             client.cut("the relay ends")
         for incoming in self.incoming_connections:
@@ -156,7 +156,7 @@ class DataPlane:
         elif isinstance(message, messages.PublicationPlaced):
             self._place_topic(message.key, message.topic)
             self._limit_topic(message)
-            self.topics[message.key, message.topic][1].silence(silent=message.silent)
+            self.topics[message.key, message.topic].upstream.silence(silent=message.silent)
         elif isinstance(message, messages.GrantInstalled):
             self._limit_subscriber(message)
         if self.waiting and message.key in self.waiting:
@@ -166,8 +166,8 @@ class DataPlane:
         for message in self._table.end(epoch):
             self._withdrawn(message)
         self._reporter.repeat_connections()
-        for topic, publisher in self.topics.values():
-            publisher.ask_again()
+        for topic in self.topics.values():
+            topic.upstream.ask_again()
             topic.repeat()
         self.interceptor.observations.repeat()
 
@@ -230,13 +230,11 @@ class DataPlane:
             over=self._loop.over,
             servers=self._servers.of,
         )
-        publisher: Upstream
         if node is not None and node.monitors:
-            publisher = self._own[topic] = OwnTopicPublisher(relayed, lambda: self._header_of(topic))
-            relayed.upstream = publisher
+            relayed.upstream = self._own[topic] = OwnTopicPublisher(relayed, lambda: self._header_of(topic))
             relayed.monitor(None, wanted=True)
         else:
-            publisher = PublisherConnection(
+            relayed.upstream = PublisherConnection(
                 self._context,
                 relayed,
                 claims=lambda: self._claims(relayed),
@@ -244,12 +242,11 @@ class DataPlane:
                 unsettled=self._not_all_is_stated,
                 objection=lambda header: self.interceptor.objection(topic, header),
             )
-            relayed.upstream = publisher
             self._attach_monitors(relayed)
         relayed.withhold(self.interceptor.mask(topic))
-        self.topics[key, topic] = (relayed, publisher)
+        self.topics[key, topic] = relayed
         waiting = self._servers.add(key, topic, name)
-        for other, _publisher in self.topics.values() if waiting else ():
+        for other in self.topics.values() if waiting else ():
             if other.topic in waiting:
                 other.announce()
 
@@ -267,7 +264,7 @@ class DataPlane:
         return "" if publication is None else publication.type
 
     def _limit_topic(self, message: messages.PublicationPlaced) -> None:
-        relayed, _publisher = self.topics[message.key, message.topic]
+        relayed = self.topics[message.key, message.topic]
         own = self._flows.of(message.limit, message.topic, relayed.host, holder=message.key)
         together = self._flows.of(message.together, message.topic, holder=message.counted_as)
         relayed.limit(own, together)
@@ -284,7 +281,7 @@ class DataPlane:
         latched, share = self.memory.latched, self.memory.latched.of(host)
         while share.refusal(size):
             greatest, held = max(latched.holders(), key=lambda holder: holder[1], default=("", 0))
-            of_greatest = (topic for topic, _publisher in self.topics.values() if topic.host == greatest)
+            of_greatest = (topic for topic in self.topics.values() if topic.host == greatest)
             largest = max(of_greatest, key=lambda topic: topic.latched, default=None)
             if held <= share.used + size or largest is None or not largest.latched:
                 return
@@ -306,10 +303,10 @@ class DataPlane:
     def _monitors_changed(self, topics: frozenset[str] | None) -> None:
         monitors = self.interceptor.monitors
         self._context.scratch.move(None if monitors is None else monitors.area)
-        for relayed, publisher in list(self.topics.values()):
-            publisher.recheck()
+        for relayed in list(self.topics.values()):
+            relayed.upstream.recheck()
             relayed.withhold(self.interceptor.mask(relayed.topic))
-            if isinstance(publisher, PublisherConnection):
+            if isinstance(relayed.upstream, PublisherConnection):
                 self._attach_monitors(relayed)
         for client in list(self.clients):
             client.recheck()
@@ -322,10 +319,10 @@ class DataPlane:
 
         Ask only on these topics (None: all): monitors of other topics would judge the same message twice.
         """
-        for relayed, publisher in list(self.topics.values()):
+        for relayed in list(self.topics.values()):
             concerned = topics is None or relayed.topic in topics
             if concerned and relayed.lacks_latched:
-                publisher.request_latched()
+                relayed.upstream.request_latched()
 
     def _own_topic(self, message: messages.OwnHeaderStated | messages.OwnPublished) -> None:
         if isinstance(message, messages.OwnPublished):
@@ -347,13 +344,13 @@ class DataPlane:
             publisher.publish(data)
 
     def _remove_topic(self, key: str, topic: str, reason: str) -> None:
-        if (key, topic) not in self.topics:
+        relayed = self.topics.pop((key, topic), None)
+        if relayed is None:
             return
-        relayed, publisher = self.topics.pop((key, topic))
         self._servers.remove(key, topic)
-        if self._own.get(topic) is publisher:
+        if self._own.get(topic) is relayed.upstream:
             del self._own[topic]
-        publisher.close()  # its remaining subscribers get nothing more
+        relayed.upstream.close()  # its remaining subscribers get nothing more
         self.interceptor.invalidate_prepared()  # its pipeline's counts are collected once more, and then freed
         self._cut_members(relayed, reason)
 
@@ -373,13 +370,13 @@ class DataPlane:
         if placed is None:
             return
         if isinstance(message, messages.UpstreamFound):
-            placed[1].found(message.host, message.port)
+            placed.upstream.found(message.host, message.port)
         else:
-            placed[1].refused()
+            placed.upstream.refused()
 
     def _tap(self, message: messages.LookWanted | messages.LookEnded) -> None:
         if isinstance(message, messages.LookWanted):
-            topics = [topic for topic, _publisher in self.topics.values() if topic.topic == message.topic]
+            topics = [topic for topic in self.topics.values() if topic.topic == message.topic]
             self._topic_taps.begin(message, topics)
         else:
             self._topic_taps.end(message.number)
@@ -417,7 +414,7 @@ class DataPlane:
 
     def _served(self) -> Iterator[Subscriber | ServiceClient]:
         yield from list(self.clients)
-        for relayed, _publisher in self.topics.values():
+        for relayed in self.topics.values():
             yield from [member for member in relayed.members if isinstance(member, Subscriber)]
 
     def _incoming_failed(self, incoming: IncomingConnection, reason: str) -> None:
@@ -514,7 +511,7 @@ class DataPlane:
     def _subscribe(
         self, incoming: IncomingConnection, sock: socket.socket, fields: Mapping[str, str]
     ) -> None:
-        relayed, _publisher = self.topics[incoming.key, fields["topic"]]
+        relayed = self.topics[incoming.key, fields["topic"]]
         refuse, ended = self._peer_refused, self._peer_ended
         subscriber = Subscriber(
             self._context, sock, relayed, incoming.host, fields, refuse=refuse, ended=ended
@@ -558,7 +555,7 @@ class DataPlane:
             self._pending.enter(farewell, host)
 
     def _rows(self) -> list[messages.TopicTraffic]:
-        rows = [row for topic, _publisher in self.topics.values() if (row := topic.traffic()) is not None]
+        rows = [row for topic in self.topics.values() if (row := topic.traffic()) is not None]
         rows += [
             row
             for (key, name), service in self._services.items()
@@ -583,9 +580,9 @@ class DataPlane:
         self._loop.after(self._limits.report_every, self._tick)
 
     def _tidy(self) -> Iterator[None]:
-        for number, (topic, publisher) in enumerate(list(self.topics.values())):
+        for number, topic in enumerate(list(self.topics.values())):
             topic.tidy()
-            publisher.check_stall()
+            topic.upstream.check_stall()
             if not number % _TIDIED:
                 yield
         for number, client in enumerate(list(self.clients)):

@@ -144,7 +144,7 @@ class RelayedTopic:
         self.topic = topic
         self.host = host
         self.name = name
-        self.upstream: Upstream | None = None
+        self.upstream = Upstream()
         self._grace = grace
         self._clock = clock
         self._sink = sink
@@ -173,8 +173,7 @@ class RelayedTopic:
             self._waiting[member] = None
         else:
             self._serve(member, self._header)
-        if self.upstream is not None:
-            self.upstream.connect()
+        self.upstream.connect()
 
     def leave(self, member: TopicSubscriber) -> None:
         self._waiting.pop(member, None)
@@ -199,8 +198,7 @@ class RelayedTopic:
         self.differs()
         if latched and self._latch.batch is not None:
             tap(self._latch.batch)
-        if self.upstream is not None:
-            self.upstream.connect()
+        self.upstream.connect()
 
     def untap(self, tap: Callable[[Batch], None]) -> None:
         self._taps = tuple(other for other in self._taps if other != tap)
@@ -242,7 +240,7 @@ class RelayedTopic:
         return bool(self._waiting or self._served or self._monitoring.wanted or self._taps)
 
     def _spare_unwanted(self) -> None:
-        if not self._is_wanted and self.upstream is not None:
+        if not self._is_wanted:
             self.upstream.release()
 
     def monitor(
@@ -259,7 +257,7 @@ class RelayedTopic:
         """
         before, self._monitoring = self._monitoring, _Monitoring(through, call, wanted)
         self.differs()
-        if wanted == before.wanted or self.upstream is None:
+        if wanted == before.wanted:
             return
         if wanted:
             self.upstream.connect()
@@ -292,7 +290,7 @@ class RelayedTopic:
         for member in waiting:
             self._serve(member, header)
         self.announce()
-        if self._is_wanted and self.upstream is not None:
+        if self._is_wanted:
             self.upstream.connect()
 
     @property
@@ -416,8 +414,7 @@ class RelayedTopic:
     def relieve(self) -> None:
         if self._state is TopicState.PAUSED:
             self._state = TopicState.OPEN
-            if self.upstream is not None:
-                self.upstream.resume()
+            self.upstream.resume()
 
     def cut_all(self, reason: str) -> None:
         self._end_stream()
@@ -481,7 +478,7 @@ class RelayedTopic:
         if self._latch.batch is not None:
             self._served.deliver(self._latch.batch, member)
         elif self._latch.is_refused:
-            if self.upstream is not None and self._latch.is_asked_again:
+            if self._latch.is_asked_again:
                 self.upstream.request_latched()
         elif self._startup_replay.keeps:
             for batch in self._startup_replay.give(member.caller_id, self._clock()):
@@ -493,7 +490,7 @@ class RelayedTopic:
             self._state, self._header = TopicState.UNKNOWN, None
 
     def announce(self) -> None:
-        if self.upstream is not None and self._header is not None:
+        if self._header is not None:
             self.upstream.announce(self._names, self._header.get("type", ""))
 
     def _names(self) -> frozenset[str]:
@@ -508,7 +505,7 @@ class RelayedTopic:
     def _pause_or_trim(self) -> None:
         """Pause the publisher if all subscribers have just fallen behind; else trim the full queues."""
         since = [member.behind_since for member in self._served.row if member.behind_since is not None]
-        if since and len(since) == len(self._served) and self.upstream is not None:
+        if since and len(since) == len(self._served):
             left = max(since) + self._grace - self._clock()
             if left > 0:
                 if self._state is TopicState.OPEN:

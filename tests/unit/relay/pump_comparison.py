@@ -90,7 +90,7 @@ class ComparedRelay(Monitored):
         self.counted: Counter[tuple[str, str]] = Counter()
         if not pumped:
             for topic in _TOPICS:
-                self.engine.topics["k", topic][0].tap(_nothing, latched=False)
+                self.engine.topics["k", topic].tap(_nothing, latched=False)
 
     def until(self, condition: Callable[[], Any], seconds: float = LIMIT) -> Any:
         """The method of `World` waits for events in each turn."""
@@ -119,7 +119,7 @@ class ComparedRelay(Monitored):
         self.subscribers[name] = peer
 
     def arrived(self, topic: str) -> bool:
-        return self.engine.topics["k", topic][0].counters.following - 1 == self.expected[topic]
+        return self.engine.topics["k", topic].counters.following - 1 == self.expected[topic]
 
     def take_all(self) -> None:
         self.until(lambda: all(map(self.arrived, _TOPICS)))
@@ -151,7 +151,7 @@ class ComparedRelay(Monitored):
         self.loop.turn(0)
         self.collect()
         for topic in _TOPICS:
-            row = self.engine.topics["k", topic][0].traffic()
+            row = self.engine.topics["k", topic].traffic()
             if row is not None:
                 self._count(row)
         interceptor = self.engine.interceptor
@@ -277,7 +277,7 @@ class PumpComparison:
     def _served(self, side: ComparedRelay, topic: str) -> None:
         """Subscribers may have left."""
         there = [*self._slow.values(), *self._fast.values()].count(topic)
-        side.until(lambda: len(side.engine.topics["k", topic][0].members) == there)
+        side.until(lambda: len(side.engine.topics["k", topic].members) == there)
 
     def _switch(self) -> None:
         name, on = (

@@ -494,7 +494,7 @@ def test_a_subscriber_costs_the_same_among_thousands(served: bool) -> None:
         story = Story()
         if served:
             story.topic.upstream_opened(HEADER)
-        story.topic.upstream = None  # the topic lists its served subscribers once in a turn of the loop
+        story.topic.upstream = Upstream()  # the topic lists its served subscribers once in a turn of the loop
         members = [LeavingMember() for _ in range(many)]
 
         def come_and_go() -> None:
