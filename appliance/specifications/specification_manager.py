@@ -411,7 +411,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
         A monitor that returns gets the switch that it had when it was removed. Raises `SpecificationsRefusedError`.
 
-        The rollback of an unconfirmed change must succeed, so there a file with an error does nothing, as after a start.
+        The rollback of an unconfirmed change must succeed: there a file with an error does nothing, as after a start.
         """
         check = self._as_at_start if who == UNCONFIRMED else self._strictly
         async with self._changing(request.expected):

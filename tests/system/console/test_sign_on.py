@@ -107,7 +107,9 @@ def test_a_group_of_the_provider_opens_console_and_door_until_it_is_taken_away(
         [client] = eventually(lambda: appliance.row("door", "list")["clients"], appliance.story)
         assert client["who"] == "sso:alice"
         refused = signed_in("mallory")
-        expect(refused.get_by_text("mallory has no role here: the claim groups has strangers")).to_be_visible()
+        expect(
+            refused.get_by_text("mallory has no role here: the claim groups has strangers")
+        ).to_be_visible()
     provider.rename_group("crew", "staff")
     expect(page.locator("[data-role]")).to_have_text("operator")  # until the next sign-on
     with provider.running():

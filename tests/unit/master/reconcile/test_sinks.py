@@ -15,8 +15,8 @@ from appliance.channel import messages
 from appliance.master.endpoints.delivery import NodeCall
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.master.reconcile.sinks import restore
-from appliance.store.ahead import Encoded, WriteAhead
 from appliance.store.changes import Change as StoredChange
+from appliance.store.changes import Encoded, WriteAhead
 from appliance.store.state_file import PermissionRow, StateStore
 from roswire.xmlrpc import Value
 from tests.support import autojump
