@@ -3,11 +3,13 @@
 1. A signature is stored only if it is valid for the checkpoint's text and made with the pinned key.
 2. The key of the first valid signature is pinned in `<log>.pub` (PEM); the program never replaces it.
 3. While the signer is not in service, checkpoints stay unsigned. Their signatures are requested later (`ask`), oldest
-   first, a limited number at a time.
+   first, a limited number at a time. The signer never signs a checkpoint that precedes one that it signed, so each
+   request says whether it is the oldest: the first one of a new signer must be.
 """
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
@@ -17,9 +19,15 @@ from appliance.audit.log.log_writer import ChainWriter
 from appliance.base.atomic_files import write_whole
 from appliance.base.input_files import read_given
 
-Signer = Callable[[int, bytes], None]
 RemovalSigner = Callable[[int, bytes, bytes], None]
 ASKED_AT_ONCE = 64
+
+
+class Signer(Protocol):
+    """Requests signatures of checkpoints; the log calls it on its own thread."""
+
+    def __call__(self, number: int, text: bytes, *, oldest: bool) -> None:
+        """Request the signature of a checkpoint; it is the `oldest` if all earlier ones are signed."""
 
 
 class KeyUnreadableError(Exception):
@@ -89,8 +97,9 @@ class Signatures:
     def _ask(self, number: int, text: bytes) -> None:
         if self._signer is None:
             return
+        oldest = not self._asked
         self._asked.add(number)
-        self._signer(number, text)
+        self._signer(number, text, oldest=oldest)
 
     def keep(self, writer: ChainWriter, number: int, signature: bytes, public_key: bytes) -> str | None:
         """Store a valid signature and pin the first key; return the reason if the signature is invalid."""

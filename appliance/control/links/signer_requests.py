@@ -1,11 +1,13 @@
 """Send requests to the signer: sign checkpoints of the audit log, approve removals from the log, make certificates.
 
-Missing signatures are requested again whenever a signer process starts.
+Missing signatures are requested again whenever a signer process starts. Until then a new signer gets none: it would
+sign the present checkpoint, and then refuse the earlier ones for ever.
 """
 
 import asyncio
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from appliance.audit.log.log import AuditLog
@@ -46,19 +48,24 @@ class SignerRequests:
         """Set with each signature of a checkpoint, after the log got it."""
         self._audit = audit
         self._loop = asyncio.get_running_loop()
+        self._in_order = False  # whether the present signer has got the oldest request
 
-    def want(self, number: int, text: bytes) -> None:
+    def want(self, number: int, text: bytes, *, oldest: bool) -> None:
         """Request the signature of a checkpoint. The log calls this method on its own thread."""
-        self._ask(messages.SignatureWanted(number, text))
+        wanted = messages.SignatureWanted(number, text)
+        self._loop.call_soon_threadsafe(partial(self._want, wanted, oldest=oldest))
+
+    def _want(self, message: messages.SignatureWanted, *, oldest: bool) -> None:
+        if oldest or self._in_order:
+            self._in_order = self.link.send(message)
 
     def want_removal(self, number: int, checkpoint: bytes, newest: bytes) -> None:
         """Request approval to remove the records up to a checkpoint. The log calls this method on its own thread."""
-        self._ask(messages.RemovalWanted(number, checkpoint, newest))
-
-    def _ask(self, message: messages.Message) -> None:
+        message = messages.RemovalWanted(number, checkpoint, newest)
         self._loop.call_soon_threadsafe(self.link.send, message)
 
     def attach(self, channel: Channel) -> None:
+        self._in_order = False
         self.link.attach(channel)
         self._audit().request_signatures()
 

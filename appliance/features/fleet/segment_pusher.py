@@ -162,6 +162,11 @@ class SegmentPusher:
         summary = self._write(file, number)
         if summary is None:
             self._look(position)
+            if _is_passed_over(self.log, number):
+                raise LogUnreadableError(
+                    f"{self.log}: checkpoint {number} is not signed, but later ones are: run rosrv audit verify;"
+                    " collecting continues when retention has removed its records"
+                )
             return False
         path = f"v1/logs/{log}/segments/{number}/{summary.name}"
         try:
@@ -272,6 +277,12 @@ def _sequence_of(log: Path, number: int, hashes: list[str]) -> int | None:
     found = signed_checkpoints(log, number - 1, 1) if number else []
     same = found and found[0].number == number and checkpoint_hash(found[0].text()) in hashes
     return found[0].sequence if same else None
+
+
+def _is_passed_over(log: Path, number: int) -> bool:
+    """Return whether this checkpoint is not signed, but a later one is, so that it never will be."""
+    signed = signed_checkpoints(log, number - 1, 1)
+    return bool(signed) and signed[0].number > number and next_segment(log, number - 1) == number
 
 
 def _waiting(log: Path, sequence: int) -> tuple[int, int]:

@@ -200,7 +200,7 @@ class FleetRobot:
         except httpx.TransportError:
             return False
 
-    def _sign(self, number: int, text: bytes) -> None:
+    def _sign(self, number: int, text: bytes, *, oldest: bool) -> None:
         log = getattr(self, "log", None)
         if log is not None:
             log.signed(number, self.key.sign(text), self.public)

@@ -71,7 +71,7 @@ def make_log(path: Path, key: Ed25519PrivateKey, notary: Notary) -> Iterator[Mak
     made: list[AuditLog] = []
     public = key.public_key().public_bytes_raw()
 
-    def sign(number: int, text: bytes) -> None:
+    def sign(number: int, text: bytes, *, oldest: bool = True) -> None:
         if logs:  # requests made by the constructor are repeated by `request_signatures`
             notary.sign(text)
             logs[-1].signed(number, key.sign(text), public)

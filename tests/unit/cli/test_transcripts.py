@@ -40,7 +40,7 @@ def write_log(signed: str | None = None, *, below: list[str]) -> None:
     log = open_log(
         file,
         checkpoint_every=10 if signed else 1000,
-        signer=lambda number, text: (
+        signer=lambda number, text, **_: (
             logs[0].signed(number, key.sign(text), public) if signed and logs else None
         ),
     )

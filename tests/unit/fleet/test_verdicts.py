@@ -78,7 +78,7 @@ def made(folder: Path, seed: int) -> Site:
     key = Ed25519PrivateKey.from_private_bytes(bytes([seed]) * 32)
     (folder / "memory").mkdir(parents=True)
     signer, asked, path = CheckpointMemory(folder / "memory", clock.wall_ns), [], folder / "audit.db"
-    log = AuditLog(path, drive=ByHand, checkpoint_every=_EVERY, signer=lambda *one: asked.append(one))
+    log = AuditLog(path, drive=ByHand, checkpoint_every=_EVERY, signer=lambda *one, **_: asked.append(one))
 
     def add(count: int, **fields: Any) -> None:
         for number in range(count):

@@ -191,7 +191,7 @@ def test_log_and_signer_together(signer: SignerProcess, tmp_path: Path) -> None:
     log = open_log(
         path,
         checkpoint_every=10,
-        signer=lambda number, text: link[0].send(SignatureWanted(number, text)) if link else None,
+        signer=lambda number, text, **_: link[0].send(SignatureWanted(number, text)) if link else None,
     )
     for number in range(100):
         log.record(decision(log, number))

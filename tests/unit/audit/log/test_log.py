@@ -461,7 +461,7 @@ def test_a_signature_can_be_requested_at_once(make_log: MakeLog, path: Path) -> 
 
 def test_a_refused_signature_is_reported(make_log: MakeLog) -> None:
     asked: list[int] = []
-    log = make_log(checkpoint_seconds=3600, signer=lambda number, _text: asked.append(number))
+    log = make_log(checkpoint_seconds=3600, signer=lambda number, _text, **_: asked.append(number))
     log.record(decision(log))
 
     async def refused() -> str | None:
@@ -477,7 +477,7 @@ def test_a_refused_signature_is_reported(make_log: MakeLog) -> None:
 
 def test_abandoned_waits_leave_no_memory(make_log: MakeLog) -> None:
     asked: list[int] = []
-    log = make_log(checkpoint_seconds=3600, signer=lambda number, _text: asked.append(number))
+    log = make_log(checkpoint_seconds=3600, signer=lambda number, _text, **_: asked.append(number))
 
     async def give_up() -> None:
         for number in range(1, 6):

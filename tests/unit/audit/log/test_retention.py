@@ -207,12 +207,12 @@ def test_a_flood_of_denials_leaves_those_of_other_hosts(time: VirtualClock) -> N
 @pytest.mark.nightly
 def test_unsigned_records_stay(make_log: MakeLog, path: Path) -> None:
     old = itertools.count(clock.wall_ns() - 7 * _DAY, 1000)
-    log = make_log(checkpoint_every=100, clock=lambda: next(old), signer=lambda number, text: None)
+    log = make_log(checkpoint_every=100, clock=lambda: next(old), signer=lambda number, text, **_: None)
     for number in range(1000):
         log.record(decision(log, number, time=next(old)))
     settle(log)
     log.close()
-    log = make_log(retention=Retention(days=1), signer=lambda number, text: None)
+    log = make_log(retention=Retention(days=1), signer=lambda number, text, **_: None)
     log.record(decision(log))
     settle(log)
     log.close()

@@ -69,7 +69,7 @@ def test_a_first_signature_during_the_verification_has_its_key(
 ) -> None:
     """The key is read after the log, because it is pinned before its first signature is stored."""
     asked: list[tuple[int, bytes]] = []
-    log = AuditLog(path, drive=ByHand, checkpoint_every=5, signer=lambda *one: asked.append(one))
+    log = AuditLog(path, drive=ByHand, checkpoint_every=5, signer=lambda *one, **_: asked.append(one))
     for number in range(10):
         log.record(decision(log, number))
     assert settle(log) is None

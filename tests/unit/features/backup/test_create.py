@@ -36,7 +36,7 @@ def state(tmp_path: Path) -> Path:
     key = Ed25519PrivateKey.generate()
     memory = CheckpointMemory(state / "signer", wall_ns)
 
-    def sign(number: int, text: bytes) -> None:
+    def sign(number: int, text: bytes, *, oldest: bool = True) -> None:
         memory.approve(text)
         logs[0].signed(number, key.sign(text), key.public_key().public_bytes_raw())
 

@@ -200,6 +200,20 @@ def test_a_replaced_log_counts_from_its_beginning(collector: Collector, make: Ma
     assert pusher.progress.sequence == 0
 
 
+def test_a_checkpoint_that_is_never_signed_is_reported(collector: Collector, make: Make, path: Path) -> None:
+    with closing(sqlite3.connect(path)) as log, log:
+        log.execute("UPDATE checkpoint SET signature = NULL WHERE number = 2")
+    pusher = make()
+    assert pusher.step() == 0
+    assert pusher.step() > 0
+    assert collector.pushed == [1]
+    assert "checkpoint 2 is not signed, but later ones are" in pusher.progress.trouble
+    with closing(sqlite3.connect(path)) as log, log:
+        log.execute("UPDATE checkpoint SET signature = NULL WHERE number > 2")
+    assert pusher.step() > 0
+    assert pusher.progress.trouble == ""
+
+
 def test_a_robot_without_records_is_present(collector: Collector, make: Make) -> None:
     pusher = make()
     collector.changes = {"segment": "0" * 64}
