@@ -25,7 +25,7 @@ from roswire.message_text import (
 )
 
 MAX_DEPTH = 64
-"""Levels of nested messages."""
+"""The most levels of nested messages."""
 
 _FILE = re.compile(r"([A-Za-z][A-Za-z0-9_]*+)/(?:(msg|srv)/)?([A-Za-z][A-Za-z0-9_]*+)\.(msg|srv)\Z")
 _TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*+/[A-Za-z][A-Za-z0-9_]*+\Z")
@@ -35,7 +35,7 @@ _Answer = TypeVar("_Answer")
 
 
 class Definitions:
-    """A set of definitions never changes."""
+    """A set of definitions, which never changes."""
 
     def __init__(
         self,
@@ -52,7 +52,8 @@ class Definitions:
 
     @classmethod
     def from_files(cls, files: Mapping[str, str]) -> Self:
-        """`files` maps names (`pkg/T.msg`, `pkg/msg/T.msg`, `pkg/T.srv` or `pkg/srv/T.srv`) to texts.
+        """Return the definitions in files; `files` maps names (`pkg/T.msg`, `pkg/msg/T.msg`, `pkg/T.srv` or
+        `pkg/srv/T.srv`) to texts.
 
         Raises `DefinitionError` with the file and line.
         """
@@ -73,7 +74,7 @@ class Definitions:
 
     @classmethod
     def from_full_text(cls, name: str, text: str) -> Self:
-        """The text, in the form used by connection headers, must also define all nested types.
+        """Return the definitions in a text that, as in connection headers, also defines all nested types.
 
         Raises `DefinitionError`.
         """
@@ -89,12 +90,12 @@ class Definitions:
         return cls(messages)
 
     def extended(self, other: "Definitions") -> "Definitions":
-        """If both define a type, the definition of `other` is used."""
+        """Return the definitions of both; if both define a type, that of `other` is used."""
         return Definitions(self._messages | other._messages, self._services | other._services)
 
     @property
     def message_types(self) -> list[str]:
-        """Requests and responses are included."""
+        """Return the names of all message types, with requests and responses."""
         return sorted(self._messages)
 
     @property
@@ -102,11 +103,11 @@ class Definitions:
         return sorted(self._services)
 
     def message(self, name: str) -> MessageDefinition:
-        """Raises `DefinitionError` with similar names."""
+        """Return a message type. Raises `DefinitionError` with similar names."""
         return _lookup(name, self._messages, "message")
 
     def service(self, name: str) -> ServiceDefinition:
-        """Raises `DefinitionError` with similar names."""
+        """Return a service type. Raises `DefinitionError` with similar names."""
         return _lookup(name, self._services, "service")
 
     def md5sum(self, name: str) -> str:
@@ -117,7 +118,7 @@ class Definitions:
         return _fingerprint(self._md5_text(service.request, ()) + self._md5_text(service.response, ()))
 
     def full_text(self, name: str) -> str:
-        """The text has all nested types, in the form used by connection headers."""
+        """Return the text of a type with all nested types, as in connection headers."""
         self.md5sum(name)  # raises if a type is missing or contains itself
         order: dict[str, MessageDefinition] = {}
         waiting = [name]
@@ -131,7 +132,7 @@ class Definitions:
         return "\n".join([own.text, *(f"{_RULE}\nMSG: {part.name}\n{part.text}" for part in parts)])
 
     def layout(self, name: str) -> MessageLayout:
-        """Raises `DefinitionError`."""
+        """Return the layout of a type. Raises `DefinitionError`."""
         return self._layout(name, ())
 
     # `outer` always lists the types that contain this type, outermost first.
@@ -178,7 +179,6 @@ class Definitions:
         outer: tuple[str, ...],
         ask: Callable[[str, tuple[str, ...]], _Answer],
     ) -> _Answer | None:
-        """None if the type of the field is built in."""
         if field.type in BUILTINS:
             return None
         if field.type not in self._messages:

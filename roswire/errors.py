@@ -6,7 +6,7 @@ class RosError(Exception):
 
 
 class EncodingError(RosError):
-    """ROS has no notation for the value, such as a control character or a 64-bit integer."""
+    """ROS cannot encode a value, such as a control character or a 64-bit integer."""
 
 
 class PeerError(RosError):
@@ -26,11 +26,11 @@ class ProtocolError(PeerError):
 
 
 class LimitExceededError(ProtocolError):
-    """The part that was read is well-formed."""
+    """A limit is exceeded; the part that was read is well-formed."""
 
 
 class DefinitionError(PeerError):
-    """`source` names the file or type, `line` counts from 1 (0: unknown)."""
+    """A definition is invalid; `source` names the file or type, `line` counts from 1 (0: unknown)."""
 
     def __init__(self, text: str, source: str, line: int = 0) -> None:
         super().__init__(f"{source}:{line}: {text}" if line else f"{source}: {text}")

@@ -12,15 +12,15 @@ from dataclasses import dataclass, field, replace
 from roswire.message_text import PRIMITIVES
 
 MAX_ITEMS = 20_000
-"""Leaves, strings and arrays in one layout; nested definitions can need exponentially many."""
+"""The most leaves, strings and arrays in one layout; nested definitions can need exponentially many."""
 
 MAX_SIZE = 1 << 32
-"""Bytes of one fixed part or array of fixed length; a TCPROS message is never longer."""
+"""The most bytes of one fixed part or array of fixed length; a TCPROS message is never longer."""
 
 
 @dataclass(frozen=True, slots=True)
 class FixedField:
-    """`type` is primitive, or for arrays also a message type of fixed size, with its `layout`.
+    """A field of fixed size; `type` is primitive, or for arrays also a message of fixed size, with its `layout`.
 
     `count` is None for a scalar.
 
@@ -37,7 +37,7 @@ class FixedField:
 
 @dataclass(frozen=True, slots=True)
 class FixedPart:
-    """`size` is the total number of bytes of the leaves."""
+    """Consecutive fields of fixed size; `size` is the number of their bytes."""
 
     size: int
     leaves: tuple[FixedField, ...]
@@ -70,7 +70,7 @@ Part = FixedPart | StringPart | ArrayPart
 
 @dataclass(frozen=True, slots=True)
 class FieldLocation:
-    """`part` is the index of the part."""
+    """The place of a field; `part` is the index of its part."""
 
     part: int
     item: FixedField | StringPart | ArrayPart
@@ -78,8 +78,8 @@ class FieldLocation:
 
 @dataclass(frozen=True, slots=True)
 class MessageLayout:
-    """`size` is the number of bytes of every such message, or None if it varies; `minimum` is that of the shortest
-    message.
+    """The layout of a message; `size` is the number of bytes of every such message, or None if it varies,
+    `minimum` that of the shortest.
 
     `places` finds the items by path (`pose.position.x`); the elements of an array are in the array's layout.
     """
@@ -95,7 +95,7 @@ class LayoutTooLargeError(Exception):
 
 
 class LayoutBuilder:
-    """Takes the fields of a message in order."""
+    """Builds a layout from the fields of a message in order."""
 
     def __init__(self) -> None:
         self._parts: list[Part] = []
@@ -104,7 +104,7 @@ class LayoutBuilder:
         self._items = 0
 
     def add_primitive(self, path: str, type_name: str, count: int | None) -> None:
-        """`count` makes a fixed array."""
+        """Add a primitive field; `count` makes a fixed array."""
         size = PRIMITIVES[type_name][1] * (1 if count is None else count)
         self._add_leaf(FixedField(path, type_name, self._offset, size, count))
 
@@ -121,7 +121,7 @@ class LayoutBuilder:
             self._add_part(ArrayPart(path, type_name, count, size, layout))
 
     def add_message(self, path: str, layout: MessageLayout) -> None:
-        """`path` is a prefix of the paths of the nested items."""
+        """Add a nested message; `path` is a prefix of the paths of its items."""
         for part in layout.parts:
             if isinstance(part, FixedPart):
                 for leaf in part.leaves:

@@ -50,7 +50,7 @@ _SEPARATOR = re.compile(r"={40,}+[ \t\r]*+\Z")
 
 @dataclass(frozen=True, slots=True)
 class Constant:
-    """Md5sums are made from `text`, the value as written."""
+    """A constant; md5sums are made from `text`, the value as written."""
 
     type: str
     name: str
@@ -60,9 +60,10 @@ class Constant:
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """`type` is the element type (`float64`, `geometry_msgs/Point`).
+    """A field; `type` is the element type (`float64`, `geometry_msgs/Point`).
 
-    `length` is the number of elements of a fixed array; None for a scalar, and for an array of variable length.
+    `length` is the number of elements of a fixed array; None for a scalar, and for an array of variable
+    length.
     """
 
     type: str
@@ -72,7 +73,7 @@ class Field:
 
     @property
     def notation(self) -> str:
-        """As it is written: `float64[36]`, `std_msgs/Header`."""
+        """Return the type as written, such as `float64[36]` or `std_msgs/Header`."""
         if not self.is_array:
             return self.type
         return f"{self.type}[{'' if self.length is None else self.length}]"
@@ -80,7 +81,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class MessageDefinition:
-    """`name` is `package/Type`; `text` is the source."""
+    """A message type; `name` is `package/Type`, `text` the source."""
 
     name: str
     fields: tuple[Field, ...]
@@ -99,7 +100,7 @@ class ServiceDefinition:
 
 
 def parse_message(name: str, text: str, source: str, first_line: int = 1) -> MessageDefinition:
-    """`source` and `first_line` give the position of the text for error messages.
+    """Return the type that a text defines; `source` and `first_line` give its position for error messages.
 
     Raises `DefinitionError`.
     """
@@ -125,7 +126,7 @@ def parse_message(name: str, text: str, source: str, first_line: int = 1) -> Mes
 
 
 def parse_service(name: str, text: str, source: str) -> ServiceDefinition:
-    """Raises `DefinitionError`."""
+    """Return the service type that a text defines. Raises `DefinitionError`."""
     lines = text.split("\n")
     breaks = [index for index, line in enumerate(lines) if line.startswith("---")]
     if len(breaks) != 1:
@@ -137,7 +138,7 @@ def parse_service(name: str, text: str, source: str) -> ServiceDefinition:
 
 
 def split_full_text(name: str, text: str) -> list[tuple[str, str, int]]:
-    """Returns (type, text, number of its first line) for `name`, then for each nested type.
+    """Return (type, text, number of its first line) for `name`, then for each nested type.
 
     In the text, each nested type follows a line `===…` and a line `MSG: package/Type`.
 

@@ -85,7 +85,6 @@ class _Reader:
         self._left = left
 
     def _size(self, kind: str) -> int | None:
-        """None if values differ in size."""
         if kind in PRIMITIVES:
             return PRIMITIVES[kind][1]
         if kind == "string":
@@ -137,7 +136,7 @@ class _CutError(Exception):
 
 
 def read_bytes(data: bytes) -> str:
-    """Hexadecimal digits, with the number of omitted bytes."""
+    """Return hexadecimal digits, with the number of omitted bytes."""
     return data[:MOST_BYTES].hex() + _more(len(data) - MOST_BYTES)
 
 
@@ -146,7 +145,7 @@ def _more(count: int) -> str:
 
 
 def read_fields(definitions: Definitions, name: str, data: bytes) -> dict[str, Any] | None:
-    """The fields that can be read; None if the type is unknown."""
+    """Return the fields that can be read, or None if the type is unknown."""
     try:
         return _Reader(definitions, data).message(name)
     except _CutError as cut:
@@ -157,7 +156,7 @@ def read_fields(definitions: Definitions, name: str, data: bytes) -> dict[str, A
 
 
 class PublisherReader:
-    """Uses the definition in the publisher's connection header."""
+    """Reads messages by the definition in the publisher's connection header."""
 
     def __init__(self, header: Mapping[str, str]) -> None:
         self.type = header.get("type", "")
@@ -169,7 +168,7 @@ class PublisherReader:
             self._why = f": {str(error)[:300]}"
 
     def read(self, data: bytes) -> tuple[dict[str, Any], str]:
-        """Returns the fields and an empty text; if the definition cannot be used, the first bytes and the reason."""
+        """Return the fields and an empty text; if the definition cannot be used, the first bytes and the reason."""
         fields = read_fields(self._definitions, self.type, data) if self._definitions is not None else None
         if fields is not None:
             return fields, ""

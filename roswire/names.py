@@ -18,7 +18,7 @@ import re
 from roswire.errors import InvalidNameError, quoted
 
 MAX_NAME_LENGTH = 1024
-"""The longest names on robots have far less than a quarter of this number."""
+"""The longest name; those on robots have far less than a quarter of this number of characters."""
 
 _NAME = re.compile(r"[A-Za-z/~][A-Za-z0-9_/]*+\Z")
 _CANONICAL = re.compile(r"(?:/[A-Za-z0-9_]++){1,512}\Z")  # a name of MAX_NAME_LENGTH has at most 512 segments
@@ -31,11 +31,13 @@ _SLASHES = re.compile("/{2,}+")
 
 
 def resolve(name: str, caller_id: str) -> str:
-    """`/a` is global, `~a` private to the caller, `a` relative to the caller's namespace. An empty `caller_id` is the
-    global namespace, as for `rosmaster`.
+    """Return the canonical form of a name.
 
-    Raises `InvalidNameError` for a name outside the ROS grammar, for the global namespace, and for a relative name if
-    the caller's own name is invalid.
+    `/a` is global, `~a` private to the caller, `a` relative to the caller's namespace. An empty `caller_id`
+    is the global namespace, as for `rosmaster`.
+
+    Raises `InvalidNameError` for a name outside the ROS grammar, for the global namespace, and for a relative
+    name if the caller's own name is invalid.
     """
     resolved = _resolve(name, caller_id, _NAME)
     if resolved == "/":
@@ -58,7 +60,7 @@ def resolve_parameter(name: str, caller_id: str) -> str:
 
 
 def canonical_caller_id(caller_id: str) -> str:
-    """`//a//b/` becomes `/a/b`, as with rospy and roscpp.
+    """Return the canonical form of a node's name: `//a//b/` becomes `/a/b`, as with rospy and roscpp.
 
     Raises `InvalidNameError` for any other text, such as a relative name.
     """
@@ -66,32 +68,32 @@ def canonical_caller_id(caller_id: str) -> str:
 
 
 def canonical_tool_id(caller_id: str) -> str:
-    """The caller need not be a node, such as `/rosparam-4711`."""
+    """Return the canonical form of a caller that need not be a node, such as `/rosparam-4711`."""
     return _canonical_id(caller_id, _TOOL)
 
 
 def is_global_name(name: str) -> bool:
-    """`/a/b`; not `/`, not `//a`, not `a`."""
+    """Whether a name is like `/a/b`, not `/`, `//a` or `a`."""
     return len(name) <= MAX_NAME_LENGTH and _CANONICAL.match(name) is not None
 
 
 def is_relative_member(name: str) -> bool:
-    """Not `/a`, not `~a`, and without empty segments."""
+    """Whether a name is relative, not `/a` or `~a`, and without empty segments."""
     return not name.startswith("~") and all(name.split("/"))
 
 
 def is_valid_type_name(name: str) -> bool:
-    """`package/Type`, or `*` for any type."""
+    """Whether a name is `package/Type`, or `*` for any type."""
     return name == "*" or (len(name) <= MAX_NAME_LENGTH and _TYPE_NAME.match(name) is not None)
 
 
 def namespace(name: str) -> str:
-    """`/a/` for `/a/b`, `/` for `/a`."""
+    """Return the namespace of a name: `/a/` for `/a/b`, `/` for `/a`."""
     return name[: name.rstrip("/").rfind("/") + 1] or "/"
 
 
 def searched(key: str, caller_id: str) -> list[str]:
-    """In order: in the caller's namespaces, from its own upwards."""
+    """Return the keys that a search tries in order: in the caller's namespaces, from its own upwards."""
     if key.startswith("/"):
         return [resolve_parameter(key, caller_id)]
     levels = [part for part in caller_id.split("/") if part]
@@ -100,7 +102,7 @@ def searched(key: str, caller_id: str) -> list[str]:
 
 
 def join(namespace: str, name: str) -> str:
-    """A global or private name stays unchanged."""
+    """Return a name in a namespace; a global or private name stays unchanged."""
     if name.startswith(("/", "~")) or not namespace:
         return name
     return f"{namespace}{name}" if namespace.endswith("/") else f"{namespace}/{name}"

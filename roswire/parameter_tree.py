@@ -10,17 +10,18 @@ Tree = dict[str, Value]
 
 @lru_cache(256)
 def parts_of(key: str) -> tuple[str, ...]:
-    """Cached, because setters call it often."""
+    """Return the parts of a key; cached, because setters call it often."""
     return tuple([part for part in key.split("/") if part])
 
 
 def holds_others(value: Value) -> bool:
-    """The keys of such a namespace also need rights."""
+    """Whether a value is a namespace with other parameters, whose keys also need rights."""
     return isinstance(value, dict) and bool(value)
 
 
 def standing_at(tree: Tree, key: str) -> tuple[Value, str | None]:
-    """Returns the value at a canonical `key` (or None), and the name of a parent that is not a namespace (or None).
+    """Return the value at a canonical `key` (or None), and the name of a parent that is not a namespace (or
+    None).
 
     If a key below such a parent is set, `rosmaster` replaces the parent by a namespace.
     """
@@ -37,7 +38,7 @@ def standing_at(tree: Tree, key: str) -> tuple[Value, str | None]:
 
 
 def names_in(tree: Tree, above: str = "/") -> Iterator[str]:
-    """As `rosmaster` lists them, without namespaces.
+    """Yield the names of parameters as `rosmaster` lists them, without namespaces.
 
     A key of a dictionary may begin with `/` or `~`: `rosmaster` lists it unchanged.
     """

@@ -105,7 +105,6 @@ def standard_definitions() -> Definitions:
 
 
 def _in_places(text: str, before: dict[str, int]) -> str:
-    """Constants without a place come last."""
     constants = iter([line for line in text.splitlines() if "=" in line])
     lines = []
     for line in [line for line in text.splitlines() if line and "=" not in line]:

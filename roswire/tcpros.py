@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from roswire.errors import LimitExceededError, ProtocolError
 
 HEADER_LIMIT = 65536
-"""The largest message definitions of MoveIt need about half of this."""
+"""The most bytes of a header; the largest message definitions of MoveIt need about half of this."""
 
 MESSAGE_LIMIT = 256 << 20
 
@@ -29,14 +29,14 @@ _ANY_BYTES = frozenset({"message_definition"})
 
 
 def encode_header(fields: Mapping[str, str]) -> bytes:
-    """With its length, and the fields in the given order."""
+    """Return a header with its length, and the fields in the given order."""
     lines = [f"{name}={value}".encode("utf-8", "surrogateescape") for name, value in fields.items()]
     body = b"".join([_LENGTH.pack(len(line)) + line for line in lines])
     return _LENGTH.pack(len(body)) + body
 
 
 def encode_frame(body: bytes | bytearray | memoryview) -> bytes:
-    """A frame is the length, then the bytes."""
+    """Return a frame: the length, then the bytes."""
     return _LENGTH.pack(len(body)) + body
 
 
@@ -45,12 +45,12 @@ def encode_service_reply(body: bytes | bytearray | memoryview) -> bytes:
 
 
 def encode_service_error(text: str) -> bytes:
-    """The calling node shows `text`."""
+    """Return an error reply, whose `text` the calling node shows."""
     return b"\x00" + encode_frame(text.encode("utf-8", "replace"))
 
 
 def decode_header(body: bytes) -> dict[str, str]:
-    """`body` is without its length.
+    """Return the fields of a header; `body` is without its length.
 
     Raises `ProtocolError`.
     """
@@ -77,7 +77,7 @@ def decode_header(body: bytes) -> dict[str, str]:
 
 
 class HeaderParser:
-    """Bytes after the header are in `rest`."""
+    """Parses a header; bytes after it are in `rest`."""
 
     def __init__(self, limit: int = HEADER_LIMIT) -> None:
         self.rest = b""
@@ -86,10 +86,10 @@ class HeaderParser:
         self._done = False
 
     def feed(self, data: bytes) -> dict[str, str] | None:
-        """None until the header is complete.
+        """Take bytes; return the header once it is complete, otherwise None.
 
-        Raises `LimitExceededError` as soon as the announced length exceeds the limit, `ProtocolError` for a malformed
-        header, and RuntimeError if the header was already returned.
+        Raises `LimitExceededError` as soon as the announced length exceeds the limit, `ProtocolError` for a
+        malformed header, and RuntimeError if the header was already returned.
         """
         if self._done:
             raise RuntimeError("the header is complete; what followed it is in .rest")
@@ -114,14 +114,14 @@ class HeaderParser:
 
 
 class FrameParser:
-    """Each frame has at most `limit` bytes."""
+    """Parses frames of at most `limit` bytes."""
 
     def __init__(self, limit: int = MESSAGE_LIMIT) -> None:
         self._limit = limit
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Returns the bodies that are now complete.
+        """Take bytes; return the bodies that are now complete.
 
         Raises `LimitExceededError`.
         """
@@ -143,24 +143,24 @@ class FrameParser:
 
 @dataclass(frozen=True, slots=True)
 class ServiceReply:
-    """`body` is the serialised response, or the text of the error."""
+    """A reply; `body` is the serialised response, or the text of the error."""
 
     ok: bool
     body: bytes
 
 
 class ServiceReplyParser:
-    """Each reply has at most `limit` bytes."""
+    """Parses replies of at most `limit` bytes."""
 
     def __init__(self, limit: int = MESSAGE_LIMIT) -> None:
         self._limit = limit
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> list[ServiceReply]:
-        """Returns the replies that are now complete.
+        """Take bytes; return the replies that are now complete.
 
-        Raises `ProtocolError` if the first byte is neither 0 nor 1, and `LimitExceededError` if the length exceeds
-        the limit.
+        Raises `ProtocolError` if the first byte is neither 0 nor 1, and `LimitExceededError` if the length
+        exceeds the limit.
         """
         buffer = self._buffer
         buffer += data

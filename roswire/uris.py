@@ -24,7 +24,7 @@ _URI = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class NodeUri:
-    """`host` is without brackets, `path` starts with `/` (empty for a service)."""
+    """A URI; `host` is without brackets, `path` starts with `/` (empty for a service)."""
 
     scheme: str
     host: str
@@ -34,12 +34,12 @@ class NodeUri:
 
 @lru_cache(4096)  # a node sends its own URI with every call
 def parse_node_uri(text: str) -> NodeUri:
-    """Raises `InvalidUriError`."""
+    """Parse the URI of a node. Raises `InvalidUriError`."""
     return _parse(text, "http", "node API", "http://host:port/")
 
 
 def parse_service_uri(text: str) -> NodeUri:
-    """The path must be empty.
+    """Parse the URI of a service, whose path must be empty.
 
     Raises `InvalidUriError`.
     """
@@ -50,12 +50,12 @@ def parse_service_uri(text: str) -> NodeUri:
 
 
 def node_uri(host: str, port: int, path: str = "/") -> str:
-    """An IPv6 `host` gets brackets."""
+    """Return the URI of a node; an IPv6 `host` gets brackets."""
     return f"http://{_bracketed(host)}:{port}{path}"
 
 
 def service_uri(host: str, port: int) -> str:
-    """An IPv6 `host` gets brackets."""
+    """Return the URI of a service; an IPv6 `host` gets brackets."""
     return f"rosrpc://{_bracketed(host)}:{port}"
 
 

@@ -72,7 +72,6 @@ def build_app(services: Services) -> FastAPI:
     app.openapi = lambda: contract_of(app)  # type: ignore[method-assign]  # FastAPI's own way to change the contract
 
     async def contract() -> JSONResponse:
-        """Return the contract of this interface (OpenAPI 3.1)."""
         return JSONResponse(app.openapi())
 
     async def page() -> Response:
@@ -146,7 +145,6 @@ async def _of_http(request: Request, error: Exception) -> Response:
 
 
 def _methods(request: Request) -> set[str]:
-    """Return GET if no route matches."""
     matching = [
         route
         for route in iter_route_contexts(request.app.routes)

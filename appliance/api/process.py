@@ -1,9 +1,8 @@
 """Run the api process: its lifeline, its link to control, its certificate, and the listener.
 
-The process ends when the supervisor sends `Stop` or has ended. It outlives control; until a new control runs, calls
-that need it get 503. If control does not come back, or closed the link because of an invalid message, the api ends and
-the supervisor starts a new one. Routes and contract are made when the first request passes the gate, so an unused api
-needs little memory.
+The process ends when the supervisor sends `Stop` or has ended. It outlives control. If control does not come back, or
+closed the link because of an invalid message, the api ends and the supervisor starts a new one. Routes and contract
+are made when the first request passes the gate, so an unused api needs little memory.
 """
 
 import asyncio
@@ -52,7 +51,7 @@ def main(lifeline_fd: int, config: Path) -> None:
 
 
 class _Application:
-    """The application is made at its first call."""
+    """Makes the application at its first call."""
 
     def __init__(self, services: Services) -> None:
         self._services = services

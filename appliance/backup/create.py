@@ -1,8 +1,8 @@
-"""Write the state directory to one file, even while the appliance runs; `restore.py` restores the file.
+"""Write the state directory of a running appliance to one file, for `restore.py`.
 
 Invariants:
 
-1. SQLite copies each database as a consistent snapshot; a running appliance need not stop or wait.
+1. SQLite copies each database as a consistent snapshot.
 2. The log is copied first. Then the signer's memory is cut to the checkpoints in that copy, so that a restored log can
    be continued.
 3. The file contains keys, so only its owner may read it. An existing file is not overwritten; an unfinished backup is

@@ -1,7 +1,6 @@
 """A clock for the age of kept data, robust against wrong system time.
 
-After a start, the system clock may be wrong by years until a person or a time service corrects it. A retention limit
-that trusted the system clock would then delete everything at once.
+After a start, the system clock may be wrong by years until a person or a time service corrects it.
 
 Invariants:
 
@@ -88,7 +87,6 @@ class AgeClock:
         return kept.lived + kept.credited
 
     def _was_off(self, ahead: int) -> None:
-        """Add the gap of the system clock, once it is credible."""
         kept, counts = self._kept, 0
         if abs(ahead) <= _AT_ONCE:
             kept.step, counts = 0, max(0, ahead)

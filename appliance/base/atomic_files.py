@@ -18,7 +18,7 @@ class NotLastingError(OSError):
 
 
 def name_to_make(path: Path) -> Path:
-    """Unique; the finished file is renamed to `path`."""
+    """Return a unique name, from which the finished file is renamed to `path`."""
     return path.with_name(f"{path.name}.{secrets.token_hex(4)}.new")
 
 
@@ -35,10 +35,11 @@ def remove_unfinished(folder: str, place: int) -> None:
 
 
 def write_whole(path: Path, data: bytes | mmap, mode: int, owner: tuple[int, int] | None = None) -> None:
-    """Raises `OSError`, which leaves the old file unchanged.
+    """Write a file atomically. Raises `OSError`, which leaves the old file unchanged.
 
-    `owner` (user and group; default: the writer) is set before the file gets its final name. With concurrent writers,
-    one complete file remains. Raises `NotLastingError` if the file is replaced but perhaps not on the disk.
+    `owner` (user and group; default: the writer) is set before the file gets its final name. With concurrent
+    writers, one complete file remains. Raises `NotLastingError` if the file is replaced but perhaps not on
+    the disk.
     """
     making = name_to_make(path)
     try:
@@ -71,11 +72,11 @@ def write_whole(path: Path, data: bytes | mmap, mode: int, owner: tuple[int, int
 
 
 def write_where_told(path: Path, data: bytes | mmap) -> None:
-    """Raises `OSError`.
+    """Write to the path that a person named. Raises `OSError`.
 
-    A regular file is replaced atomically and keeps its mode and owner, even if `path` is a symbolic link. A pipe, a
-    device, or a file with an owner that this process cannot set is written in place. If `path` is the process's own
-    output (/dev/stdout), the data is appended to its earlier output.
+    A regular file is replaced atomically and keeps its mode and owner, even if `path` is a symbolic link. A
+    pipe, a device, or a file with an owner that this process cannot set is written in place. If `path` is the
+    process's own output (/dev/stdout), the data is appended to its earlier output.
     """
     try:
         there = path.stat()

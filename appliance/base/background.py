@@ -11,10 +11,10 @@ _log = structlog.get_logger()
 
 
 async def run_always(what: str, work: Callable[[], Awaitable[object]]) -> None:
-    """Start again a second after each error, until `work` returns or is cancelled.
+    """Run `work`, and start it again a second after each error, until it returns or is cancelled.
 
-    An expected error is handled in `work`. Any other is a defect, which must not end other work of the process: its
-    traceback is logged as a fault in `what`.
+    An expected error is handled in `work`. Any other is a defect, which must not end other work of the
+    process: its traceback is logged as a fault in `what`.
     """
     while True:
         try:

@@ -16,16 +16,16 @@ _SECOND = 1e9
 
 
 class ClockSource(Protocol):
-    """All readings are in nanoseconds."""
+    """A source of time; all readings are in nanoseconds."""
 
     def now_ns(self) -> int:
-        """This clock only advances, and may begin at any number."""
+        """Return the monotonic time, which may begin at any number."""
 
     def wall_ns(self) -> int:
-        """Since the epoch; people and time services set it."""
+        """Return the time since the epoch, which people and time services set."""
 
     def since_boot_ns(self) -> int:
-        """Also counts while the machine is suspended."""
+        """Return the time since the boot, which includes suspensions of the machine."""
 
 
 class SystemClock:
@@ -45,7 +45,7 @@ _source: ContextVar[ClockSource] = ContextVar("clock", default=_SYSTEM)
 
 @contextmanager
 def using(source: ClockSource) -> Iterator[None]:
-    """Tasks that the block creates use the source too."""
+    """Use the source in the block, and in tasks that the block creates."""
     before = _source.set(source)
     try:
         yield
@@ -58,7 +58,7 @@ def source() -> ClockSource:
 
 
 def now() -> float:
-    """Monotonic seconds: for durations, timeouts and the order of events."""
+    """Return monotonic seconds, for durations, timeouts and the order of events."""
     return _source.get().now_ns() / _SECOND
 
 
@@ -67,12 +67,11 @@ def now_ns() -> int:
 
 
 def wall() -> float:
-    """Seconds since the epoch: for people, and for dates that others have set."""
+    """Return seconds since the epoch, for people and for dates that others have set."""
     return _source.get().wall_ns() / _SECOND
 
 
 def wall_ns() -> int:
-    """Nanoseconds since the epoch."""
     return _source.get().wall_ns()
 
 

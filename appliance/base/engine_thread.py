@@ -18,24 +18,24 @@ class Driver(Protocol):
     """Calls the turns of one engine. Thread-safe."""
 
     def wake(self) -> None:
-        """Call this when there is new work."""
+        """Call the engine soon, because it has new work."""
 
     def hurry(self) -> None:
-        """Call this when a caller waits for the work."""
+        """Call the engine at once, because a caller waits for the work."""
 
     def end(self, seconds: float | None) -> bool:
         """Return whether the engine ended within `seconds`."""
 
 
 Drive = Callable[[str, Turn, float], Driver]
-"""Returns a driver of the engine with this name after its first turn.
+"""Start the engine with this name; return its driver after the first turn.
 
 After `wake`, the driver gathers work for the given number of seconds.
 """
 
 
 class EngineThread:
-    """A defect also ends the thread."""
+    """Runs an engine in a thread, which a defect of the engine also ends."""
 
     def __init__(self, name: str, turn: Turn, gather: float) -> None:
         self._turn = turn
@@ -49,7 +49,7 @@ class EngineThread:
         self._begun.wait()
 
     def wake(self) -> None:
-        """The engine runs after the time for gathering."""
+        """Run the engine after the time for gathering."""
         if not self._wake.is_set():  # `set` takes a lock
             self._wake.set()
 
@@ -78,7 +78,7 @@ class EngineThread:
 
 
 class InCaller:
-    """First, last, and when the only caller waits, in its thread."""
+    """Runs an engine in its only caller's thread: at first, at the end, and when the caller waits."""
 
     def __init__(self, _name: str, turn: Turn, _gather: float) -> None:
         self._turn = turn

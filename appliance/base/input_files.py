@@ -15,7 +15,7 @@ from pathlib import Path
 from appliance.base.owner_access import open_named
 
 LONGEST = 64 << 20
-"""In bytes."""
+"""The largest file that is read, in bytes."""
 
 _NULL = os.makedev(1, 3)  # /dev/null: an empty file
 _KINDS = {
@@ -28,7 +28,7 @@ _KINDS = {
 
 
 def open_given(path: Path) -> io.BufferedReader:
-    """A pipe that a shell made for `<(command)` or `command |` is accepted. Raises `OSError`."""
+    """Open a regular file, or a pipe that a shell made for `<(command)` or `command |`. Raises `OSError`."""
     descriptor = open_named(path)
     try:
         about = os.fstat(descriptor)
@@ -45,7 +45,7 @@ def open_given(path: Path) -> io.BufferedReader:
 
 
 def read_given(path: Path, longest: int = LONGEST) -> bytes:
-    """At most `longest` bytes. Raises `OSError`."""
+    """Return the content of a file of at most `longest` bytes. Raises `OSError`."""
     with open_given(path) as file:
         data = file.read(longest + 1)
     if len(data) > longest:
@@ -55,7 +55,7 @@ def read_given(path: Path, longest: int = LONGEST) -> bytes:
 
 @contextlib.contextmanager
 def path_for_library(path: Path) -> Iterator[Path]:
-    """For a library that opens the file: a copy in memory if only its owner may read it.
+    """Yield a path for a library that opens the file: a copy in memory if only its owner may read it.
 
     Raises `OSError`.
     """
@@ -71,13 +71,13 @@ def path_for_library(path: Path) -> Iterator[Path]:
 
 
 def read_given_text(path: Path, encoding: str = "utf-8", errors: str = "strict") -> str:
-    """Line ends become LF. Raises `OSError` and `UnicodeDecodeError`."""
+    """Return the text of a file, with LF as line ends. Raises `OSError` and `UnicodeDecodeError`."""
     with io.TextIOWrapper(io.BytesIO(read_given(path)), encoding, errors) as text:
         return text.read()
 
 
 def files_below(folder: Path) -> list[Path]:
-    """Sorted; a link is one of the files. Raises `OSError`.
+    """Return the sorted files below a folder; a link is a file. Raises `OSError`.
 
     `Path.glob` and `rglob` take a folder that may not be read for an empty one.
     """
@@ -88,7 +88,7 @@ def files_below(folder: Path) -> list[Path]:
 
 
 def entries_of(folder: Path) -> list[tuple[Path, bool]]:
-    """Sorted, and whether each is a folder; a link is not. Raises `OSError`."""
+    """Return the sorted entries, and whether each is a folder; a link is not. Raises `OSError`."""
     descriptor = open_named(folder)
     try:
         with os.scandir(descriptor) as entries:
@@ -100,7 +100,7 @@ def entries_of(folder: Path) -> list[tuple[Path, bool]]:
 
 
 def stat_given(path: Path) -> os.stat_result:
-    """A link is followed. Raises `OSError`."""
+    """Return the status of a file; a link is followed. Raises `OSError`."""
     try:
         return path.stat()
     except (PermissionError, FileNotFoundError):  # as in `open_named`

@@ -6,7 +6,7 @@ BOUNDS = (0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1,
 
 
 class Metric(NamedTuple):
-    """`name` is that in Prometheus."""
+    """A metric; `name` is its name in Prometheus."""
 
     name: str
     kind: Literal["counter", "gauge", "histogram"]

@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class OptionGroup(Generic[T]):
-    """typer reads the options from the signature of a function."""
+    """Options that several verbs share; typer reads them from the signature of a function."""
 
     function: Callable[..., T]
 
@@ -28,13 +28,12 @@ class OptionGroup(Generic[T]):
         return tuple(self._command.params)
 
     def value(self, given: Mapping[str, Any]) -> T:
-        """`given` are the `params` of the context."""
         made: T = self._command.callback(**{option.name: given[option.name] for option in self.options})
         return made
 
 
 class GroupedCommand(TyperCommand):
-    """Options before and after its own are read by the group's function."""
+    """A command with the options of a group before and after its own."""
 
     def __init__(
         self,
@@ -54,7 +53,7 @@ class GroupedCommand(TyperCommand):
 
 @dataclass(frozen=True)
 class GroupedVerb:
-    """`command` makes the command as typer does with a command's class."""
+    """Makes commands with a group of options; `command` is used like typer's decorator."""
 
     function: Callable[..., None]
     command: Callable[..., GroupedCommand]

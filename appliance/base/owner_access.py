@@ -20,7 +20,7 @@ from typing import ClassVar
 from appliance.base.user_errors import UserError
 
 OPENING = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
-"""A pipe or a device does not block the caller."""
+"""Flags of `open` with which a pipe or a device does not block the caller."""
 
 _PASSING = os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC
 
@@ -37,12 +37,12 @@ class FileLender:
 
     @classmethod
     def install(cls, opened: Callable[[Path], int | None]) -> None:
-        """Used from now on if the process has no right."""
+        """Use `opened` from now on if the process lacks a right."""
         cls.open = opened
 
 
 def open_named(path: Path) -> int:
-    """Raises `OSError`."""
+    """Return a descriptor of the file. Raises `OSError`."""
     try:
         return os.open(path, OPENING)
     except PermissionError:
@@ -56,7 +56,7 @@ def open_named(path: Path) -> int:
 
 
 def is_named_there(path: Path) -> bool:
-    """Root may not be able to look as itself."""
+    """Whether the file exists, by the rights with which it would be opened: root's own may not suffice."""
     try:
         os.close(open_named(path))
     except (FileNotFoundError, NotADirectoryError):
@@ -67,12 +67,12 @@ def is_named_there(path: Path) -> bool:
 
 
 def open_as_owner(path: Path) -> int:
-    """Use the rights of the folder's owner, or of the file's. Raises `OSError`."""
+    """Open the file with the rights of the folder's owner, or of the file's. Raises `OSError`."""
     return _open_in(_folder(path.absolute().parent), path.name, path)
 
 
 def open_below(folder: Path, path: Path) -> int:
-    """No folder in between may be a link. Raises `OSError`."""
+    """Open a file below a folder; no folder between them may be a link. Raises `OSError`."""
     place = _folder(folder)
     for name in path.relative_to(folder).parent.parts:
         place = _next(place, name, os.O_NOFOLLOW)
@@ -81,7 +81,7 @@ def open_below(folder: Path, path: Path) -> int:
 
 @contextlib.contextmanager
 def acting_as(uid: int) -> Iterator[None]:
-    """Only this thread; without root, nothing changes."""
+    """Give this thread the user's rights in the block; without root, nothing changes."""
     # seteuid would also take root from the other threads.
     if os.geteuid() != 0 or uid == 0:
         yield
@@ -97,7 +97,7 @@ def acting_as(uid: int) -> Iterator[None]:
 
 
 def _folder(path: Path) -> int:
-    """For passing through, with the rights of the owners of the folders above."""
+    """Open a folder for passing through, with the rights of the owners of the folders above."""
     try:
         return os.open(path, _PASSING)
     except PermissionError:

@@ -14,6 +14,6 @@ _DAY = 86_400.0
 
 
 def before_program() -> float:
-    """Seconds that the system clock is behind the program's files; 0 for less than a day."""
+    """Return the seconds that the system clock is behind the program's files; 0 for less than a day."""
     before = Path(__file__).stat().st_mtime - clock.wall()
     return before if before > _DAY else 0.0

@@ -30,7 +30,6 @@ def parse_timestamp(text: str, now: int) -> int:
 
 
 def _dated(text: str, now: int) -> str:
-    """Replace `today` or `yesterday`, and put a date before a bare time."""
     found = re.fullmatch(r"(?:(today|yesterday)(?:[ T](?=.)|$))?(\d\d:\d\d(?::\d\d)?)?", text, re.ASCII)
     if not text or found is None:
         return text
@@ -42,7 +41,7 @@ def _dated(text: str, now: int) -> str:
 
 
 def parse_date(text: str) -> int:
-    """Nanoseconds since the epoch, of a date or an RFC 3339 time. Raises `ValueError`."""
+    """Return nanoseconds since the epoch for a date or an RFC 3339 time. Raises `ValueError`."""
     # datetime keeps only microseconds. The log prints nanoseconds, and every printed time must be valid input.
     fraction = re.search(r"\.(\d{1,9})", text)
     whole = text if fraction is None else text.replace(fraction[0], "", 1)

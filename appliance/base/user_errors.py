@@ -1,4 +1,4 @@
-"""The base class of errors for users. It imports nothing, so the command starts fast."""
+"""The base class of errors for users; it imports nothing."""
 
 
 class UserError(Exception):

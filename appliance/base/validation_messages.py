@@ -37,7 +37,7 @@ _MUST_BE = {
     "too_long": "{max_length} at most in number",
     "too_short": "{min_length} at least in number",
 }
-"""The key is pydantic's error type, its first word, or msgspec's type name."""
+"""The requirement on a value, by pydantic's error type, its first word, or msgspec's type name."""
 _BOUNDS = {">=": "at least", "<=": "at most", ">": "more than", "<": "less than"}
 _PARTS = {"str": "characters", "array": "entries", "object": "fields"}
 _BODY: dict[str, Callable[..., str]] = {
@@ -51,7 +51,7 @@ _BODY: dict[str, Callable[..., str]] = {
     r"(?s)Object contains unknown field `(.*)`": lambda name: f"there is no field `{name}`",
     r"Number out of range": lambda: "must be a smaller number",
 }
-"""msgspec's messages, and those for users."""
+"""Patterns of msgspec's messages, and the messages for users."""
 
 
 _NAME = re.compile(r"\^\(?\[([\w.-]+)\]\[([\w.-]+)\]\{0,(\d+)\}(?:\)\?)?(?:\$|\\Z)")
@@ -66,7 +66,7 @@ _YAML = {
 
 
 def not_yaml(problem: object) -> str:
-    """`is not YAML: ` with the parser's message and advice."""
+    """Return `is not YAML: ` with the parser's message and advice."""
     said = " ".join(str(problem).split())
     return "; ".join(
         [f"is not YAML: {said}", *[do for what, do in _YAML.items() if re.search(what, said)][:1]]
@@ -74,7 +74,7 @@ def not_yaml(problem: object) -> str:
 
 
 def nearest(word: str, candidates: Collection[str]) -> str | None:
-    """None if no candidate is similar or there are too many."""
+    """Return the nearest candidate; None if none is similar or there are too many."""
     if len(candidates) > _MAXIMUM_CANDIDATES or len(word) > 100:
         return None
     folded = {candidate.casefold(): candidate for candidate in candidates}
@@ -83,13 +83,13 @@ def nearest(word: str, candidates: Collection[str]) -> str | None:
 
 
 def meant(word: str, candidates: Collection[str]) -> str:
-    """`; did you mean X?`, or an empty string."""
+    """Return `; did you mean X?`, or an empty string."""
     found = nearest(word, candidates)
     return f"; did you mean {found}?" if found else ""
 
 
 def must_be(error: Mapping[str, Any]) -> str:
-    """`error` is one of pydantic's `errors()`."""
+    """Return what a value must be; `error` is one of pydantic's `errors()`."""
     kind, context = str(error["type"]), error.get("ctx") or {}
     wanted = _MUST_BE.get(kind) or _MUST_BE.get(kind.partition("_")[0]) or f"of another type ({kind})"
     shown = {name: _plain(value) for name, value in context.items()}
@@ -99,7 +99,7 @@ def must_be(error: Mapping[str, Any]) -> str:
 
 
 def refusal(error: Mapping[str, Any]) -> str:
-    """For the command line or a query; `error` is one of pydantic's `errors()`."""
+    """Return the message for the command line or a query; `error` is one of pydantic's `errors()`."""
     if error["type"] == "missing":
         return "must be given"
     if error["type"] == "value_error":  # raised by the appliance's own validator, with a complete message
@@ -108,9 +108,9 @@ def refusal(error: Mapping[str, Any]) -> str:
 
 
 def body_refusal(text: str, choices: Collection[str] = ()) -> str:
-    """`text` is msgspec's `ValidationError` without its path.
+    """Return the message for a REST body; `text` is msgspec's `ValidationError` without its path.
 
-    `choices`: the valid strings of an enumeration.
+    `choices` are the valid strings of an enumeration.
     """
     no_choice = text.removeprefix("Invalid enum value ")
     if no_choice != text:
@@ -146,5 +146,4 @@ def _typed(types: str) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Libraries store whole bounds as `1.0`."""
     return int(value) if isinstance(value, float) and value.is_integer() else value

@@ -5,8 +5,7 @@ Invariants:
 1. Every order calls `take_effect` before its first change. `take_effect` raises `WithdrawnError` if the client gave up
    earlier (timeout, disconnection, kill). A withdrawn order changes nothing, now or later.
 2. After `take_effect`, the order runs to its end even if its client gives up.
-3. A client that gave up therefore knows that its order does not start later. The audit log lists every order that
-   started.
+3. The audit log lists every order that started.
 4. Work outside an order (a start, a signal, an automatic rollback) is never withdrawn. Tasks that outlive their order
    are not withdrawn either.
 
@@ -23,7 +22,7 @@ WITHDRAWN = (
 
 
 class WithdrawnError(Exception):
-    """Nothing was changed."""
+    """The client gave up before its order changed anything."""
 
     def __init__(self) -> None:
         super().__init__(WITHDRAWN)
@@ -42,7 +41,7 @@ _PRESENT: ContextVar[_Order | None] = ContextVar("order", default=None)
 
 @contextlib.contextmanager
 def awaited(given_up: Callable[[], bool]) -> Iterator[None]:
-    """`given_up()` returns whether the client stopped waiting."""
+    """Run the block as an order; `given_up()` returns whether its client stopped waiting."""
     order = _Order(given_up)
     before = _PRESENT.set(order)
     try:
@@ -60,7 +59,7 @@ def require_awaited() -> None:
 
 
 def take_effect() -> None:
-    """Raises `WithdrawnError` if the client gave up."""
+    """Mark the present order as begun. Raises `WithdrawnError` if the client gave up."""
     require_awaited()
     order = _PRESENT.get()
     if order is not None:

@@ -3,8 +3,8 @@
 The admin socket carries one JSON document per line in each direction, and one request per connection at a time. It is
 in the state directory; only its owner and root may use it. It accepts all requests except `ChallengeWanted`.
 
-Over REST, the api process passes on all requests with `@rest`. It gets the same JSON document back.
-`channel/operations.py` has both unions, with the requests of features.
+The api process passes on all requests with `@rest`. `channel/operations.py` has both unions, with the requests of
+features.
 
 `@rest` defines a request's row in the table of operations (`channel/rest_operation.py`): method, path, role, ETag. The
 docstring of a request is its description in the REST contract, unless the row has `words`.
@@ -82,7 +82,6 @@ class WaitingRequest(AdminRequest[A], Generic[A], frozen=True):
 
 
 def verb_of(request: AdminRequest[Any]) -> str:
-    """The name is the `verb` in JSON."""
     return str(type(request).__struct_config__.tag)
 
 
@@ -165,7 +164,7 @@ class RegistrationsWanted(AdminRequest[graph_answers.Registrations], frozen=True
 
 @rest("viewer", "GET", "/v1/graph", name="graph")
 class GraphWanted(AdminRequest[graph_answers.Graph], frozen=True, tag="graph"):
-    """Nodes, topics and services, whether they are mediated, and rates."""
+    """Nodes, topics and services, whether the appliance relays them, and rates."""
 
 
 @rest(
@@ -173,7 +172,7 @@ class GraphWanted(AdminRequest[graph_answers.Graph], frozen=True, tag="graph"):
     problems={404: "No node publishes or subscribes to it."}, tag="graph",
 )  # fmt: skip
 class TopicLook(WaitingRequest[graph_answers.TopicMessages], frozen=True, tag="topic look"):
-    """The next messages of a topic as subscribers get them, read as fields. The query is recorded."""
+    """The next messages of a topic as subscribers get them, with their fields. The query is recorded."""
 
     topic: Annotated[str, parameter("name of the topic", max_length=500, examples=["/scan"])]
     messages: Annotated[int, parameter("maximum number of messages", ge=1, le=20)] = 1
@@ -219,7 +218,7 @@ class MonitorLoad(AdminRequest[monitor_answers.Replacement], frozen=True, tag="m
 
 @rest("operator", of=MONITORS)
 class MonitorTry(WaitingRequest[monitor_answers.Tried], frozen=True, tag="monitor try"):
-    """Compile these and report what loading them would do (see `MonitorLoad`); nothing changes."""
+    """Compile specifications and report what loading them would do (see `MonitorLoad`); nothing changes."""
 
     files: dict[str, str]
     definitions: dict[str, str] = {}
@@ -259,7 +258,7 @@ class MonitorReplace(AdminRequest[monitor_answers.Replacement], frozen=True, tag
     admin_with={"prune": "removing files that the folder does not have"},
 )  # fmt: skip
 class MonitorReload(AdminRequest[monitor_answers.Replacement], frozen=True, tag="monitor reload"):
-    """Load the files of the folder; files that it does not have stay in force unless an admin sets `prune`."""
+    """Load the files of the folder. Specifications that the folder lacks stay in force unless an admin sets `prune`."""
 
     expected: str | None = None
     prune: Annotated[bool, parameter("also remove files that the folder does not have")] = False
@@ -278,7 +277,7 @@ class MonitorReload(AdminRequest[monitor_answers.Replacement], frozen=True, tag=
 
 )  # fmt: skip
 class MonitorRemove(AdminRequest[monitor_answers.Replacement], frozen=True, tag="monitor remove"):
-    """Remove the file of a monitor (or the file of this name); refused where others use its variables."""
+    """Remove the file of a monitor (or the file of this name); rejected if other files use its variables."""
 
     names: SomeMonitors
     expected: str | None = None
@@ -290,7 +289,7 @@ class MonitorRemove(AdminRequest[monitor_answers.Replacement], frozen=True, tag=
 
 )  # fmt: skip
 class MonitorRollback(AdminRequest[monitor_answers.Replacement], frozen=True, tag="monitor rollback"):
-    """Bring a kept revision into force again, as a new one; what comes back is switched as it was."""
+    """Bring a kept revision into force again, as a new one; monitors are enabled and disabled as they were."""
 
     revision: int | None = None  # None: the one before the present
     expected: str | None = None
@@ -349,7 +348,8 @@ class MonitorSwitch(AdminRequest[monitor_answers.Switched], frozen=True, tag="mo
 class MonitorShadow(AdminRequest[monitor_answers.Switched], frozen=True, tag="monitor shadow"):
     """Put these monitors into shadow mode, or (false) bring those in shadow mode into force.
 
-    `force` as of a load. With `confirm_within` they return to shadow mode unless confirmed.
+    `force` has the same meaning as for a load. With `confirm_within` the monitors return to shadow mode
+    unless confirmed.
     """
 
     names: SomeMonitors
@@ -364,7 +364,7 @@ class MonitorShadow(AdminRequest[monitor_answers.Switched], frozen=True, tag="mo
     problems=_NO_MONITOR,
 )  # fmt: skip
 class MonitorGive(AdminRequest[monitor_answers.GivenSet], frozen=True, tag="monitor set"):
-    """Set constants that are given to a monitor, within their ranges; its state and its text stay."""
+    """Set constants that are given to a monitor, within their ranges; the monitor keeps its state and text."""
 
     name: OneMonitor
     values: dict[str, bodies.GivenValue]
@@ -374,7 +374,7 @@ class MonitorGive(AdminRequest[monitor_answers.GivenSet], frozen=True, tag="moni
 @rest("operator", "PATCH", _SEVERAL, says={"held": False}, of=MONITORS)
 @rest("operator", "PATCH", _ONE, says={"held": False}, of=MONITORS)
 class MonitorResume(AdminRequest[monitor_answers.Switched], frozen=True, tag="monitor resume"):
-    """Let the topics that these monitors hold go on."""
+    """Release the topics that these monitors hold."""
 
     names: SomeMonitors
     expected: str | None = None
@@ -410,7 +410,7 @@ class TokenList(AdminRequest[token_answers.Tokens], frozen=True, tag="token list
     problems={422: "There is no valid token of this name."},
 )  # fmt: skip
 class TokenRevoke(AdminRequest[token_answers.Token], frozen=True, tag="token revoke"):
-    """End a token now: from then on it is answered with 401, and open streams of its holder end. For admins."""
+    """End a token: it is then answered with 401, and open streams of its holder end. For admins."""
 
     name: Annotated[str, parameter(min_length=1, max_length=80, examples=["shift"])]
 
@@ -421,11 +421,10 @@ class ChallengeWanted(AdminRequest[token_answers.Challenge], frozen=True, tag="c
 
 
 CORE_REQUESTS: tuple[type[AdminRequest[Any]], ...] = (TokenAdd, TokenRotate, *rows())
-"""`channel/operations.py` adds the requests of features."""
+"""The requests of the core; `channel/operations.py` adds those of features."""
 
 
 def operation_of(request: AdminRequest[Any]) -> Operation | None:
-    """None if REST does not have the request."""
     given = msgspec.structs.asdict(request)
     for operation in rows().get(type(request), ()):
         if all(given[name] == value for name, value in operation.fixed.items()):
@@ -472,5 +471,5 @@ def answer_to(kind: type[AdminRequest[A]]) -> type[A]:
 
 
 def decode(document: bytes, request: AdminRequest[A]) -> AdminAnswer[A]:
-    """Raises `ValueError`."""
+    """Parse control's answer to the request. Raises `ValueError`."""
     return _decoder(type(request)).decode(document)

@@ -36,7 +36,7 @@ class AlarmList(msgspec.Struct, frozen=True):
 
 
 def open_alarms(status: Status) -> list[Alarm]:
-    """The most severe alarms come first."""
+    """Return the present alarms, the most severe first."""
     found = [*_system(status), *_policy(status), *_monitors(status)]
     found += [("warning", "ipsec", "hosts", line) for line in status.ipsec.troubles]
     found += _blocks(status.blocks)
@@ -49,7 +49,7 @@ def open_alarms(status: Status) -> list[Alarm]:
 
 
 def activity(status: Status) -> list[Alarm]:
-    """The denials and drops of the last minute are not faults of the appliance."""
+    """Return notices of the last minute's denials and drops, which are not faults of the appliance."""
     recent = status.last_minute
     found = [
         Alarm(
@@ -68,7 +68,7 @@ def activity(status: Status) -> list[Alarm]:
 
 
 def _handled(status: Status, alarms: Iterable[Alarm]) -> Iterator[Alarm]:
-    """Alarms that an operator acknowledged or silenced get a note about it."""
+    """Yield the alarms, with a note if an operator acknowledged or silenced them."""
     rows = {row.kind: row for row in status.handled_alarms}
     for alarm in alarms:
         row = rows.get(alarm.kind)

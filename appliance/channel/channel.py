@@ -1,11 +1,10 @@
 """Send and receive typed messages and file descriptors over a Unix stream socket, without blocking.
 
-A frame is a 4-byte big-endian length, followed by a MessagePack document of this length. Descriptors are sent as
-SCM_RIGHTS with the first byte of their frame. The kernel never merges two sends with descriptors, so received
-descriptors are queued in order and assigned to frames in this order.
+A frame is a 4-byte big-endian length, followed by a MessagePack document of this length. Descriptors are sent
+as SCM_RIGHTS with the first byte of their frame. The kernel never merges two sends with descriptors, so
+received descriptors are queued in order and assigned to frames in this order.
 
-The channel has no event loop. Its owner waits on `fileno()`, calls `receive()` when it is readable, and `flush()`
-when it is writable. So the same class works with asyncio (`attach`) and with the relay's epoll loop.
+The owner of a channel waits on `fileno()`, calls `receive()` when it is readable, and `flush()` when it is writable.
 
 If the peer does not read, `send` raises `ChannelFullError` beyond `limit` bytes of backlog: a defect, because both
 ends belong to the appliance. A sender that can wait does so while the channel is `crowded`.
@@ -50,7 +49,7 @@ class ChannelFullError(Exception):
 
 
 class Channel:
-    """`union` is a union of `Message` structs."""
+    """One end of a link; `union` is a union of `Message` structs."""
 
     def __init__(
         self, sock: socket.socket, union: Any, *, limit: int = 64 << 20, longest: int = 64 << 20
@@ -84,10 +83,10 @@ class Channel:
         return self._backlog > self._limit // 2
 
     def send(self, message: Message, descriptors: tuple[int, ...] = (), *, soon: bool = False) -> None:
-        """Raises `ChannelFullError`.
+        """Queue a message. Raises `ChannelFullError`.
 
-        Descriptors are duplicated; the caller keeps its own. `soon`: an attached channel writes the message within
-        `SOON_SECONDS`, together with other messages.
+        Descriptors are duplicated; the caller keeps its own. `soon`: an attached channel writes the message
+        within `SOON_SECONDS`, together with other messages.
         """
         if len(descriptors) != message.descriptors:
             raise ValueError(f"{type(message).__name__} travels with {message.descriptors} descriptors")
@@ -225,7 +224,7 @@ class Channel:
         self._watch_writable()
 
     def detach(self) -> None:
-        """Messages stay in the socket until the next `attach`."""
+        """Stop serving; messages stay in the socket until the next `attach`."""
         if self._loop is not None:
             self._loop.remove_reader(self.fileno())
             self._loop.remove_writer(self.fileno())
@@ -272,7 +271,7 @@ class Channel:
         self._backlog = 0
 
     def close(self) -> None:
-        """Descriptors that no message has claimed are closed too."""
+        """Close this end, and descriptors that no message has claimed."""
         if self._socket.fileno() < 0:
             return
         if self._loop is not None:

@@ -16,7 +16,7 @@ from appliance.channel.messages import Failed, LinkOpened, MemoryGiven, Message,
 
 
 class Child:
-    """`said(message)` gets control's messages; `linked()` is called for each new link."""
+    """A child's loop; `said(message)` gets control's messages, `linked()` is called for each new link."""
 
     def __init__(
         self,
@@ -46,7 +46,7 @@ class Child:
         self._answer(ready)
 
     def tell(self, message: Message) -> bool:
-        """Return False if there is no link.
+        """Send a message to control; return False if there is no link.
 
         If control does not read, close the link and return False: control asks again over its next link.
         """
@@ -57,7 +57,7 @@ class Child:
             return False
 
     def fail(self, reason: str, output: list[str]) -> None:
-        """`output` is that of the program that this process ran."""
+        """Report that the child cannot serve; `output` is the output of the program that this process ran."""
         self._answer(Failed(reason, output))
 
     def close(self) -> None:

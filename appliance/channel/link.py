@@ -11,12 +11,13 @@ from appliance.channel.messages import Message
 
 
 class Link:
-    """`heard(message)` gets messages of the present process only.
+    """The present channel; `heard(message)` gets messages of the present process only.
 
-    `took(message, descriptors)` gets the messages with descriptors, which it then owns; without it, they are closed.
+    `took(message, descriptors)` gets the messages with descriptors, which it then owns; without it, they are
+    closed.
 
-    `lost(reason)` is called when the process is gone and has no successor yet. The reason is empty unless the process
-    sent an invalid message.
+    `lost(reason)` is called when the process is gone and has no successor yet. The reason is empty unless the
+    process sent an invalid message.
     """
 
     def __init__(
@@ -81,20 +82,19 @@ class Link:
             del self._asked[number]
 
     def answered(self, number: int, answer: Any) -> None:
-        """Ignore the answer if its question has ended."""
+        """Answer the open question with this number; ignore the answer if the question has ended."""
         future = self._asked.get(number)
         if future is not None and not future.done():
             future.set_result(answer)
 
     def release(self) -> Channel | None:
-        """The other link gets all later messages; None if not connected."""
+        """Give the channel to another link, which gets all later messages; None if not connected."""
         channel, self.channel = self.channel, None
         if channel is not None:
             channel.detach()
         return channel
 
     def close(self) -> None:
-        """Open questions fail then."""
         if self.channel is None:
             return
         self.channel.close()

@@ -9,7 +9,7 @@ from appliance.features.table import FEATURES
 REQUESTS = (*CORE_REQUESTS, *(request for feature in FEATURES for request in feature.operations()))
 OPERATIONS = tuple(operation for request in REQUESTS for operation in rows().get(request, ()))
 CHANGES = frozenset(operation.request for operation in OPERATIONS if operation.is_change)
-"""In the name of a token: control requires the client's HTTP request for each."""
+"""The changes in the name of a token; for each, control requires the client's HTTP request."""
 
 ORDERS = CHANGES | {operation.request for operation in OPERATIONS if operation.changes}
 """All changes over REST, in the name of a token or of a host."""

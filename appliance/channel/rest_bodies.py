@@ -52,13 +52,13 @@ class PolicyText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Rollback(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where to go back to; null: the revision before the present one."""
+    """The revision to return to; null: the revision before the present one."""
 
     revision: Annotated[int, msgspec.Meta(ge=1, le=LONGEST_REVISION)] | None = None
 
 
 class NewSpecifications(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Specifications to add, or to put in the place of those in files of the same name."""
+    """Specifications to add; they replace those in files of the same name."""
 
     files: Annotated[
         dict[FileName, FileText], doc("texts by the name of the file", min_length=1, max_length=1000)
@@ -105,7 +105,6 @@ class Switch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     ] = None
 
     def __post_init__(self) -> None:
-        """Raises `ValueError`."""
         if [self.enabled, self.held, self.shadow].count(None) != 2 or self.held is True:
             raise ValueError("one of `enabled` (true or false), `shadow` (true or false) and `held` (false)")
         if self.for_seconds is not None and self.enabled is not False:
@@ -113,6 +112,6 @@ class Switch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class SwitchMany(Switch, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The same for several monitors at once: all of them, or none when there is an unknown name."""
+    """The same for several monitors at once: for all, or for none if a name is unknown."""
 
     names: Annotated[list[MonitorName], msgspec.Meta(min_length=1, max_length=1000)]

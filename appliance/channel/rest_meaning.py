@@ -28,7 +28,7 @@ _SECOND = 1_000_000_000
 
 
 class NoOrderError(ValueError):
-    """The message gives the reason."""
+    """A request does not make an order; the message gives the reason."""
 
 
 class BadTagError(NoOrderError):
@@ -36,7 +36,7 @@ class BadTagError(NoOrderError):
 
 
 class RestCall(NamedTuple):
-    """`match`: it is sent with `If-Match: *`, so it changes any revision in force."""
+    """An order as an HTTP request; `match`: it is sent with `If-Match: *`, so it changes any revision in force."""
 
     method: str
     target: str
@@ -49,7 +49,7 @@ def is_dry_run(query: str) -> bool:
 
 
 def meant(asked: ClientRequest, *, dry_run: bool = False) -> AdminRequest[Any]:
-    """With `dry_run`, the request must be a dry run. Raises `NoOrderError`."""
+    """Return the order that a request makes; with `dry_run`, it must be a dry run. Raises `NoOrderError`."""
     path, _mark, text = asked.target.partition("?")
     if is_dry_run(text) is not dry_run:
         raise NoOrderError("a dry run changes nothing")
@@ -80,7 +80,6 @@ def filled_in(order: AdminRequest[Any], given: AdminRequest[Any]) -> AdminReques
 
 
 def call_of(order: AdminRequest[Any], operation: Operation) -> RestCall:
-    """The inverse of `meant`."""
     values = msgspec.structs.asdict(order)
     path, query = operation.path, []
     for name, field in operation.fields().items():
@@ -140,7 +139,6 @@ def _order(
 
 
 def _read(kind: Any, given: list[str]) -> Any:
-    """The last one of a repeated parameter counts."""
     kind = plain(kind)
     if get_origin(kind) is list:
         return given
@@ -150,7 +148,6 @@ def _read(kind: Any, given: list[str]) -> Any:
 
 
 def _moment(field: msgspec.structs.FieldInfo, value: Any) -> Any:
-    """A date in a numeric field becomes seconds or nanoseconds since the epoch."""
     kind = plain(field.type)
     if not isinstance(value, str) or kind not in (int, float):
         return value
@@ -174,7 +171,7 @@ def _body(asked: ClientRequest) -> dict[str, Any]:
 
 
 def _tag(operation: Operation, if_match: str) -> str | None:
-    """Return None for `*`. Raises `BadTagError`."""
+    """Return the tag in `If-Match`, or None for `*`. Raises `BadTagError`."""
     assert operation.of is not None  # noqa: S101  a request with `expected` changes something that has an ETag
     given = if_match.strip()
     if given == "*":

@@ -19,19 +19,18 @@ R = TypeVar("R", bound=msgspec.Struct)
 
 
 class RequestParameter(NamedTuple):
-    """For FastAPI: the description, bounds and name of a field in the path or the query."""
+    """The description, bounds and name of a field in the path or the query, for FastAPI."""
 
     name: str
     rules: Mapping[str, Any]
 
 
 def parameter(description: str = "", *, name: str = "", **rules: Any) -> RequestParameter:
-    """Annotates a field that is sent in the path or the query; `name` is its name there, if it differs."""
+    """Annotate a field that is sent in the path or the query; `name` is its name there, if it differs."""
     return RequestParameter(name, {**({"description": description} if description else {}), **rules})
 
 
 def parameter_of(kind: Any) -> RequestParameter:
-    """Return an empty one if the annotation has none."""
     if get_origin(kind) is Annotated:
         return next(
             (one for one in kind.__metadata__ if isinstance(one, RequestParameter)), RequestParameter("", {})
@@ -40,7 +39,7 @@ def parameter_of(kind: Any) -> RequestParameter:
 
 
 def plain(kind: Any) -> Any:
-    """Remove the annotation, and `| None`."""
+    """Return a type without its annotation and `| None`."""
     while True:
         if get_origin(kind) is Annotated:
             kind = get_args(kind)[0]
@@ -120,7 +119,6 @@ class Operation:
         return bool(self.path) and self.method != "GET"
 
     def fields(self) -> Mapping[str, msgspec.structs.FieldInfo]:
-        """By their names in the path and the query."""
         return _fields(self.request)
 
     def in_body(self) -> list[msgspec.structs.FieldInfo]:

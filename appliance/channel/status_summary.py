@@ -6,12 +6,11 @@ from appliance.channel.answers.status import ProcessInfo, Status
 
 
 def probe_failed(status: Status) -> bool:
-    """The probe reached the hidden ROS master past the appliance; False before the first probe."""
+    """Whether the probe reached the hidden ROS master past the appliance; False before the first probe."""
     return status.probe not in ("", "passed")
 
 
 def no_relay(presence: str) -> str | None:
-    """Return the effect of missing relay processes."""
     if presence == "connected":
         return None
     if presence == "away":
@@ -20,7 +19,6 @@ def no_relay(presence: str) -> str | None:
 
 
 def unserved(status: Status) -> str | None:
-    """Return why nodes are not served now."""
     if probe_failed(status):
         return f"the ROS master is not hidden: {status.probe}"
     if status.audit.failed and status.audit.on_failure == "deny":
@@ -32,7 +30,7 @@ def unserved(status: Status) -> str | None:
 
 
 def process_names(processes: Sequence[ProcessInfo]) -> list[str]:
-    """A number from 0 follows the role if it has several processes."""
+    """Return the names of processes: the role, with a number from 0 if it has several processes."""
     roles = [row.role for row in processes]
     return [
         f"{role} {roles[:place].count(role)}" if roles.count(role) > 1 else role

@@ -28,12 +28,11 @@ ConfirmWithin = Annotated[
 
 
 def seconds_within(text: str | None, noun: str) -> float | None:
-    """--confirm-within of `rosrv noun`. Exits with status 2 if it is not a duration."""
+    """Return the seconds of --confirm-within. Exits with status 2 if it is not a duration."""
     return None if text is None else span_given("--confirm-within", text, "30s, 5m or 1h", f"rosrv {noun}")
 
 
 def say_deadline(confirm_by: float | None, noun: str) -> None:
-    """Print nothing for a permanent change."""
     if confirm_by is not None:
         say(f"rolls back at {_time(confirm_by)} unless you run: rosrv {noun} confirm", "yellow")
 
@@ -46,9 +45,10 @@ def verbs_of(
     back: Callable[[int | None], AdminRequest[_Done]],
     say_done: Callable[[_Done], None],
 ) -> tuple[GroupedVerb, GroupedVerb, GroupedVerb]:
-    """`revisions`, `rollback` and `confirm` of `rosrv noun`.
+    """Return `revisions`, `rollback` and `confirm` of `rosrv noun`.
 
-    `listed`, `confirmation` and `back(revision)` are their requests; `say_done` prints the result of a rollback.
+    `listed`, `confirmation` and `back(revision)` are their requests; `say_done` prints the result of a
+    rollback.
     """
 
     def revisions(appliance: Appliance) -> None:

@@ -36,8 +36,6 @@ topics = _names(admin.GraphWanted(), lambda body: [row.name for row in body.topi
 
 
 def _names_of_feature(verb: str, of: Callable[[Any], Iterable[str]]) -> Complete:
-    """Without the feature there are no names."""
-
     def complete(context: typer.Context, incomplete: str) -> list[str]:
         from appliance.channel.operations import request_named  # noqa: PLC0415  only completion needs all features
 

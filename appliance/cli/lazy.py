@@ -28,7 +28,7 @@ def application(
     callback: Callable[..., None] | None = None,
     **settings: Any,
 ) -> typer.Typer:
-    """`callback` takes the options before the verb.
+    """Return a typer application; `callback` takes the options before the verb.
 
     `further` returns more verbs; it is called for the help, for completion and for a name that `verbs` lacks.
     """
@@ -49,7 +49,7 @@ def _nothing() -> None:
 
 def _group_of(verbs: Verbs, further: Callable[[], Verbs]) -> type[TyperGroup]:
     class _Lazy(TyperGroup):
-        """Commands are imported when they are run."""
+        """A group whose commands are imported when they are run."""
 
         # click sets it
         commands = property(lambda self: self.all_commands, lambda _self, _given: None)
@@ -67,11 +67,11 @@ def _group_of(verbs: Verbs, further: Callable[[], Verbs]) -> type[TyperGroup]:
             return _without_type_of_flags(super().get_params(ctx))
 
         def get_command(self, ctx: Any, cmd_name: str) -> Any:
-            """Features are imported only for a command that the core lacks."""
+            """Return a command; features are imported only for a command that the core lacks."""
             return self.own_commands.get(cmd_name) or super().get_command(ctx, cmd_name)
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-            """For an unknown name without a close match, list all verbs."""
+            """Find the command; for an unknown name without a close match, list all verbs."""
             name = args[0]
             if name in self.own_commands:
                 return super().resolve_command(ctx, args)
@@ -139,7 +139,7 @@ def loaded(verb: Verb, name: str) -> Any:
 
 
 def _without_type_of_flags(options: list[Any]) -> list[Any]:
-    """typer prints `<bool>` for a flag, which takes no value."""
+    """Remove `<bool>`, which typer prints for a flag, although a flag takes no value."""
     for option in options:
         if isinstance(option, TyperOption) and option.is_flag:
             option.metavar = ""

@@ -133,7 +133,6 @@ app = application(
 
 
 def main() -> None:
-    """Errors are text, never a traceback."""
     _open_closed_streams()
     sys.argv[1:] = _asking_for_help(_without_old_flags(sys.argv[1:]))
     try:
@@ -171,13 +170,13 @@ _OLD_FLAGS = {"-list": "list", "-rvstate": "rvstate", "-enable": "enable", "-dis
 
 
 def _without_old_flags(arguments: list[str]) -> list[str]:
-    """`rosrv -enable M…` becomes `rosrv monitor enable M…`."""
+    """Convert flags of the original ROSRV: `rosrv -enable M…` becomes `rosrv monitor enable M…`."""
     verb = _OLD_FLAGS.get(arguments[0]) if arguments else None
     return arguments if verb is None else ["monitor", verb, *arguments[1:]]
 
 
 def _asking_for_help(arguments: list[str]) -> list[str]:
-    """`rosrv help policy check` and `rosrv policy help check` become `rosrv policy check --help`."""
+    """Convert `help`: `rosrv help policy check` and `rosrv policy help check` become `rosrv policy check --help`."""
     if "help" not in arguments[:2]:
         return arguments
     return [*(word for word in arguments[:2] if word != "help"), *arguments[2:], "--help"]

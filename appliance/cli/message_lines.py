@@ -7,7 +7,7 @@ from rosmop.tool.terminal import printable
 
 
 def lines_of(value: Any, depth: int) -> Iterator[str]:
-    """One field per line, without control characters."""
+    """Yield one line for each field, without control characters."""
     indent = "  " * depth
     if isinstance(value, Mapping):
         for name, inner in value.items():
@@ -26,7 +26,6 @@ def lines_of(value: Any, depth: int) -> Iterator[str]:
 
 
 def _is_deep(value: Any) -> bool:
-    """A value with fields needs its own lines."""
     return isinstance(value, Mapping) or (isinstance(value, list) and any(map(_is_deep, value)))
 
 

@@ -26,7 +26,6 @@ Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one
 
 
 def moment(seconds: float) -> str:
-    """The text is in UTC, to the minute."""
     return datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%MZ")
 
 
@@ -42,13 +41,13 @@ def loaded_by(who: str, seconds: float | None) -> str:
 
 
 def usage_error(text: str, verb: str = "rosrv") -> typer.Exit:
-    """The caller raises the result (exit status 2)."""
+    """Print the text and return an exit with status 2, which the caller raises."""
     typer.echo(f"{verb}: {printable(text)}", err=True)
     return typer.Exit(2)
 
 
 def write_told(path: Path, data: bytes | mmap) -> None:
-    """Warn if the data may not survive a power cut. Raises `OSError`."""
+    """Write to the path that the operator named; warn if a power cut may lose the data. Raises `OSError`."""
     try:
         write_where_told(path, data)
     except NotLastingError as error:
@@ -60,13 +59,13 @@ def say_json(fields: msgspec.Struct | Mapping[str, Any] | tuple[Any, ...]) -> No
 
 
 def say_diff(lines: Iterable[str]) -> None:
-    """Additions are green, removals red, positions cyan."""
+    """Print a diff: additions green, removals red, positions cyan."""
     for line in lines:
         terminal.say(line, {"+": "green", "-": "red", "@": "cyan"}.get(line[:1], ""))
 
 
 def by_host(rows: Iterable[_T], host: Callable[[_T], str]) -> list[tuple[str, list[_T]]]:
-    """The host with the most rows comes first."""
+    """Group rows by host; the host with the most rows comes first."""
     found: dict[str, list[_T]] = {}
     for row in rows:
         found.setdefault(host(row), []).append(row)
@@ -74,7 +73,7 @@ def by_host(rows: Iterable[_T], host: Callable[[_T], str]) -> list[tuple[str, li
 
 
 def say_row(parts: Iterable[str], style: str = "") -> None:
-    """One line in a pipe; on a terminal, parts without room are on more, indented lines."""
+    """Print a row: one line in a pipe; on a terminal, parts without room are on more, indented lines."""
     first, *rest = parts
     width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
     line = first

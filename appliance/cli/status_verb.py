@@ -84,7 +84,7 @@ def status(
 
 
 def _look(appliance: Appliance) -> StatusView:
-    """Raises `NotRunningError` also for an appliance that cannot give its status now."""
+    """Return the status. Raises `NotRunningError` also for an appliance that cannot give its status now."""
     answer = _answer(appliance)
     if not answer.ok:
         raise NotRunningError(answer.error)
@@ -92,7 +92,7 @@ def _look(appliance: Appliance) -> StatusView:
 
 
 def _answer(appliance: Appliance) -> AdminAnswer[StatusView]:
-    """A standby has no status: return the state of both appliances. Raises `NotRunningError`."""
+    """Return the status, or a standby's view of both appliances. Raises `NotRunningError`."""
     answer = appliance.ask(StatusWanted())
     if answer.trouble == "standby":
         pair = pair_view()
@@ -116,12 +116,12 @@ def _view(body: Status, appliance: Appliance) -> StatusView:
 
 
 def _is_attention(alarm: Alarm, body: Status) -> bool:
-    """Recent denials and drops, and silenced alarms, are shown without being a trouble."""
+    """Whether an alarm affects the exit status; recent denials and drops, and silenced alarms, do not."""
     return alarm in activity(body) or (alarm.severity == "notice" and alarm.handled != "")
 
 
 def troubles_of(body: Status) -> list[str]:
-    """Most urgent first: alarms except notices, and audit-only sections."""
+    """Return alarms except notices, and audit-only sections, the most urgent first."""
     return [
         alarm.text
         for alarm in open_alarms(body)
@@ -131,7 +131,7 @@ def troubles_of(body: Status) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class StatusScreen:
-    """Problems come first, then recent denials and drops."""
+    """Prints a status: problems come first, then recent denials and drops."""
 
     body: Status
     troubles: list[str]
@@ -240,7 +240,7 @@ def _ports(known: dict[str, PortsSeen], host_in_words: HostInWords) -> str:
 
 
 def _others_rules(firewall: FirewallState) -> Iterator[tuple[str, str]]:
-    """For isolation netns; --json lists the chains' names."""
+    """Yield the rules of other programs that affect isolation netns; --json lists the chains' names."""
     translating, dropping = firewall.translations or [], firewall.obstacles or []
     words = []
     if translating:
@@ -263,7 +263,7 @@ def _isolation(body: Status) -> str:
 
 
 def processes_table(rows: Sequence[ProcessInfo], width: int, now: float | None = None) -> Table:
-    """As many columns as fit, read downwards; processes of one role are numbered from 0."""
+    """Return a table with as many columns as fit, read downwards; processes of one role are numbered from 0."""
     across = max(1, min(3, width // _COLUMN))
     high = -(-len(rows) // across)
     table = table_of(*["process", "pid", "for", "restarts"] * across)
@@ -283,7 +283,7 @@ def _cells(row: ProcessInfo, name: str, now: float | None) -> list[Text]:
 
 
 def missing_sandbox(rows: Sequence[ProcessInfo]) -> str | None:
-    """None if this kernel supports all sandbox limits."""
+    """Return the missing sandbox limits, or None if this kernel supports all."""
     lacking = [f"{row.role}: {what}" for row in rows for what in row.lacks]
     if not lacking:
         return None
@@ -291,7 +291,7 @@ def missing_sandbox(rows: Sequence[ProcessInfo]) -> str | None:
 
 
 def doubted_clock(clock: ClockState) -> str | None:
-    """Why the times of records are unreliable."""
+    """Return why the times of records are unreliable, or None."""
     if clock.before_program_seconds:
         days = clock.before_program_seconds / 86_400
         return f"wrong: {days:.0f} days before this program was built; set it before hosts get certificates"

@@ -29,7 +29,7 @@ _MINUTES = slice(11, 19)  # the time of day in RFC 3339
 
 
 class StatusView(NamedTuple):
-    """Exit status, how a terminal shows it, and the JSON object."""
+    """A status: the exit status, its form on a terminal, and the JSON object."""
 
     exit_status: int
     screen: RenderableType
@@ -40,7 +40,7 @@ Look = Callable[[], StatusView]
 
 
 class _Looks:
-    """While the appliance does not answer, the view has the reason and the time since when."""
+    """Queries the status; while the appliance does not answer, the view has the reason and the time since then."""
 
     def __init__(self, look: Look) -> None:
         self._look = look

@@ -99,7 +99,6 @@ def _say_new(body: NewToken) -> None:
 
 
 def _forget_first(appliance: Appliance, ended: Token) -> None:
-    """Remove the file with the text of the first token if that one has ended."""
     if not isinstance(appliance.way, AdminSocket):
         return
     file = appliance.way.state / "first-token"
@@ -135,7 +134,6 @@ def list_tokens(appliance: Appliance) -> None:
 
 
 def _use(row: Token, since: float | None) -> str:
-    """Uses before `since` are unknown."""
     if row.last_used is not None:
         return f"last used {moment(row.last_used)}"
     if since is None:

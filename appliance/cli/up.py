@@ -130,7 +130,7 @@ def _announce_waiting(pairing: Pairing | None, *, as_json: bool) -> None:
 
 
 def _write(line: str, *, as_json: bool) -> None:
-    """Write a line to standard output, as it is for `--json`. Raises `OSError`."""
+    """Write a line to standard output as JSON or text. Raises `OSError`."""
     if as_json:
         sys.stdout.write(f"{line}\n")
         sys.stdout.flush()
@@ -139,7 +139,9 @@ def _write(line: str, *, as_json: bool) -> None:
 
 
 def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
-    """If the first token cannot be stored, print nothing and raise `StartError`."""
+    """Print that nodes may connect, with the first token. If it cannot be stored, print nothing and raise
+    `StartError`.
+    """
     rest = _rest_url(settings)
     more: list[str] = []
     if as_json:
@@ -194,7 +196,7 @@ def _rest_url(settings: Settings) -> str | None:
 
 
 def _keep_token(state: Path, token: str) -> Path:
-    """Only the owner can read the file. Raises `StartError`; no file is then left."""
+    """Write the token to a file that only the owner can read. Raises `StartError`, and leaves no file, on an error."""
     path = state / "first-token"
     try:
         path.unlink(missing_ok=True)

@@ -36,7 +36,7 @@ _LAST_POLICY = """
 def read_inputs(settings: Settings, robot: str | None = None) -> range:
     """Return the range of ports that the policy gives to nodes.
 
-    One of two appliances, which knows the address of the `robot`, starts with what was in force on the active one.
+    One of two appliances, which knows the address of the `robot`, starts with the policy of the active one.
 
     Raises `StartError` with every error of the policy or of the specifications.
     """
@@ -68,7 +68,7 @@ def read_node_ports(settings: Settings, robot: str | None = None) -> range:
 
 
 class _Stored(NamedTuple):
-    """Not `complete`: an earlier run left changes that are not in the database."""
+    """The content of the store; if it is not `complete`, an earlier run left changes that are not in the database."""
 
     policy: KeptPolicy | None
     hosts: Mapping[str, Address]
@@ -142,7 +142,7 @@ def _errors_in(folder: Path, site_keys: Sequence[str], *, kept: bool) -> str:
 
 
 def _last_author(state: Path) -> str:
-    """`DISK` means that they were read from the folder.
+    """Return the author of the specifications in the store; `DISK` means that they were read from the folder.
 
     A question mark means unknown: an earlier run may have left changes that are not in the database yet.
     """

@@ -8,10 +8,10 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True)
 class Verb:
-    """`place` is `module:function`; in the help, `first` precedes its docstring.
+    """A row of the table; `place` is `module:function`, and in the help, `first` precedes its docstring.
 
-    `module` is relative to this folder; a feature gives its whole name. The help lists a feature's verb `after`
-    another one.
+    `module` is relative to this folder; a feature gives its whole name. The help lists a feature's verb
+    `after` another one.
     """
 
     place: str
@@ -25,7 +25,6 @@ class Verb:
 
     @property
     def help(self) -> str:
-        """The module is not imported for this."""
         module, _colon, function = self.path.partition(":")
         file = _PACKAGES.joinpath(*module.split(".")).with_suffix(".py")
         return self.first or _first_sentence(file, function)
@@ -45,7 +44,7 @@ class Group:
 
 Verbs = Mapping[str, Verb | Group]
 FIRST = "(first)"
-"""For `after`: before all others."""
+"""The value of `after` for a verb before all others."""
 _PACKAGES = Path(__file__).parents[2]
 
 

@@ -11,7 +11,7 @@ from rosmop.tool.terminal import say
 def version(appliance: Appliance) -> None:
     """Show the version of rosrv, Python and the system.
 
-    With --state or --api: those of the running appliance.
+    With --state or --api, show the versions of the running appliance instead.
 
     Example: rosrv version --json
     """

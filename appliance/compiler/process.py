@@ -1,4 +1,4 @@
-"""The compiler as a process of the appliance: lifeline, link to control, and a worker thread.
+"""Run the compiler: lifeline, link to control, and a worker thread.
 
 Invariants:
 
@@ -80,7 +80,6 @@ class CompilerProcess:
         os._exit(0)
 
     def _lost(self, _reason: str) -> None:
-        """End the process, because control can no longer ask it."""
         os._exit(0)
 
     def _said(self, message: Any) -> None:

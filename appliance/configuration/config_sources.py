@@ -95,7 +95,6 @@ def read(values: Mapping[str, Any]) -> Settings:
 
 
 def plain(settings: Settings) -> dict[str, Any]:
-    """Return the settings in the form of `appliance.yaml`."""
     found: dict[str, Any] = _reader().dump_python(settings, mode="json")
     return found
 

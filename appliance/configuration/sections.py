@@ -26,7 +26,6 @@ def key(*, description: str = "", default: Any = dataclasses.MISSING, **rules: A
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(key,))
 def section(cls: type[T]) -> type[T]:
-    """Define a table of keys; unknown keys are rejected."""
     cls.__pydantic_config__ = {"extra": "forbid"}  # type: ignore[attr-defined]  # pydantic reads this attribute
     return dataclasses.dataclass(frozen=True, kw_only=True)(cls)
 
@@ -64,7 +63,6 @@ def split_receiver(text: str) -> tuple[str, str, int]:
 
 
 def checked_receiver(text: str) -> str:
-    """Return the receiver, checked. Raises `ValueError`."""
     split_receiver(text)
     return text
 
@@ -90,7 +88,7 @@ class FeatureSection:
 
     @property
     def holds_records(self) -> str:
-        """The key that keeps old audit records until the feature has stored them elsewhere; empty: none."""
+        """Return the key that keeps old audit records until the feature has stored them elsewhere, or an empty text."""
         return ""
 
     @classmethod
@@ -99,7 +97,6 @@ class FeatureSection:
         return given
 
     def receivers(self) -> dict[str, tuple[str | None, str | None]]:
-        """Return the URL and the address of each receiver on another machine, by key."""
         return {}
 
     def services(self) -> tuple[str, ...]:

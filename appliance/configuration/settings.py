@@ -65,7 +65,6 @@ _ADDRESS = GetPydanticSchema(lambda _source, handler: handler(IPvAnyAddress))
 
 
 def _comma_separated(value: object) -> object:
-    """Return a list of strings as one string with commas; return any other value unchanged."""
     return (
         ",".join(value) if isinstance(value, list) and all(isinstance(item, str) for item in value) else value
     )
@@ -476,7 +475,6 @@ class Settings:
 
     @property
     def api_address(self) -> tuple[str, int] | None:
-        """`api` as host and port; None when it is off."""
         return None if self.api == "off" else split_address(self.api)
 
     @property

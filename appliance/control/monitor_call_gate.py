@@ -58,7 +58,6 @@ class MonitorCallGate:
         return MonitorCallAnswered(wanted.number, self.host, port, self.name, "")
 
     async def _refused(self, service: str) -> str:
-        """Return why the call is denied; empty if it is allowed."""
         request = request_of(_CALL, ipaddress.ip_address(self.host), self.name, service)
         # A guard stops the robot also if another host holds the group (`[Authority]`).
         policy = replace(self.policy(), authority={}) if self.policy().authority else self.policy()

@@ -2,9 +2,9 @@
 
 Invariants:
 
-1. The core knows these classes and `table.py`, and nothing else of a feature. No feature imports another one.
+1. The core knows only these classes and `table.py`. No feature imports another one.
 2. Each process loads the table, so a row imports only settings and roles. `make`, `operations` and entries of roles
-   import the rest when they are called, in the process that needs it; routes and verbs are named by strings.
+   import the rest when they are called; routes and verbs are named by strings.
 3. No feature imports `configuration.settings` except in the entry of a process, because the settings import the
    table.
 """
@@ -49,7 +49,7 @@ class KeptHosts(Protocol):
     """Hosts of a feature that the policy names."""
 
     def addresses(self) -> "Mapping[str, Address]":
-        """Names are as in the policy, such as `door:alice`."""
+        """Return the hosts' addresses by their names in the policy, such as `door:alice`."""
 
 
 @dataclass(frozen=True)
@@ -97,15 +97,15 @@ class OperatorContext:
 class FeaturePart:
     """A feature's part of control.
 
-    `links` are control's ends of the links to the feature's roles, with the messages that control accepts, and
-    `longest` limits the bytes of a message. `methods` answer the feature's `operations`. `work` runs until control
-    ends; its names go into error messages. `limits` returns how much of its resources is used. `connected(door,
-    ticket, peer, descriptor)` passes a WebSocket of the api on; it returns an HTTP status and why it is refused, or
-    an empty text. `details` returns what it adds to the details of a record (`RecordDetails`), if it adds anything.
-    `called` answers nodes' calls of its services, by name without the appliance's own name. `sessions` are those of
-    people whom the feature signs in. `holders` returns the host that holds each group (`Policy.holders`). `approved`
-    returns the approvals that last (`Policy.approved`), `hold_call` holds a call that needs one, and `approve`
-    decides about a request to a service.
+    `links` are control's ends of the links to the feature's roles, with the messages that control accepts,
+    and `longest` limits the bytes of a message. `methods` answer the feature's `operations`. `work` runs
+    until control ends; its names go into error messages. `limits` returns the use of its resources.
+    `connected(door, ticket, peer, descriptor)` passes a WebSocket of the api on; it returns an HTTP status
+    and why it is refused, or an empty text. `details` returns its additions to the details of a record
+    (`RecordDetails`). `called` answers nodes' calls of its services, by name without the appliance's own
+    name. `sessions` are the sessions of people. `holders` returns the host that holds each group
+    (`Policy.holders`). `approved` returns the approvals that last (`Policy.approved`), `hold_call` holds a
+    call that needs one, and `approve` decides about a request to a service.
 
     `status_fields()` returns the present states of the feature by their fields in `rosrv status --json`. The
     feature's view defines the fields (`StateView`). A state that is None or missing is null there.
@@ -146,23 +146,24 @@ class ConsolePart(NamedTuple):
 
 @dataclass(frozen=True)
 class Feature:
-    """All that a feature adds: a section of `appliance.yaml`, processes, requests, verbs, and a part of control.
+    """All that a feature adds: a section of `appliance.yaml`, processes, requests, verbs, and a part of
+    control.
 
-    `operations` returns the requests of operators' tools; the admin socket, REST and the client follow from their
-    rows. `answers` are the `Answer`s (`module:name`) of operations over REST that are not just control's, by name,
-    and `routes` is the function (`module:function`) that returns further routes of the api for its `Services`.
-    `without_token` lists the paths of routes that need no token. `page` returns settings for the console's page.
-    `quotas` are rows that the table of quotas lists. `recorded` is the function (`module:function`) that gives `rosrv
-    monitor replay` the recorded messages of a period. `console` are components of the console; all style sheets of
-    the folder are part of its style. `memory` makes the memory that the supervisor shares with this number of relays;
-    None if none is configured.
+    `operations` returns the requests of operators' tools; the admin socket, REST and the client follow from
+    their rows. `answers` are the `Answer`s (`module:name`) of operations over REST that are not just
+    control's, by name, and `routes` is the function (`module:function`) that returns further routes of the
+    api for its `Services`. `without_token` lists the paths of routes that need no token. `page` returns
+    settings for the console's page. `quotas` are rows that the table of quotas lists. `recorded` is the
+    function (`module:function`) that gives `rosrv monitor replay` the recorded messages of a period.
+    `console` are components of the console; all style sheets of the folder are part of its style. `memory`
+    makes the memory that the supervisor shares with this number of relays; None if none is configured.
 
-    `pairing(state)` returns what the start of one of two appliances needs; it raises `StartError`. `state_files` are
-    files in the state directory that the feature may write before the first start. Hooks of control are named by
-    `module:name`, so that their modules may import what imports the table. `may_start` is a class of
-    `control.assembly.active_role.StartGate`. `keep(sections, store, lifeline)` returns `KeptHosts`, before the policy
-    comes into force. `inherit(foundation, parts)` returns a `FeaturePart` once control may serve and has its parts,
-    before it serves.
+    `pairing(state)` returns what the start of one of two appliances needs; it raises `StartError`.
+    `state_files` are files in the state directory that the feature may write before the first start. Hooks of
+    control are named by `module:name`, so that their modules may import what imports the table. `may_start`
+    is a class of `control.assembly.active_role.StartGate`. `keep(sections, store, lifeline)` returns
+    `KeptHosts`, before the policy comes into force. `inherit(foundation, parts)` returns a `FeaturePart` once
+    control may serve and has its parts, before it serves.
     """
 
     name: str

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from appliance.policy.policy import Approval
 
 LONGEST = 64 << 20
-"""Applies unless a part has a smaller limit."""
+"""The limit of a message, unless a part has a smaller one."""
 
 
 _NO_APPROVALS = "no operator can approve calls on this appliance"
@@ -58,7 +58,6 @@ class FeatureParts:
         )
 
     def operate(self, **later: Any) -> None:
-        """`later` has the fields of `OperatorContext`."""
         context = OperatorContext(self._core, **later, hosts=self.hosts(), kept=self.kept)
         self._parts += [feature.operate(context) for feature in FEATURES if feature.operate is not None]
 
@@ -131,7 +130,7 @@ class FeatureParts:
         return ApprovalAnswered(wanted.number, _NO_APPROVALS)
 
     def sessions(self) -> "Sessions | None":
-        """Return None if people sign in with tokens only."""
+        """Return people's sessions, or None if they sign in with tokens only."""
         return next((part.sessions for part in self._parts if part.sessions is not None), None)
 
     def hosts(self) -> TunnelHosts:

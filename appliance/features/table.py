@@ -63,7 +63,7 @@ FEATURES: tuple[Feature, ...] = (
 
 
 def memories(sections: Sections, relays: int) -> tuple[SharedMemory, ...]:
-    """Raises `StartError`, `OSError`."""
+    """Return the features' shared memory. Raises `StartError`, `OSError`."""
     return tuple(filter(None, (feature.memory(sections, relays) for feature in FEATURES)))
 
 
@@ -72,12 +72,11 @@ def recorded_messages() -> Any:
 
 
 def pairing_in(state: Path) -> "Pairing | None":
-    """None on a single appliance. Raises `StartError`."""
+    """Return the pairing, or None on a single appliance. Raises `StartError`."""
     found = (feature.pairing(state) for feature in FEATURES if feature.pairing is not None)
     return next(filter(None, found), None)
 
 
 def start_gate() -> Any:
-    """The gate decides when control may serve."""
     named = (feature.may_start for feature in FEATURES if feature.may_start is not None)
     return next((pkgutil.resolve_name(name)() for name in named), None)

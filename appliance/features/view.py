@@ -11,11 +11,11 @@ from appliance.base.user_errors import UserError
 S = TypeVar("S")
 
 Samples = Iterable[tuple[tuple[str, ...], Any]]
-"""Values of labels, and the value."""
+"""The samples of a metric: the values of labels, and the value."""
 
 
 class Trouble(NamedTuple):
-    """A condition that needs attention; `text` has the reason and what to do, `about` is as in `Alarm`."""
+    """A condition that needs attention; `text` has the reason and the remedy, `about` is as in `Alarm`."""
 
     severity: Literal["alarm", "warning", "notice"]
     kind: str
@@ -25,10 +25,11 @@ class Trouble(NamedTuple):
 
 @dataclass(frozen=True)
 class StateView(Generic[S]):
-    """`kind` defines a field of `rosrv status --json`, described by `doc`. The field belongs to the status, or to its
-    `audit`, before the field `before`, or at the end. It is null without a state; a client may rely on a field that
-    is `required`. `metrics` have no samples without a state. `line(state)` returns what `rosrv status` prints: a
-    name, and a text for rich; an empty name adds the text to the line of the audit log.
+    """`kind` defines a field of `rosrv status --json`, described by `doc`. The field belongs to the status,
+    or to its `audit`, before the field `before`, or at the end. It is null without a state; a client may rely
+    on a field that is `required`. `metrics` have no samples without a state. `line(state)` returns what
+    `rosrv status` prints: a name, and a text in rich's markup; an empty name adds the text to the line of the
+    audit log.
     """
 
     field: str
@@ -47,7 +48,7 @@ _NO_PAIRS = UserError("this appliance is one of two, which this rosrv cannot sho
 
 
 class PairView:
-    """This class is for a product without pairs."""
+    """The views of a product without pairs."""
 
     def request(self) -> Any:
         raise _NO_PAIRS
@@ -57,7 +58,7 @@ class PairView:
         return {}
 
     def status(self, state: Any) -> Any:
-        """For an appliance that waits for the other one to end."""
+        """Return the status of an appliance that waits for the end of the other one."""
         del state
         raise _NO_PAIRS
 
@@ -69,9 +70,9 @@ class PairView:
         state: Path,
         verify: Callable[[], Any],
     ) -> tuple[Any, Callable[[Any], None]]:
-        """`verified` is the `Verification` of the log `own`, and `verify()` returns that of `other`.
+        """Return the result of verifying two logs, and the function that prints it.
 
-        Return the result, and the function that prints it.
+        `verified` is the `Verification` of the log `own`, and `verify()` returns that of `other`.
         """
         del verified, state, verify
         raise UserError(f"{own} and {other}: this rosrv cannot verify takeovers: use one with `standby`")
@@ -79,7 +80,7 @@ class PairView:
 
 @dataclass(frozen=True)
 class FeatureView:
-    """`pair` is a class of `PairView` (`module:name`), for the feature that makes pairs."""
+    """A feature's views; `pair` is a class of `PairView` (`module:name`), for the feature that makes pairs."""
 
     name: str
     states: tuple[StateView[Any], ...] = ()

@@ -45,7 +45,6 @@ def states_in(states: Mapping[str, Any], part: str) -> dict[str, Any]:
 
 
 def states_of(status: Any) -> Iterator[tuple[StateView[Any], Any]]:
-    """Features that are not configured have no state."""
     for view in STATES:
         state = getattr(status.audit if view.part == "audit" else status, view.field)
         if state is not None:

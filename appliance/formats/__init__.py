@@ -1,1 +1,1 @@
-"""Formats that the appliance writes and the collector reads, and the other way round."""
+"""Define formats that one of appliance and collector writes and the other reads."""

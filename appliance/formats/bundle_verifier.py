@@ -81,7 +81,7 @@ def unhexed(text: str) -> bytes:
 
 
 def packed(value: Any) -> bytes:
-    """Return a column of a record in MessagePack, the bytes that the appliance hashed."""
+    """Return a column of a record in MessagePack, as the appliance hashed it."""
     if value is None:
         return b"\xc0"
     if isinstance(value, int):

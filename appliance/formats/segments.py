@@ -63,7 +63,6 @@ class SegmentHeader(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     @property
     def start(self) -> tuple[int, bytes]:
-        """Return the sequence and the hash that the first record follows."""
         place = self.begin or self.after
         return (0, genesis(self.end.log)) if place is None else (place.sequence, bytes.fromhex(place.hash))
 

@@ -20,7 +20,6 @@ _MOST_RINGS = 20
 _MOST_ROBOTS = 1000
 _LONGEST_WAIT = 30 * 86_400
 CUSTOM = "rosrv"
-"""The key of the terms in a target's custom field."""
 
 
 class TermsError(ValueError):
@@ -28,7 +27,7 @@ class TermsError(ValueError):
 
 
 class BundlePath(NamedTuple):
-    """The name of a bundle: for which robots it is, and its version."""
+    """The name of a bundle: its site, group and version."""
 
     site: str
     group: str
@@ -39,7 +38,6 @@ class BundlePath(NamedTuple):
 
     @property
     def role(self) -> str:
-        """Return the name of the delegated TUF role that signs it."""
         return role_of(self.site, self.group)
 
     @classmethod

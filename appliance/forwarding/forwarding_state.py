@@ -26,7 +26,6 @@ class ForwardingState(msgspec.Struct, frozen=True):
 
 
 def samples_of(to: str, state: ForwardingState) -> dict[str, Samples]:
-    """Return the samples of the metrics whose names begin with `rosrv_TO_`."""
     return {
         f"rosrv_{to}_up": [((), not state.trouble)],
         f"rosrv_{to}_sent_total": [((), state.sent)],

@@ -49,7 +49,6 @@ class ForwardingProcess:
         self._forwarder = forwarder
 
     async def run(self) -> None:
-        """Forward until the supervisor stops the process."""
         # A daemon thread: shutdown does not wait for a hanging receiver; its batch is sent again at the next start.
         said_with_logs = contextvars.copy_context()  # keeps the process name in the thread's log lines
         thread = threading.Thread(

@@ -8,31 +8,30 @@ CERTIFICATE_DAYS = 90.0
 
 
 class Appliances:
-    """One of two appliances also has the `other` one (`paired`)."""
+    """The appliances; with a pair (`paired`), also the `other` one."""
 
     paired = False
 
     def __init__(self, kept: HostTables, revoked: RevokedCertificates) -> None:
-        """Remove and revoke the appliances of the state: this one is single now."""
+        """Remove and revoke the appliances in the state, because this one is single now."""
         for row in kept.appliances():
             revoked.add("", row.serial, row.expires)
             kept.forget_appliance(row.key)
 
     @property
     def other(self) -> ApplianceRow | None:
-        """None if it has not introduced itself."""
+        """Return the other appliance, or None if it has not introduced itself."""
         return None
 
     async def until_introduced(self) -> None:
-        """Wait a moment for the other appliance of two."""
+        """Wait a moment for the other appliance of a pair."""
 
     def certificate(self, key: str) -> bytes:
-        """Return the certificate of the tunnel key, in PEM, or an empty text."""
         del key
         return b""
 
     def is_served(self, pin: str) -> None:
-        """`pin` is that of this appliance's REST server."""
+        """Note the pin of this appliance's REST server."""
 
     def note_own(self, key: str) -> None: ...
 

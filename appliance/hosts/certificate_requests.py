@@ -13,7 +13,7 @@ M = TypeVar("M", messages.AuthorityStated, messages.CertificateMade, messages.Re
 
 
 class AuthorityError(Exception):
-    """`refused`: the authority rejected the request; otherwise it did not answer."""
+    """The authority does not serve a request; `refused`: it rejected the request, otherwise it did not answer."""
 
     def __init__(self, reason: str, *, refused: bool = False) -> None:
         super().__init__(reason)
@@ -21,7 +21,7 @@ class AuthorityError(Exception):
 
 
 class Authority:
-    """Every method raises `AuthorityError` for a rejection or a missing answer."""
+    """Sends requests; the methods raise `AuthorityError` for a rejection or a missing answer."""
 
     def __init__(self, signer: Link) -> None:
         self._signer = signer
@@ -32,7 +32,7 @@ class Authority:
     async def issue(
         self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> messages.CertificateMade:
-        """`request` is a signing request.
+        """Return the certificate for a signing request.
 
         If `former` (a certificate in PEM) is given, `proof` must be a signature over the request by that
         certificate's key.
@@ -43,7 +43,6 @@ class Authority:
         )
 
     async def revocations(self, revoked: list[tuple[str, float]]) -> bytes:
-        """PEM, of serial numbers and times."""
         rows = [messages.RevokedCertificate(serial, moment) for serial, moment in revoked]
         made = await self._ask(
             lambda number: messages.RevocationsRequest(number, rows), messages.RevocationsMade

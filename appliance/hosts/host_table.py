@@ -33,7 +33,7 @@ MOST_MACHINES = 1024
 
 
 class HostRefusedError(Exception):
-    """The text has the reason. `ours`: the appliance, not the request, is the cause."""
+    """A request about hosts is refused, with the reason. `ours`: the appliance, not the request, is the cause."""
 
     def __init__(self, reason: str, *, ours: bool = False) -> None:
         super().__init__(reason)
@@ -53,7 +53,7 @@ class HostsChangedError(Exception):
 
 
 class HostTable:
-    """`own_address` is the appliance's, the first of the pool."""
+    """All hosts; `own_address` is the appliance's, the first of the pool."""
 
     def __init__(self, store: StateStore, pool: ipaddress.IPv4Network, declared: DeclaredHosts) -> None:
         self._store = store
@@ -88,11 +88,11 @@ class HostTable:
         return [row for row in self.enrolled() if self.declared.wants(row.name)]
 
     def addresses(self) -> dict[str, Address]:
-        """`host:NAME` means these in the policy while the tunnels are open."""
+        """Return the addresses that `host:NAME` means in the policy while the tunnels are open."""
         return {row.name: ipaddress.ip_address(row.address) for row in self.admitted()}
 
     def enrolled_row(self, name: str) -> HostRow:
-        """Raises `UnknownHostError`."""
+        """Return the row of an enrolled host. Raises `UnknownHostError`."""
         row = self.rows.get(name)
         if row is None or row.revoked is not None:
             known = ", ".join(host.name for host in self.enrolled()[:20]) or "none"
@@ -106,7 +106,7 @@ class HostTable:
         return self.revoked.listed(self._enrolled_names())
 
     def missing_as_revoked(self) -> int:
-        """Revoked certificates of enrolled hosts that do not fit on the list."""
+        """Return the number of enrolled hosts' revoked certificates that do not fit on the list."""
         return self.revoked.missing(self._enrolled_names())
 
     def require_room(self, name: str) -> None:
@@ -140,7 +140,7 @@ class HostTable:
             raise HostRefusedError(f"the table is full: {MOST_HOSTS} hosts, including revoked ones")
 
     def address_for(self, name: str, wanted: str | None, awaited: dict[str, str]) -> str:
-        """`awaited` maps addresses that tokens reserve to names.
+        """Return the address for a host; `awaited` maps addresses that tokens reserve to names.
 
         Raises `HostRefusedError`.
         """
@@ -185,7 +185,6 @@ class HostTable:
         return row
 
     def keep_next(self, name: str, made: CertificateMade) -> None:
-        """It will follow the present certificate."""
         row = self.certificates.get(name)
         before = row.certificate if row is not None else ""
         since = row.made if row is not None else clock.wall()
@@ -196,7 +195,7 @@ class HostTable:
         self.changed()
 
     def take_next(self, name: str) -> HostRow | None:
-        """None if no successor is stored."""
+        """Replace a certificate by its successor; None if no successor is stored."""
         row, certificate = self.rows[name], self.certificates.get(name)
         if certificate is None or certificate.next is None:
             return None
@@ -214,7 +213,7 @@ class HostTable:
         return self._set(row._replace(revoked=clock.wall()))
 
     def keep_ports(self, row: PortsRow) -> None:
-        """Raises `HostRefusedError`."""
+        """Store the result of a port check. Raises `HostRefusedError`."""
         if row.name not in self.ports and len(self.ports) >= MOST_MACHINES:
             raise HostRefusedError(f"the limit of {MOST_MACHINES} machines with known ports is reached")
         self.ports[row.name] = row

@@ -8,8 +8,7 @@ hosts:
     groups: [operators]     # optional
     tunnel: true            # false: enrolled or not, its tunnel stays closed
 
-An invalid file changes nothing, neither on reload nor at a start: the previously read hosts stay declared, and the
-status reports the error.
+An invalid file changes nothing, also at a start, and the status reports the error.
 """
 
 import contextlib
@@ -40,12 +39,12 @@ _GROUP = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 
 
 class DeclaredHostsError(Exception):
-    """The text has each location, its mistake, and a valid value."""
+    """The file is invalid; the text has each location, its mistake, and a valid value."""
 
 
 @dataclass(frozen=True)
 class DeclaredHost:
-    """`wanted`: the tunnel may be open."""
+    """A declared host; `wanted`: the tunnel may be open."""
 
     name: str
     address: str | None
@@ -54,10 +53,10 @@ class DeclaredHost:
 
 
 class DeclaredHosts:
-    """`error` is the reason if the text is invalid now.
+    """The declared hosts; `error` is the reason if the text is invalid now.
 
-    `bundled` is the text of a bundle, in place of the file. `text` is the file's last valid text. At a start it is
-    the stored one, which is used if the file is invalid now.
+    `bundled` is the text of a bundle, in place of the file. `text` is the file's last valid text. At a start
+    it is the stored one, which is used if the file is invalid now.
     """
 
     def __init__(self, path: Path, bundled: str = "", text: str = "") -> None:
@@ -77,11 +76,11 @@ class DeclaredHosts:
 
     @property
     def there(self) -> bool:
-        """Without declared hosts, none can diverge from the file."""
+        """Whether hosts are declared; otherwise none can diverge from the file."""
         return bool(self.hosts)
 
     def reload(self) -> None:
-        """Raises `DeclaredHostsError`; the earlier content is then kept."""
+        """Read the file again. Raises `DeclaredHostsError`, and then keeps the earlier content."""
         try:
             self.text, self.hosts = _read(self.path)
         except DeclaredHostsError as error:
@@ -90,7 +89,7 @@ class DeclaredHosts:
         self.error = self.bundled = ""
 
     def take(self, text: str) -> None:
-        """The text is that of a bundle. Raises `DeclaredHostsError`; then nothing changes."""
+        """Use the text of a bundle. Raises `DeclaredHostsError`, and then changes nothing."""
         self.hosts = parse_declared(text, IN_BUNDLE)
         self.error, self.bundled = "", text or "\n"
 
@@ -104,7 +103,7 @@ class DeclaredHosts:
 
 
 def read_declared(path: Path) -> dict[str, DeclaredHost]:
-    """By name; none without a file. Raises `DeclaredHostsError`."""
+    """Return the hosts in a file by name; none without a file. Raises `DeclaredHostsError`."""
     return _read(path)[1]
 
 
@@ -120,7 +119,7 @@ def _read(path: Path) -> tuple[str, dict[str, DeclaredHost]]:
 
 
 def parse_declared(text: str, path: str) -> dict[str, DeclaredHost]:
-    """By name; `path` is the name in errors. Raises `DeclaredHostsError`."""
+    """Return the hosts in a text by name; `path` is its name in errors. Raises `DeclaredHostsError`."""
     if len(text) > _LARGEST:
         raise DeclaredHostsError(f"{path}: longer than {_LARGEST} characters")
     reading = _Reading()
@@ -180,7 +179,7 @@ _KEYS: dict[str, Callable[[object], object]] = {
 
 
 class _Reading:
-    """Each mistake has its line and column."""
+    """Reads the text, and collects mistakes with line and column."""
 
     def __init__(self) -> None:
         self.found: dict[str, DeclaredHost] = {}

@@ -22,7 +22,7 @@ _AT_ONCE_BYTES = 2 * (_ENTRY_BYTES + 20)  # two entries: a certificate and its s
 
 
 class RevokedCertificates:
-    """`enrolled` are the names whose certificates charon accepts."""
+    """All revoked certificates; `enrolled` are the names whose certificates charon accepts."""
 
     def __init__(self, kept: HostTables) -> None:
         self._kept = kept
@@ -36,7 +36,7 @@ class RevokedCertificates:
             self._kept.save_revoked(row)
 
     def forget_ended(self) -> None:
-        """Even a wrong clock would not accept them."""
+        """Delete certificates that even a wrong clock would not accept."""
         before = clock.wall() - _KEPT_SECONDS
         ended = [row.serial for row in self._rows.values() if row.expires < before]
         for serial in ended:
@@ -57,7 +57,7 @@ class RevokedCertificates:
         return kept
 
     def missing(self, enrolled: Set[str]) -> int:
-        """Enrolled hosts' certificates that do not fit on the list."""
+        """Return the number of enrolled hosts' certificates that do not fit on the list."""
         rows = self._not_ended()
         if _bytes_of(rows) <= ENTRIES_BYTES:
             return 0
@@ -65,7 +65,7 @@ class RevokedCertificates:
         return sum(_matters(row, enrolled) and row.serial not in on_it for row in rows)
 
     def wait_for_room(self, enrolled: Set[str]) -> float:
-        """Return 0 if there is room, else when there will be (seconds since the epoch)."""
+        """Return 0 if there is room, otherwise the time when there will be (seconds since the epoch)."""
         rows = [row for row in self._not_ended() if _matters(row, enrolled)]
         if _bytes_of(rows) + _AT_ONCE_BYTES <= ENTRIES_BYTES:
             return 0.0

@@ -8,7 +8,7 @@ from appliance.store.host_tables import AuthorityRow, HostTables
 
 
 class StoredAuthority:
-    """`replaced()` is called if the authority is another one than before.
+    """The authority in use; `replaced()` is called if it differs from the last one.
 
     Every method raises `AuthorityError`.
     """
@@ -23,7 +23,7 @@ class StoredAuthority:
 
     @property
     def waits(self) -> str:
-        """The text says what needs the authority's key, and until when tunnels open."""
+        """Return what needs the authority's key, and until when tunnels open, as a text."""
         return ""
 
     async def certificate(self) -> bytes:
@@ -40,7 +40,7 @@ class StoredAuthority:
         return kept.certificate == own.decode()
 
     async def obstacle(self) -> str:
-        """Why this appliance cannot issue certificates."""
+        """Return why this appliance cannot issue certificates, or an empty text."""
         await self.certificate()
         return ""
 
@@ -51,7 +51,6 @@ class StoredAuthority:
         return await self._signer.issue(request, name, days, proof=proof, former=former)
 
     async def require_key(self) -> None:
-        """Raise `AuthorityError`, with the remedy."""
         if obstacle := await self.obstacle():
             raise AuthorityError(obstacle)
 

@@ -1,4 +1,4 @@
-"""Define what other parts of control need of the hosts in tunnels; this class is for a product without tunnels."""
+"""Define what other parts of control need of the hosts in tunnels, as for a product without tunnels."""
 
 from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.status import IpsecState
@@ -12,11 +12,11 @@ class TunnelHosts:
 
     @property
     def bundled(self) -> str:
-        """The bundle's text that is used instead of hosts.yaml."""
+        """Return the bundle's text that is used instead of hosts.yaml, or an empty text."""
         return self._text
 
     async def take_bundle(self, text: str, who: str) -> object:
-        """An empty text stands for the file. Raises `HostRefusedError`."""
+        """Use a bundle's text; an empty one stands for the file. Raises `HostRefusedError`."""
         del who
         if text.strip():
             raise HostRefusedError("the bundle declares hosts, and this appliance has no tunnels")
@@ -33,8 +33,7 @@ class TunnelHosts:
         )  # fmt: skip
 
     def rows(self) -> list[Host]:
-        """The hosts are enrolled, awaited or declared."""
         return []
 
     def served_by(self, pin: str) -> None:
-        """Hosts recognise the api by the pin."""
+        """Note the pin by which hosts recognise the api."""

@@ -1,4 +1,4 @@
-"""Keep the state of the tunnels: their firewall, the configuration for charon, and charon's reports.
+"""Keep the state of the tunnels: firewall, configuration for charon, and charon's reports.
 
 Invariants:
 
@@ -36,7 +36,7 @@ _SIGNED_SECONDS = 60.0
 
 
 class SignedRevocations:
-    """Signed again when it is requested and the table of hosts has changed or a new minute has begun."""
+    """The revocation list, signed again on request after a change of the table of hosts or a new minute."""
 
     def __init__(self, table: HostTable, authority: StoredAuthority) -> None:
         self._table = table
@@ -46,7 +46,7 @@ class SignedRevocations:
         self._signed = b""
 
     async def signed(self) -> bytes:
-        """The list is in PEM. Raises `AuthorityError`."""
+        """Return the list in PEM. Raises `AuthorityError`."""
         async with self._one_at_a_time:
             state = (self._table.revision, int(clock.wall() // _SIGNED_SECONDS))
             if state != self._state:
@@ -103,7 +103,7 @@ class Tunnels:
 
     @property
     def esp(self) -> messages.Esp | None:
-        """None if no tunnels are open."""
+        """Return how ESP runs, or None if no tunnels are open."""
         return None if self._enclosed is None else self._enclosed.esp
 
     @property
@@ -119,7 +119,7 @@ class Tunnels:
         return self._table.addresses() if self.enclosed else {}
 
     async def start(self) -> None:
-        """Log a failure. Call this before nodes are served."""
+        """Open the tunnels before nodes are served; log a failure."""
         if not self._table.admitted():
             return
         try:
@@ -132,7 +132,7 @@ class Tunnels:
         self._answered.set()
 
     async def open(self) -> None:
-        """The supervisor blocks clear text for the pool. Raises `HostRefusedError`."""
+        """Open the tunnels, for which the supervisor blocks clear text for the pool. Raises `HostRefusedError`."""
         async with self._opening:
             if self.enclosed:
                 return
@@ -155,7 +155,7 @@ class Tunnels:
     # --- the process that runs charon ---
 
     def attach(self, link: Channel, needed: messages.CertificateNeeded | None = None) -> None:
-        """A new process first requests its certificate, unless it already `needed` it."""
+        """Serve a new process, which first requests its certificate unless it already `needed` it."""
         self._certificate = self.charon = None
         self._link.attach(link)
         if needed is not None:
@@ -166,7 +166,7 @@ class Tunnels:
         self._dirty.set()
 
     async def run(self, each_hour: Callable[[], None]) -> None:
-        """After a change, when a certificate ends, and every hour with a new list.
+        """Update charon after a change, when a certificate ends, and every hour with a new list.
 
         `each_hour()` is called before each update.
         """
@@ -184,13 +184,15 @@ class Tunnels:
                 asyncio.get_running_loop().call_later(self._again(), self._dirty.set)
 
     def _until_it_changes(self) -> float:
-        """Seconds, at most an hour. charon does not close the tunnel of an ended certificate."""
+        """Return the seconds to the next update, at most an hour; charon does not close a tunnel whose certificate
+        ends.
+        """
         now = clock.wall()
         ends = [row.expires - now for row in self._table.admitted() if row.expires > now]
         return min([_RESTATE_SECONDS, *(end + _JUST_AFTER_SECONDS for end in ends)])
 
     async def until_taken(self) -> bool:
-        """Return False if charon does not confirm the last `state_anew` in time."""
+        """Wait until charon confirms the last `state_anew`; return False if it does not in time."""
         wanted = self._changes
         deadline = clock.now() + _TAKEN_SECONDS
         while self._taken_changes < wanted:
@@ -264,7 +266,7 @@ class Tunnels:
         return _AGAIN_SECONDS[min(self._failures, len(_AGAIN_SECONDS)) - 1]
 
     async def _own_certificate(self, needed: messages.CertificateNeeded) -> bytes:
-        """Without the authority's key, return the certificate that the other appliance issued before."""
+        """Return the appliance's certificate; without the authority's key, the one that the other appliance issued."""
         obstacle = await self._authority.obstacle()
         kept = self._appliances.certificate(needed.key) if obstacle else b""
         if kept:
@@ -307,7 +309,7 @@ class Tunnels:
             self.seen[name] = row
 
     def _look_where(self, row: messages.TunnelSeen) -> None:
-        """The tunnel of a moved host stays open, but a stolen kit would look the same."""
+        """Record that a host moved: its tunnel stays open, but a stolen kit would look the same."""
         before = self.seen[row.name].remote
         if row.remote != before:
             self._trail.happened(

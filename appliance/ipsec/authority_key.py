@@ -35,7 +35,7 @@ def make_key(kind: Kind) -> Key:
 
 
 def read_passphrase(descriptor: int) -> bytes:
-    """The first line; the file is closed. Raises `SignerKeyError`, `OSError`."""
+    """Return the first line of the file, and close it. Raises `SignerKeyError`, `OSError`."""
     with os.fdopen(descriptor, "rb") as file:
         line = file.read(_LONGEST_PASSPHRASE + 2).partition(b"\n")[0].rstrip(b"\r")
     if not line:
@@ -54,13 +54,12 @@ def is_encrypted(data: bytes) -> bool:
 
 
 def write_key(path: Path, key: Key, passphrase: bytes | None) -> None:
-    """Only the owner can read the file."""
     encryption = NoEncryption() if passphrase is None else BestAvailableEncryption(passphrase)
     write_whole(path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, encryption), 0o600)
 
 
 def load_key(path: Path, certificate_file: str, kind: Kind, passphrase: bytes | None) -> Key:
-    """Raises `OSError`, and `SignerKeyError` for an invalid key or one of another kind."""
+    """Return the key. Raises `OSError`, and `SignerKeyError` for an invalid key or one of another kind."""
     if not path.exists():
         raise SignerKeyError(
             f"{path}: missing, but its certificate is there; restore it from a backup, or remove"

@@ -14,7 +14,7 @@ FOLDER = "joined"  # of the signer's directory
 
 
 def open_authority(directory: Path, kind: Kind, passphrase: bytes | None) -> tuple[CertificateAuthority, str]:
-    """Without a usable key, return the appliance's own authority with the reason.
+    """Return the authority; without the brought key, the appliance's own authority with the reason.
 
     Raises `SignerKeyError` and `OSError` if the appliance's own authority cannot be used.
     """

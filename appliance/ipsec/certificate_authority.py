@@ -47,7 +47,7 @@ _CLOCKS_DIFFER = datetime.timedelta(hours=1)
 
 @dataclass(frozen=True)
 class IssuedCertificate:
-    """PEM, hexadecimal, and seconds since the epoch."""
+    """A certificate in PEM, its serial number in hexadecimal, and its end in seconds since the epoch."""
 
     certificate: bytes
     serial: str
@@ -55,7 +55,7 @@ class IssuedCertificate:
 
 
 class CertificateAuthority:
-    """Created with a key of this kind if missing.
+    """The authority in a folder, made with a key of this kind if missing.
 
     Raises `SignerKeyError`, `OSError`.
     """
@@ -88,7 +88,7 @@ class CertificateAuthority:
     def issue(
         self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> IssuedCertificate:
-        """The request is PEM. Raises `RequestRefusedError`.
+        """Issue a certificate for a request (PEM). Raises `RequestRefusedError`.
 
         `proof` is the signature over the request by the key of the certificate `former` (PEM).
         """
@@ -129,7 +129,7 @@ class CertificateAuthority:
         )
 
     def revocations(self, serials: Iterable[tuple[str, float]]) -> bytes:
-        """PEM, of serial numbers (hexadecimal) and times (seconds since the epoch)."""
+        """Return the list (PEM) of serial numbers (hexadecimal) and times (seconds since the epoch)."""
         now = clock.utc_now()
         builder = (
             x509.CertificateRevocationListBuilder()
@@ -160,7 +160,7 @@ class CertificateAuthority:
 
 
 def _key_of(request: bytes) -> ec.EllipticCurvePublicKey | ed25519.Ed25519PublicKey:
-    """Raises `RequestRefusedError` unless the private key signed the request."""
+    """Return the key of a request. Raises `RequestRefusedError` unless its private key signed the request."""
     if len(request) > LONGEST_REQUEST:
         raise RequestRefusedError(f"the signing request is longer than {LONGEST_REQUEST} bytes")
     try:

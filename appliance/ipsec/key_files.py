@@ -5,11 +5,10 @@ from pathlib import Path
 
 
 class SignerKeyError(Exception):
-    """The message has the path, the reason and the remedy."""
+    """A key cannot be used; the message has the path, the reason and the remedy."""
 
 
 def require_private(path: Path) -> None:
-    """Raise `SignerKeyError` if others may read the key."""
     mode = path.stat().st_mode
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
         raise SignerKeyError(

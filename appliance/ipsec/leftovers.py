@@ -1,8 +1,8 @@
 """Remove IPsec states and policies, with their keys, that a killed charon left in the kernel.
 
-With these leftovers the kernel still accepts packets, even from a host that was revoked since. So they are removed
-before charon starts again, and when the appliance ends. Only the appliance's own leftovers are removed: the states of
-ESP in UDP on port 4500, which only charon uses, and the policies from and to the appliance's tunnel address.
+With them the kernel would accept packets even from a revoked host. So they are removed before charon starts again, and
+when the appliance ends. Only the appliance's own leftovers are removed: the states of ESP in UDP on port 4500, which
+only charon uses, and the policies from and to the appliance's tunnel address.
 """
 
 import itertools
@@ -21,7 +21,8 @@ class LeftoversError(Exception):
 
 
 def clear_leftovers(own: str) -> int:
-    """In the calling thread's network namespace, where charon must not run; return their number.
+    """Clear the calling thread's network namespace, where charon must not run; return the number of
+    leftovers.
 
     `own` is the appliance's address in the tunnels. Raises `LeftoversError`.
     """
@@ -35,7 +36,7 @@ def clear_leftovers(own: str) -> int:
 
 
 def state_orders(listed: str) -> list[str]:
-    """Delete charon's states in the output of `ip xfrm state list nokeys`."""
+    """Return orders that delete charon's states in the output of `ip xfrm state list nokeys`."""
     starts = [*(found.start() for found in re.finditer(r"^src ", listed, re.MULTILINE)), len(listed)]
     orders = []
     for begin, end in itertools.pairwise(starts):
@@ -47,7 +48,7 @@ def state_orders(listed: str) -> list[str]:
 
 
 def policy_orders(listed: str, own: str) -> list[str]:
-    """Delete the policies from and to `own` in the output of `ip xfrm policy`."""
+    """Return orders that delete the policies from and to `own` in the output of `ip xfrm policy`."""
     return [
         f"xfrm policy delete src {source} dst {destination} dir {direction}"
         for source, destination, direction in _POLICY.findall(listed)

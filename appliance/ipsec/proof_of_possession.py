@@ -12,7 +12,7 @@ LONGEST_PROOF = 1024  # bytes
 
 
 class RequestRefusedError(Exception):
-    """No certificate is issued."""
+    """A request is refused, so no certificate is issued."""
 
 
 def require_proof(

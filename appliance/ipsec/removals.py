@@ -6,7 +6,7 @@ own settings and memory, and trusts neither the log nor control:
 1. Records are removed up to a checkpoint that the signer signed.
 2. By age (`retention_days`): the signer signed that checkpoint long enough ago, by the age clock.
 3. By size (`retention_bytes`): the records sealed since that checkpoint would fill the size if each had
-   `LARGEST_RECORD` bytes. The signer does not know their real sizes, so this is only a bound.
+   `LARGEST_RECORD` bytes.
 """
 
 from collections.abc import Callable
@@ -16,13 +16,13 @@ from appliance.ipsec.signed_checkpoints import CheckpointMemory, read_checkpoint
 from appliance.signing.log_proof import Checkpoint, Removal, checkpoint_hash
 
 LARGEST_RECORD = 64 << 10
-"""Bytes, with the largest details; the average is smaller."""
+"""The assumed bytes of a record with the largest details; the average is smaller."""
 
 _DAY = 86_400_000_000_000
 
 
 class RemovalRefusedError(Exception):
-    """`early`: the removal may be permitted later."""
+    """A removal is refused; `early`: it may be permitted later."""
 
     def __init__(self, reason: str, *, early: bool = False) -> None:
         super().__init__(reason)
@@ -31,14 +31,14 @@ class RemovalRefusedError(Exception):
 
 @dataclass(frozen=True)
 class RetentionLimits:
-    """Age in days, size in bytes."""
+    """The limits of retention: age in days, size in bytes."""
 
     days: float | None = None
     size: int | None = None
 
 
 class RemovalApprover:
-    """By the memory of signatures `signed` and the limits `kept`."""
+    """Approves removals by the signatures in `signed` and the limits in `kept`."""
 
     def __init__(self, signed: CheckpointMemory, kept: RetentionLimits, clock: Callable[[], int]) -> None:
         self._signed = signed

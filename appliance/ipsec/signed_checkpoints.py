@@ -24,11 +24,11 @@ _NUMBER = 8
 
 
 class CheckpointRefusedError(Exception):
-    """The checkpoint must not be signed."""
+    """A checkpoint must not be signed; the message gives the reason."""
 
 
 def read_checkpoint(text: bytes) -> Checkpoint:
-    """Raises `CheckpointRefusedError`."""
+    """Parse the text of a checkpoint. Raises `CheckpointRefusedError`."""
     try:
         return parse_checkpoint(text)
     except ValueError:
@@ -36,7 +36,7 @@ def read_checkpoint(text: bytes) -> Checkpoint:
 
 
 def newest_signing(directory: Path) -> int | None:
-    """The time is nanoseconds since the epoch."""
+    """Return the time of the last signature in nanoseconds since the epoch, or None."""
     times = (path.read_bytes() for path in directory.glob("*.times"))
     return max(
         (int.from_bytes(kept[-_NUMBER:], "big") for kept in times if len(kept) > _NUMBER), default=None
@@ -44,14 +44,14 @@ def newest_signing(directory: Path) -> int | None:
 
 
 class CheckpointMemory:
-    """`clock` gives nanoseconds since the epoch."""
+    """The memory in a folder; `clock` returns nanoseconds since the epoch."""
 
     def __init__(self, directory: Path, clock: Callable[[], int]) -> None:
         self._directory = directory
         self._clock = clock
 
     def approve(self, text: bytes) -> None:
-        """Raises `CheckpointRefusedError`, `OSError`."""
+        """Remember a checkpoint that may be signed. Raises `CheckpointRefusedError`, `OSError`."""
         wanted = read_checkpoint(text)
         path = self._path(wanted.log, "signed")
         if not path.exists():
@@ -73,7 +73,7 @@ class CheckpointMemory:
             os.close(descriptor)
 
     def signed_at(self, checkpoint: Checkpoint) -> int | None:
-        """Without a stored time, return the checkpoint's own."""
+        """Return when a checkpoint was signed, or the checkpoint's own time if that is not stored."""
         path = self._path(checkpoint.log, "signed")
         if not path.exists():
             return None
@@ -88,7 +88,6 @@ class CheckpointMemory:
         return int.from_bytes(moment, "big") if len(moment) == _NUMBER else checkpoint.time
 
     def removed(self, log: str) -> int | None:
-        """The sequence of the last record whose removal was approved."""
         path = self._path(log, "removed")
         return int.from_bytes(path.read_bytes(), "big") if path.exists() else None
 
@@ -151,7 +150,7 @@ def _extent(descriptor: int) -> tuple[int, int]:
 
 
 def _is_known(descriptor: int, wanted: Checkpoint, first: int, count: int) -> bool:
-    """Raises `CheckpointRefusedError` if the checkpoint does not follow the last one."""
+    """Whether a checkpoint was signed before. Raises `CheckpointRefusedError` if it does not follow the last one."""
     index = wanted.number - first
     if index < 0 or index > count:
         raise CheckpointRefusedError(f"checkpoint {wanted.number} does not follow number {first + count - 1}")

@@ -28,13 +28,12 @@ _PREFIX = "host-"
 
 
 def plugins(esp: Esp) -> str:
-    """In the order in which charon loads them."""
     kernel = ("kernel-libipsec",) if esp == "user space" else ()
     return " ".join((*_PLUGINS, *kernel, "kernel-netlink", "socket-default", "vici"))
 
 
 def configuration(directory: Path, esp: Esp) -> str:
-    """`strongswan.conf`, with the socket in `directory` and the log on stderr."""
+    """Return `strongswan.conf`, with the socket in `directory` and the log on stderr."""
     return f"""\
 charon-systemd {{
   load = {plugins(esp)}
@@ -64,20 +63,20 @@ charon-systemd {{
 
 @dataclass(frozen=True)
 class Proposals:
-    """The best method comes first."""
+    """The proposals of charon, the best first."""
 
     ike: tuple[str, ...] = IKE_PROPOSALS
     esp: tuple[str, ...] = ESP_PROPOSALS
 
     @property
     def key_exchange(self) -> list[str]:
-        """The name in the status: `x25519+mlkem768`, `x25519` or `ecp384`."""
+        """Return the names in the status, such as `x25519+mlkem768`, `x25519` or `ecp384`."""
         words = [proposal.removeprefix("aes256gcm16-prfsha384-") for proposal in self.ike]
         return [word.replace("-ke1_", "+") for word in words]
 
 
 def proposals_of(key_exchanges: Iterable[str]) -> Proposals:
-    """The names are charon's own."""
+    """Return the proposals for key exchanges by charon's names."""
     if _ML_KEM_ALGORITHM not in key_exchanges:
         return Proposals()
     return Proposals(
@@ -90,17 +89,16 @@ def connection_name(host: str) -> str:
 
 
 def host_of(connection: str) -> str | None:
-    """None for other connections, such as a handshake before its host is known."""
+    """Return the host of a connection, or None, such as for a handshake before its host is known."""
     return connection.removeprefix(_PREFIX) if connection.startswith(_PREFIX) else None
 
 
 def pool(host: TunnelHost) -> dict[str, Any]:
-    """For vici's `load-pool`, with the one address of a host."""
+    """Return the message `load-pool` of vici, with the one address of a host."""
     return {connection_name(host.name): {"addrs": f"{host.address}-{host.address}"}}
 
 
 def connection(host: TunnelHost, stated: TunnelsStated, proposals: Proposals) -> Mapping[str, Any]:
-    """The message `load-conn` of vici."""
     child = {
         "local_ts": [f"{stated.address}/32"],
         "remote_ts": ["dynamic"],

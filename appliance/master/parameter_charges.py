@@ -60,7 +60,7 @@ class _Place:
 
 
 class ParameterCharges:
-    """Charge parameters to a pool of bytes. `owners` has keys and hosts from the journal."""
+    """Charges parameters to a pool of bytes. `owners` has keys and hosts from the journal."""
 
     def __init__(
         self, pool: Pool[Address], journal: OwnersJournal, owners: Iterable[tuple[str, str]] = ()

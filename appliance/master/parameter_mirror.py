@@ -112,7 +112,6 @@ class ParameterMirror:
         self._changed()
 
     def delete(self, key: str) -> None:
-        """Delete `key` (canonical), if it exists."""
         parts = parts_of(key)
         there, in_the_way = standing_at(self.tree, key)
         if not parts or there is None or in_the_way is not None:

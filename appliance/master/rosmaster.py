@@ -1,9 +1,8 @@
 """Call the hidden ROS master over reused connections. A *door* holds calls back while the ROS master is rebuilt.
 
-While the ROS master is down or not yet restored, calls of nodes wait at the door for a limited time. So a node that
-sets a parameter notices only a delay. The reconcile loop shuts and opens the door, and calls through it in the meantime
-(`call_now`, `all_now`). Changes of registrations are forwarded through the open door behind the answers to nodes
-(`call_once`, see `reconcile/entries.py`).
+While the ROS master is down or not yet restored, calls of nodes wait at the door for a limited time. The reconcile
+loop shuts and opens the door, and calls through it in the meantime (`call_now`, `all_now`). Changes of registrations
+are forwarded through the open door behind the answers to nodes (`call_once`, see `reconcile/entries.py`).
 
 If the order of several calls matters, they are sent as one `system.multicall`. The ROS master is one Python process and
 does only one thing at a time, so a multicall also saves most of the cost of its calls. A fault of one part affects only
@@ -164,7 +163,6 @@ class RosMaster:
         return answer
 
     async def all_now(self, calls: Sequence[Wanted]) -> list[Answer]:
-        """Make many calls in order, in few requests, like `call_now`."""
         answers: list[Answer] = []
         for start in range(0, len(calls), LARGEST_MULTICALL):
             for answer in await self._in_order(calls[start : start + LARGEST_MULTICALL]):

@@ -22,7 +22,7 @@ _ALARMING = frozenset({"violation", "fail", "timeout"})  # categories of verdict
 
 @dataclass(slots=True)
 class Rosout:
-    """Publish reports of monitors on `/rosout` in the name of `node`; `publish(message)` sends a message.
+    """Publishes reports of monitors on `/rosout` in the name of `node`; `publish(message)` sends a message.
 
     `file_of(monitor)` returns the file that defines a monitor.
     """
@@ -67,7 +67,7 @@ def header(definitions: Definitions) -> OwnHeaderStated:
 
 
 def _words(event: MonitorEvent) -> tuple[int, str]:
-    """Return the level and the text of a report; level 0: it is not for `/rosout`."""
+    """Return the level and the text of a report; level 0 if it is not for `/rosout`."""
     text, level, category = event.text, event.detail.get("level"), event.detail.get("category")
     if event.count:
         text = f"{event.count} more in the same second" + (f": {text}" if text else "")

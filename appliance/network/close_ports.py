@@ -1,7 +1,7 @@
 """Close the ROS ports of the machine that the nodes run on, with an nftables file.
 
-For its API, TCPROS and UDPROS, a ROS node listens on ports of the local port range. The appliance does not reveal
-these ports, but a port scanner finds them. The file closes the range to all but loopback and the appliance:
+A ROS node listens on ports of the local port range, which a port scanner finds. The file closes the range to all but
+loopback and the appliance:
 
 1. A TCP connection is refused at its SYN, without the connection tracker. Older connections, and connections that the
    machine itself opens, continue.
@@ -36,7 +36,7 @@ _SERVICE = re.compile(r"(tcp|udp)/(\d{1,5})(?:-(\d{1,5}))?")
 
 @dataclass(frozen=True)
 class OpenService:
-    """The ports stay open to all hosts."""
+    """A service whose ports stay open to all hosts."""
 
     protocol: Literal["tcp", "udp"]
     ports: PortRange
@@ -46,7 +46,7 @@ class OpenService:
 
 
 def parse_services(texts: Sequence[str]) -> tuple[OpenService, ...]:
-    """`tcp/22,udp/123,tcp/8000-8010`. Raises `ValueError` with the invalid service."""
+    """Parse services such as `tcp/22,udp/123,tcp/8000-8010`. Raises `ValueError` with the invalid one."""
     return tuple(_service(part.strip()) for text in texts for part in text.split(","))
 
 
@@ -58,7 +58,7 @@ def parse_ports(text: str) -> PortRange:
 
 
 def parse_address(text: str) -> str:
-    """Networks and names are rejected."""
+    """Parse an address; networks and names are rejected."""
     try:
         address = ipaddress.ip_address(text)
     except ValueError:
@@ -71,7 +71,7 @@ def parse_address(text: str) -> str:
 
 
 def local_port_range() -> PortRange:
-    """The kernel has one range for IPv4 and IPv6."""
+    """Return the kernel's local port range, the same for IPv4 and IPv6."""
     try:
         first, last = RANGE_FILE.read_text(encoding="ascii").split()
     except (OSError, ValueError) as error:
@@ -127,7 +127,6 @@ def _indented(rules: Sequence[str]) -> str:
 
 
 def apply(text: str) -> None:
-    """The file of `protection` replaces an earlier one."""
     _nft(["-f", "-"], text)
 
 

@@ -33,7 +33,7 @@ class ProcessActivity:
         self._since = clock.now()
 
     def stalled_seconds(self) -> float:
-        """Since it last progressed or waited for processor or disk; call this every second or so."""
+        """Return the seconds since the process progressed or waited for processor or disk; call this every second."""
         now = clock.now()
         try:
             fields = self._stat.read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
@@ -46,7 +46,7 @@ class ProcessActivity:
 
 
 def run_program(program: Start, text: str, what: str) -> tuple[int, str, str]:
-    """Return exit status, standard output and standard error.
+    """Run a program; return exit status, standard output and standard error.
 
     `program` gets the pipes as arguments of `subprocess.Popen`. Raises `TimeoutError`, `OSError`.
     """

@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 
 def create_veth(near: Namespace, near_name: str, far: Namespace, far_name: str) -> None:
-    """One end in each namespace; both are set up."""
+    """Create a veth pair with one end in each namespace, and set both up."""
     for name in (near_name, far_name):
         if not 0 < len(name) <= IFNAMSIZ:
             raise ValueError(f"interface name {name!r} must have 1 to {IFNAMSIZ} characters")
@@ -43,7 +43,7 @@ def create_veth(near: Namespace, near_name: str, far: Namespace, far_name: str) 
 
 
 def create_bridge(namespace: Namespace, name: str) -> None:
-    """Without spanning tree; it is set up."""
+    """Create a bridge without spanning tree, and set it up."""
     _netlink(
         namespace,
         f"creating the bridge {name}",
@@ -69,7 +69,7 @@ def set_link(namespace: Namespace, name: str, *, up: bool) -> None:
 
 
 def delete_link(namespace: Namespace, name: str) -> None:
-    """The other end of a veth pair is deleted too."""
+    """Delete an interface, with the other end of a veth pair."""
 
     def delete(route: Any) -> None:
         for index in route.link_lookup(ifname=name):
@@ -107,7 +107,7 @@ def delete_address(namespace: Namespace, name: str, address: str) -> None:
 
 
 def add_route(namespace: Namespace, destination: str, via: str) -> None:
-    """`destination` is a network, or "default"."""
+    """Add a route; `destination` is a network, or "default"."""
     family = _family(via)
     everywhere = "::/0" if family == socket.AF_INET6 else "0.0.0.0/0"
     where = everywhere if destination == "default" else destination
@@ -119,7 +119,7 @@ def add_route(namespace: Namespace, destination: str, via: str) -> None:
 
 
 def add_near_route(namespace: Namespace, name: str, destination: str, *, source: str, hop_limit: int) -> None:
-    """Packets leave with `source` and this TTL."""
+    """Add a route whose packets leave with `source` and this TTL."""
     length = 128 if _family(destination) == socket.AF_INET6 else 32
     _netlink(
         namespace,
@@ -137,7 +137,7 @@ def add_near_route(namespace: Namespace, name: str, destination: str, *, source:
 
 
 def add_local_route(namespace: Namespace, network: str) -> None:
-    """No interface is needed for each address."""
+    """Make a network's addresses local, without an interface for each."""
     _netlink(
         namespace,
         f"adding the own network {network}",
@@ -163,12 +163,12 @@ def links(namespace: Namespace) -> list[str]:
 
 
 def addresses(namespace: Namespace) -> list[str]:
-    """Include link-local ones, with prefix lengths."""
+    """Return the addresses with prefix lengths, including link-local ones."""
     return _netlink(namespace, "listing addresses", _held)
 
 
 def addresses_by_interface(namespace: Namespace) -> dict[str, list[str]]:
-    """The addresses have prefix lengths."""
+    """Return the addresses with prefix lengths by interface."""
 
     def read(route: Any) -> dict[str, list[str]]:
         names = _names(route)
@@ -184,7 +184,7 @@ def addresses_by_interface(namespace: Namespace) -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class DefaultRoute:
-    """`source` is the preferred source address, if any."""
+    """A default route; `source` is the preferred source address, if any."""
 
     interface: str
     gateway: str | None
@@ -192,7 +192,7 @@ class DefaultRoute:
 
 
 def default_route(namespace: Namespace, version: int) -> DefaultRoute | None:
-    """The lowest metric in the main table counts; `version` is 4 or 6."""
+    """Return the route with the lowest metric in the main table; `version` is 4 or 6."""
 
     def read(route: Any) -> DefaultRoute | None:
         family = socket.AF_INET if version == 4 else socket.AF_INET6
@@ -214,7 +214,7 @@ def default_route(namespace: Namespace, version: int) -> DefaultRoute | None:
 
 
 def networks(namespace: Namespace) -> list[str]:
-    """The networks of every route and address, without default routes."""
+    """Return the networks of every route and address, without default routes."""
 
     def read(route: Any) -> list[str]:
         routes = [
@@ -228,7 +228,7 @@ def networks(namespace: Namespace) -> list[str]:
 
 
 def source_address_for(namespace: Namespace, peer: str) -> str:
-    """By the routing table. Raises `NetworkError` if no route."""
+    """Return the source address by the routing table. Raises `NetworkError` without a route."""
     family = _family(peer)
 
     def look_up(route: Any) -> str:
@@ -242,7 +242,6 @@ def source_address_for(namespace: Namespace, peer: str) -> str:
 
 
 def _netlink(namespace: Namespace, what: str, work: Callable[[Any], T]) -> T:
-    """Errors name the operation `what` and the namespace."""
     from pyroute2 import IPRoute  # noqa: PLC0415  a hundred modules, only needed to change a network
     from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415  likewise
 

@@ -83,7 +83,7 @@ class IsolationSettings:
 
 @dataclass(frozen=True)
 class LinkAddresses:
-    """The addresses have no prefix length."""
+    """The addresses of the link's ends, without a prefix length."""
 
     network: str
     host: str
@@ -110,11 +110,10 @@ class _IpForwarding:
         return self._host.sysctl("net/ipv6/conf/all/disable_ipv6") == "0"
 
     def before(self, family: Family) -> bool:
-        """The value before `enable` changes it."""
+        """Return the value before `enable` changes it."""
         return self._host.sysctl(_GLOBAL[family]) != "0"
 
     def record(self) -> dict[str, str]:
-        """In the order to restore them."""
         families: tuple[Family, ...] = (4, 6) if self.has_ipv6() else (4,)
         keys = [_GLOBAL[family] for family in families]
         for name in (*interfaces.links(self._host), "default"):
@@ -155,7 +154,7 @@ class Isolation:
         self._lock: int | None = None
 
     def up(self) -> None:
-        """Remove leftovers of a crash first.
+        """Isolate the appliance, after removing leftovers of a crash.
 
         Raises `PrivilegeError`, or `NetworkError` with the obstacle; the host is then left unchanged.
         """
@@ -172,7 +171,6 @@ class Isolation:
             raise
 
     def down(self) -> None:
-        """Restore the host's settings."""
         if self._lock is None:
             return
         try:
@@ -190,11 +188,11 @@ class Isolation:
         return interfaces.source_address_for(self._host, peer)
 
     def endpoint(self) -> PublicAddress:
-        """For hosts of other networks. Raises `NetworkError` if unknown."""
+        """Return the address for hosts of other networks. Raises `NetworkError` if it is unknown."""
         return outward_address(self._host, without=("lo", self.settings.link))
 
     def obstacles(self) -> tuple[str, ...]:
-        """Chains of other programs on the host that drop forwarded packets by default.
+        """Return chains of other programs on the host that drop forwarded packets by default.
 
         Our rules cannot override them; the owner of such a chain must accept the appliance's link.
         """
@@ -205,14 +203,14 @@ class Isolation:
         )
 
     def translations(self) -> tuple[str, ...]:
-        """Chains of other programs on the host that translate addresses of machines or containers.
+        """Return chains of other programs on the host that translate addresses of machines or containers.
 
         These translations do not apply to connections to the appliance.
         """
         return (*self._backend.foreign_translations(), *iptables.foreign_translations(self._host))
 
     def forward_tunnels(self) -> None:
-        """UDP 500 and 4500. Raises `NetworkError` if the host uses these ports."""
+        """Forward UDP 500 and 4500. Raises `NetworkError` if the host uses these ports."""
         if self._udp == _TUNNELS:
             return
         used = self._host.run(udp_ports_in_use) & {port.first for port in _TUNNELS}
@@ -368,7 +366,7 @@ def isolation_rules(
     tcp: tuple[PortRange, ...] = (),
     udp: tuple[PortRange, ...] = (),
 ) -> tuple[PacketRule, ...]:
-    """`routers` are the families for which the host was already a router.
+    """Return the host's rules; `routers` are the families for which the host was already a router.
 
     `tcp` and `udp` ports are forwarded besides those of the settings.
     """
@@ -426,7 +424,7 @@ def _true_sources(family: Family, end: LinkAddresses, inward: Interface) -> tupl
 
 
 def _loopback(family: Family, inward: Interface) -> PacketRule:
-    """127.0.0.1 gets the veth's address; ::1 cannot leave a host, so it stays refused."""
+    """Return the rule that gives 127.0.0.1 the veth's address; ::1 cannot leave a host, so it stays refused."""
     if family == 4:
         local = partial(PacketRule, chain=Chain.KEPT_SOURCE, source="127.0.0.0/8", leaves_on=inward)
         return local("from the host's own loopback", PacketVerdict.MASQUERADE)

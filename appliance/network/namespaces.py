@@ -3,7 +3,7 @@
 A namespace is a name under `/run/netns`, as with `ip netns`. A *thread*, not a process, is in a namespace, so each
 call gets its own thread, which moves into the namespace and ends there:
 
-1. No other thread of this process is in the namespace, and no thread has to return from it, which could fail.
+1. No thread has to return from the namespace, which could fail.
 2. A program started with `popen` is inside the namespace before its first instruction. Only `subprocess` runs between
    fork and exec, so `popen` is safe in a process with threads.
 3. The netlink library works whether or not the calling thread runs an asyncio loop.
@@ -46,7 +46,7 @@ T = TypeVar("T")
 
 
 class NetworkError(UserError):
-    """The message has the cause, the place and the remedy."""
+    """The network cannot be changed; the message has the cause, the place and the remedy."""
 
 
 class PrivilegeError(NetworkError):
@@ -54,7 +54,7 @@ class PrivilegeError(NetworkError):
 
 
 def has_privileges() -> bool:
-    """Making namespaces needs CAP_SYS_ADMIN and CAP_NET_ADMIN."""
+    """Whether this process can make namespaces, for which it needs CAP_SYS_ADMIN and CAP_NET_ADMIN."""
     return _has_capabilities(1 << _CAP_NET_ADMIN | 1 << _CAP_SYS_ADMIN)
 
 
@@ -83,7 +83,7 @@ def require_privileges(what: str) -> None:
 
 
 class Namespace:
-    """The object itself does not create the namespace."""
+    """A namespace by its name; the object does not create it."""
 
     def __init__(self, name: str) -> None:
         if not _VALID_NAME.fullmatch(name):
@@ -95,7 +95,6 @@ class Namespace:
 
     @classmethod
     def own(cls) -> "Namespace":
-        """The object can neither create nor delete the namespace of this process."""
         return _OwnNamespace()
 
     def __repr__(self) -> str:
@@ -108,7 +107,7 @@ class Namespace:
         return hash(self.path)
 
     def exists(self) -> bool:
-        """A bare file from a crash does not count."""
+        """Whether the namespace exists; a bare file from a crash does not count."""
         try:
             here, above = self.path.stat(), self.path.parent.stat()
         except OSError:
@@ -116,7 +115,7 @@ class Namespace:
         return here.st_dev != above.st_dev
 
     def create(self) -> "Namespace":
-        """The namespace has only `lo`, which is down.
+        """Create the namespace, which has only `lo`, which is down.
 
         Raises `PrivilegeError`, or `NetworkError` if the name exists.
         """
@@ -139,7 +138,7 @@ class Namespace:
         _mount(_HERE, self.path, _MS_BIND)
 
     def delete(self) -> None:
-        """The kernel's namespace ends with its last process."""
+        """Delete the name; the kernel's namespace ends with its last process."""
         if self.exists():
             require_privileges(f"deleting the network namespace {self.name}")
             if _libc().umount2(os.fsencode(self.path), _MNT_DETACH) != 0:
@@ -148,7 +147,7 @@ class Namespace:
 
     @contextlib.contextmanager
     def entered(self) -> Iterator[None]:
-        """Move the calling thread for the block.
+        """Move the calling thread into the namespace for the block.
 
         For short synchronous work (open a socket, start a program); do not await in the block.
         """
@@ -164,8 +163,6 @@ class Namespace:
             os.close(home)
 
     def run(self, function: Callable[[], T]) -> T:
-        """The function runs in a thread inside the namespace."""
-
         def inside() -> T:
             self._enter()
             return function()
@@ -173,7 +170,7 @@ class Namespace:
         return _in_thread(inside)
 
     def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
-        """`options` are those of `subprocess.Popen`."""
+        """Start a program in the namespace; `options` are those of `subprocess.Popen`."""
         return self.run(lambda: subprocess.Popen(args, **options))
 
     def sysctl(self, key: str, value: str | None = None) -> str:
@@ -194,14 +191,14 @@ class Namespace:
             raise NetworkError(f"sysctl {key} in {self.name}: {error.strerror}") from error
 
     def lacks_syn_cookies(self) -> bool:
-        """Forged first packets could fill a listener's queue of half-open connections."""
+        """Whether forged first packets could fill a listener's queue of half-open connections."""
         try:
             return self.sysctl("net.ipv4.tcp_syncookies") == "0"
         except NetworkError:  # the kernel was built without SYN cookies
             return True
 
     def processes(self) -> list[int]:
-        """This process is not included."""
+        """Return the processes in the namespace, without this one."""
         if not self.exists():
             return []
         mark = self.path.stat()
@@ -215,7 +212,7 @@ class Namespace:
         return sorted(found)
 
     def open(self) -> int:
-        """For netlink; the caller closes the descriptor."""
+        """Open the namespace for netlink; the caller closes the descriptor."""
         try:
             return os.open(self.path, os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
@@ -240,7 +237,7 @@ class _OwnNamespace(Namespace):
         return True
 
     def _enter(self) -> None:
-        """Do nothing if the thread is already there, because containers may not call setns."""
+        """Move this thread into the namespace; do nothing if it is there, because containers may not call setns."""
         if not os.path.samestat(_HERE.stat(), self.path.stat()):
             super()._enter()
 
@@ -252,7 +249,7 @@ class _OwnNamespace(Namespace):
 
 
 def namespaces(prefix: str = "") -> list[Namespace]:
-    """Include names whose namespace no longer exists."""
+    """Return the namespaces by name, including names whose namespace no longer exists."""
     if not DIRECTORY.is_dir():
         return []
     names = sorted(entry.name for entry in DIRECTORY.iterdir())
@@ -276,7 +273,6 @@ def _in_thread(function: Callable[[], T]) -> T:
 
 @contextlib.contextmanager
 def _directory_lock() -> Iterator[None]:
-    """`/run/netns` must be a shared mount, as `ip netns add` makes it."""
     DIRECTORY.mkdir(mode=0o755, exist_ok=True)
     lock = os.open(DIRECTORY.parent / "rosrv-netns.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
@@ -290,7 +286,7 @@ def _directory_lock() -> Iterator[None]:
 
 
 def _is_mount_point(path: Path) -> bool:
-    """`os.path.ismount` misses a bind mount onto itself."""
+    """Whether a path is a mount point, even of a bind mount onto itself, which `os.path.ismount` misses."""
     with Path("/proc/thread-self/mountinfo").open(encoding="utf-8", errors="replace") as lines:
         return any(line.split(" ", 5)[4] == str(path) for line in lines)
 
@@ -320,7 +316,7 @@ def lives_on_the_machines_network(proc: Path = Path("/proc")) -> bool:
 
 
 def is_contained(root: Path = Path("/")) -> bool:
-    """The container may have its own network or not."""
+    """Whether this is a container, with its own network or not."""
     if any((root / mark).exists() for mark in _CONTAINER_MARKS):
         return True
     try:
@@ -330,12 +326,12 @@ def is_contained(root: Path = Path("/")) -> bool:
 
 
 def bridges(classes: Path = Path("/sys/class/net")) -> list[str]:
-    """A container has none; a machine that runs containers has at least one."""
+    """Return the bridges; a container has none, a machine that runs containers at least one."""
     return sorted(link.name for link in classes.glob("*") if (link / "bridge").is_dir())
 
 
 def end_processes(pids: Sequence[int]) -> None:
-    """SIGKILL follows SIGTERM after `_END_SECONDS`.
+    """End processes by SIGTERM, and by SIGKILL after `_END_SECONDS`.
 
     A descriptor refers to each process, so a reused id is never signalled.
     """

@@ -70,7 +70,7 @@ class ProbeResult:
 
     @property
     def closed(self) -> bool:
-        """Every attempt has a clear outcome and none connected."""
+        """Whether every attempt has a clear outcome and none connected."""
         return not any(
             attempt.outcome in (ConnectOutcome.REACHED, ConnectOutcome.UNCLEAR) for attempt in self.attempts
         )
@@ -87,7 +87,7 @@ class ProbeResult:
 
 
 def probe_port(namespace: Namespace, port: int, uid: int = PROBE_UID) -> ProbeResult:
-    """Try over loopback, not as root. Raises `NetworkError` if the probe cannot run."""
+    """Probe a port over loopback, not as root. Raises `NetworkError` if the probe cannot run."""
     if uid <= 0:
         raise ValueError("the probe must run as an unprivileged user, not as root")
     listening = namespace.run(lambda: listening_addresses(port))

@@ -16,14 +16,14 @@ _VERSIONS = (4, 6)  # IPv4 first, because every ROS 1 host has it
 
 @dataclass(frozen=True)
 class PublicAddress:
-    """With the reason for this choice."""
+    """An address with the reason for its choice."""
 
     address: str
     reason: str
 
 
 def outward_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAddress:
-    """Prefer the address towards the default route; without one, there must be only one address.
+    """Return the address towards the default route, or the only address if there is no route.
 
     Interfaces in `without` do not count. Raises `NetworkError` if there is no such address or more than one.
     """
@@ -38,7 +38,7 @@ def outward_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAd
 
 
 def only_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAddress:
-    """Prefer IPv4. Interfaces in `without` do not count.
+    """Return the only address, of IPv4 if possible. Interfaces in `without` do not count.
 
     Raises `NetworkError` if there is no such address or more than one.
     """
@@ -58,7 +58,7 @@ def only_address(namespace: Namespace, *, without: Sequence[str]) -> PublicAddre
 
 
 def _first(namespace: Namespace, route: interfaces.DefaultRoute, version: int) -> str | None:
-    """The source address of packets to the gateway; without one (a modem), the interface's first address."""
+    """Return the source address of packets to the gateway; without a gateway (a modem), the interface's first one."""
     if route.gateway is not None:
         return interfaces.source_address_for(namespace, route.gateway)
     held = interfaces.addresses_by_interface(namespace).get(route.interface, [])

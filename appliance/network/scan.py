@@ -27,7 +27,7 @@ _SILENT = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ETIMEDOUT, errno.EACCES,
 
 @dataclass(frozen=True)
 class ScanResult:
-    """The ports of one address."""
+    """The open and the untested ports of one address."""
 
     address: str
     open: tuple[int, ...]
@@ -42,7 +42,7 @@ class ScanResult:
 
 
 def addresses_of(host: str) -> tuple[str, ...]:
-    """Raises `NetworkError` for an unknown name or an own address."""
+    """Return the addresses of a host. Raises `NetworkError` for an unknown name or an own address."""
     try:
         found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
     except socket.gaierror as error:
@@ -58,7 +58,7 @@ def addresses_of(host: str) -> tuple[str, ...]:
 
 
 def scan(address: str, ports: Iterable[int], seconds: float) -> ScanResult:
-    """At most `seconds` for each port. Raises `NetworkError` for an unusable address."""
+    """Scan ports for at most `seconds` each. Raises `NetworkError` for an unusable address."""
     wanted = list(ports)
     opened: list[int] = []
     refused = silent = untried = 0
@@ -86,7 +86,6 @@ def scan(address: str, ports: Iterable[int], seconds: float) -> ScanResult:
 
 
 def _at_once() -> int:
-    """`AT_ONCE`, limited by the files that the process may still open."""
     used = len(os.listdir("/proc/self/fd"))  # noqa: PTH208  only their number counts
     return max(1, min(AT_ONCE, resource.getrlimit(resource.RLIMIT_NOFILE)[0] - used))
 
@@ -107,7 +106,7 @@ def _try(address: str, port: int, seconds: float) -> tuple[bool, int]:
 
 
 def _is_own(address: str) -> bool:
-    """Packets to an own address would have the same address as source."""
+    """Whether this machine has the address, so that packets to it would also have it as source."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     try:
         with socket.socket(family, socket.SOCK_DGRAM) as probe:

@@ -19,7 +19,7 @@ VERBS = {"use-node" if category is Category.NODE else category.value: category f
 
 
 class BadWordError(ValueError):
-    """The message gives the reason and the remedy."""
+    """A word is invalid; the message gives the reason and the remedy."""
 
 
 def parse_action(text: str) -> tuple[Category, str]:
@@ -33,7 +33,7 @@ def parse_action(text: str) -> tuple[Category, str]:
 
 
 def check_resource(category: Category, name: str) -> str:
-    """Raises `BadWordError` if a request of this category cannot have such a resource."""
+    """Return a resource. Raises `BadWordError` if a request of this category cannot have it."""
     if category is Category.COMMAND:
         if ALIASES.get(name, name) not in COMMANDS:
             elsewhere = DECIDED_ELSEWHERE.get(name)
@@ -45,7 +45,7 @@ def check_resource(category: Category, name: str) -> str:
 
 
 def find_hosts(text: str, policy: Policy) -> tuple[Address, ...]:
-    """Return the first host of a group's network.
+    """Return the addresses that the text names; of a group's network, the first host.
 
     Raises `BadWordError`.
     """
@@ -62,7 +62,7 @@ def find_hosts(text: str, policy: Policy) -> tuple[Address, ...]:
 
 
 def find_host(text: str, policy: Policy) -> Address:
-    """Return the first address of `robot`. Raises `BadWordError`, also for a group of several."""
+    """Return the address that the text names; of `robot`, the first one. Raises `BadWordError`, also for several."""
     found = find_hosts(text, policy)
     if len(found) > 1 and text != ROBOT:
         some = ", ".join(map(str, found[:_MOST_NAMED]))

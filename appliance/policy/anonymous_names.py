@@ -7,5 +7,5 @@ _ANONYMOUS = re.compile(r"_[0-9]++_[0-9]{10,}+$|_[0-9]{15,}+$")
 
 
 def key_of(name: str) -> str:
-    """The key of `/rostopic_4711_1700000000000` is `/rostopic_*`."""
+    """Return the key of a name: `/rostopic_*` for `/rostopic_4711_1700000000000`."""
     return "/".join(_ANONYMOUS.sub("_*", level) for level in name.split("/"))

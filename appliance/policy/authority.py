@@ -25,14 +25,17 @@ from roswire.names import is_global_name
 
 DEFAULT_LEASE = 5.0
 SHORTEST_LEASE, LONGEST_LEASE = 2.0, 3600.0
-"""Relays report once a second which publications move, so a shorter lease could end while its holder publishes."""
+"""The bounds of a lease in seconds.
+
+Relays report once a second which publications move, so a shorter lease could end while its holder publishes.
+"""
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]{0,63}", re.ASCII)
 _SECONDS = re.compile(r"([0-9]{1,5}(?:\.[0-9]{1,3})?)s", re.ASCII)
 _MOST = 100
 
 
 class Claim(StrEnum):
-    """Take a group if it is free, take it from its holder, or only ask for it."""
+    """The right of a host to a group: take it if it is free, take it from its holder, or only ask for it."""
 
     TAKE = "take"
     OVERRIDE = "override"
@@ -45,7 +48,7 @@ _OPTIONS = (*Claim, _LEASE)
 
 @dataclass(frozen=True, slots=True)
 class AuthorityGroup:
-    """`lease` is the seconds after which silence ends it."""
+    """A group; its authority ends after `lease` seconds of silence."""
 
     name: str
     names: frozenset[str]
@@ -62,7 +65,7 @@ class AuthorityGroup:
 def read_authority(
     section: SectionText | None, file: str, groups: HostGroups, findings: Findings
 ) -> dict[str, AuthorityGroup]:
-    """Invalid lines are left out and reported in `findings`."""
+    """Return the groups; invalid lines are left out and reported in `findings`."""
     found: dict[str, AuthorityGroup] = {}
     options: list[tuple[str, str, Entry]] = []
     first_lines: dict[str, int] = {}

@@ -41,7 +41,7 @@ _Pairs = dict[str, tuple[_Node, _Node]]
 
 @dataclass(frozen=True, slots=True)
 class CaseResult:
-    """`line` and `column` count from 1."""
+    """The result of a test case; `line` and `column` count from 1."""
 
     file: str
     line: int
@@ -52,12 +52,12 @@ class CaseResult:
 
     @property
     def passed(self) -> bool:
-        """A request that passes only because of audit-only mode counts as denied."""
+        """Whether the case passed; a request that passes only because of audit-only mode counts as denied."""
         verdict = self.decision.verdict
         return self.expected == ("deny" if verdict == "would deny" else verdict)
 
     def __str__(self) -> str:
-        """`landshark.ini.tests.yaml:7:13: expected allow: 10.0.0.9 is not among …`."""
+        """Return the text, such as `landshark.ini.tests.yaml:7:13: expected allow: 10.0.0.9 is not among …`."""
         return f"{self.file}:{self.line}:{self.column}: {self.finding.text}"
 
     @property
@@ -67,7 +67,8 @@ class CaseResult:
 
 
 def run_cases(policy: Policy, text: str, file: str) -> list[CaseResult]:
-    """`file` is the name of `text` in the results. Raises `PolicyError` with all mistakes in the text.
+    """Return the results; `file` is the name of `text` in them. Raises `PolicyError` with all mistakes in the
+    text.
 
     A file without cases is a mistake, because it would pass with every policy.
     """
@@ -98,7 +99,7 @@ def _compose(text: str, findings: Findings) -> _Node | None:
 
 
 class _CaseReader:
-    """YAML nodes know their line and column."""
+    """Reads cases from YAML nodes, which know their line and column."""
 
     def __init__(self, policy: Policy, findings: Findings) -> None:
         self._policy = policy
@@ -185,7 +186,7 @@ class _CaseReader:
     # --- YAML with places ---
 
     def _mapping(self, node: _Node, what: str, keys: tuple[str, ...] | None) -> _Pairs:
-        """Unknown and repeated keys are errors; without `keys`, any key is permitted."""
+        """Return the pairs of a mapping; unknown and repeated keys are errors, unless `keys` is None."""
         pairs: _Pairs = {}
         if not isinstance(node, yaml.MappingNode):
             expected = f" with {', '.join(keys)}" if keys else ""

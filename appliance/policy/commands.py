@@ -98,7 +98,7 @@ CALLS = _Calls(
 )
 
 COMMANDS = frozenset(name for name, call in CALLS.items() if not call.elsewhere)
-"""Calls that `[Commands]` may grant."""
+"""The calls that `[Commands]` may grant."""
 
 NAMED_ONLY = frozenset(name for name, call in CALLS.items() if call.named_only)
 DECIDED_ELSEWHERE = {name: call.elsewhere for name, call in CALLS.items() if call.elsewhere}

@@ -46,17 +46,16 @@ class DecisionExplanation:
     namespace: Decision | None = None
     told: str | None = None
     limit: str = ""
-    """With its line in `[Limits]`."""
+    """The limit of the request, with its line in `[Limits]`."""
     blocked: bool = False
 
     @property
     def allowed(self) -> bool:
-        """The request has all rights that it needs, without an approval."""
+        """Whether the request has all rights that it needs, without an approval."""
         return self.together == "allow"
 
     @property
     def together(self) -> str:
-        """Allow, ask or deny, for all rights together."""
         verdicts = {each.decision.verdict for each in (self, *self.also)}
         return "deny" if "deny" in verdicts else "ask" if "ask" in verdicts else "allow"
 
@@ -73,7 +72,7 @@ class DecisionExplanation:
 
 
 def explain(policy: Policy, request: Request) -> DecisionExplanation:
-    """The resource must be a resolved name, as for `decide`."""
+    """Explain a decision; the resource must be a resolved name, as for `decide`."""
     first, *others = (_explain(policy, right) for right in rights_of(request))
     return replace(first, also=tuple(others))
 
@@ -101,7 +100,7 @@ def _explain(policy: Policy, right: Right) -> DecisionExplanation:
 
 
 def render(explanation: DecisionExplanation) -> Iterator[str]:
-    """For a blocked host the block is the whole reason."""
+    """Yield the lines of an explanation; for a blocked host, the block is the whole reason."""
     yield from _render_one(explanation)
     if explanation.blocked:
         return
@@ -145,7 +144,6 @@ def _limit(policy: Policy, request: Request) -> str:
 
 
 def _matching(policy: Policy, request: Request) -> list[CompiledRule]:
-    """The most specific rule comes first, `default` last."""
     command = request.category is Category.COMMAND
     name = commands.ALIASES.get(request.resource, request.resource) if command else request.resource
     rules = policy.rules(request.category)

@@ -10,23 +10,22 @@ from appliance.policy.rights import decide, rights_of
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """`count` is the number of occurrences of the request."""
+    """A changed decision; `count` is the number of occurrences of the request."""
 
     request: Request
     old: Decision
     new: Decision
     count: int
     limited: int = 0
-    """If both policies allow the request: -1 for a stricter limit, 1 for a weaker one."""
+    """The change of the limit if both policies allow the request: -1 for a stricter limit, 1 for a weaker one."""
 
     @property
     def granted(self) -> bool:
-        """The new policy grants a request that the old one denied, or limits it less."""
+        """Whether the new policy grants a request that the old one denied, or limits it less."""
         return self.new.rank > self.old.rank or self.limited > 0
 
     @property
     def word(self) -> str:
-        """Granted, denied, needs approval, limited, or limited less."""
         if self.limited:
             return "limited" if self.limited < 0 else "limited less"
         if self.new.verdict == "ask":

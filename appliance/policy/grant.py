@@ -30,12 +30,12 @@ _MOST_LINES = 8  # the most lines that one grant may change, besides one for eac
 
 
 class UngrantableError(Exception):
-    """The message gives the reason."""
+    """No rule can grant a request; the message gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class DecidedRequest:
-    """`takeover`: the request needs a node name that another host has."""
+    """A request that was decided; `takeover`: it needs a node name that another host has."""
 
     request: Request
     rights: list[Right]
@@ -47,13 +47,12 @@ class DecidedRequest:
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """`added` are the lines that were changed or added (none: it was granted before)."""
+    """A changed text; `added` are the lines that were changed or added (none: the request was granted before)."""
 
     text: str
     added: tuple[str, ...]
 
     def findings(self, file: str, known: PolicyContext) -> list[str]:
-        """Return the findings that would reject the text, such as failed test cases."""
         try:
             unsigned = replace(known, site_keys=())  # the new text cannot be signed yet
             judge(self.text, file, unsigned).accepted()
@@ -67,7 +66,7 @@ class Grant:
 
 
 def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> Grant:
-    """Change as few lines as possible.
+    """Grant a request by changing as few lines as possible.
 
     Raises `UngrantableError`, and `PolicyError` if the text is not a valid policy.
     """
@@ -104,7 +103,7 @@ def _granted(policy: Policy, right: Right) -> bool:
 
 
 def _word(text: str, known: PolicyContext, host: Address) -> str:
-    """`host:NAME`, a group of this host alone, `robot`, or the address."""
+    """Return the word for a host: `host:NAME`, a group of this host alone, `robot`, or the address."""
     enrolled = next((name for name, address in known.hosts.items() if address == host), None)
     if enrolled is not None:
         return word_of(enrolled)
@@ -218,7 +217,7 @@ def _with_line(text: str, section: SectionText | None, name: str, line: str) -> 
 def asked(
     host: str, caller_id: str, category: str, resource: str, detail: Mapping[str, object]
 ) -> DecidedRequest:
-    """Raises `UngrantableError` for records without a decision."""
+    """Return the request of a record. Raises `UngrantableError` for records without a decision."""
     try:
         request = Request(ipaddress.ip_address(host), caller_id, Category(category), resource)
     except ValueError:

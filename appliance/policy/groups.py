@@ -20,7 +20,7 @@ _SHOWN_LIMIT = 80
 
 @dataclass(slots=True)
 class HostGroup:
-    """`used`: a rule or another group names this group."""
+    """A group; `used`: a rule or another group names it."""
 
     atom: Atom
     word: Word | None
@@ -29,7 +29,7 @@ class HostGroup:
 
 
 class HostGroups:
-    """Mistakes are added to the findings."""
+    """The groups of a policy; mistakes are added to the findings."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class HostGroups:
         table.put((table.network(network) for network in self.robot), self.groups[ROBOT].atom)
 
     def define(self, section: SectionText | None) -> None:
-        """A group may name groups that are defined later."""
+        """Define the groups of a section; a group may name groups that are defined later."""
         if section is None:
             return
         for entry in section.entries:
@@ -79,7 +79,7 @@ class HostGroups:
             self.groups[word.text] = HostGroup(self._table.group(), word, entry.values)
 
     def read(self, words: Iterable[Word]) -> tuple[tuple[str, Atom], ...]:
-        """An invalid word is an error, a repetition a warning."""
+        """Yield words with their atoms; an invalid word is an error, a repetition a warning."""
         atoms: dict[Atom, str] = {}
         for word in words:
             if self._findings.full:
@@ -136,7 +136,7 @@ class HostGroups:
         return network
 
     def _robot_instead(self) -> str:
-        """Loopback is the appliance itself, so suggest `robot` for the robot's nodes."""
+        """Return the advice to use `robot` for the robot's nodes, because loopback is the appliance itself."""
         if not self.robot:
             return "(unless isolation is none): write robot if you mean the nodes of its machine"
         robot = ", ".join(str(member).removesuffix("/32").removesuffix("/128") for member in self.robot)
@@ -189,7 +189,6 @@ class HostGroups:
             self._findings.error(word.line, word.column, text)
 
     def shown(self, words: Iterable[Word]) -> str:
-        """Groups with few addresses are spelled out."""
         parts: list[str] = []
         length = 0
         for word in words:
@@ -228,7 +227,6 @@ def _as_network(member: Address | Network) -> Network:
 
 
 def _address_fault(text: str) -> str:
-    """Return why a text that looks like an address or network is invalid."""
     address, slash, _ = text.partition("/")
     if "%" in text:
         return f"{quoted(text)} has a zone: write the address alone"

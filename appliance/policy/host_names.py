@@ -1,4 +1,4 @@
-"""Names of hosts: `robot`, the groups of the policy, and enrolled hosts. Pure; no other module resolves such a name.
+"""Names of hosts: `robot`, the groups of the policy, and enrolled hosts. Only this module resolves them. Pure.
 
 Invariants:
 
@@ -21,19 +21,19 @@ from appliance.policy.policy_findings import Findings, quoted
 from appliance.policy.sections import GROUPS
 
 HostInWords = Callable[[str], str]
-"""Returns a host as text for people: `tablet (10.0.0.7)`, or the address alone."""
+"""A function that returns a host as text for people: `tablet (10.0.0.7)`, or the address alone."""
 
 _MOST_NAMED = 20
 _EVERY = tuple(map(ipaddress.ip_network, ("0.0.0.0/0", "::/0")))
 
 
 class UnknownHostNameError(ValueError):
-    """The message names the nearest known name."""
+    """No host has this name; the message has the nearest known name."""
 
 
 @dataclass(frozen=True)
 class HostNames:
-    """`robot` is one of the groups."""
+    """The names of a policy; `robot` is one of the groups."""
 
     groups: Mapping[str, tuple[Network, ...]]
     enrolled: Mapping[str, Address]
@@ -52,7 +52,7 @@ class HostNames:
         return cls(groups, enrolled)
 
     def networks(self, text: str) -> tuple[Network, ...]:
-        """Raises `UnknownHostNameError`."""
+        """Return the networks of a name. Raises `UnknownHostNameError`."""
         try:
             return (canonical_network(ipaddress.ip_network(text)),)
         except ValueError:
@@ -76,7 +76,7 @@ class HostNames:
         return f"{quoted(text)} is not an address, nor the name of a group or an enrolled host{guess}"
 
     def labels(self) -> list[tuple[Network, str]]:
-        """The first network that contains an address names it."""
+        """Return networks with their labels; the first network that contains an address gives its label."""
         rows = [(-1, _network_of(address), name) for name, address in self.enrolled.items()]
         rows += [
             (0 if name == ROBOT else len(some), one, name)
@@ -91,7 +91,7 @@ class HostNames:
 
 
 def label_of(address: str, labels: Iterable[tuple[Network, str]]) -> str:
-    """`labels` are from `HostNames.labels`. Return an empty text if none applies, or if `address` is not one."""
+    """Return the label of an address, or an empty text. `labels` are from `HostNames.labels`."""
     try:
         found = canonical_address(ipaddress.ip_address(address))
     except ValueError:
@@ -110,7 +110,7 @@ def _define(
     groups: dict[str, tuple[Network, ...]],
     enrolled: Mapping[str, Address],
 ) -> tuple[Network, ...]:
-    """Networks that it names come first; an invalid word has none."""
+    """Return the networks of a name, after those of the names in it; an invalid word has none."""
     if name not in groups:
         groups[name] = ()  # a valid policy has no cycle
         found: dict[Network, None] = {}

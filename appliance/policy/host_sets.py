@@ -17,20 +17,20 @@ Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 Atom = int
 
 EVERYONE: Final[Atom] = 0
-"""Every host has the atom of `*`."""
+"""The atom of `*`, which every host has."""
 
 _BITS = {4: 32, 6: 128}
 
 
 def canonical_address(address: Address) -> Address:
-    """An IPv4-mapped IPv6 address becomes IPv4."""
+    """Return the address; an IPv4-mapped IPv6 address becomes IPv4."""
     if isinstance(address, ipaddress.IPv6Address):
         return address.ipv4_mapped or address
     return address
 
 
 def canonical_network(network: Network) -> Network:
-    """A network within ::ffff:0:0/96 becomes IPv4."""
+    """Return the network; a network within ::ffff:0:0/96 becomes IPv4."""
     if isinstance(network, ipaddress.IPv6Network) and network.prefixlen >= 96:
         mapped = network.network_address.ipv4_mapped
         if mapped is not None:
@@ -39,7 +39,7 @@ def canonical_network(network: Network) -> Network:
 
 
 class HostSets:
-    """The networks and groups of a policy do not change after it is compiled."""
+    """The networks and groups of a policy, which do not change after it is compiled."""
 
     __slots__ = ("_lengths", "_networks", "_parents", "_tables")
 
@@ -51,7 +51,7 @@ class HostSets:
         self._lengths: dict[int, list[tuple[int, dict[int, Atom]]]] = {4: [], 6: []}
 
     def network(self, network: Network) -> Atom:
-        """Add the network if it is new."""
+        """Return the atom of a network, which is added if it is new."""
         network = canonical_network(network)
         atom = self._networks.get(network)
         if atom is None:
@@ -99,7 +99,7 @@ class HostSets:
         return network((number >> min(shifts) << min(shifts), bits - min(shifts)))
 
     def above(self, atoms: Iterable[Atom]) -> frozenset[Atom]:
-        """Include every group that contains one of the atoms, at any depth."""
+        """Return the atoms and every group that contains one of them, at any depth."""
         waiting = list(atoms)
         found = set(waiting)
         while waiting:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from appliance.policy.policy_findings import Findings, quoted
 
 MAXIMUM_CHARACTERS = 2 * 1024 * 1024
-"""A policy with 10,000 rules has about 600,000 characters."""
+"""The most characters of a policy; one with 10,000 rules has about 600,000."""
 
 _WORD = re.compile(r"[^\s,]++", re.ASCII)
 _COMMENT = re.compile(r"[#;]")
@@ -20,7 +20,7 @@ _FOREIGN = re.compile(r"[^\t\x20-\x7e]")
 
 @dataclass(frozen=True, slots=True)
 class Word:
-    """`line` and `column` count from 1."""
+    """A word of the text; `line` and `column` count from 1."""
 
     text: str
     line: int
@@ -29,7 +29,7 @@ class Word:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """`key = value value …`; blanks or commas separate words."""
+    """An entry `key = value value …`; blanks or commas separate words."""
 
     key: Word
     values: tuple[Word, ...]
@@ -44,7 +44,7 @@ class SectionText:
 
 
 def read(text: str, findings: Findings) -> list[SectionText]:
-    """Unreadable lines are skipped and reported in `findings`."""
+    """Return the sections; unreadable lines are skipped and reported in `findings`."""
     if len(text) > MAXIMUM_CHARACTERS:
         findings.error(1, 1, f"the file has {len(text)} characters; the limit is {MAXIMUM_CHARACTERS}")
         return []

@@ -20,11 +20,11 @@ def approvals_of(rows: Iterable[Iterable[str]]) -> frozenset[Approval]:
 
 @dataclass(frozen=True, slots=True)
 class PolicyContext:
-    """The addresses of `host:NAME` and `robot`, and the text of the test cases.
+    """The surroundings of a policy: the addresses of `host:NAME` and `robot`, and the test cases.
 
-    `cases` is None if the policy has no test cases. `cases_error` is the reason if they could not be read; it rejects
-    the policy. If `site_keys` is not empty, one of these keys must have signed the policy. `blocks`, `holders` and
-    `approved` are those of `Policy`; none of them affects checks and test cases.
+    `cases` is None if the policy has no test cases. `cases_error` is the reason if they could not be read; it
+    rejects the policy. If `site_keys` is not empty, one of these keys must have signed the policy. `blocks`,
+    `holders` and `approved` are those of `Policy`; none of them affects checks and test cases.
     """
 
     hosts: Mapping[str, Address] = field(default_factory=dict)
@@ -39,7 +39,6 @@ class PolicyContext:
 
     @classmethod
     def of(cls, fields: Mapping[str, Any]) -> Self:
-        """Unknown fields are ignored."""
         return cls(
             {name: ipaddress.ip_address(address) for name, address in fields["hosts"].items()},
             [ipaddress.ip_network(place) for place in fields["robot"]],
@@ -64,14 +63,14 @@ class PolicyContext:
 
 
 class PolicyJudgement(NamedTuple):
-    """A policy without errors in its text."""
+    """A policy without errors in its text, and the results of its test cases."""
 
     policy: Policy
     results: list[CaseResult]
     signed_by: str
 
     def accepted(self) -> Policy:
-        """Raises `PolicyError` with every failed test case."""
+        """Return the policy. Raises `PolicyError` with every failed test case."""
         failed = [result.finding for result in self.results if not result.passed]
         if failed:
             raise PolicyError(failed)
@@ -79,7 +78,7 @@ class PolicyJudgement(NamedTuple):
 
 
 def judge(text: str, file: str, known: PolicyContext, signature: str = "") -> PolicyJudgement:
-    """`file` is the name in findings and rules.
+    """Check a text; `file` is its name in findings and rules.
 
     Raises `PolicyError` with all errors of the text; if it has none, of the signature or the test cases.
     """

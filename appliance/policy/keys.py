@@ -25,16 +25,16 @@ from roswire.errors import InvalidNameError
 from roswire.names import is_global_name, resolve_parameter
 
 Step = tuple[str, bool]
-"""The text of one level, and whether a star follows it."""
+"""One level of a key: its text, and whether a star follows it."""
 
 
 class BadKeyError(ValueError):
-    """The message gives the reason and the correct form."""
+    """A key is invalid; the message gives the reason and the correct form."""
 
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """`subtree`: the key includes everything below the last level (`/**`)."""
+    """A key; `subtree`: it includes everything below the last level (`/**`)."""
 
     text: str
     steps: tuple[Step, ...]
@@ -50,12 +50,12 @@ class Key:
 
     @property
     def specificity(self) -> tuple[bool, int, bool]:
-        """If two keys match a name, the one with the greater specificity decides."""
+        """Return the specificity; of two keys that match a name, the one with the greater specificity decides."""
         return (self.exact, len(self.literal), not self.subtree)
 
     @property
     def inner_star(self) -> bool:
-        """A star before the end (`/*/state`, `/arm*/**`): only such keys can tie."""
+        """Whether the key has a star before the end (`/*/state`, `/arm*/**`), because only such keys can tie."""
         return any(star for _, star in (self.steps if self.subtree else self.steps[:-1]))
 
     def matches(self, name: str) -> bool:
@@ -70,7 +70,6 @@ class Key:
         )
 
     def ties_with(self, other: "Key") -> bool:
-        """The keys are equally specific and some name matches both."""
         if self.specificity != other.specificity:
             return False
         if len(self.steps) != len(other.steps) and not self.subtree:
@@ -85,12 +84,12 @@ def _compatible(one: Step, other: Step) -> bool:
 
 
 def levels(name: str) -> list[str]:
-    """The name `/` has no levels."""
+    """Return the levels of a name; `/` has none."""
     return name[1:].split("/") if name != "/" else []
 
 
 def parse_key(text: str, *, parameter: bool = False) -> Key:
-    """Names of parameters have a wider grammar than those of topics. Raises `BadKeyError`."""
+    """Parse a key; names of parameters have a wider grammar than those of topics. Raises `BadKeyError`."""
     if not text.startswith("/"):
         raise BadKeyError(f"names here are resolved and begin with a slash: /{text.lstrip('~')}")
     if "//" in text:
@@ -111,12 +110,11 @@ def parse_key(text: str, *, parameter: bool = False) -> Key:
 
 
 def command_key(name: str) -> Key:
-    """The name of a call is not a ROS name."""
     return Key(name, (), subtree=False)
 
 
 def is_parameter_key(text: str) -> bool:
-    """`/` is one; the spelling must be canonical."""
+    """Whether a text is a parameter's key in canonical spelling, such as `/`."""
     try:
         return text.startswith("/") and resolve_parameter(text, "") == text
     except InvalidNameError:

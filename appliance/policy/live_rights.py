@@ -36,7 +36,7 @@ class LiveRight(NamedTuple):
         return {**self._asdict(), "host": str(self.host)}
 
     def requests(self) -> list[Request]:
-        """Explain access to the parameter, if there is one, and the call."""
+        """Return the requests to explain: access to the parameter, if there is one, and the call."""
         asked = [request_of(self.call, self.host, self.caller_id, self.resource)]
         touch = CALLS[self.call].touches
         return asked if touch is None else [Request(self.host, self.caller_id, touch, self.resource), *asked]
@@ -44,7 +44,7 @@ class LiveRight(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """`what` is a word such as "publication"."""
+    """A live right that a policy would end; `what` is a word such as "publication"."""
 
     host: str
     caller_id: str

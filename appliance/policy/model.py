@@ -13,7 +13,7 @@ Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 class _Stored:
-    """The standard library computes these properties at each use."""
+    """A property that is computed once; the standard library would compute it at each use."""
 
     is_loopback = False
 
@@ -38,11 +38,11 @@ class _IPv6(_Stored, ipaddress.IPv6Address):
 
 
 HOST, DOOR = "host:", "door:"
-"""Mappings of names have doors as `door:NAME`."""
+"""The prefixes of hosts and doors; mappings of names have doors as `door:NAME`."""
 
 
 def known_name(word: str) -> str | None:
-    """`host:NAME` or `door:NAME` in mappings of names; None for any other word."""
+    """Return the name of a word in mappings of names, for `host:NAME` or `door:NAME`; None for any other word."""
     if word.startswith(DOOR):
         return word
     return word.removeprefix(HOST) if word.startswith(HOST) else None
@@ -54,7 +54,8 @@ def word_of(name: str) -> str:
 
 @lru_cache(4096)
 def address_of(text: str) -> Address:
-    """Return the same object for the same text, to speed up the look-ups of every call.
+    """Return the address in a text, the same object for the same text, to speed up the look-ups of every
+    call.
 
     The result equals the address that `ipaddress` makes, and has the same hash. Raises `ValueError`.
     """
@@ -62,7 +63,7 @@ def address_of(text: str) -> Address:
 
 
 class Category(enum.StrEnum):
-    """The kind of access. Each category has its own section, but both for parameters share one."""
+    """The kind of access. Each category has its own section, except that both for parameters share one."""
 
     NODE = "node"  # use a node name                [Nodes]
     PUBLISH = "publish"  # publish a topic          [Publishers]
@@ -98,7 +99,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """The position of a rule."""
+    """A rule: its section, key and position."""
 
     section: str  # as written in the documentation: "Publishers"
     key: str  # as written in the file: "/arm/**", "default", "read /ns/**"
@@ -106,7 +107,7 @@ class Rule:
     line: int  # counted from 1
 
     def __str__(self) -> str:
-        """`[Publishers] /arm/** (landshark.ini:12)`."""
+        """Return the text, such as `[Publishers] /arm/** (landshark.ini:12)`."""
         return f"[{self.section}] {self.key} ({self.file}:{self.line})"
 
 
@@ -132,26 +133,26 @@ class Decision:
 
     @property
     def rank(self) -> int:
-        """How much the rules grant: nothing, with an approval, only in audit-only mode, or all."""
+        """Return how much is granted: nothing, with an approval, only in audit-only mode, or all."""
         return 2 if self.would_deny else 1 if self.asks is not None else 3 if self.allowed else 0
 
     @property
     def verdict(self) -> Literal["allow", "deny", "would deny", "ask"]:
-        """The policy's tools also know `ask`."""
+        """Return the word for the policy's tools, which also know `ask`."""
         return "ask" if self.rank == 1 else self.word
 
     @property
     def word(self) -> Literal["allow", "deny", "would deny"]:
-        """The words are those of the audit log."""
+        """Return the word in the audit log."""
         return "would deny" if self.would_deny else "allow" if self.allowed else "deny"
 
 
 TELLS = ("rule", "full", "id")
-"""`[Options] tell` limits the text for a denied caller; the first value is the default."""
+"""The values of `[Options] tell`, which limits the text for a denied caller; the first is the default."""
 
 
 def text_for_caller(decision: Decision, tell: str) -> str:
-    """The reason (`full`), no other hosts (`rule`), or only the denial (`id`)."""
+    """Return the reason (`full`), the reason without other hosts (`rule`), or only the denial (`id`)."""
     if tell == "full":
         return decision.reason
     return "denied" if tell == "id" else decision.told or decision.reason

@@ -1,6 +1,6 @@
 """A compiled policy, and the one function that decides: `Policy.decide(request)`.
 
-The function is pure: the same request always gets the same answer, without I/O and without a clock.
+The function is pure: without I/O and without a clock.
 
 Invariants:
 1. A request that no rule grants is denied. Exception: if an extension section is missing, its requests are allowed.
@@ -34,7 +34,7 @@ _KEPT_NAME = 256
 _LONGEST_REASON = 299
 
 Approval = tuple[Address, Category, str]
-"""A host may publish a topic, or write a parameter."""
+"""The right of a host to publish a topic or write a parameter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ class CompiledRule:
 
 @dataclass(slots=True)
 class RuleTable:
-    """`audit_only`: requests that these rules deny still pass."""
+    """The rules of a category; `audit_only`: requests that these rules deny still pass."""
 
     tree: KeyTree[CompiledRule] = field(default_factory=KeyTree)
     default: CompiledRule | None = None
@@ -91,16 +91,16 @@ class HostStanding(NamedTuple):
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class Policy:
-    """Only `compile_policy` makes it.
+    """A compiled policy, which only `compile_policy` makes.
 
-    `text` and `file` are its source. `named` has the atoms of all hosts that a rule names. `present` lists the
-    categories that have a section. `monitored_topics` and `monitored_services` are the names in `[Monitor]`.
-    `takeover` is `same-host` or `granted`; `ports` are for proxy endpoints and relay. `enrolled` and `robot` are the
-    given addresses of `host:NAME` and `robot`. `blocks` has the hosts that an operator blocks, by canonical address:
-    the end of a sentence, such as `blocked by ann`. `authority` has the groups of `[Authority]`, and `holders` the
-    host that holds each of them; a group without an entry is free. Without `holders` (for checks of a text), each
-    host with a claim counts as the holder. `approved` has the approvals that last, as host, category and name.
-    Without it, no request that needs an approval passes.
+    `text` and `file` are its source. `named` has the atoms of all hosts that a rule names. `present` lists
+    the categories that have a section. `monitored_topics` and `monitored_services` are the names in
+    `[Monitor]`. `takeover` is `same-host` or `granted`; `ports` are for proxy endpoints and relay. `enrolled`
+    and `robot` are the addresses of `host:NAME` and `robot`. `blocks` has the hosts that an operator blocks,
+    by canonical address: the end of a sentence, such as `blocked by ann`. `authority` has the groups of
+    `[Authority]`, and `holders` the host that holds each of them; a group without an entry is free. Without
+    `holders` (for checks of a text), each host with a claim counts as the holder. `approved` has the
+    approvals that last, as host, category and name. Without it, no request that needs an approval passes.
     """
 
     text: str
@@ -136,7 +136,7 @@ class Policy:
     def decide(self, request: Request) -> Decision:
         """Decide by the rules of the request's own category.
 
-        A call may need further rights: `policy/rights` lists them and decides on all of them.
+        `policy/rights` lists the further rights that a call may need, and decides on all of them.
         """
         host = request.host
         key = (host.version, int(host), request.category, request.resource)
@@ -150,10 +150,10 @@ class Policy:
         return decision
 
     def decide_parameter(self, request: Request, *, namespace: bool = False) -> Decision:
-        """A rule for a name below that denies the host denies the call.
+        """Decide access to a parameter; a rule for a name below that denies the host denies the call.
 
-        `namespace`: the parameter contains other parameters. Then the rule for contained parameters without their own
-        key must also grant the host, because an exact key `/arm` does not match `/arm/speed`.
+        `namespace`: the parameter contains other parameters. Then the rule for contained parameters without
+        their own key must also grant the host, because an exact key `/arm` does not match `/arm/speed`.
         """
         decision = self.decide(request)
         if not decision.allowed or decision.would_deny or request.category not in self.present:
@@ -170,7 +170,7 @@ class Policy:
         return kept
 
     def _decide_below(self, request: Request, namespace: bool) -> Decision | None:
-        """Return None if all keys below grant the host."""
+        """Return the denial by a key below, or None if all keys below grant the host."""
         table = self.tables[request.category]
         atoms = self.atoms_of(request.host)
         deciding = table.tree.below(request.resource)
@@ -201,7 +201,7 @@ class Policy:
         return rule.rate(part, self.atoms_of(host) if host is not None else frozenset())
 
     def limit_on(self, request: Request) -> Rate:
-        """Other requests than to publish or subscribe have no limit."""
+        """Return the limit on publishing or subscribing; other requests have none."""
         part = _LIMITED.get(request.category)
         return NO_LIMIT if part is None else self.limit(part, request.resource, request.host)
 
@@ -222,18 +222,18 @@ class Policy:
         return HostStanding(atoms, known, free and network is not None, named_as, str(named_as), text)
 
     def knows(self, address: Address) -> bool:
-        """A rule includes this address, and the host is not blocked. Other hosts are unknown hosts.
+        """Whether a rule includes this address, and the host is not blocked. Other hosts are unknown hosts.
 
-        In audit-only mode without a rule that names a host, every host is known, because a robot is being learned.
+        In audit-only mode without a rule that names a host, every host is known, because a robot is being
+        learned.
         """
         return self.standing(address).known
 
     def serves(self, address: Address) -> bool:
-        """Requests of this address are read: it is known, or a section in audit-only mode lets them pass."""
+        """Whether requests of this address are read: it is known, or a section in audit-only mode lets them pass."""
         return self.knows(address) or (self._any_audit_only and self.blocked(address) is None)
 
     def blocked(self, address: Address) -> Decision | None:
-        """The denial of every request of a blocked host."""
         if not self.blocks or (block := self.blocks.get(host := canonical_address(address))) is None:
             return None
         return Decision(False, None, f"{host} is {block}", told=f"{host} is blocked by an operator")
@@ -251,14 +251,14 @@ class Policy:
         return self.holder(group) == canonical_address(host)
 
     def holder(self, group: AuthorityGroup) -> Address | None:
-        """The holder must still have a claim; None means that the group is free."""
+        """Return the holder of a group if it still has a claim; None if the group is free."""
         host = (self.holders or {}).get(group.name)
         if host is None or self.blocked(host) is not None or group.claim(self.atoms_of(host)) is None:
             return None
         return host
 
     def asks_for(self, category: Category, name: str) -> bool:
-        """Some hosts need an approval to access this name."""
+        """Whether some hosts need an approval to access this name."""
         rule = self.tables[category].tree.find(name) or self.tables[category].default
         return rule is not None and bool(rule.asked)
 
@@ -271,7 +271,7 @@ class Policy:
         return self.standing(address).alike
 
     def counted_as(self, address: Address) -> str:
-        """`alike`, or one empty string for all unknown hosts."""
+        """Return `alike`, or one empty string for all unknown hosts."""
         return self.alike(address) if self.knows(address) else ""
 
     def names(self, address: Address) -> bool:
@@ -279,7 +279,7 @@ class Policy:
         return self.standing(address).named
 
     def audit_only(self, category: Category) -> bool:
-        """Requests of this category pass although the rules deny them."""
+        """Whether requests of this category pass although the rules deny them."""
         return self.tables[category].audit_only
 
     def atoms_of(self, address: Address) -> frozenset[Atom]:
@@ -312,11 +312,10 @@ class Policy:
         return decision if group is None else self._commanding(request, decision, group)
 
     def _commanding(self, request: Request, decision: Decision, group: AuthorityGroup) -> Decision:
-        """Deny what the rules grant to a host without a claim to the group, and calls of a host that does not hold
-        it.
+        """Deny a host without a claim to the group, and calls of a host that does not hold it.
 
-        The publication of a host with a claim stays registered, because a ROS 1 node never registers again. The relay
-        carries its messages only while the host holds the group.
+        The publication of a host with a claim stays registered, because a ROS 1 node never registers again.
+        The relay carries its messages only while the host holds the group.
         """
         if not decision.allowed and decision.asks is None:
             return decision
@@ -356,9 +355,7 @@ class Policy:
         return _by_rule(what, found, table.audit_only)
 
     def _asking(self, request: Request, rule: CompiledRule, audit_only: bool) -> Decision:
-        """Decide for a host that needs an approval. A service call passes here, because the relay holds each of its
-        requests.
-        """
+        """Decide for a host that needs an approval. A service call passes: the relay holds each of its requests."""
         if self._is_approved(request):
             reason = f"{self._what(request, 'may')} by {rule.place}, while an approval lasts"
             return Decision(True, rule.rule, reason, asks=request)
@@ -401,7 +398,7 @@ def _decided(allowed: bool, rule: Rule | None, reason: str, audit_only: bool) ->
 
 
 def _by_rule(what: str, rule: CompiledRule, audit_only: bool) -> Decision:
-    """The reason lists the allowed hosts, unless it would be too long."""
+    """Return the decision of a rule; the reason lists the allowed hosts unless it would be too long."""
     told = f"{what}, by {rule.place}"
     reason = f"{what}: {rule.shown}, by {rule.place}"
     decision = _decided(False, rule.rule, reason if len(reason) <= _LONGEST_REASON else told, audit_only)
@@ -414,6 +411,5 @@ def _shortened(text: str, limit: int = 60) -> str:
 
 
 def place_of(rule: Rule) -> str:
-    """The place is short enough for a sentence."""
     file = rule.file.rpartition("/")[2]
     return f"[{rule.section}] {_shortened(rule.key, 50)} ({_shortened(file, 30)}:{rule.line})"

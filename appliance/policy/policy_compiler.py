@@ -27,10 +27,11 @@ def compile_policy(
     hosts: Mapping[str, Address] | None = None,
     robot: Collection[Address | Network] = (),
 ) -> Policy:
-    """Raises `PolicyError` with every error in the text.
+    """Return the policy. Raises `PolicyError` with every error in the text.
 
-    `file` is the name of the text in findings and rules. `hosts` has the addresses of enrolled hosts (`host:NAME`). A
-    name without an address matches no host and causes a warning. `robot` lists the addresses of the group `robot`.
+    `file` is the name of the text in findings and rules. `hosts` has the addresses of enrolled hosts
+    (`host:NAME`). A name without an address matches no host and causes a warning. `robot` lists the addresses
+    of the group `robot`.
     """
     findings = Findings(file)
     written = _by_name(read(text, findings), findings)

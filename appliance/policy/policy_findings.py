@@ -10,7 +10,7 @@ MAXIMUM_FINDINGS = 200
 
 
 class FindingSeverity(enum.StrEnum):
-    """An error rejects the file."""
+    """The severity of a finding; an error rejects the file."""
 
     ERROR = "error"
     WARNING = "warning"
@@ -18,7 +18,7 @@ class FindingSeverity(enum.StrEnum):
 
 @dataclass(frozen=True, slots=True, order=True)
 class PolicyFinding:
-    """`line` and `column` count from 1; `text` describes the mistake and the remedy."""
+    """A finding; `line` and `column` count from 1, `text` describes the mistake and the remedy."""
 
     file: str
     line: int
@@ -27,12 +27,12 @@ class PolicyFinding:
     text: str
 
     def __str__(self) -> str:
-        """`landshark.ini:12:5: error: …`, as compilers write it."""
+        """Return the text as compilers write it, such as `landshark.ini:12:5: error: …`."""
         return f"{self.file}:{self.line}:{self.column}: {self.severity}: {self.text}"
 
 
 class PolicyError(Exception):
-    """`findings` has every error, and the warnings found so far."""
+    """A file has errors; `findings` has all of them, and the warnings found so far."""
 
     def __init__(self, findings: list[PolicyFinding]) -> None:
         self.findings = findings
@@ -40,7 +40,7 @@ class PolicyError(Exception):
 
 
 class Findings:
-    """Beyond `MAXIMUM_FINDINGS`, errors of the file are only counted."""
+    """Collects findings; beyond `MAXIMUM_FINDINGS`, errors are only counted."""
 
     def __init__(self, file: str) -> None:
         self.file = file
@@ -75,7 +75,7 @@ class Findings:
 
 
 def quoted(text: str, limit: int = 60) -> str:
-    """Quote, shorten and escape untrusted text."""
+    """Return untrusted text quoted, shortened and escaped."""
     shown = text if len(text) <= limit else text[: limit - 1] + "…"
     return '"' + "".join(c if c.isprintable() and c != '"' else _escaped(c) for c in shown) + '"'
 

@@ -61,7 +61,7 @@ def _dead_rules(tables: Tables, table: HostSets, findings: Findings) -> None:
 
 
 def _nameless(named: set[Atom], table: HostSets) -> dict[Atom, Network]:
-    """For each atom, return a network that does not overlap the hosts of `[Nodes]`, if there is one."""
+    """Return, for each atom, a network that does not overlap the hosts of `[Nodes]`, if there is one."""
     networks = table.networks()
     nodes = [network for network, atom in networks.items() if not named.isdisjoint(table.above([atom]))]
     overlap = _Overlap(nodes)
@@ -78,7 +78,7 @@ def _nameless(named: set[Atom], table: HostSets) -> dict[Atom, Network]:
 
 
 class _Overlap:
-    """Overlaps with a set of networks."""
+    """Finds overlaps with a set of networks."""
 
     def __init__(self, networks: list[Network]) -> None:
         self._starts: dict[int, list[int]] = {}
@@ -119,7 +119,7 @@ def _unused_groups(groups: HostGroups, findings: Findings) -> None:
 
 
 def _missing_sections(present: set[Category], findings: Findings) -> None:
-    """Requests of a missing section are denied for all hosts."""
+    """Warn about missing sections, whose requests are denied for all hosts."""
     for decider in sections.DECIDERS:
         if not decider.extension and decider.categories[0] not in present:
             findings.warn(

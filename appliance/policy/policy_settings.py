@@ -14,7 +14,7 @@ from roswire.names import is_global_name
 
 TAKEOVERS = ("same-host", "granted")
 AT_ONCE = "[Options] takeover = granted"
-"""Lets another host take over a node name; a denial that it would prevent names this option."""
+"""The option that lets another host take over a node name; a denial that it would prevent names it."""
 _MASTER_PORT = 11311
 _RANGE = re.compile(r"([0-9]{1,5})-([0-9]{1,5})", re.ASCII)
 
@@ -75,7 +75,6 @@ def read_monitor(section: SectionText | None, findings: Findings) -> MonitorSect
 
 
 def read_options(section: SectionText | None, findings: Findings) -> Options:
-    """An option that is not set has its default."""
     options = Options()
     for entry in _entries(section, ("takeover", "audit-only", "tell"), findings):
         match entry.key.text:
@@ -117,7 +116,6 @@ def _audit_only(entry: Entry, findings: Findings) -> frozenset[str]:
 
 
 def _entries(section: SectionText | None, keys: Collection[str], findings: Findings) -> Iterator[Entry]:
-    """Entries with an unknown or repeated key are errors."""
     first_lines: dict[str, int] = {}
     for entry in section.entries if section else ():
         word = entry.key

@@ -27,7 +27,7 @@ from appliance.policy.sections import DEFAULT, LIMITS
 
 
 class LimitScope(StrEnum):
-    """A limit counts the messages in its scope together."""
+    """The scope of a limit, which counts all messages in it together."""
 
     PUBLISHER = "publisher"
     SUBSCRIBER = "subscriber"
@@ -36,7 +36,7 @@ class LimitScope(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """Rates are per second; 0 means unlimited."""
+    """A limit per second; 0 means unlimited."""
 
     messages: float = 0.0
     bytes: float = 0.0
@@ -45,7 +45,7 @@ class Rate:
         return self.messages > 0 or self.bytes > 0
 
     def __str__(self) -> str:
-        """`30 Hz, 10 MB/s`; `no limit`."""
+        """Return the text, such as `30 Hz, 10 MB/s` or `no limit`."""
         parts = [f"{self.messages:g} Hz"] if self.messages else []
         if self.bytes:
             unit = next(unit for unit in reversed(_BYTES) if self.bytes >= _BYTES[unit] or unit == "B/s")
@@ -68,7 +68,7 @@ _LINES = 1000
 
 @dataclass(frozen=True, slots=True)
 class Clause:
-    """Applies to nodes on hosts with one of `atoms` (None: on all hosts)."""
+    """A limit for nodes on hosts with one of `atoms` (None: on all hosts)."""
 
     part: LimitScope
     atoms: frozenset[Atom] | None
@@ -77,14 +77,13 @@ class Clause:
 
 @dataclass(frozen=True, slots=True)
 class LimitRule:
-    """`key` is None for `default`."""
+    """A line of `[Limits]`; `key` is None for `default`."""
 
     rule: Rule
     key: Key | None
     clauses: tuple[Clause, ...]
 
     def rate(self, part: LimitScope, atoms: frozenset[Atom]) -> Rate:
-        """The strictest clause counts."""
         rate = NO_LIMIT
         for clause in self.clauses:
             if clause.part is part and (clause.atoms is None or not clause.atoms.isdisjoint(atoms)):
@@ -112,7 +111,6 @@ class LimitTable:
 
 
 def read_limits(section: SectionText | None, file: str, groups: HostGroups, findings: Findings) -> LimitTable:
-    """Invalid parts are left out and reported in `findings`."""
     table = LimitTable()
     first_lines: dict[str, int] = {}
     patterns: list[tuple[Key, int]] = []
@@ -137,7 +135,7 @@ def read_limits(section: SectionText | None, file: str, groups: HostGroups, find
 
 
 def _key(word: Word, patterns: list[tuple[Key, int]], findings: Findings) -> Key | None:
-    """Return None for `default`, and for an invalid key."""
+    """Return the key, or None for `default` and for an invalid key."""
     if word.text == DEFAULT:
         return None
     try:
@@ -156,7 +154,6 @@ def _key(word: Word, patterns: list[tuple[Key, int]], findings: Findings) -> Key
 
 
 def _clauses(entry: Entry, groups: HostGroups, findings: Findings) -> Iterator[Clause]:
-    """Each clause begins with the word for its scope."""
     parts: list[tuple[Word, list[Word]]] = []
     for word in entry.values:
         if word.text in _PARTS:
@@ -192,7 +189,7 @@ def _clause(part: Word, words: list[Word], groups: HostGroups, findings: Finding
 
 
 def _rate(part: Word, words: list[Word], findings: Findings) -> Rate | None:
-    """`5Hz` or `5 Hz`. Report an error and return None if invalid."""
+    """Return a rate such as `5Hz` or `5 Hz`; report an error and return None if it is invalid."""
     found: dict[str, float] = {}
     words = list(words)
     while words:

@@ -1,10 +1,10 @@
 """List the rights that a call needs. Only this module knows which rules must grant a call.
 
-RVMaster's gate, revocation, `explain`, test cases, `diff` and `learn` all use it, so they cannot contradict each
-other. `rights_of_call` returns the rights of a whole call. `rights_of` returns the rights of an action that a person
-names (`publish /cmd_vel`). `decide` makes one decision on several rights.
+RVMaster's gate, revocation, `explain`, test cases, `diff` and `learn` all use it. `rights_of_call` returns the rights
+of a whole call. `rights_of` returns the rights of an action that a person names (`publish /cmd_vel`). `decide` makes
+one decision on several rights.
 
-A right is a question to one section of the policy. A call needs all of these rights:
+A call needs all of these rights:
 
 1. the action itself: access to a topic or service, or the call as a command;
 2. the command that carries out the action, if `COMMAND_FOR` lists one;
@@ -26,7 +26,7 @@ from roswire.xmlrpc import Value
 
 _NODE_CATEGORIES = {call.category for call in CALLS.values() if call.node} - {Category.COMMAND}
 COMMAND_FOR = {Category.CALL: "lookupService", Category.READ: "getParam", Category.WRITE: "setParam"}
-"""A node calls a service, reads and writes a parameter by these commands."""
+"""The commands by which a node calls a service, or reads and writes a parameter."""
 
 
 class Right(NamedTuple):
@@ -41,7 +41,9 @@ class Right(NamedTuple):
     alone: bool = False
 
     def __str__(self) -> str:
-        """`write /arm/**` for a namespace (`read /**` for all), `write /arm` for one parameter, `node /it`."""
+        """Return the text: `write /arm/**` for a namespace (`read /**` for all), `write /arm` for one
+        parameter, `node /it`.
+        """
         name = self.request.resource
         return f"{self.request.category} {name.rstrip('/') + '/**' if self.namespace else name}"
 
@@ -55,7 +57,7 @@ def request_of(call: str, host: Address, caller_id: str, resource: str) -> Reque
 def rights_of_call(
     request: Request, call: str, key: str | None = None, *, value: Value = None, tree: Tree | None = None
 ) -> list[Right]:
-    """`request` is the one that decides the call (`request_of`).
+    """Return the rights of a call; `request` is the one that decides it (`request_of`).
 
     `key` and `value` are those of its parameter, and `tree` is the present parameter tree.
     """
@@ -80,7 +82,7 @@ def rights_to_keep(request: Request, call: str, resource: str, *, namespace: boo
 
 
 def rights_of(request: Request, touched: Iterable[Right] = ()) -> list[Right]:
-    """`touched` are the rights on the action's parameters."""
+    """Return the rights of an action; `touched` are the rights on its parameters."""
     rights = [Right(request)]
     if (command := COMMAND_FOR.get(request.category)) is not None:
         rights.append(Right(_of(request, Category.COMMAND, command)))
@@ -95,7 +97,7 @@ def right_to_read(request: Request, value: Value) -> Right:
 
 
 def right_to_find(request: Request) -> Right:
-    """The right to learn that a parameter exists does not include anything below it."""
+    """Return the right to learn that a parameter exists, without anything below it."""
     return Right(request, alone=True)
 
 

@@ -11,7 +11,7 @@ from appliance.policy.policy_findings import Findings, quoted
 from appliance.policy.sections import ASK, ASKING, DEFAULT, PARAMETERS, Decider
 
 MAXIMUM_INNER_STARS = 1000
-"""In all sections together: keys with a star before the end make the search branch."""
+"""The most keys with a star before the end, in all sections together, because they make the search branch."""
 
 
 class RuleCompiler:
@@ -61,7 +61,6 @@ class RuleCompiler:
             )
 
     def _asking(self, category: Category, entry: Entry) -> tuple[tuple[Word, ...], tuple[Word, ...]]:
-        """Return the words before and after `ask`."""
         places = [place for place, word in enumerate(entry.values) if word.text == ASK]
         if not places:
             return entry.values, ()

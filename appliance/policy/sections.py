@@ -42,12 +42,12 @@ BY_CATEGORY = {category: decider for decider in DECIDERS for category in decider
 PARAMETERS = frozenset({Category.READ, Category.WRITE})
 
 ASK = "ask"
-"""Hosts after this word need an operator's approval."""
+"""The word before hosts that need an operator's approval."""
 
 ASKING = frozenset({Category.PUBLISH, Category.CALL, Category.WRITE})
 
 DEFAULT = "default"
-"""Applies to names without another matching key in the section."""
+"""The key for names without another matching key in the section."""
 
 GROUPS, PORTS, MONITOR, LIMITS, OPTIONS = "Groups", "Ports", "Monitor", "Limits", "Options"
 AUTHORITY = "Authority"

@@ -17,14 +17,14 @@ _LOG_LEVEL = ("get_loggers", "set_logger_level")
 
 @dataclass(frozen=True, slots=True)
 class StockTool:
-    """The calls are made under the tool's own name; `node`: it also starts an anonymous node."""
+    """The calls that a tool makes under its own name; `node`: it also starts an anonymous node."""
 
     name: str
     calls: tuple[str, ...]
     node: bool = True
 
     def rights(self, host: Address) -> list[Right]:
-        """Topics and services of the tool's user are not included."""
+        """Return the rights that the tool needs, without those to the topics and services of its user."""
         name = f"/{self.name}_1_1000000000"
         asked = [(Category.COMMAND, call) for call in self.calls]
         if self.node:
@@ -50,7 +50,7 @@ _TOOLS = (
 
 
 def stock_tool(caller_id: str) -> StockTool | None:
-    """A tool calls as `/rostopic`, `/rostopic_4711_1700000000000` or `/rosparam-4711`."""
+    """Return the tool of a caller such as `/rostopic`, `/rostopic_4711_1700000000000` or `/rosparam-4711`, or None."""
     if len(caller_id) > _LONGEST:
         return None
     key = key_of(caller_id)

@@ -157,7 +157,6 @@ class Pool(Generic[Holder]):
         return ((host, amount) for host, (_, amount) in self._held.items())
 
     def _look_up(self, host: Holder) -> tuple[QuotaClass, int]:
-        """Return the present quota class and holdings of a host; count them under that class."""
         quota_class = self._quota_class(host)
         counted_as, amount = self._held.get(host, _NOTHING)
         if amount and counted_as is not quota_class:

@@ -443,4 +443,4 @@ QUOTA_ROWS = (
     REST_EXPORTS, REST_WORK, AUDIT_KINDS, AUDIT_READ_KINDS, AUDIT_BYTES, AUDIT_RESERVE, NODE_PORTS, NAMES, GRANTS,
     IKE_HANDSHAKES, DESCRIPTORS,
 )  # fmt: skip
-"""Every row of the core, in the order of the page. A test checks that none is missing. Features have further rows."""
+"""Every row of the core, in the order of the page. A test checks that none is missing. Features add rows."""

@@ -23,7 +23,7 @@ class RelayContext:
     scratch: Scratch
     interceptor: Interceptor
     payer: Callable[[str], str]
-    """Returns the payer for the processor time of a host."""
+    """A function that returns the payer for the processor time of a host."""
 
     @classmethod
     def of(

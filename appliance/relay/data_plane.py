@@ -397,7 +397,7 @@ class DataPlane:
         self.incoming_connections.add(incoming)
 
     def _make_connection_room(self, host: str) -> bool:
-        """End a connection in favour of this host: an unserved one, else one of the host with the most connections."""
+        """End a connection in favour of this host: an unserved one, or one of the host with the most connections."""
         if self._pending.make_room(host):
             return True
         pool = self.ports.connected
@@ -418,7 +418,7 @@ class DataPlane:
             yield from [member for member in relayed.members if isinstance(member, Subscriber)]
 
     def _incoming_failed(self, incoming: IncomingConnection, reason: str) -> None:
-        """Forget a peer that is gone; report its refusal if it had no grant."""
+        """Forget a peer that disconnected; report its refusal if it had no grant."""
         incoming.close()
         self._forget_incoming(incoming)
         self.ports.left(incoming.host)
@@ -569,7 +569,6 @@ class DataPlane:
         self._go_on_tidying()
 
     def _go_on_tidying(self) -> None:
-        """Tidy up, one quantum at a time (there may be thousands of topics), then report."""
         for _ in self._tidying:
             if self._loop.over():
                 self._loop.after(0, self._go_on_tidying)

@@ -146,7 +146,6 @@ class _WorkThread:
         self._thread.start()
 
     def discard(self) -> None:
-        """Wait for the thread, and stop watching it."""
         self._thread.join()
         self._loop.unwatch(self._ended)
         os.close(self._ended)
@@ -232,7 +231,6 @@ class EventLoop:
         return timer
 
     def later(self, callback: Callable[[], None], payer: str) -> None:
-        """Call `callback` once, when it is the payer's turn again."""
         found = self._payer(payer)
         found.later.append(callback)
         self._waiting[payer] = found
@@ -292,7 +290,6 @@ class EventLoop:
             self._close_discarded()
 
     def close(self) -> None:
-        """Release the epoll descriptors and every discarded socket."""
         self._close_discarded()
         self._watched.clear()
         self._epoll.close()

@@ -10,70 +10,70 @@ class RelayLimits:
     """Bounds of one relay process; lengths in bytes, times in seconds."""
 
     connections: int = 16_384
-    """Subscribers and clients connected at once, those that have not sent their header yet included."""
+    """The most subscribers and clients connected at once, with those that have not sent their header."""
 
     connections_per_host: int = 8_192
-    """The same for one host: a robot with all nodes on one machine has one connection for each subscription."""
+    """The most connections of one host: a robot with all nodes on one machine has one for each subscription."""
 
     header_bytes: int = 64 << 10
-    """A TCPROS connection header, its length field not counted."""
+    """The longest TCPROS connection header in bytes, without its length field."""
 
     header_seconds: float = 10.0
-    """From accepting a connection to receiving its whole header."""
+    """The seconds from accepting a connection to receiving its whole header."""
 
     grant_seconds: float = 2.0
-    """How long a peer waits for a missing grant before it is refused."""
+    """The seconds that a peer waits for a missing grant before it is refused."""
 
     message_bytes: int = 256 * MIB
-    """One message, request or response; a peer that declares more is cut. At least 1 MiB."""
+    """The longest message, request or response in bytes; a peer that declares more is cut. At least 1 MiB."""
 
     queue_messages: int = 1000
-    """Messages that wait for one slow subscriber; beyond, the oldest are dropped."""
+    """The most messages that wait for one slow subscriber; beyond, the oldest are dropped."""
 
     queue_bytes: int = 64 * MIB
-    """The same in bytes. A message that is sent in part does not count: it is never dropped."""
+    """The most bytes that wait for one slow subscriber. A partly sent message does not count: it is never dropped."""
 
     queue_grace: float = 0.05
-    """How long at most a publisher is not read while *every* subscriber of its topic is behind."""
+    """The longest time that a publisher is not read while *every* subscriber of its topic is behind."""
 
     memory_bytes: int = 1024 * MIB
     """The memory of the whole process: half for unfinished messages, a quarter each for queues and latched ones."""
 
     header_memory_bytes: int = 64 * MIB
-    """Bytes of all headers that are incomplete or wait for a grant; the first 4 KiB of each do not count."""
+    """The bytes of all headers that are incomplete or wait for a grant; the first 4 KiB of each do not count."""
 
     budget: float = 10.0
     """Milliseconds of processor time that monitors may take for one message, request or reply."""
 
     stall_seconds: float = 10.0
-    """How long the transfer of a large message may make no progress before its connection is cut."""
+    """The seconds without progress after which the transfer of a large message is cut."""
 
     connect_seconds: float = 3.0
-    """To connect to a publisher or a service, and from there to a publisher's header."""
+    """The seconds for connecting to a publisher or a service, and from there to a publisher's header."""
 
     service_seconds: float = 30.0
-    """From connecting to a service to its header: a server that is busy may let its clients wait, as in plain ROS."""
+    """The seconds from connecting to a service to its header; a busy server may let clients wait, as in plain ROS."""
 
     answer_seconds: float = 10.0
-    """How long to wait for control's answer to `UpstreamWanted` before asking again."""
+    """The seconds to wait for control's answer to `UpstreamWanted` before asking again."""
 
     retry_first: float = 0.1
-    """Wait before control is asked for a lost publisher again; doubled with each failure."""
+    """The seconds before control is asked for a lost publisher again; doubled with each failure."""
 
     retry_longest: float = 5.0
-    """The longest wait between two tries."""
+    """The longest wait between two tries, in seconds."""
 
     linger: float = 2.0
-    """How long a publisher's connection is kept after its last subscriber left, during a reload or a restart."""
+    """The seconds that a publisher's connection outlives its last subscriber, during a reload or a restart."""
 
     farewell: float = 2.0
-    """How long a refused peer may take to read the reason before its connection is closed."""
+    """The seconds that a refused peer has to read the reason before its connection is closed."""
 
     report_every: float = 1.0
-    """Time between two `TrafficReported`, in which equal refusals are counted together."""
+    """The seconds between two `TrafficReported`, in which equal refusals are counted together."""
 
     refusals: int = 100
-    """Different refusals that are reported one by one in that time; the rest are counted together."""
+    """The number of different refusals that are reported one by one in that time; the rest are counted together."""
 
     def __post_init__(self) -> None:
         if self.message_bytes < MIB:

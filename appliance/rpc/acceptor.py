@@ -167,10 +167,10 @@ def _instruction(operation: int, operand: int, if_true: int = 0, if_false: int =
 
 
 class Acceptor:
-    """`accepted` owns the socket; the host is charged for the time.
+    """Accepts connections; `accepted` owns the socket, and the host is charged for the time.
 
-    If it returns False (too many connections), other connections of this host in the same turn are closed at once.
-    With `paced`, accepting waits for the turn of unknown hosts.
+    If it returns False (too many connections), other connections of this host in the same turn are closed at
+    once. With `paced`, accepting waits for the turn of unknown hosts.
     """
 
     def __init__(

@@ -31,30 +31,30 @@ class Stage(StrEnum):
     IDLE = "idle"
 
     UNFINISHED = "unfinished"
-    """Waits for the rest of a request, for its turn, or for the peer to read an answer."""
+    """The connection waits for the rest of a request, for its turn, or for the peer to read an answer."""
 
     SERVED = "served"
     """A handler works on a request."""
 
 
 class TrackedConnection(Protocol):
-    """`deadline` is in monotonic seconds."""
+    """A connection in the table; `deadline` is in monotonic seconds."""
 
     deadline: float
 
     @property
     def holding(self) -> int:
-        """Bytes that are released when the connection ends."""
+        """Return the bytes that are released when the connection ends."""
 
     def expire(self) -> None:
-        """The deadline has passed."""
+        """End the connection, because the deadline has passed."""
 
     def abort(self) -> None:
         """End now, and `leave` the table."""
 
 
 Patience = Callable[[QuotaClass, Stage, bool], float]
-"""Returns the seconds before a connection may be evicted. True: for a host of the same quota class."""
+"""A function that returns the seconds before a connection may be evicted. True: for a host of the same quota class."""
 
 
 def _of_ros(_quota_class: QuotaClass, stage: Stage, own: bool) -> float:
@@ -64,7 +64,8 @@ def _of_ros(_quota_class: QuotaClass, stage: Stage, own: bool) -> float:
 
 
 class ConnectionTable(Generic[Holder]):
-    """Listeners may share the table. `quota_class` returns the present class of a host.
+    """The connections of listeners, which may share the table. `quota_class` returns the present class of a
+    host.
 
     `connection_class` returns the class that counts for connections (None: `quota_class`).
     """
@@ -102,11 +103,10 @@ class ConnectionTable(Generic[Holder]):
 
     @property
     def connections(self) -> frozenset[TrackedConnection]:
-        """Include those that wait for their refusal."""
         return frozenset(self._of)
 
     def enter(self, connection: TrackedConnection, host: Holder) -> str:
-        """Evict another connection if necessary. Return why there is no room."""
+        """Add a connection, and evict another one if necessary. Return the reason if there is no room."""
         why = self._take(self.connected, host, 1)
         if not why:
             self._of[connection] = host, self.connected
@@ -114,14 +114,13 @@ class ConnectionTable(Generic[Holder]):
         return why
 
     def turn_away(self, connection: TrackedConnection, host: Holder) -> bool:
-        """The connection stays open for its refusal. Return False if too many stay already."""
+        """Keep a connection open for its refusal. Return False if too many are kept already."""
         if self.farewells.take(host):
             return False
         self._of[connection] = host, self.farewells
         return True
 
     def leave(self, connection: TrackedConnection) -> None:
-        """Ignore a connection that is not in the table."""
         if connection in self._stages:
             self._queues[self._stages.pop(connection)].remove(connection)
         host, pool = self._of.pop(connection, (None, self.connected))
@@ -129,7 +128,7 @@ class ConnectionTable(Generic[Holder]):
             pool.give_back(host)
 
     def file(self, connection: TrackedConnection, stage: Stage) -> None:
-        """The wait of the connection starts again."""
+        """Set the stage of a connection, whose wait starts again."""
         host, pool = self._of.get(connection, (None, self.farewells))
         if host is None or pool is not self.connected:
             return
@@ -140,14 +139,14 @@ class ConnectionTable(Generic[Holder]):
         self._queues[stage].put(connection, host, self._clock())
 
     def hold(self, host: Holder, size: int) -> str:
-        """Return the reason if the bytes are too many, which are then not counted."""
+        """Count a connection's bytes; return the reason if there are too many, which are then not counted."""
         return self._take(self.held, host, size)
 
     def release(self, host: Holder, size: int) -> None:
         self.held.give_back(host, size)
 
     async def sweep(self) -> None:
-        """This runs once a second until it is cancelled."""
+        """Close connections without progress once a second, until cancelled."""
         while True:
             await asyncio.sleep(1.0)
             now = clock.now()
@@ -165,7 +164,6 @@ class ConnectionTable(Generic[Holder]):
         return why
 
     def _to_make_room(self, host: Holder) -> TrackedConnection | None:
-        """Return the connection to evict for a new one of this host."""
         mine = self._connection_class(host)
         for quota_class in QuotaClass:
             if quota_class > mine:

@@ -40,9 +40,11 @@ def itself(host: Hashable) -> Hashable:
 
 
 class Turns(Generic[Holder]):
-    """While a slot is free, a request waits only if its host or group has used up its quota. `alike(host)` returns
-    the group of a host. A host must pay for its audit records before it gets a slot: `pause(host)` returns the
-    seconds until the next check, or 0 if everything is paid.
+    """The turns of hosts. While a slot is free, a request waits only if its host or group has used up its
+    quota.
+
+    `alike(host)` returns the group of a host. A host must pay for its audit records before it gets a slot:
+    `pause(host)` returns the seconds until the next check, or 0 if everything is paid.
     """
 
     def __init__(
@@ -66,7 +68,7 @@ class Turns(Generic[Holder]):
         self.waiting: OrderedDict[Hashable, OrderedDict[Holder, Queue]] = OrderedDict()
 
     async def enter(self, host: Holder) -> None:
-        """Audit records must be paid first."""
+        """Wait for a slot; audit records must be paid first."""
         while seconds := self.pause(str(host)):
             await asyncio.sleep(seconds)
         kind = self._alike(host)
@@ -84,7 +86,6 @@ class Turns(Generic[Holder]):
             raise
 
     def leave(self, host: Holder) -> None:
-        """Free slots go to the longest waiting hosts that may have them."""
         self._give_back(host)
         while self.waiting and (following := self._next()) is not None:
             kind, host = following
@@ -101,7 +102,6 @@ class Turns(Generic[Holder]):
                 turn.set_result(None)
 
     def _next(self) -> tuple[Hashable, Holder] | None:
-        """Return the next host with its group, or None if no host may have a slot."""
         for kind, hosts in self.waiting.items():
             if self._taken.get(kind, 0) < self._together or (self._own_slots and kind not in self._own):
                 for host in hosts:

@@ -28,7 +28,7 @@ _FIELD_FRAMING = len(": \r\n")
 
 @dataclass(frozen=True, slots=True)
 class HttpLimits:
-    """Sizes are in bytes, times in seconds."""
+    """The limits of HTTP; sizes are in bytes, times in seconds."""
 
     head_bytes: int = 64 << 10
     head_seconds: float = 10.0
@@ -39,7 +39,6 @@ class HttpLimits:
 
     @property
     def framing_bytes(self) -> int:
-        """The limit of head, chunk sizes and trailers together."""
         return self.head_bytes + self.body_bytes // 16
 
 
@@ -66,29 +65,29 @@ class Front(asyncio.BaseProtocol, ABC):
         self.allow(limits.head_seconds)
 
     def allow(self, seconds: float) -> None:
-        """The connection must make progress within this time."""
+        """Let the connection end unless it makes progress within this time."""
         self.deadline = clock.now() + seconds
 
     @abstractmethod
     def reject(self, status: bytes, what: str) -> None:
-        """Close the connection after the answer. `what` describes the peer's action."""
+        """Answer, then close the connection. `what` describes the peer's action."""
 
     @property
     @abstractmethod
     def waiting(self) -> int:
-        """Requests that wait while another one is served."""
+        """Return the number of requests that wait while another one is served."""
 
     @property
     @abstractmethod
     def is_quiet(self) -> bool:
-        """No answer is in progress: only then does the next head have a deadline."""
+        """Whether no answer is in progress, so that the next head has a deadline."""
 
     @property
     def is_open(self) -> bool:
         return self._socket is None
 
     def open(self, transport: asyncio.Transport) -> bool:
-        """Return False, and abort the transport, if the connection has ended already."""
+        """Begin with a transport; return False, and abort it, if the connection has ended already."""
         self.transport, self._socket = transport, None
         if self.closing or not transport.get_extra_info("peername"):
             self.abort()
@@ -100,7 +99,6 @@ class Front(asyncio.BaseProtocol, ABC):
         return True
 
     def parse(self, data: bytes) -> None:
-        """Rejects a request that exceeds a limit."""
         if self.closing:
             return
         try:
@@ -119,7 +117,7 @@ class Front(asyncio.BaseProtocol, ABC):
                 self._reject_head()
 
     def _await_rest(self) -> None:
-        """Most requests end in their first piece, and wait for nothing."""
+        """Set the deadline for the rest of a request; most requests end in their first piece, and wait for nothing."""
         if self.is_quiet and (self.in_request or self.closing):
             self.connection_table.file(self, Stage.UNFINISHED)
             if not self.closing:
@@ -159,7 +157,7 @@ class Front(asyncio.BaseProtocol, ABC):
         return 0
 
     def leave(self) -> None:
-        """A second call has no effect."""
+        """Remove the connection from the table; a second call has no effect."""
         self.closing = True
         self.connection_table.leave(self)
 
@@ -176,7 +174,7 @@ class Front(asyncio.BaseProtocol, ABC):
 
 
 def plain_address(text: str) -> Address:
-    """The scope id is dropped, and an IPv4-mapped IPv6 address becomes IPv4."""
+    """Return the address without its scope id; an IPv4-mapped IPv6 address becomes IPv4."""
     address = address_of(text.partition("%")[0])
     if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
         return address_of(str(address.ipv4_mapped))

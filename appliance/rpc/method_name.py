@@ -7,6 +7,5 @@ _METHOD = re.compile(rb"<methodName>\s*+([^<>&\s]{1,128}+)\s*+</methodName>")
 
 
 def method_named(body: bytes) -> str:
-    """From the beginning of a body; may be empty."""
     found = _METHOD.search(body, 0, _BEGINNING)
     return "" if found is None else found[1].decode("utf-8", "replace")

@@ -40,7 +40,7 @@ Work = Callable[[], None]
 
 
 class Line(Generic[Key, Item]):
-    """The key with the least use, in seconds, is next.
+    """A queue in which the key with the least use, in seconds, is next.
 
     A key that comes back starts with `start`, the use of the key that was served last.
     """
@@ -56,7 +56,7 @@ class Line(Generic[Key, Item]):
         return sum(map(len, self.queues.values()))
 
     def used(self, key: Key) -> float:
-        """The value is at least `start`."""
+        """Return the use of a key, at least `start`."""
         used, start = self._used.get(key, self.start), self.start
         return used if used > start else start
 
@@ -81,7 +81,7 @@ class Line(Generic[Key, Item]):
             queue.append(item)
 
     def pop(self) -> tuple[Key, Item]:
-        """Among keys with equal use, the longest waiting one is next."""
+        """Remove and return the next key and item; of keys with equal use, the longest waiting one is next."""
         order = self._order
         while True:
             stored, _, key = order[0]
@@ -101,7 +101,7 @@ class Line(Generic[Key, Item]):
 
 
 class ProcessorTime:
-    """`kind(host)` returns the class of a host; `clock` returns processor seconds."""
+    """Shares the time of the loop; `kind(host)` returns the class of a host, `clock` processor seconds."""
 
     def __init__(
         self,
@@ -130,7 +130,7 @@ class ProcessorTime:
         return self._spent + running < TURN_SECONDS
 
     def run(self, host: Address, work: Work) -> bool:
-        """Return False if the work is queued for the host's turn.
+        """Run work of a host now, or queue it for the host's turn and return False.
 
         Exceptions of the work are reported to the event loop.
         """
@@ -141,20 +141,18 @@ class ProcessorTime:
         return False
 
     def charge(self, host: Address, seconds: float) -> None:
-        """The time was used in this turn of the loop."""
         self._spent += seconds
         self.charge_beside(host, seconds)
         self._end_turn_later()
 
     def charge_beside(self, host: Address, seconds: float) -> None:
-        """Another thread used the time."""
         kind = self._kind(host)
         self._classes.charge(kind, seconds)
         if (hosts := self._hosts.get(kind)) is not None:
             hosts.charge(host, seconds)
 
     def begin(self) -> bool:
-        """Return False if another piece is running; its host is charged for both."""
+        """Begin a piece of work; return False if another piece is running, whose host is charged for both."""
         if self._since is not None:
             return False
         self._since = self._clock()

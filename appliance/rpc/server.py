@@ -51,10 +51,7 @@ _BEGINNING_SECONDS = 1.0  # the longest wait for these bytes
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """`local` is the address that the peer connected to. `here`: the peer is on this machine.
-
-    `here` is true if the peer is on this machine.
-    """
+    """The other end of a connection, which connected to `local`. `here`: it is on this machine."""
 
     host: Address
     text: str
@@ -66,7 +63,7 @@ class Peer:
 
 
 class HttpRequest(NamedTuple):
-    """`arrived` is when its last byte came (monotonic ns)."""
+    """A request; `arrived` is when its last byte came (monotonic ns)."""
 
     peer: Peer
     path: str
@@ -77,10 +74,10 @@ class HttpRequest(NamedTuple):
 Handler = Callable[[HttpRequest], Awaitable[bytes]]
 
 AtOnce = Callable[[HttpRequest], bytes | None]
-"""Answers a request that needs no waiting; None leaves it to the handler."""
+"""A function that answers a request without waiting; None leaves it to the handler."""
 
 Refusal = Callable[[bytes], bytes]
-"""Answers a refused request, from the beginning of its body."""
+"""A function that answers a refused request, from the beginning of its body."""
 
 
 def not_at_once(_request: HttpRequest) -> bytes | None:
@@ -88,18 +85,18 @@ def not_at_once(_request: HttpRequest) -> bytes | None:
 
 
 class NoAnswerError(Exception):
-    """The connection is reset, as if the node were gone."""
+    """Raised by a handler to reset the connection, as if the node were gone."""
 
 
 @dataclass(eq=False)
 class HttpServer:
-    """`handler` returns the response body of a request.
+    """A server; `handler` returns the response body of a request.
 
-    `refuse(peer)` is called after the head of a request. If it returns a `Refusal`, this function makes the answer
-    from the beginning of the body, as far as it arrives in time. Then the connection is closed. Without `keep`, every
-    answer closes the connection. `troubled(peer, reason)` is called for each exceeded limit, `malformed(peer,
-    reason)` for each request that is not one of HTTP's, or that is not served here. The program `first` sends some
-    connections to a second socket; they are accepted in the turn of unknown hosts.
+    `refuse(peer)` is called after the head of a request. If it returns a `Refusal`, this function makes the
+    answer from the beginning of the body, as far as it arrives in time. Then the connection is closed.
+    Without `keep`, every answer closes the connection. `troubled(peer, reason)` is called for each exceeded
+    limit, `malformed(peer, reason)` for each request that is invalid HTTP or not served here. The program
+    `first` sends some connections to a second socket; they are accepted in the turn of unknown hosts.
     """
 
     sock: socket.socket
@@ -117,7 +114,7 @@ class HttpServer:
     malformed: Callable[[Peer, str], None] = lambda peer, reason: None  # noqa: ARG005 - same
     connections: "set[_Connection]" = field(default_factory=set, init=False)
     buffer: bytearray = field(default_factory=lambda: bytearray(_READ_AT_ONCE), init=False)
-    """Shared by all connections: the event loop fills it and calls `buffer_updated` in one step."""
+    """The receive buffer of all connections: the event loop fills it and calls `buffer_updated` in one step."""
     _acceptors: list[Acceptor] = field(default_factory=list, init=False)
     _queues: SourceQueues | None = field(default=None, init=False)
     _opening: set[asyncio.Task[None]] = field(default_factory=set, init=False)
@@ -143,7 +140,6 @@ class HttpServer:
             connection.abort()
 
     def _accepted(self, sock: socket.socket, host: Address) -> bool:
-        """Close the connection and return False if there are too many."""
         if self._queues is not None:
             self._queues.update()
         too_many = self.connection_table.arriving.take(host)
@@ -158,7 +154,6 @@ class HttpServer:
         return False
 
     def _admit(self, sock: socket.socket, host: Address) -> None:
-        """It may have ended already or exceed a limit."""
         self.connection_table.arriving.give_back(host)
         if self._closed or _has_ended(sock):
             sock.close()
@@ -214,7 +209,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
     # --- asyncio.Protocol ---
 
     def enter(self) -> bool:
-        """Enter at least for a refusal; return False if that is impossible too."""
+        """Enter the table, at least for a refusal; return False if that is also impossible."""
         self._too_many = self.connection_table.enter(self, self.peer.host)
         self._counted = not self._too_many
         if self._too_many and not self.connection_table.turn_away(self, self.peer.host):
@@ -251,7 +246,6 @@ class _Connection(Front, asyncio.BufferedProtocol):
             self.transport.resume_reading()
 
     def parse(self, data: bytes) -> None:
-        """The body is limited too."""
         super().parse(data)
         if self.closing or not (self.in_request and self.head_done):
             return
@@ -365,7 +359,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
             self.transport.pause_reading()
 
     def _body_is_held(self) -> bool:
-        """Count its bytes so far. If they are too many, refuse the request and return False."""
+        """Count the body's bytes so far. If there are too many, refuse the request and return False."""
         unheld = len(self._body) - self._held
         too_much = self.connection_table.hold(self.peer.host, unheld) if unheld else ""
         if too_much:
@@ -381,11 +375,11 @@ class _Connection(Front, asyncio.BufferedProtocol):
 
     @property
     def holding(self) -> int:
-        """All held bytes except a request being served."""
+        """Return all held bytes, without those of a request being served."""
         return self._held + self._unsent + sum(_held_by(request) for request, _ in self._pending)
 
     def leave(self) -> None:
-        """A request being served continues, but its answer is dropped."""
+        """Leave the table; a request being served continues, but its answer is dropped."""
         if self._patience is not None:
             self._patience.cancel()
         self.server.connections.discard(self)
@@ -486,10 +480,10 @@ class _Connection(Front, asyncio.BufferedProtocol):
         self.connection_table.release(self.peer.host, size)
 
     def _write(self, status: bytes, body: bytes, *, keep: bool, unread: bool = False) -> None:
-        """Without `keep`, close the connection.
+        """Write an answer; without `keep`, close the connection.
 
-        `unread`: the rest of the request is read and dropped for a while, because an immediate close would reset the
-        connection and the peer would lose the answer.
+        `unread`: the rest of the request is read and dropped for a while, because an immediate close would
+        reset the connection and the peer would lose the answer.
         """
         connection = b"keep-alive" if keep else b"close"
         head = b"HTTP/1.1 %b\r\nContent-Type: text/xml\r\nContent-Length: %d\r\nConnection: %b\r\n\r\n"
@@ -531,13 +525,12 @@ class _Connection(Front, asyncio.BufferedProtocol):
         self.abort()
 
     def _reset(self) -> None:
-        """The peer sees an error and not an orderly end."""
         self.transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
         self.abort()
 
 
 def _has_ended(sock: socket.socket) -> bool:
-    """The peer closed it without data. Opening the transport would take a hundred times as long."""
+    """Whether the peer closed a connection without data. Opening the transport would take a hundred times as long."""
     try:
         return not sock.recv(1, socket.MSG_PEEK)
     except BlockingIOError:
@@ -551,7 +544,7 @@ def _held_by(request: HttpRequest) -> int:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Port 0 is any free port; `::` also accepts IPv4."""
+    """Return a listening socket; port 0 is any free port, and `::` also accepts IPv4."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     sock = socket.socket(family, socket.SOCK_STREAM)
     try:
@@ -567,5 +560,5 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 def exceeds_limit(status: bytes) -> bool:
-    """Otherwise the request is wrong, however small it is."""
+    """Whether a request exceeded a limit; otherwise it is wrong, however small it is."""
     return status[:3] in (b"413", b"431", b"503")

@@ -19,19 +19,19 @@ from roswire.xmlrpc import FaultReceived, Value, XmlRpcLimits, build_call, parse
 
 
 class CallFailedError(Exception):
-    """No usable answer; the message gives the reason and the address."""
+    """A call has no usable answer; the message gives the reason and the address."""
 
 
 class RefusedError(CallFailedError):
-    """There is no server at the address."""
+    """No server listens at the address."""
 
 
 class UnreachedError(CallFailedError):
-    """No connection in time: the machine is off, or packets are lost."""
+    """No connection was made in time: the machine is off, or packets are lost."""
 
 
 class UnansweredError(CallFailedError):
-    """No answer in time: the peer hangs or is very slow."""
+    """No answer came in time: the peer hangs or is very slow."""
 
 
 class BrokenOffError(CallFailedError):
@@ -39,10 +39,11 @@ class BrokenOffError(CallFailedError):
 
 
 class XmlRpcClient:
-    """Keeps up to `pool` connections (0: a new one for each call).
+    """A client that keeps up to `pool` connections (0: a new one for each call).
 
-    `timeout` is in seconds and applies to a whole call. `bare` leaves out the header fields that the ROS master does
-    not need: each would cost it 10 µs. `disconnected` is called when the server closes a kept connection.
+    `timeout` is in seconds and applies to a whole call. `bare` leaves out the header fields that the ROS
+    master does not need: each would cost it 10 µs. `disconnected` is called when the server closes a kept
+    connection.
     """
 
     def __init__(
@@ -68,7 +69,7 @@ class XmlRpcClient:
         self._head = head.encode("ascii")
 
     async def call(self, method: str, *params: Value) -> Value:
-        """Raises `CallFailedError` (or `RefusedError`)."""
+        """Make a call, and return its value. Raises `CallFailedError` (or `RefusedError`)."""
         body = await self._written(method, params)
         request = self._head % len(body) + body
         seconds = self._timeout + len(request) // _READ_IN_A_SECOND
@@ -88,7 +89,7 @@ class XmlRpcClient:
             raise CallFailedError(f"{self._where} answered {method} with nonsense: {error}") from error
 
     async def refuses(self, seconds: float) -> bool:
-        """A server that is silent for these seconds does not refuse."""
+        """Whether no server listens; a server that is silent for these seconds does not refuse."""
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(seconds):
@@ -112,8 +113,10 @@ class XmlRpcClient:
         return node_uri(self.uri.host, self.uri.port, self.uri.path)
 
     async def _exchange(self, request: bytes, seconds: float) -> bytes:
-        """Raises `UnreachedError` if the time limit passes before a connection is made, `TimeoutError` if it passes
-        later, and another `OSError` if the connection fails.
+        """Return the response.
+
+        Raises `UnreachedError` if the time limit passes before a connection is made, `TimeoutError` if it
+        passes later, and another `OSError` if the connection fails.
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + seconds
@@ -151,7 +154,7 @@ class XmlRpcClient:
                 connection.close()
 
     def close(self) -> None:
-        """A call under way closes its connection at its end."""
+        """Close the idle connections; a call under way closes its connection at its end."""
         self._pool = 0
         while self._idle:
             self._idle.pop().close()
@@ -171,7 +174,6 @@ class _Connection(asyncio.Protocol):
         self.alive = True
 
     def request(self, data: bytes) -> "asyncio.Future[bytes]":
-        """The future gets the response's body."""
         self._answer = asyncio.get_running_loop().create_future()
         self._parser = httptools.HttpResponseParser(self)
         self._body = bytearray()

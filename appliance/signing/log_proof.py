@@ -21,7 +21,7 @@ from typing import Callable, NamedTuple
 
 NO_CHECKPOINT = "0" * 64  # the hash before the first checkpoint
 HasSigned = Callable[[bytes, bytes, bytes], bool]
-"""Returns whether a key signed: from its 32 raw bytes, the signature, and the text."""
+"""A function that returns whether a key signed: from its 32 raw bytes, the signature, and the text."""
 
 
 class ProofFault(enum.Enum):
@@ -73,7 +73,6 @@ class Excerpt:
         self.begin = sequence + 1 if digest else 0
 
     def add(self, sequence: int, previous: bytes, packed: bytes, digest: bytes) -> list[ProofFault]:
-        """Go to the next record; return its faults."""
         changed = not follows(previous, packed, digest)
         is_next = (sequence, previous) == (self.sequence + 1, self.hash)
         moved = self.hash and not is_next and (self.begin or sequence <= self.sequence + 1)
@@ -141,7 +140,6 @@ def parse_checkpoint(text: bytes) -> Checkpoint:
 
 
 def checkpoint_hash(text: bytes) -> str:
-    """Return the hash of a checkpoint, which the next checkpoint stores as `previous`."""
     return sha256(text).hex()
 
 

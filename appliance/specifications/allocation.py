@@ -23,12 +23,14 @@ from appliance.specifications.specification_files import CheckedSpecifications
 
 TOPIC, SERVICE = "topic", "service"
 Resource = tuple[str, str]
-"""`TOPIC` or `SERVICE`, and a name."""
+"""A topic or service: `TOPIC` or `SERVICE`, and a name."""
 
 
 @dataclass(frozen=True, slots=True)
 class FileGroup:
-    """`files` has the number of specifications in each; `resources` are what they use."""
+    """A group of files; `files` has the number of specifications in each, `resources` are the topics and
+    services that they use.
+    """
 
     files: Mapping[str, int]
     resources: frozenset[Resource]
@@ -50,18 +52,18 @@ class Move:
 
 @dataclass(frozen=True, slots=True)
 class AllocationPlan:
-    """The relays of files and resources, and what moves."""
+    """The relays of files and resources, and the moves."""
 
     files: Mapping[str, int] = field(default_factory=dict)
     resources: Mapping[Resource, int] = field(default_factory=dict)
     moves: tuple[Move, ...] = ()
     moved_files: frozenset[str] = frozenset()
     losing: frozenset[int] = frozenset()
-    """Relays that give up monitors, or topics and services that may have had some."""
+    """The relays that give up monitors, or topics and services that may have had some."""
 
 
 class Allocation:
-    """`save(text)` stores the allocation."""
+    """The present assignment; `save(text)` stores it."""
 
     def __init__(self, relays: int, save: Callable[[str], None] = lambda _text: None) -> None:
         self.relays = relays
@@ -76,11 +78,11 @@ class Allocation:
 
     @property
     def resources(self) -> set[Resource]:
-        """Others are placed by their names."""
+        """Return the assigned resources; all others are placed by their names."""
         return set(self._plan.resources)
 
     def restore(self, text: str) -> bool:
-        """Return False if the text is unreadable or has another number of relays."""
+        """Use a stored allocation; return False if the text is unreadable or has another number of relays."""
         try:
             kept = json.loads(text)
             plan = AllocationPlan(
@@ -95,7 +97,7 @@ class Allocation:
         return True
 
     def plan(self, checked: CheckedSpecifications, carried: Collection[Resource] = ()) -> AllocationPlan:
-        """`carried` are topics and services."""
+        """Return the plan for specifications; `carried` are the topics and services that relays carry."""
         carried = set(carried)
         groups = groups_of(checked)
         homes = self._homes(groups, carried)
@@ -120,7 +122,7 @@ class Allocation:
     def _one_way(
         self, groups: Sequence[FileGroup], homes: Sequence[int], carried: Collection[Resource]
     ) -> list[int]:
-        """All groups that move are on one relay, so that no group has to leave it."""
+        """Return homes by which all groups that move are on one relay, so that no group has to leave it."""
         moving = [
             self._cost(group, home, carried) != (0, 0) for group, home in zip(groups, homes, strict=True)
         ]
@@ -184,7 +186,7 @@ class Allocation:
 
 
 def groups_of(checked: CheckedSpecifications) -> list[FileGroup]:
-    """Largest first; equal ones in the order of their files' names."""
+    """Return the groups, the largest first, and equal ones in the order of their files' names."""
     touched: dict[str, set[Resource]] = {file: set() for file in checked.monitors.values()}
     for name, file in checked.monitors.items():
         touched[file] |= {(TOPIC, topic) for topic in checked.topics[name]}
@@ -203,7 +205,6 @@ def groups_of(checked: CheckedSpecifications) -> list[FileGroup]:
 
 
 def _join(touched: Mapping[str, Iterable[Resource]], checked: CheckedSpecifications) -> list[set[str]]:
-    """Topics, services or variables connect files, directly or indirectly."""
     group = {file: {file} for file in touched}
 
     def join(one: str, other: str) -> None:

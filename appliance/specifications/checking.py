@@ -23,7 +23,7 @@ from roswire.errors import DefinitionError
 from roswire.standard import standard_definitions
 
 Topics = Mapping[str, Mapping[str, str]]
-"""By monitor and name."""
+"""Given topics by monitor and name."""
 
 NO_TOPICS: Topics = MappingProxyType({})
 
@@ -39,10 +39,10 @@ def contents(
     unbuilt: Mapping[str, str] = {},
     given_topics: Topics = NO_TOPICS,
 ) -> Contents:
-    """Raises `SpecificationsRefusedError` with all errors.
+    """Return the contents of a whole set. Raises `SpecificationsRefusedError` with all errors.
 
-    With `load`, the module of the whole set is also built and loaded. The monitors of the files in `unbuilt` do
-    nothing, for the reason given. `given_topics` replace topics given in the texts.
+    With `load`, the module of the whole set is also built and loaded. The monitors of the files in `unbuilt`
+    do nothing, for the reason given. `given_topics` replace topics given in the texts.
     """
     try:
         definitions = _standard().extended(Definitions.from_files(texts))
@@ -113,7 +113,7 @@ def _givens(monitors: MonitorSet, name: str) -> Iterator[GivenDeclared]:
 def contents_at_start(
     files: Mapping[str, str], texts: Mapping[str, str], given_topics: Topics = NO_TOPICS
 ) -> Contents:
-    """Monitors of files with errors do nothing (`Contents.unbuilt`, `Contents.left_out`).
+    """Return the contents for a start: monitors of files with errors do nothing (`unbuilt`, `left_out`).
 
     Raises `SpecificationsRefusedError` if the files exceed a limit.
     """
@@ -177,7 +177,7 @@ def _topics_known(text: str, file: str, texts: Mapping[str, str]) -> bool:
 def _good(
     files: Mapping[str, str], texts: Mapping[str, str], topics: Topics
 ) -> tuple[set[str], dict[str, str]]:
-    """Return files that compile together, and the last error of each file that has had one."""
+    """Return the files that compile together, and the last error of each file that has had one."""
     errors: dict[str, str] = {}
 
     def grown(good: set[str], more: Sequence[str]) -> set[str]:
@@ -199,7 +199,6 @@ def _good(
 
 
 def _places(monitors: MonitorSet) -> dict[str, str]:
-    """Where each topic is first named."""
     named = [
         (event.position, event.topic) for monitor in monitors.monitors for event in monitor.code.events
     ] + [(publication.position, publication.topic) for publication in monitors.compiled.publications]
@@ -211,7 +210,7 @@ def _places(monitors: MonitorSet) -> dict[str, str]:
 
 
 def parts(compiled: bytes, wanted: Sequence[PartNames]) -> list[bytes]:
-    """Raises `SpecificationsRefusedError`."""
+    """Return the parts that relays run. Raises `SpecificationsRefusedError`."""
     try:
         return [*map(_bounded, parts_of(compiled, [(names.monitors, names.shadows) for names in wanted]))]
     except SpecificationError as error:

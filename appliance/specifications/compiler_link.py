@@ -74,7 +74,8 @@ class SpecificationCompiler:
         return await self._checked(sources, site_keys, broken, at_start=False)
 
     async def check_at_start(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-        """For a start: files with errors do not keep the others from coming into force (`Contents.unbuilt`).
+        """Compile for a start: files with errors do not keep the others from coming into force
+        (`Contents.unbuilt`).
 
         Raises the errors of `check`.
         """
@@ -126,13 +127,15 @@ class SpecificationCompiler:
         return checked(answer.contents, sources, site_keys)
 
     async def parts(self, compiled: bytes, wanted: list[messages.PartNames]) -> list[bytes]:
-        """Raises `SpecificationsRefusedError`, also if the compiler does not answer."""
+        """Return the parts that relays run. Raises `SpecificationsRefusedError`, also without an answer."""
         answer = await self._asked_once(lambda number: messages.PartsWanted(number, compiled, wanted))
         parts: list[bytes] = answer.parts
         return parts
 
     async def _asked_once(self, question: Callable[[int], messages.Message]) -> Any:
-        """The same question as the last one gets the same answer. Raises as `_asked` does."""
+        """Return the answer to a question, or the last answer if the question is the same. Raises as `_asked`
+        does.
+        """
         wanted = question(0)
         last, answer = self._kept.get(type(wanted), (None, None))
         if last != wanted:
@@ -141,13 +144,13 @@ class SpecificationCompiler:
         return answer
 
     async def _ordered(self, question: Callable[[int], messages.Message]) -> Any:
-        """Raises as `_asked` does."""
+        """Return the answer for an order. Raises as `_asked` does."""
         with self._order():
             return await self._asked(question)
 
     @contextlib.contextmanager
     def _order(self) -> Iterator[None]:
-        """End a dry run in progress, and let none begin."""
+        """End a dry run in progress, and let none begin in the block."""
         self._orders += 1
         self._no_order.clear()
         if self._dry_run:
@@ -162,7 +165,7 @@ class SpecificationCompiler:
     async def _asked(
         self, question: Callable[[int], messages.Message], *, goes_on: Callable[[], bool] = lambda: True
     ) -> Any:
-        """If the compiler has just ended, ask its successor.
+        """Return the compiler's answer, or its successor's if it has just ended.
 
         Raises `SpecificationsRefusedError`, also if `goes_on()` returns False.
         """
@@ -189,7 +192,7 @@ class SpecificationCompiler:
         raise SpecificationsRefusedError([_ENDED])
 
     async def _answer(self, question: Callable[[int], messages.Message]) -> Any:
-        """End the compiler if the order is withdrawn before the answer. Raises the errors of `Link.ask`."""
+        """Return the answer; end the compiler if the order is withdrawn before. Raises the errors of `Link.ask`."""
         asking = asyncio.ensure_future(self._link.ask(question, _WORK_SECONDS))
         try:
             while not (await asyncio.wait((asking,), timeout=_LOOK_SECONDS))[0]:

@@ -20,13 +20,12 @@ _TOPIC = "topic"
 
 
 class Givens:
-    """`said` has the values by monitor and name; those of topics belong to a revision's sources."""
+    """The values that operators gave; `said` has them by monitor and name. Topics belong to a revision's sources."""
 
     def __init__(self) -> None:
         self.said: dict[str, dict[str, GivenValue]] = {}
 
     def in_force(self, checked: CheckedSpecifications) -> dict[str, dict[str, GivenValue]]:
-        """Only constants that these specifications declare."""
         found = {
             monitor: {
                 one.name: values[one.name] for one in declared if one.name in values and _holds(one, values)
@@ -37,7 +36,7 @@ class Givens:
         return {monitor: values for monitor, values in found.items() if values}
 
     def dropped(self, checked: CheckedSpecifications) -> list[str]:
-        """A text for each value that these specifications do not allow."""
+        """Return a text for each value that these specifications do not allow."""
         kept = self.in_force(checked)
         return [
             f"{monitor}: {name}={_shown(value)} no longer applies, because the text does not allow it: the default of"
@@ -48,13 +47,12 @@ class Givens:
         ]
 
     def enforce(self, checked: CheckedSpecifications) -> list[str]:
-        """Return the texts of `dropped` values."""
+        """Drop values that these specifications do not allow, and return their texts."""
         dropped = self.dropped(checked)
         self.said = self.in_force(checked)
         return dropped
 
     def states(self, checked: CheckedSpecifications, monitor: str) -> list[GivenState]:
-        """The states have the present values."""
         said = self.said.get(monitor, {})
         return [
             GivenState(
@@ -67,7 +65,7 @@ class Givens:
 def parsed(
     declared: tuple[GivenDeclared, ...], monitor: str, values: Mapping[str, GivenValue]
 ) -> dict[str, GivenValue]:
-    """Raises `SpecificationsRefusedError` with all errors."""
+    """Return the parsed values. Raises `SpecificationsRefusedError` with all errors."""
     known = {one.name: one for one in declared}
     found: dict[str, GivenValue] = {}
     findings = []
@@ -89,7 +87,7 @@ def parsed(
 
 
 def split(given: Given) -> tuple[dict[str, dict[str, str]], dict[str, dict[str, GivenValue]]]:
-    """A string that begins with `/` is a topic."""
+    """Divide given values into constants and topics; a string that begins with `/` is a topic."""
     topics: dict[str, dict[str, str]] = {}
     constants: dict[str, dict[str, GivenValue]] = {}
     for monitor, values in given.items():
@@ -102,7 +100,7 @@ def split(given: Given) -> tuple[dict[str, dict[str, str]], dict[str, dict[str, 
 
 
 def require_topics(topics: Mapping[str, Mapping[str, str]], checked: CheckedSpecifications) -> None:
-    """Raise `SpecificationsRefusedError` for each topic that is given to no monitor, or under no such name."""
+    """Raise `SpecificationsRefusedError` for each topic that is given to no monitor, or under an unknown name."""
     findings = [
         f"no topic {name} is given to {monitor}, so {topic} replaces none; see rosrv monitor set {monitor}"
         for monitor, given in topics.items()
@@ -114,7 +112,6 @@ def require_topics(topics: Mapping[str, Mapping[str, str]], checked: CheckedSpec
 
 
 def _value(declared: GivenDeclared, value: GivenValue) -> GivenValue | None:
-    """None if the type cannot hold the value."""
     if declared.kind == "bool":
         words = {"true": True, "false": False}
         found = words.get(value) if isinstance(value, str) else value
@@ -142,7 +139,6 @@ def _holds(declared: GivenDeclared, values: Mapping[str, GivenValue]) -> bool:
 
 
 def _allowed(declared: GivenDeclared) -> str:
-    """The text ends an error message."""
     unit = f" {declared.unit}" if declared.unit else ""
     if declared.kind == "bool":
         return "is not true or false"

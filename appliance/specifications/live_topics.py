@@ -17,7 +17,7 @@ from appliance.specifications.specification_files import CheckedSpecifications
 class LiveType(NamedTuple):
     """The type that a node registered, and the md5sum in its header (empty if no relay has seen it).
 
-    `moving`: it has published in the last minute, as far as is known.
+    `moving`: it has published in the last minute, or this is not known.
     """
 
     name: str
@@ -31,7 +31,7 @@ _ANY = "*"
 
 
 class TopicFindings(NamedTuple):
-    """`conflicts` would be cut; both are `file:line:column: severity: text`."""
+    """Findings about topics; `conflicts` would be cut; all have the form `file:line:column: severity: text`."""
 
     conflicts: list[str]
     warnings: list[str]
@@ -115,7 +115,7 @@ _UNREAD = "monitors in shadow mode do not see its messages"
 
 
 def _difference(theirs: LiveType, ours: LiveType) -> str:
-    """As in ROS, `*` fits any type, and the md5sum decides."""
+    """Return how the types differ, or an empty text; as in ROS, `*` fits any type, and the md5sum decides."""
     if theirs.name not in (_ANY, ours.name):
         return f"{theirs.name}, not as {ours.name}"
     if {theirs.md5sum, ours.md5sum} & {"", _ANY} or theirs.md5sum == ours.md5sum:

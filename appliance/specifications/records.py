@@ -27,11 +27,11 @@ _LEVELS = {"WARN": Severity.WARNING, "ERROR": Severity.WARNING, "FATAL": Severit
 
 @dataclass(frozen=True, slots=True)
 class MonitorRecords:
-    """`fields(topic, data)` parses a message.
+    """Makes the records and counts; `fields(topic, data)` parses a message.
 
-    `counts` has the number of events by kind and monitor; a change by several monitors counts for each of them. `at`
-    has the number of dropped or changed messages by topic. Actions that monitors in shadow mode would have taken are
-    separate kinds. Each callback in `told` gets every event; a feature adds its own.
+    `counts` has the number of events by kind and monitor; a change by several monitors counts for each of
+    them. `at` has the number of dropped or changed messages by topic. Actions that monitors in shadow mode
+    would have taken are separate kinds. Each callback in `told` gets every event; a feature adds its own.
     """
 
     trail: AuditTrail

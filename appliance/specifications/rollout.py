@@ -28,7 +28,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 
 SHADOW: Literal["shadow"] = "shadow"
 Switch = bool | Literal["shadow"]
-"""Do actions take effect? In shadow mode they are only reported."""
+"""Whether a monitor's actions take effect; in shadow mode they are only reported."""
 
 _RELAY_SECONDS = 15.0
 _TRIES = 5  # attempts, because affected nodes may come and go during each
@@ -39,19 +39,18 @@ class Relays(Protocol):
     """The interface to the relays."""
 
     def send(self, message: Message, relay: int) -> bool:
-        """Return False if the relay is not connected."""
+        """Send a message to a relay; return False if it is not connected."""
 
     async def carried_out(self) -> None:
-        """Every relay has carried out its messages."""
+        """Wait until every relay has carried out its messages."""
 
-    def live_resources(self) -> set[Resource]:
-        """The resources of live nodes."""
+    def live_resources(self) -> set[Resource]: ...
 
     def withdraw(self, moves: Sequence[Move]) -> None:
-        """Called before the new allocation is adopted."""
+        """Withdraw resources from their old relays; called before the new allocation is adopted."""
 
     def place(self, moves: Sequence[Move]) -> None:
-        """Called after the allocation was adopted."""
+        """Place resources on their new relays; called after the allocation was adopted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +67,8 @@ class Revision:
 class InheritedState:
     """The states that the other appliance's relays `left`.
 
-    `at`: the time of its monitors by then, if it is later than that in the states. `lost`: why other states are lost.
+    `at` is the time of its monitors then, if it is later than the time in the states. `lost` is why other
+    states are lost.
     """
 
     lost: str = ""
@@ -77,15 +77,15 @@ class InheritedState:
 
 
 Parts = Callable[[bytes, list[messages.PartNames]], Awaitable[list[bytes]]]
-"""Raises `SpecificationsRefusedError`."""
+"""A function that returns the parts of relays. Raises `SpecificationsRefusedError`."""
 
 
 @dataclass(slots=True)
 class Rollout:
-    """`states(checked)` returns each monitor's switch.
+    """The specifications on all relays; `states(checked)` returns each monitor's switch.
 
-    Each relay gets only its own part, which `parts` makes before the specifications are stated. `rows` are the last
-    reports.
+    Each relay gets only its own part, which `parts` makes before the specifications are stated. `rows` are
+    the last reports.
     """
 
     allocation: Allocation
@@ -129,11 +129,11 @@ class Rollout:
 
     @property
     def why_held(self) -> dict[str, str]:
-        """The reason is empty if no state was lost."""
+        """Return the held monitors with the reason, which is empty if no state was lost."""
         return {name: why for names in self._held.values() for name, why in names.items()}
 
     async def start(self, now: Revision, *, restarted: bool, kept: str) -> None:
-        """After a crash of control (`restarted`), relays keep the specifications that they have.
+        """Begin with specifications; after a crash of control (`restarted`), relays keep theirs.
 
         Raises `SpecificationsRefusedError`.
         """
@@ -154,7 +154,7 @@ class Rollout:
         return [answer.content or b"" for answer in await self._states(seconds, copy=False)]
 
     async def copies(self, seconds: float, *, full: bool) -> list[messages.StateLeft]:
-        """`full`, or only if changed. Raises as `leave` does."""
+        """Return the states that have changed, or (`full`) all. Raises as `leave` does."""
         return await self._states(seconds, copy=True, full=full)
 
     async def _states(self, seconds: float, *, copy: bool, full: bool = True) -> list[messages.StateLeft]:
@@ -173,16 +173,16 @@ class Rollout:
             self.relays.send(self.statement(relay), relay)
 
     def has_state(self) -> bool:
-        """The state may be copied: no relay leaves it, and all have the inherited one."""
+        """Whether the state may be copied: no relay leaves it, and all have the inherited one."""
         return bool(self._now.checked.monitors) and not self._leaving and not self._heirs
 
     def inherit(self, state: InheritedState, taken: Callable[[], None]) -> None:
-        """Call `taken` once all relays have it."""
+        """Give relays inherited states; call `taken` once all relays have them."""
         self._inherited, self._heirs = state, set(range(self.allocation.relays))
         self._inheritance_taken = taken
 
     def statement(self, relay: int) -> messages.SpecificationsStated:
-        """A restarted relay must hold topics as its monitors require."""
+        """Return the message for a relay; a restarted relay must hold topics as its monitors require."""
         restarted = relay in self._known
         self._known.add(relay)
         (self._fresh.add if restarted else self._fresh.discard)(relay)
@@ -212,10 +212,10 @@ class Rollout:
         return [name for name in names if name in self._began]
 
     async def take(self, coming: Revision) -> list[str]:
-        """Return the monitors that began again because they moved.
+        """Bring specifications into force; return the monitors that began again because they moved.
 
-        A disconnected relay gets them when it returns. If this raises `SpecificationsRefusedError`, nothing has
-        changed.
+        A disconnected relay gets them when it returns. If this raises `SpecificationsRefusedError`, nothing
+        has changed.
         """
         plan = self.allocation.plan(coming.checked, self.relays.live_resources())
         self._began = set()
@@ -230,7 +230,7 @@ class Rollout:
         raise SpecificationsRefusedError(["topics that must move changed during the rollout; try again"])
 
     def moved_files(self, coming: CheckedSpecifications) -> frozenset[str]:
-        """Their monitors would lose their state."""
+        """Return the files that would move to another relay, so that their monitors lose their state."""
         return self.allocation.plan(coming, self.relays.live_resources()).moved_files
 
     async def all_taken(self) -> None:
@@ -286,7 +286,7 @@ class Rollout:
         return [finding for findings in said for finding in findings]
 
     def _settle(self, coming: Revision, plan: AllocationPlan) -> list[str]:
-        """Do not `await`, so that no message of a relay is processed in between.
+        """Adopt a plan without `await`, so that no message of a relay is processed in between.
 
         Relays that already have the revision confirm it again.
         """
@@ -334,7 +334,6 @@ class Rollout:
             self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
 
     async def _make(self, revision: Revision, of_file: Callable[[str], int]) -> None:
-        """Only missing parts are made."""
         compiled = revision.checked.compiled
         wanted = parts_wanted(revision, self.allocation.relays, of_file)
         missing = [names for names in wanted if (compiled, names) not in self.compiled_parts]
@@ -395,7 +394,7 @@ class Rollout:
                 self._merge_rows()
 
     def lost(self, relay: int) -> None:
-        """A lost relay may have been killed by specifications that it has not answered."""
+        """Note that a relay ended, perhaps because of specifications that it has not answered."""
         for at, statement in [entry for entry in self._waiting if entry[0] == relay]:
             self._answer(at, statement, ["a relay process exited during the load: try again"])
 
@@ -425,7 +424,6 @@ class Rollout:
         self._answer(relay, statement, [])
 
     def _say_held(self, relay: int, taken: messages.SpecificationsTaken) -> None:
-        """The record has the command that resumes the monitor."""
         before = self._held.get(relay, {})
         for name, why in taken.because.items():
             if before.get(name) != why:
@@ -467,7 +465,7 @@ def _names(revision: Revision, relay: int, of_file: Callable[[str], int]) -> mes
 def parts_wanted(
     revision: Revision, relays: int, of_file: Callable[[str], int] | None = None
 ) -> list[messages.PartNames]:
-    """Without `of_file`, return the parts of a start on another appliance."""
+    """Return the parts for each relay; without `of_file`, those of a start on another appliance."""
     if of_file is None:
         of_file = _of(Allocation(relays).plan(revision.checked))
     names = dict.fromkeys(_names(revision, relay, of_file) for relay in range(relays))

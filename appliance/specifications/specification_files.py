@@ -23,7 +23,7 @@ _LONGEST = (
 
 
 class SpecificationsRefusedError(Exception):
-    """`findings` has every reason, as `file:line:column: error: text`."""
+    """The specifications are rejected; `findings` has every reason, as `file:line:column: error: text`."""
 
     def __init__(self, findings: list[str]) -> None:
         super().__init__("\n".join(findings))
@@ -31,9 +31,10 @@ class SpecificationsRefusedError(Exception):
 
 
 class Sources(msgspec.Struct, frozen=True):
-    """By file name, and definitions by `package/Type.msg` (or `.srv`).
+    """Specifications by file name, and definitions by `package/Type.msg` (or `.srv`).
 
-    `signatures` of the site have the same names. `topics` replace topics given in the texts, by monitor and name.
+    `signatures` of the site have the same names. `topics` replace topics given in the texts, by monitor and
+    name.
     """
 
     files: dict[str, str] = {}
@@ -48,7 +49,6 @@ class Sources(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, topics=kept)
 
     def with_files(self, new: "Sources") -> "Sources":
-        """Files are added or replaced by name, and sorted."""
         fresh = new.files.keys() | new.definitions.keys()
         signatures = {name: text for name, text in self.signatures.items() if name not in fresh}
         signatures |= {name: text for name, text in new.signatures.items() if text and name in fresh}
@@ -61,7 +61,7 @@ class Sources(msgspec.Struct, frozen=True):
         )
 
     def without(self, files: set[str]) -> "Sources":
-        """The message definitions stay."""
+        """Return the sources without some files; the message definitions stay."""
         left, signatures = (
             {name: text for name, text in texts.items() if name not in files}
             for texts in (self.files, self.signatures)
@@ -69,7 +69,7 @@ class Sources(msgspec.Struct, frozen=True):
         return Sources(left, self.definitions, signatures, self.topics)
 
     def signers(self, site_keys: Sequence[str]) -> list[str]:
-        """Empty without site keys.
+        """Return the names of the keys that signed; none without site keys.
 
         Raises `SpecificationsRefusedError` with every file and definition that no site key signed.
         """
@@ -79,7 +79,7 @@ class Sources(msgspec.Struct, frozen=True):
         return sorted(found)
 
     def signed(self, site_keys: Sequence[str]) -> tuple["Sources", dict[str, str]]:
-        """Return also the errors of the others by their names below the folder."""
+        """Return the signed sources, and the errors of the others by their names below the folder."""
         _, errors = self._signed(site_keys)
         files, definitions = (
             {name: text for name, text in texts.items() if folder + name not in errors}
@@ -99,7 +99,7 @@ class Sources(msgspec.Struct, frozen=True):
         return found, unsigned
 
     def difference(self, before: "Sources") -> tuple[list[str], list[str], list[str]]:
-        """Added, changed and removed files; a definition is `msg/package/Type.msg`."""
+        """Return the added, changed and removed files; a definition is `msg/package/Type.msg`."""
         old, new = before.named(), self.named()
         return (
             [name for name in new if name not in old],
@@ -112,18 +112,18 @@ class Sources(msgspec.Struct, frozen=True):
 
 
 class CheckedSpecifications(messages.Contents, frozen=True):
-    """May come into force; `signed_by` are keys of the site."""
+    """Specifications that may come into force; `signed_by` are keys of the site."""
 
     signed_by: list[str] = []  # noqa: RUF012  each struct gets one of its own
 
     def fields(self, topic: str, data: bytes) -> dict[str, Any] | None:
-        """Only the first bytes are given. Return None if the type is not known."""
+        """Return the fields in the first bytes of a message, or None if the type is not known."""
         name = self.types.get(topic)
         definitions = _definitions(name, self.texts.get(name, "")) if name is not None else None
         return read_fields(definitions, name, data) if name is not None and definitions is not None else None
 
     def md5sum(self, topic: str) -> str:
-        """Empty if the definition is not known."""
+        """Return the md5sum of a topic's type; empty if the definition is not known."""
         name = self.types.get(topic, "")
         definitions = _definitions(name, self.texts.get(name, ""))
         return "" if definitions is None else definitions.md5sum(name)
@@ -144,7 +144,7 @@ def _definitions(name: str, text: str) -> Definitions | None:
 
 
 def checked(contents: messages.Contents, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-    """Raises `SpecificationsRefusedError`."""
+    """Return contents that may come into force. Raises `SpecificationsRefusedError`."""
     return CheckedSpecifications(**msgspec.structs.asdict(contents), signed_by=sources.signers(site_keys))
 
 
@@ -168,7 +168,7 @@ def _too_long(name: str) -> str:
 
 
 def read_folder(folder: Path) -> Sources:
-    """The definitions are in its `msg/`; signatures are read too.
+    """Return the sources in a folder, with the definitions in its `msg/` and the signatures.
 
     Raises `SpecificationsRefusedError`.
     """
@@ -179,9 +179,9 @@ def read_folder(folder: Path) -> Sources:
 
 
 def read_usable(folder: Path, site_keys: Sequence[str]) -> tuple[Sources, dict[str, str]]:
-    """Return also the errors of files that may not come into force, by name.
+    """Return the sources in a folder, and by name the errors of files that may not come into force.
 
-    They cannot be opened, are not UTF-8 text, are too long, or have no signature of a site key. Raises
+    These cannot be opened, are not UTF-8 text, are too long, or have no signature of a site key. Raises
     `SpecificationsRefusedError` if the folder cannot be read.
     """
     found, errors = _read_folder(folder)
@@ -191,7 +191,6 @@ def read_usable(folder: Path, site_keys: Sequence[str]) -> tuple[Sources, dict[s
 
 
 def _read_folder(folder: Path) -> tuple[Sources, dict[str, str]]:
-    """Return also the errors of unreadable files by their names below the folder."""
     try:
         if not _is(stat.S_ISDIR, folder):
             raise SpecificationsRefusedError([f"{folder}: the folder of specifications does not exist"])
@@ -218,7 +217,7 @@ def _read_folder(folder: Path) -> tuple[Sources, dict[str, str]]:
 
 
 def _definitions_in(own: Path) -> dict[str, Path]:
-    """The keys are `package/Type.msg`. Raises `SpecificationsRefusedError`."""
+    """Return the files of definitions by `package/Type.msg`. Raises `SpecificationsRefusedError`."""
     found = {}
     try:
         for path in files_below(own) if _is(stat.S_ISDIR, own) else ():
@@ -239,7 +238,7 @@ def _unreadable(path: Path, error: OSError) -> SpecificationsRefusedError:
 
 
 def _is(kind: Callable[[int], bool], path: Path) -> bool:
-    """Raises `OSError` if it is unknown whether the path exists."""
+    """Whether a path is of this kind. Raises `OSError` if it is unknown whether the path exists."""
     try:
         return kind(stat_given(path).st_mode)
     except (FileNotFoundError, NotADirectoryError):
@@ -264,10 +263,10 @@ _Stamp = tuple[str, int, int, int, int]
 
 
 class SpecificationFolder:
-    """Empty without a folder.
+    """The folder of specifications, or an empty one.
 
-    Each status and list request compares the folder with the specifications in force. Therefore the files are read
-    only if one has changed.
+    Each status and list request compares the folder with the specifications in force. Therefore the files are
+    read only if one has changed.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -276,15 +275,15 @@ class SpecificationFolder:
         self._found: Sources | None = None
 
     def read(self) -> Sources:
-        """Raises `SpecificationsRefusedError`."""
+        """Return the sources. Raises `SpecificationsRefusedError`."""
         return read_folder(self.path) if self.path is not None else Sources()
 
     def read_usable(self, site_keys: Sequence[str]) -> tuple[Sources, dict[str, str]]:
-        """See the function of this name. Raises `SpecificationsRefusedError`."""
+        """Return the result of the function of this name. Raises `SpecificationsRefusedError`."""
         return read_usable(self.path, site_keys) if self.path is not None else (Sources(), {})
 
     def looked_at(self) -> Sources | None:
-        """None if the content is not valid. Unchanged files are not read again."""
+        """Return the sources, or None if they are not valid. Unchanged files are not read again."""
         if self.path is None:
             return Sources()
         stamps = _stamps(self.path)
@@ -298,7 +297,7 @@ class SpecificationFolder:
 
 
 def _stamps(folder: Path) -> list[_Stamp] | None:
-    """They change when a file changes; None if the folder cannot be read."""
+    """Return values that change when a file changes; None if the folder cannot be read."""
     try:
         own = folder / "msg"
         found = [path for path, _is_folder in entries_of(folder) if path.match("*.rv*")]

@@ -105,21 +105,23 @@ class MonitorsChangedError(Exception):
 
 
 class _Consent(NamedTuple):
-    """`force`: topics may be cut whose publishers have another type. `hold`: topics with traffic may be held."""
+    """The consent to effects; `force`: topics may be cut whose publishers have another type. `hold`: topics
+    with traffic may be held.
+    """
 
     force: bool = False
     hold: bool = False
 
 
 _ALL = _Consent(force=True, hold=True)
-"""A rollback must never fail."""
+"""The consent of a rollback, which must never fail."""
 
 
 class SpecificationManager(Revisions[MonitorRevisionRow]):
-    """Changes are made one at a time.
+    """The specifications in force; changes are made one at a time.
 
-    `published()` is called when monitors may publish other topics. Each callback in `told` gets every event that a
-    relay reports. With `site_keys`, everything in force is signed with one of these keys.
+    `published()` is called when monitors may publish other topics. Each callback in `told` gets every event
+    that a relay reports. With `site_keys`, everything in force is signed with one of these keys.
     """
 
     refusal = SpecificationsRefusedError
@@ -175,11 +177,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     # --- start ---
 
     async def start(self, *, restarted: bool, taken_over: bool = False) -> None:
-        """Raises `SpecificationsRefusedError`.
+        """Bring the specifications of a start into force. Raises `SpecificationsRefusedError`.
 
-        As with the policy, after a crash of control, use the specifications that were in force. At the start of the
-        appliance, use the folder's, unless an operator's own revision was in force when the appliance stopped. One of
-        two appliances (`taken_over`) uses those that were in force on the active one.
+        After a crash of control, these are the specifications that were in force. At the start of the
+        appliance, they are the folder's, unless an operator's own revision was in force when the appliance
+        stopped. One of two appliances (`taken_over`) uses those of the active one.
         """
         settings = self.store.settings()
         self.switches.restore(settings.get(SWITCHES, "{}"))
@@ -229,11 +231,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return self.folder is not None and not self._is_folder(self.sources)
 
     def names(self) -> list[str]:
-        """In the order in which they get messages."""
+        """Return the monitors in the order in which they get messages."""
         return list(self.checked.monitors)
 
     def file_of(self, name: str) -> str:
-        """`name` is a file or a monitor. Raises `UnknownMonitorError`."""
+        """Return the file of a monitor, or the file of this name. Raises `UnknownMonitorError`."""
         if name in self.sources.files:
             return name
         if name not in self.checked.monitors:
@@ -241,12 +243,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return self.checked.monitors[name]
 
     async def revisions(self, _request: admin.MonitorRevisions) -> answers.MonitorRevisionList:
-        """The newest revision comes first."""
         rows = [self._described(row) for row in await self._kept()]
         return answers.MonitorRevisionList(msgspec.convert(rows, list[answers.MonitorRevision]))
 
     async def texts(self, request: admin.MonitorRevisionWanted) -> answers.RevisionTexts:
-        """Raises `UnknownMonitorError`."""
+        """Return a revision with its texts. Raises `UnknownMonitorError`."""
         row = await self._find(request.revision)
         if row is None:
             raise UnknownMonitorError(f"revision {request.revision} of the specifications does not exist")
@@ -259,10 +260,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     # --- changing ---
 
     async def load(self, request: admin.MonitorLoad, who: str, *, enable: bool = False) -> Replacement:
-        """Files of the same names are replaced. Raises `SpecificationsRefusedError`.
+        """Load specifications, and replace files of the same names. Raises `SpecificationsRefusedError`.
 
-        With `enable`, monitors that would be disabled by the setting of this name are enabled. With `confirm_within`,
-        this change, like any other, is rolled back automatically after that many seconds unless confirmed.
+        With `enable`, monitors that would be disabled by the setting of this name are enabled. With
+        `confirm_within`, this change, like any other, is rolled back automatically after that many seconds
+        unless confirmed.
         """
         async with self._changing(request.expected):
             topics, constants = split(request.given)
@@ -315,7 +317,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return answers.Tried(revision, tag, *files, [*checked.warnings, *warnings], [*checked.monitors])
 
     async def replace(self, request: admin.MonitorReplace, who: str) -> Replacement:
-        """Raises `UnknownMonitorError`, and the errors of `load`."""
+        """Replace the text of a monitor's file. Raises `UnknownMonitorError`, and the errors of `load`."""
         file = self.file_of(request.name)
         load = admin.MonitorLoad(
             {file: request.text},
@@ -331,7 +333,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return await self.load(load, who)
 
     async def reload(self, request: admin.MonitorReload, who: str) -> Replacement:
-        """Other files stay in force, unless `prune` is set.
+        """Load the folder; other files stay in force, unless `prune` is set.
 
         Raises `SpecificationsRefusedError`, also without a folder.
         """
@@ -361,7 +363,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             )
 
     async def take_bundle(self, sources: Sources, who: str, note: str) -> Replacement:
-        """Bring exactly these sources into force. Raises `SpecificationsRefusedError`; then nothing has changed."""
+        """Bring exactly these sources into force. `SpecificationsRefusedError` means that nothing has changed."""
         async with self._changing(None):
             sources = sources.with_topics(self.sources.topics)
             if self.in_force.who != DISK and sources == self.sources:
@@ -379,10 +381,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return self._held(checked, self._in_shadow(checked), hold=False).conflicts
 
     async def remove(self, request: admin.MonitorRemove, who: str) -> Replacement:
-        """Files are given by their names or those of their monitors.
+        """Remove files, which are given by their names or those of their monitors.
 
-        Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` if other monitors use variables of these
-        files, or if a file has further monitors that are not named.
+        Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` if other monitors use variables of
+        these files, or if a file has further monitors that are not named.
         """
         async with self._changing(request.expected):
             names, owners = request.names, self.checked.monitors
@@ -407,7 +409,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             return await self._change(sources, keeper, who, note, within, check=check, consent=_Consent())
 
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
-        """None is the previous revision, 0 no specifications.
+        """Bring a kept revision into force; None is the previous revision, 0 no specifications.
 
         A monitor that returns gets the switch that it had when it was removed. Raises `SpecificationsRefusedError`.
 
@@ -447,10 +449,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             return answers.MonitorsConfirmed(waited, self.revision, self.tag)
 
     async def switch(self, request: admin.MonitorSwitch, who: str) -> Switched:
-        """For `for_seconds` or until further notice; return the monitors that changed.
+        """Enable or disable monitors, permanently or for `for_seconds`; return those that changed.
 
-        Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` if a monitor to enable is in shadow mode, or
-        shares variables with a monitor in shadow mode.
+        Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` if a monitor to enable is in shadow
+        mode, or shares variables with a monitor in shadow mode.
         """
         async with self._changing(request.expected):
             self._all_known(request.names)
@@ -466,11 +468,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             return self._switched(names, until=self.returns.until(names[0]) if names else None)
 
     async def shadow(self, request: admin.MonitorShadow, who: str) -> Switched:
-        """Return the monitors that changed.
+        """Put monitors into shadow mode or into force; return those that changed.
 
-        With `confirm_within`, monitors return to shadow mode after that many seconds unless confirmed. Raises the
-        errors of `switch`. Raises `SpecificationsRefusedError` also for a disabled monitor that should come into
-        force, and for a monitor that would cut a topic.
+        With `confirm_within`, monitors return to shadow mode after that many seconds unless confirmed. Raises
+        the errors of `switch`. Raises `SpecificationsRefusedError` also for a disabled monitor that should
+        come into force, and for a monitor that would cut a topic.
         """
         async with self._changing(request.expected):
             self.judge_shadow(request)
@@ -482,7 +484,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             )
 
     def judge_shadow(self, request: admin.MonitorShadow) -> list[str]:
-        """Return warnings; nothing changes. Raises the errors of `shadow`."""
+        """Return the warnings about a change of shadow mode, which is not made. Raises the errors of `shadow`."""
         self._all_known(request.names)
         disabled = [name for name in request.names if self.switches.states[name] is False]
         if disabled and not request.shadow:
@@ -511,7 +513,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             raise SpecificationsRefusedError([text])
 
     async def _come_back(self, back: Mapping[str, Switch]) -> None:
-        """Their time is over. Raises `SpecificationsRefusedError`."""
+        """Apply the switches of monitors whose time is over. Raises `SpecificationsRefusedError`."""
         async with self._one_change:
             for to in (True, SHADOW):
                 names = [name for name in self.switches.states if back.get(name) == to]
@@ -612,10 +614,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         )
 
     async def resume(self, request: admin.MonitorResume, who: str) -> Switched:
-        """Return the monitors that held their topics.
+        """Release held topics; return the monitors that held them.
 
-        Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` for monitors whose relay process is not
-        running, because the next process will hold the topics again.
+        Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` for monitors whose relay process is
+        not running, because the next process will hold the topics again.
         """
         async with self._changing(request.expected):
             self._all_known(request.names)
@@ -643,7 +645,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             return self._switched(held)
 
     async def give(self, request: admin.MonitorGive, who: str) -> answers.GivenSet:
-        """Return everything that is given to the monitor.
+        """Set given constants; return everything that is given to the monitor.
 
         Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` for a value outside of its range.
         """
@@ -697,7 +699,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     # --- internals ---
 
     def _is_folder(self, sources: Sources) -> bool:
-        """Return whether these are the folder's; False without a folder, or if it is not valid."""
         found = self._folder.looked_at() if self.folder is not None else None
         return found is not None and found.with_topics(sources.topics) == sources
 
@@ -720,7 +721,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             raise UnknownMonitorError(self._unknown(unknown))
 
     async def _count(self) -> None:
-        """Store the new tag first, so that no crash restores an old one."""
+        """Store the new tag before it is used, so that no crash restores an old one."""
         self.store.save_setting(_ACTS, str(self._acts + 1))
         await self.store.settled()
         self._acts += 1
@@ -749,9 +750,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     ) -> Replacement:
         """`kept` are files that are not in the folder, `loaded` those that the operator named.
 
-        `switches`, and the values `given`, are for monitors that are not in force yet; monitors in the files `shadow`
-        start in shadow mode, and those in the files `enable` are not disabled. `topics` and `constants` are new values
-        of this change.
+        `switches`, and the values `given`, are for monitors that are not in force yet; monitors in the files
+        `shadow` start in shadow mode, and those in the files `enable` are not disabled. `topics` and
+        `constants` are new values of this change.
         """
         before, previous, switched = self.revision, self.sources, self.switches.said
         said = self.givens.said
@@ -846,7 +847,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     def _check_given(
         self, topics: Mapping[str, Mapping[str, str]], constants: Given, checked: CheckedSpecifications
     ) -> dict[str, dict[str, messages.GivenValue]]:
-        """Raises `SpecificationsRefusedError`."""
+        """Return the given constants. Raises `SpecificationsRefusedError`."""
         require_topics(topics, checked)
         if topics and self.site_keys:
             text = "the site signs the topics of a text, so a load cannot replace them: sign a text with another topic"
@@ -859,7 +860,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         }
 
     def _in_shadow(self, checked: CheckedSpecifications, files: Collection[str] = ()) -> set[str]:
-        """All monitors in `files` are included."""
         states = self.switches.states_of(checked)
         return {name for name, file in checked.monitors.items() if states[name] == SHADOW or file in files}
 

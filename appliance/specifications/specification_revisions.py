@@ -18,17 +18,17 @@ from appliance.specifications.specification_files import (
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 
 Check = Callable[[Sources, Sequence[str]], Awaitable[CheckedSpecifications]]
-"""Raises `SpecificationsRefusedError`."""
+"""A function that compiles sources. Raises `SpecificationsRefusedError`."""
 
 CheckBeside = Callable[[Sources, Sequence[str], Sequence[str]], Awaitable[CheckedSpecifications]]
 """The files named last had errors before, and may still have them. Raises `SpecificationsRefusedError`."""
 
 NOTHING = MonitorRevisionRow(0, "{}", 0.0, DISK, "")
-"""The revision before the first."""
+"""The revision before the first one."""
 
 
 class StartingSpecifications(NamedTuple):
-    """`refused` has the errors of the folder, if the revision that was in force stays in force instead."""
+    """The specifications of a start; `refused` has the folder's errors, if the last revision stays in force."""
 
     sources: Sources
     checked: CheckedSpecifications
@@ -36,7 +36,7 @@ class StartingSpecifications(NamedTuple):
 
 
 class StoredSpecifications(Sources, frozen=True):
-    """`switches` and `given` are those of the time when the revision was replaced."""
+    """The sources of a revision; `switches` and `given` are of the time when the revision was replaced."""
 
     switches: dict[str, Switch] = {}  # noqa: RUF012  each struct gets one of its own
     given: dict[str, dict[str, GivenValue]] = {}  # noqa: RUF012  as above
@@ -63,12 +63,12 @@ async def specifications_at_start(
     named: Collection[str],
     kept: MonitorRevisionRow | None = None,
 ) -> StartingSpecifications:
-    """Use the stored revision `last`, or the folder.
+    """Return the stored revision `last`, or the folder's sources.
 
     If a reload would refuse the folder, use `kept`, the revision that was in force.
 
-    Raises `SpecificationsRefusedError`, also if they are not of an operator and lack a monitor that is `named` to be
-    enabled, unless a file is left out.
+    Raises `SpecificationsRefusedError`, also if they are not of an operator and lack a monitor that is
+    `named` to be enabled, unless a file is left out.
     """
     refused: list[str] = []
     if last is None:
@@ -112,7 +112,7 @@ async def _folder_or_kept(
 def _without_unusable(
     checked: CheckedSpecifications, sources: Sources, folder: SpecificationFolder, site_keys: Sequence[str]
 ) -> CheckedSpecifications:
-    """Files of the folder without a usable text in force count as left out."""
+    """Return specifications in which files of the folder without a usable text count as left out."""
     try:
         _, errors = folder.read_usable(site_keys)
     except SpecificationsRefusedError:
@@ -130,7 +130,7 @@ def unknown_monitors(names: Sequence[str], checked: CheckedSpecifications) -> st
 async def _check_kept(
     check: Check, row: MonitorRevisionRow, site_keys: Sequence[str]
 ) -> CheckedSpecifications:
-    """The error of a revision that a newer version refuses has the command that discards it."""
+    """Check a stored revision; the error of one that this version refuses has the command that discards it."""
     try:
         return await check(sources_of(row), site_keys)
     except SpecificationsRefusedError as error:
@@ -142,7 +142,8 @@ async def _check_kept(
 
 
 def forget_revision(store: StateStore, now: float) -> int | None:
-    """The next start uses the folder. Return the discarded revision, or None if the folder was in use.
+    """Discard the revision, so that the next start uses the folder; return it, or None if the folder was in
+    use.
 
     Call this only while the appliance is not running.
     """

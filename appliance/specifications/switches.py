@@ -16,7 +16,7 @@ SWITCHES = "monitor switches"
 
 
 class Switches:
-    """`said` has the switches that were made; `enable` is the start option."""
+    """The switches of all monitors; `said` has those of operators, `enable` is the start option."""
 
     def __init__(self, enable: str) -> None:
         self.starts_in_shadow = enable == "shadow"
@@ -39,11 +39,11 @@ class Switches:
         return [name for name, state in self.states.items() if state == SHADOW]
 
     def switched_off(self) -> dict[str, Switch]:
-        """By an operator, not the configuration."""
+        """Return the monitors that an operator, not the configuration, disabled or put into shadow mode."""
         return {name: to for name, to in self.said.items() if to is not True and self.states.get(name) == to}
 
     def states_of(self, checked: CheckedSpecifications) -> dict[str, Switch]:
-        """Shadow mode extends to monitors that share variables with one in it."""
+        """Return each monitor's switch; shadow mode extends to monitors that share variables with one in it."""
         states = {name: self._own(name) for name in checked.monitors}
         if SHADOW in states.values():
             for group in checked.sharing:
@@ -58,7 +58,7 @@ class Switches:
         return self.said.get(name, self._all or name in self.named)
 
     def enforce(self, checked: CheckedSpecifications) -> list[str]:
-        """Return the monitors that are in shadow mode only because of others."""
+        """Keep the switches of these monitors; return those that are in shadow mode only because of others."""
         self.said = {name: to for name, to in self.said.items() if name in checked.monitors}
         self.states = self.states_of(checked)
         drawn_in = [name for name, to in self.states.items() if to == SHADOW and self._own(name) != SHADOW]

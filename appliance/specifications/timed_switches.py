@@ -24,7 +24,7 @@ from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 
 LONGEST = 30 * 86_400.0
-"""In seconds."""
+"""The longest time of a switch, in seconds."""
 
 _SETTING = "monitor returns"
 _AGAIN_SECONDS = 5.0
@@ -32,7 +32,9 @@ _log = structlog.get_logger()
 
 
 class _Return(msgspec.Struct, frozen=True):
-    """The switch `of` ends at `until` (seconds since the epoch), after `seconds`; then `back` applies."""
+    """A time limit: the switch `of` ends at `until` (seconds since the epoch), after `seconds`; then `back`
+    applies.
+    """
 
     until: float
     seconds: float
@@ -47,7 +49,7 @@ def returns_moved(store: StateStore, seconds: float) -> None:
 
 
 class TimedSwitches:
-    """When a time limit ends, `come_back(back)` is called, which calls `end` like every switch."""
+    """The time limits; when one ends, `come_back(back)` is called, which calls `end` like every switch."""
 
     def __init__(
         self, store: StateStore, come_back: Callable[[Mapping[str, Switch]], Awaitable[None]]
@@ -63,15 +65,14 @@ class TimedSwitches:
         return name in self._kept
 
     def until(self, name: str) -> float | None:
-        """When a disabled monitor is enabled again, in seconds since the epoch."""
+        """Return when a disabled monitor is enabled again, in seconds since the epoch, or None."""
         return self._end_of(name, False)
 
     def confirm_by(self, name: str) -> float | None:
-        """When a monitor in force returns to shadow mode unless confirmed, in seconds since the epoch."""
+        """Return when a monitor returns to shadow mode unless confirmed, in seconds since the epoch, or None."""
         return self._end_of(name, True)
 
     def unconfirmed(self) -> list[str]:
-        """They return to shadow mode unless confirmed."""
         return [name for name, one in self._kept.items() if one.of is True]
 
     def _end_of(self, name: str, of: Switch) -> float | None:
@@ -79,7 +80,7 @@ class TimedSwitches:
         return found.until if found is not None and found.of == of else None
 
     def start(self, states: Mapping[str, Switch]) -> None:
-        """Only of monitors that still have the limited switch."""
+        """Continue the limits of monitors that still have the limited switch."""
         text = self._store.settings().get(_SETTING, "{}")
         kept = msgspec.json.decode(text, type=dict[str, _Return])
         now = clock.wall()
@@ -91,9 +92,9 @@ class TimedSwitches:
         self._save()
 
     def begin(self, back: Mapping[str, Switch], seconds: float, of: Switch = False) -> None:
-        """After `seconds`, apply the switches in `back`.
+        """Apply the switches in `back` after `seconds`.
 
-        A monitor that has a limit already goes back to the switch of that limit.
+        A monitor that already has a limit returns to the switch of that limit.
         """
         until = clock.wall() + seconds
         self._kept |= {

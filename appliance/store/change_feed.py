@@ -32,7 +32,6 @@ class ChangeFeed:
         self._changed()
 
     def keep(self, room: int) -> None:
-        """Keep at most `room` bytes from now on."""
         with self._lock:
             self._room = room
             self._shrink()
@@ -55,7 +54,7 @@ class ChangeFeed:
             return found
 
     def release(self, number: int) -> None:
-        """Drop the changes up to this number: the consumer has them."""
+        """Drop the changes up to this number, because the consumer has them."""
         with self._lock:
             while self._changes and self._before < number:
                 self._drop_oldest()

@@ -135,7 +135,6 @@ class Tables:
 
     @staticmethod
     def statement(change: Change) -> tuple[str, list[Value]]:
-        """Return the SQL of a change that was checked, and its values."""
         if isinstance(change, Put):
             marks = f"({', '.join('?' * len(change.rows[0]))})"
             rows = ", ".join([marks] * len(change.rows))

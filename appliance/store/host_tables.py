@@ -185,12 +185,11 @@ class HostTables:
         self._database.put("revocation", *row)
 
     def forget_revoked(self, before: float) -> None:
-        """Remove certificates that expired before this time: they are invalid even without a revocation."""
+        """Remove certificates that expired before this time, and are therefore invalid even without a revocation."""
         self._database.delete("revocation", ("expires", "<", before))
         self._database.delete("revoked_certificate", ("moment", "<", before - _LONGEST_SECONDS))
 
     def revoked(self) -> list[RevokedCertificateRow]:
-        """Return all revoked certificates, the earliest revocation first."""
         # Rows of the older table `revoked_certificate` have no expiry: assume the longest life of a certificate.
         rows = self._database.query(
             "SELECT serial, name, moment, expires FROM revocation UNION ALL"
@@ -213,7 +212,6 @@ class HostTables:
         self._database.put("authority", 1, *row)
 
     def authority(self) -> AuthorityRow | None:
-        """Return the authority; None before the first start."""
         rows = self._database.query("SELECT certificate, revocations, signed FROM authority")
         return AuthorityRow(*rows[0]) if rows else None
 
@@ -224,5 +222,4 @@ class HostTables:
         self._database.delete("appliance", key=key)
 
     def appliances(self) -> list[ApplianceRow]:
-        """Return both appliances; none if this is a single appliance."""
         return [ApplianceRow(*row) for row in self._database.query("SELECT * FROM appliance")]

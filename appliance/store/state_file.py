@@ -152,7 +152,6 @@ class StateStore:
     # --- registry ---
 
     def save_incarnation(self, row: IncarnationRow) -> None:
-        """Store an incarnation, or its new `life`."""
         with self.database.together():
             self.database.put("incarnation", *row[:-1])
             self.database.delete("relay_port", key=row.key)
@@ -171,7 +170,6 @@ class StateStore:
         self.database.delete("registration", key=key, kind=kind, resource=resource)
 
     def load_registry(self) -> tuple[list[IncarnationRow], list[RegistrationRow]]:
-        """Return everything that is stored, registrations in order."""
         query = self.database.query
         ports: dict[str, tuple[int, ...]] = {}
         for key, port in query("SELECT key, port FROM relay_port ORDER BY key, relay"):
@@ -211,7 +209,7 @@ class StateStore:
 
     @property
     def tree_is_due(self) -> bool:
-        """Return whether the tree should be stored: for a large value, or because many keys have changed."""
+        """Whether the tree should be stored, for a large value or because many keys have changed."""
         return self._only_in_tree or len(self._noted) > _MOST_NOTED
 
     def note_parameter(self, key: str, value: Any) -> None:
@@ -253,7 +251,6 @@ class StateStore:
         self.database.put("parameter_owner", key, host)
 
     def parameters_disowned(self, key: str) -> None:
-        """Remove the owners of this key and of all keys below it."""
         above = key.rstrip("/")  # '0' follows '/'
         with self.database.together():
             self.database.delete("parameter_owner", key=key)
@@ -263,7 +260,6 @@ class StateStore:
         return [(key, host) for key, host in self.database.query("SELECT key, host FROM parameter_owner")]
 
     def load_parameters(self) -> dict[str, Any]:
-        """Return the stored parameter tree; empty if there is none."""
         rows = self.database.query("SELECT tree FROM parameters WHERE id = 1")
         return msgspec.msgpack.decode(rows[0][0], type=dict[str, Any]) if rows else {}
 
@@ -316,7 +312,6 @@ class StateStore:
                 self.database.put("token", *row[:-1])
 
     def tokens(self) -> list[TokenRow]:
-        """Return all tokens that were ever made, the oldest first."""
         kept = {token: TokenKeys(*keys) for token, *keys in self.database.query("SELECT * FROM token_keys")}
         rows = self.database.query("SELECT * FROM token ORDER BY created")
         return [TokenRow._make((*row, kept.get(row[0]))) for row in rows]
@@ -337,7 +332,6 @@ class StateStore:
         self.database.delete("token_left", id=token)
 
     def time_left(self) -> dict[str, float]:
-        """Return the stored seconds until the ends of tokens, by id."""
         return dict(self.database.query("SELECT id, seconds FROM token_left"))
 
     # --- settings ---

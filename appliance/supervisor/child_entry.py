@@ -32,7 +32,7 @@ _INCOMPLETE = "the installation is incomplete: install the package again, or run
 
 
 class LaunchPlan(msgspec.Struct, frozen=True):
-    """JSON in the child's arguments, without secrets."""
+    """The plan of a child's start, as JSON in its arguments, without secrets."""
 
     parent: int
     lifeline: int
@@ -57,7 +57,7 @@ class LaunchPlan(msgspec.Struct, frozen=True):
 
 
 def title_of(role: str, index: int | None) -> str:
-    """A number follows the role unless the process is its first."""
+    """Return the title of a process; a number follows the role unless the process is its first."""
     return role if not index else f"{role}-{index + 1}"
 
 
@@ -110,10 +110,10 @@ def _leave_network_if_allowed() -> None:
 
 
 def _enter_sandbox(plan: LaunchPlan) -> None:
-    """Report to the supervisor the limits that this kernel lacks.
+    """Limit the process, and report limits that this kernel lacks to the supervisor.
 
-    The process runs without them. Raises `SeccompError` only for a role without network: such a role must not be able
-    to make a socket.
+    The process runs without them. Raises `SeccompError` only for a role without network, because such a role
+    must not be able to make a socket.
     """
     lacks = []
     abi = 0

@@ -10,7 +10,7 @@ _LARGE_ENOUGH = 512  # bytes; the kernel writes 208
 
 
 class Timex(ctypes.Structure):
-    """With `modes` 0 the kernel only reads; this is the beginning of `struct timex`."""
+    """The beginning of `struct timex`; with `modes` 0 the kernel only reads."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -27,7 +27,7 @@ _libc = ctypes.CDLL(None)
 
 
 def clock_is_synchronised() -> bool | None:
-    """None if the kernel denies the call, as in some containers."""
+    """Whether the clock is synchronised; None if the kernel denies the call, as in some containers."""
     timex = Timex()
     if _libc.adjtimex(ctypes.pointer(timex)) < 0:
         return None

@@ -14,11 +14,11 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:/\[\]-]{0,199}")
 
 
 class ListenerRejectedError(ValueError):
-    """The message says why a socket is not kept."""
+    """A socket is not kept; the message has the reason."""
 
 
 class InheritedListeners:
-    """Owns the descriptors."""
+    """The kept sockets, whose descriptors this object owns."""
 
     def __init__(self, *, limit: int = 10_000) -> None:
         self._limit = limit
@@ -31,9 +31,10 @@ class InheritedListeners:
         return iter(list(self._sockets.items()))
 
     def keep(self, name: str, descriptor: int) -> None:
-        """Close the name's earlier socket. Close `descriptor` if it is rejected.
+        """Keep a socket, and close the name's earlier one. Close `descriptor` if it is rejected.
 
-        Raises `ListenerRejectedError` for an invalid name, a socket that does not listen, or too many sockets.
+        Raises `ListenerRejectedError` for an invalid name, a socket that does not listen, or too many
+        sockets.
         """
         try:
             self._check(name, descriptor)

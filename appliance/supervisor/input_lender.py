@@ -26,7 +26,7 @@ _ANSWER_SECONDS = 0.5  # RVMaster may wait for it
 
 
 class Borrower:
-    """A supervisor that hangs delays the role once, not at each request."""
+    """The role's end. A supervisor that hangs delays the role once, not at each request."""
 
     def __init__(self, link: socket.socket) -> None:
         self._link = link
@@ -34,7 +34,7 @@ class Borrower:
         self._is_owed = False  # the answer to an earlier request
 
     def open(self, path: Path) -> int | None:
-        """Return None if the path is not an input of the role.
+        """Return an open file, or None if the path is not an input of the role.
 
         Raises `OSError`, which is `TimeoutError` while the supervisor does not answer.
         """
@@ -66,7 +66,7 @@ class Borrower:
 
 
 def lend_inputs(inputs: Collection[Path]) -> socket.socket | None:
-    """None if the role has the supervisor's rights anyway."""
+    """Open inputs for a role in a thread; return its socket, or None if the role has the supervisor's rights anyway."""
     if not inputs or os.geteuid() != 0:
         return None
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

@@ -59,7 +59,7 @@ log = structlog.get_logger()
 
 @dataclass(frozen=True)
 class AppliancePorts:
-    """`inner` and `own` are known only when control is ready."""
+    """The ports of the appliance; `inner` and `own` are known only when control is ready."""
 
     master: int
     rosmaster: int
@@ -81,11 +81,10 @@ class NoIsolation:
 
     @contextlib.contextmanager
     def inside(self) -> Iterator[None]:
-        """For a block that does not await."""
         yield
 
     def build(self) -> None:
-        """Raises `StartError` after removing everything that was built."""
+        """Build the isolation. Raises `StartError` after removing everything that was built."""
 
     def remove(self) -> None: ...
 
@@ -113,26 +112,26 @@ class NoIsolation:
         )
 
     def clear_tunnels(self) -> None:
-        """An ended charon left IPsec states and policies. Raises `NetworkError`, `LeftoversError`."""
+        """Remove the IPsec states and policies of an ended charon. Raises `NetworkError`, `LeftoversError`."""
 
     def route_to(self, host: str) -> str | None:  # noqa: ARG002  the same everywhere
-        """Return None if the address that `host` used is right."""
+        """Return the address at which `host` reaches the appliance, or None if the address that it used is right."""
         return None
 
     def endpoint(self) -> PublicAddress:
-        """For hosts of other networks. Raises `NetworkError` if unknown."""
+        """Return the address for hosts of other networks. Raises `NetworkError` if it is unknown."""
         raise NetworkError(f"isolation {self.kind} has no tunnels: use isolation netns or container")
 
     def report(self) -> FirewallState:
         return FirewallState()
 
     def probe(self) -> str | None:
-        """Return why a hidden port may be reachable by other users."""
+        """Return why a hidden port may be reachable by other users, or None."""
         return None
 
 
 class ContainerIsolation(NoIsolation):
-    """The supervisor's own namespace, with the firewall."""
+    """Uses the supervisor's own namespace, with the firewall."""
 
     kind = "container"
     probes = True
@@ -157,7 +156,7 @@ class ContainerIsolation(NoIsolation):
 
     @contextlib.contextmanager
     def _standing(self) -> Iterator[None]:
-        """Raises `NetworkError` after the rules are removed."""
+        """Run the block while the rules are in force. Raises `NetworkError` after they are removed."""
         with self._changing:
             self._require_standing()
             yield
@@ -168,7 +167,7 @@ class ContainerIsolation(NoIsolation):
 
     @contextlib.contextmanager
     def _taking_away(self) -> Iterator[None]:
-        """Wait at most `_PATIENCE_SECONDS` for a call that hangs."""
+        """Run the block after a running call, or once that has hung for `_PATIENCE_SECONDS`."""
         self._ending = True
         held = self._changing.acquire(timeout=_PATIENCE_SECONDS)
         if not held:
@@ -180,7 +179,7 @@ class ContainerIsolation(NoIsolation):
                 self._changing.release()
 
     def build(self) -> None:
-        """Raises `StartError`."""
+        """Install the firewall. Raises `StartError`."""
         self._ending = False
         if self._namespace == Namespace.own():
             _require_own_network()
@@ -211,7 +210,7 @@ class ContainerIsolation(NoIsolation):
                 log.error("firewall rules may remain", error=str(error))
 
     def _end_tunnels(self, own: str) -> None:
-        """Remove also the IPsec states and policies that a killed charon left in the kernel."""
+        """Close the tunnels, and remove the IPsec states and policies that a killed charon left in the kernel."""
         try:
             self._namespace.run(lambda: clear_leftovers(own.partition("/")[0]))
             interfaces.delete_address(self._namespace, "lo", own)
@@ -219,7 +218,6 @@ class ContainerIsolation(NoIsolation):
             log.error("tunnel state may remain", error=str(error))
 
     def control_ready(self, inner_port: int, own_port: int) -> None:
-        """The users of rosmaster and rosout still reach them."""
         with self._standing():
             if self.firewall is not None and (inner_port, own_port) != (self._ports.inner, self._ports.own):
                 self._ports = replace(self._ports, inner=inner_port, own=own_port)
@@ -228,7 +226,7 @@ class ContainerIsolation(NoIsolation):
                 self._owed = False
 
     def open_tunnels(self, pool: str, address: str) -> Esp:
-        """The pool is closed to clear text before it becomes reachable."""
+        """Close the pool to clear text before it becomes reachable."""
         with self._standing():
             if self.firewall is None:
                 raise NetworkError("the firewall is not in force")
@@ -250,7 +248,7 @@ class ContainerIsolation(NoIsolation):
             return esp
 
     def open_own_network(self, network: str, ports: list[int]) -> None:
-        """The network is closed to other machines before its addresses become the appliance's."""
+        """Close the network to other machines before its addresses become the appliance's."""
         # Control is not trusted: accept only a network that was not in use before, and ports without a privilege.
         wanted, opened = str(ipaddress.IPv4Network(network)), tuple(map(PortRange.one, sorted(set(ports))))
         if any(port.first < _FIRST_FREE_PORT for port in opened):
@@ -270,7 +268,6 @@ class ContainerIsolation(NoIsolation):
                 raise
 
     def _require_unused(self, network: ipaddress.IPv4Network) -> None:
-        """Raise `NetworkError` if an interface has an address in the network."""
         for text in interfaces.addresses(self._namespace):
             held = ipaddress.ip_interface(text).network
             if held.version == 4 and held.overlaps(network):
@@ -279,14 +276,13 @@ class ContainerIsolation(NoIsolation):
                 )
 
     def clear_tunnels(self) -> None:
-        """The addresses stay closed to clear text."""
         with self._standing():
             if self._own is not None:
                 address = self._own.partition("/")[0]
                 self._namespace.run(lambda: clear_leftovers(address))
 
     def endpoint(self) -> PublicAddress:
-        """Among several addresses, it is unknown which one outside hosts reach."""
+        """Return the only address; among several, it is unknown which one outside hosts reach."""
         found = only_address(self._namespace, without=("lo", USER_SPACE_INTERFACE))
         if is_contained() and not lives_on_the_machines_network():
             reason = f"{found.reason}, in a container: outside the machine the address may differ"
@@ -294,7 +290,7 @@ class ContainerIsolation(NoIsolation):
         return found
 
     def report(self) -> FirewallState:
-        """Missing rules are installed again."""
+        """Return the state, after installing missing rules again."""
         with self._standing():
             if self.firewall is None:
                 return FirewallState()
@@ -309,7 +305,7 @@ class ContainerIsolation(NoIsolation):
         return FirewallState(report.backend, list(report.not_used), list(report.rules))
 
     def probe(self) -> str | None:
-        """The attempt is made as another local user."""
+        """Try to reach the hidden ports as another local user; return the reason of a success."""
         ports = {
             "ROSMaster": self._ports.rosmaster,
             "the master-side proxy endpoint": self._ports.inner,
@@ -363,7 +359,6 @@ class ContainerIsolation(NoIsolation):
         return (*self._ports.api_networks, *([self._tunnels[0]] if self._tunnels else []))
 
     def _neighbours(self) -> tuple[str, ...]:
-        """On the link to the appliance, only the machine itself may use these addresses."""
         return ()
 
     def _forwarders(self) -> tuple[ForwarderAccess, ...]:
@@ -380,7 +375,7 @@ class ContainerIsolation(NoIsolation):
 
 
 class NetnsIsolation(ContainerIsolation):
-    """A separate namespace on a bare host, with forwarded ports for RVMaster, nodes and REST."""
+    """Uses a separate namespace on a bare host, with forwarded ports for RVMaster, nodes and REST."""
 
     kind = "netns"
 
@@ -411,14 +406,14 @@ class NetnsIsolation(ContainerIsolation):
             yield
 
     def open_tunnels(self, pool: str, address: str) -> Esp:
-        """The namespace also gets the IKE and ESP packets of the host."""
+        """Open the tunnels, and forward the host's IKE and ESP packets to the namespace."""
         with self._standing():
             esp = super().open_tunnels(pool, address)
             self._isolation.forward_tunnels()
             return esp
 
     def open_own_network(self, network: str, ports: list[int]) -> None:
-        """The namespace also gets the connections to these ports of the host."""
+        """Open the network, and forward connections to these ports of the host to the namespace."""
         with self._standing():
             self._isolation.require_free(ports)
             super().open_own_network(network, ports)
@@ -447,7 +442,7 @@ class NetnsIsolation(ContainerIsolation):
         return tuple(ends.host for ends in self._isolation.ends.values())
 
     def route_to(self, host: str) -> str | None:
-        """Return None for a host in a tunnel."""
+        """Return the address at which a host reaches the appliance; None for a host in a tunnel."""
         # `host` comes from control, which is not trusted: accept only an address.
         address = ipaddress.ip_address(host)
         if self._tunnels is not None and address in ipaddress.ip_network(self._tunnels[0]):
@@ -455,7 +450,7 @@ class NetnsIsolation(ContainerIsolation):
         return self._isolation.host_address_for(host)
 
     def endpoint(self) -> PublicAddress:
-        """Prefer the address towards the default route; without one, there must be only one address."""
+        """Return the address towards the default route, or the only address if there is no route."""
         return self._isolation.endpoint()
 
     def report(self) -> FirewallState:
@@ -471,7 +466,7 @@ class NetnsIsolation(ContainerIsolation):
             return msgspec.structs.replace(super().report(), forwarding=list(rules), **self._look_at_others())
 
     def _look_at_others(self) -> dict[str, list[str]]:
-        """Log changes of other programs' rules for forwarded packets, such as Docker's."""
+        """Log changes of other programs' rules for forwarded packets, such as Docker's; return these rules."""
         try:
             found = {
                 "translations": list(self._isolation.translations()),
@@ -494,14 +489,13 @@ class NetnsIsolation(ContainerIsolation):
 def isolation_for(
     isolation: str, ports: AppliancePorts, backend: Literal["auto", "iptables", "nft"]
 ) -> NoIsolation:
-    """Nothing is built yet."""
     if isolation == "container":
         return ContainerIsolation(ports, backend)
     return NetnsIsolation(ports, backend) if isolation == "netns" else NoIsolation()
 
 
 def _require_own_network() -> None:
-    """In a container with the machine's network, the firewall would affect the whole machine."""
+    """Raise `StartError` in a container with the machine's network: the firewall would affect the whole machine."""
     shared = lives_on_the_machines_network()
     if is_contained() and (shared or bridges()):
         raise StartError(

@@ -30,7 +30,7 @@ log = structlog.get_logger()
 
 
 class IsolationWatchdog:
-    """`tell` sends a message to control."""
+    """Checks the isolation; `tell` sends a message to control."""
 
     def __init__(
         self,
@@ -51,7 +51,6 @@ class IsolationWatchdog:
         return [self._report] if self._probe is None else [self._report, self._probe]
 
     async def look(self) -> str | None:
-        """Return why a hidden port is open."""
         async with self._one_at_a_time:
             reason = await self._find_fault()
         self._found(reason)
@@ -91,7 +90,7 @@ class IsolationWatchdog:
         return messages.TunnelsEnclosed(esp)
 
     async def open_own_network(self, network: str, ports: list[int]) -> str:
-        """Return why that is not possible, or an empty text."""
+        """Open the own network; return the reason of a failure, or an empty text."""
         try:
             async with self._one_at_a_time:
                 await in_thread(lambda: self.isolation.open_own_network(network, ports))
@@ -103,7 +102,7 @@ class IsolationWatchdog:
         return ""
 
     async def clear_tunnels(self, passive: Callable[[], bool]) -> None:
-        """This appliance must be passive and run no other charon."""
+        """Remove what a charon left, while this appliance is passive and runs no other charon."""
         try:
             async with self._one_at_a_time:
                 if passive():

@@ -19,7 +19,7 @@ _LONGEST_REQUEST = 16 << 20  # bytes, as in `control/admin_socket.py`
 
 
 async def answer_for_control(listener: Callable[[], socket.socket], reason: str) -> None:
-    """Answer from `_PATIENCE_SECONDS` on; `listener()` copies the admin socket."""
+    """Answer with the reason from `_PATIENCE_SECONDS` on; `listener()` copies the admin socket."""
     await asyncio.sleep(_PATIENCE_SECONDS)
     async with await asyncio.start_unix_server(
         partial(_answer, reason), sock=listener(), limit=_LONGEST_REQUEST

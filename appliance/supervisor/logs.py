@@ -20,7 +20,7 @@ _transform = structlog.tracebacks.ExceptionDictTransformer(show_locals=False)
 
 
 def configure_logs(process: str) -> None:
-    """Every line has the name of the process."""
+    """Configure the logs of a process; every line has its name."""
     human = sys.stderr.isatty()
     shared: list[structlog.typing.Processor] = [
         structlog.contextvars.merge_contextvars,

@@ -24,7 +24,7 @@ from appliance.channel.messages import StateGiven
 
 FOLDER = "monitors"
 SIZE = 32 << 20
-"""In bytes, for each file."""
+"""The size of each file in bytes."""
 
 _ENDED = "ended"
 _MOST_LIVES = 4  # folders kept while no run is complete
@@ -35,7 +35,7 @@ log = structlog.get_logger()
 
 
 class _Ended(msgspec.Struct):
-    """`at` is nanoseconds since the epoch."""
+    """The orderly end of a run; `at` is nanoseconds since the epoch."""
 
     boot: str
     at: int
@@ -106,7 +106,6 @@ class MonitorMemory:
         return ended
 
     def _lives(self) -> list[Path]:
-        """Remove folders that are no longer needed; return the others, the oldest first."""
         kept: list[Path] = []
         runs = [path for path in self._folder.iterdir() if path.is_dir() and path.name.isdecimal()]
         for life in sorted(runs, reverse=True):

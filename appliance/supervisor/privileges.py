@@ -60,10 +60,10 @@ def raise_file_limit(wanted: int) -> int:
 
 
 def raise_oom_score(score: int) -> None:
-    """The kernel kills this process earlier if memory is short. The score is never lowered.
+    """Let the kernel kill this process earlier if memory is short. The score is never lowered.
 
-    Call this before the change of user: the role's user may not write the file. With a read-only /proc, nothing
-    changes.
+    Call this before the change of user: the role's user may not write the file. With a read-only /proc,
+    nothing changes.
     """
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "r+") as file:  # noqa: PTH123  as below
         if score > int(file.read()):
@@ -71,7 +71,7 @@ def raise_oom_score(score: int) -> None:
 
 
 def raise_priority(by: int) -> int:
-    """Return `by`, or 0 if this is not permitted."""
+    """Raise the priority of this process; return `by`, or 0 if this is not permitted."""
     try:
         os.setpriority(os.PRIO_PROCESS, 0, os.getpriority(os.PRIO_PROCESS, 0) - by)
     except PermissionError:
@@ -80,11 +80,12 @@ def raise_priority(by: int) -> int:
 
 
 def add_niceness(by: int) -> None:
-    """Do nothing that is not permitted.
+    """Add to the niceness of this process, if permitted.
 
-    Where the kernel shares the processor among sessions (autogroups), the niceness of a process has an effect only
-    inside its session. So a session with a process of higher priority gets its niceness: call this in a session of
-    this process alone. One with a lower priority keeps its share, or a busy machine would lock operators out.
+    Where the kernel shares the processor among sessions (autogroups), the niceness of a process has an effect
+    only inside its session. So a session with a process of higher priority gets its niceness: call this in a
+    session of this process alone. A session of lower priority keeps its share, or a busy machine would lock
+    operators out.
     """
     with contextlib.suppress(PermissionError):
         os.nice(by)
@@ -95,9 +96,10 @@ def add_niceness(by: int) -> None:
 
 
 def shorten_slice(nanoseconds: int) -> None:
-    """Ask the scheduler for short turns, so that this process runs soon after it wakes; its share stays the same.
+    """Ask the scheduler for short turns, so that this process runs soon after it wakes; its share stays the
+    same.
 
-    Linux before 6.12 ignores the request. A container may forbid it; then nothing changes.
+    Linux before 6.12 ignores the request. If a container forbids it, nothing changes.
     """
     call = _SCHED_SETATTR.get(os.uname().machine)
     if call is None:
@@ -111,7 +113,7 @@ def shorten_slice(nanoseconds: int) -> None:
 
 
 def leave_network() -> None:
-    """The process moves into an empty network namespace. Raises `OSError`."""
+    """Move this process into an empty network namespace. Raises `OSError`."""
     libc_call("unshare(CLONE_NEWNET)", _CLONE_NEWNET)
 
 
@@ -135,7 +137,6 @@ SUPERVISOR_CAPABILITIES = {
 
 
 def drop_unused_capabilities() -> None:
-    """Keep `SUPERVISOR_CAPABILITIES`."""
     if os.geteuid() != 0:
         return
     kept = sum(1 << number for number in SUPERVISOR_CAPABILITIES.values())
@@ -149,7 +150,7 @@ def drop_unused_capabilities() -> None:
 
 
 def drop_privileges(account: Account, *, parent: int, capabilities: Sequence[str] = ()) -> None:
-    """Become `account` for good; `capabilities` are of `SUPERVISOR_CAPABILITIES`. Raises `OSError`."""
+    """Become `account` permanently; `capabilities` are of `SUPERVISOR_CAPABILITIES`. Raises `OSError`."""
     os.umask(0o077)
     if os.geteuid() == 0:
         kept = sum(1 << SUPERVISOR_CAPABILITIES[name] for name in capabilities)
@@ -179,7 +180,7 @@ def _empty_bounding_set(*, but: int = 0) -> None:
 
 
 def _reduce_capabilities(kept: int) -> None:
-    """Executed programs inherit the capabilities of this bit set."""
+    """Keep only the capabilities of this bit set, which executed programs inherit."""
     prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
     low, high = kept & 0xFFFFFFFF, kept >> 32
@@ -190,12 +191,12 @@ def _reduce_capabilities(kept: int) -> None:
 
 
 def prctl(option: int, first: int, second: int = 0) -> None:
-    """See `prctl(2)`. Raises `OSError`."""
+    """Call `prctl(2)`. Raises `OSError`."""
     libc_call(f"prctl({option})", ctypes.c_int(option), *map(ctypes.c_ulong, (first, second, 0, 0)))
 
 
 def libc_call(what: str, *arguments: Any) -> None:
-    """`what` begins with the function's name. Raises `OSError`."""
+    """Call a function of libc, whose name begins `what`. Raises `OSError`."""
     function = ctypes.CDLL(None, use_errno=True)[what.partition("(")[0]]
     if function(*arguments) != 0:
         number = ctypes.get_errno()

@@ -32,7 +32,7 @@ _log = structlog.get_logger()
 
 
 class ProgramOutput:
-    """Reads until the program and all that it started have ended."""
+    """The output of a program, read until the program and all that it started have ended."""
 
     def __init__(self, role: str, output: IO[bytes], loop: asyncio.AbstractEventLoop) -> None:
         self._role = role
@@ -69,7 +69,7 @@ _PROGRAM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
 @dataclass(frozen=True)
 class ProcessCallbacks:
-    """Called for the events of a process."""
+    """The functions to call for the events of a process."""
 
     received: Callable[["ProcessHandle", Any, tuple[int, ...]], None]
     violated: Callable[["ProcessHandle", str], None]
@@ -77,7 +77,7 @@ class ProcessCallbacks:
 
 
 def is_hanging(silent: float, *, starting: bool, still: float) -> bool:
-    """Return whether a process hangs: `silent` seconds without an answer, `still` seconds without progress.
+    """Whether a process hangs: `silent` seconds without an answer, `still` seconds without progress.
 
     During a start, `silent` counts from the start; a start that progresses may take long.
     """
@@ -144,7 +144,6 @@ class ProcessHandle:
 
     @property
     def alive(self) -> bool:
-        """The process's death is not known yet."""
         return self._pidfd >= 0
 
     @property
@@ -158,7 +157,7 @@ class ProcessHandle:
         ]
 
     def send(self, message: Message, descriptors: tuple[int, ...] = ()) -> None:
-        """Do nothing if the process is dead, because its death is reported separately."""
+        """Send a message; do nothing if the process is dead, because its death is reported separately."""
         if self._channel is None:
             return
         try:
@@ -176,7 +175,7 @@ class ProcessHandle:
         self.answered = clock.now()
 
     def discount_pause(self, seconds: float) -> None:
-        """The supervisor did not run (a suspended machine), so the answer may come this much later."""
+        """Accept the answer this much later, because the supervisor did not run (a suspended machine)."""
         self.started += seconds
         if self.answered is not None:
             self.answered += seconds
@@ -248,7 +247,7 @@ def _environment(home: str) -> dict[str, str]:
 
 
 def program_environment(home: str, extra: dict[str, str]) -> dict[str, str]:
-    """Only language and time zone are inherited."""
+    """Return the environment of a program, which inherits only language and time zone."""
     environment = _environment(home)
     del environment["PYTHONPATH"], environment["PYDANTIC_DISABLE_PLUGINS"]
     return {**environment, **extra}

@@ -41,19 +41,19 @@ class ProcessSlot:
 
     @property
     def is_starting(self) -> bool:
-        """The appliance does not serve yet because this process is not ready."""
+        """Whether the appliance does not serve yet because this process is not ready."""
         if self.role.on_demand or self.role.dispensable:
             return False
         return self.process is None or not (self.process.ready or self.process.is_program)
 
     @property
     def is_failing(self) -> bool:
-        """The last runs were all short, so operators must be notified."""
+        """Whether the last runs were all short, so operators must be notified."""
         return self.short_runs >= FAILING_AFTER
 
     @property
     def is_late(self) -> bool:
-        """Nodes cannot connect because this process is not ready."""
+        """Whether nodes cannot connect because this process is not ready."""
         role = self.role
         waited_for = (
             role.program is None and role.after is None and not role.on_demand and not role.dispensable
@@ -61,7 +61,6 @@ class ProcessSlot:
         return waited_for and (self.process is None or not self.process.ready)
 
     def record_death(self, process: ProcessHandle) -> float:
-        """Return the run time in seconds."""
         self.process = None
         self.since = process.since
         lived = clock.now() - process.started
@@ -77,13 +76,13 @@ class ProcessSlot:
         return True
 
     def delay(self) -> float:
-        """In seconds: 0 after a long run, more after each short run."""
+        """Return the delay in seconds: 0 after a long run, more after each short run."""
         if self.is_failing and self.role.dispensable:
             return min(2.0 ** (self.short_runs - FAILING_AFTER + 1), _LONGEST_DELAY)
         return _BACKOFF[min(max(self.short_runs - 1, 0), len(_BACKOFF) - 1)]
 
     def plan(self, facts: Facts, lifeline: int, lender: int | None) -> LaunchPlan:
-        """`lifeline` and `lender` are the child's ends."""
+        """Return the plan of the next start; `lifeline` and `lender` are the child's ends."""
         role = self.role
         home = str(facts.part(role.part))
         plan = LaunchPlan(

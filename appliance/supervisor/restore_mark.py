@@ -7,7 +7,7 @@ from appliance.supervisor.errors import StartError
 
 
 def set_mark(state: Path) -> Path:
-    """`state` must be empty. Raises `OSError`, even if the folder is already marked."""
+    """Mark the directory `state`, which must be empty. Raises `OSError`, even if it is already marked."""
     mark = _mark(state)
     os.close(os.open(mark, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600))
     return mark

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Facts:
-    """Control reports some of these when it is ready."""
+    """The facts that rows need; control reports some of them when it is ready."""
 
     state: Path
     config: Path
@@ -32,12 +32,11 @@ class Facts:
         return self.state / name
 
     def run(self, name: str) -> Path:
-        """The supervisor writes this file for the other processes."""
         return self.config.with_name(name)
 
 
 class RemoteReceiver(NamedTuple):
-    """`client` is a name in the firewall's rules."""
+    """A receiver on another machine; `client` is a name in the firewall's rules."""
 
     client: str
     protocol: str  # udp, or a protocol over TCP
@@ -46,7 +45,7 @@ class RemoteReceiver(NamedTuple):
 
 
 class SharedMemory(Protocol):
-    """Made at the start and given to processes; it survives them."""
+    """Memory that is made at the start, given to processes, and outlives them."""
 
     def messages_for(self, role: str, index: int) -> "Iterator[tuple[MemoryGiven, int]]":
         """Yield messages and descriptors for the start of a process."""
@@ -56,7 +55,7 @@ class SharedMemory(Protocol):
 
 @dataclass(frozen=True)
 class ExternalProgram:
-    """The environment does not include HOME and PATH."""
+    """A program with its environment, without HOME and PATH."""
 
     argv: tuple[str, ...]
     environment: Mapping[str, str] = field(default_factory=dict)
@@ -66,31 +65,33 @@ class ExternalProgram:
 class Role:
     """One row of the table.
 
-    Start: `path` returns the last argument of `entry`. `indexed` roles get their number; they have
-    `most` processes, or one for each relay (None). `after` is the role that must
-    be ready first. `outlives_takeover`: the role goes on when this appliance becomes passive. `stands_by`: a role with
-    `after` also runs while this appliance is passive. `listens`: each process of the role gets the listening socket
-    that the supervisor keeps for it. `on_demand`: the role starts when control requests it, and does not restart after
+    Start: `path` returns the last argument of `entry`. `indexed` roles get their number; they have `most`
+    processes (None: one for each relay). `after` is the role that must be ready first. `outlives_takeover`:
+    the role continues when this appliance becomes passive. `stands_by`: a role with `after` also runs while
+    this appliance is passive. `listens`: each process of the role gets the listening socket that the
+    supervisor keeps for it. `on_demand`: the role starts when control requests it, and does not restart after
     exit status 0.
 
-    Watching: `asks`: the supervisor checks over HTTP whether the role is alive (for a program without a lifeline).
-    `dispensable`: the other roles continue when this role cannot serve. `outlives_control` roles are stopped last.
+    Watching: `asks`: the supervisor checks over HTTP whether the role is alive (for a program without a
+    lifeline). `dispensable`: the other roles continue when this role cannot serve. `outlives_control` roles
+    are stopped last.
 
-    Permissions: `part` is the role's folder in the state directory. `links` are the roles it talks to. `files` is the
-    limit on open files. `readable_by` is the user whose group may enter `part` and read its group-readable files.
-    `group` is the user whose group replaces the role's own, so the role can read files that are `readable_by` that
-    user. `capabilities` lists the `privileges.SUPERVISOR_CAPABILITIES` that the role keeps. `secret` is a file that
-    the role's user may not read; it is opened before the privileges are dropped, and the last argument of `entry`
-    is its descriptor or None. `inputs` are files and folders of the operator, which the supervisor opens for the
-    role if the role's user may not reach them. `sandbox` has the permitted system calls, and the files and ports
-    besides the role's part and the system. `ended_early` is the role's `oom_score_adj` (0 to 1000): the kernel
-    kills a higher one earlier if memory is short. `nice` is its niceness: a higher one yields the processor, so that
-    no console delays a stop. A negative one has effect if the supervisor may give it (CAP_SYS_NICE). `slice_ns` is
-    the length of its turns at the processor (0: the kernel's): a process with short turns waits less for each.
-    `receiver` is the only other machine that the firewall lets the user reach.
+    Permissions: `part` is the role's folder in the state directory. `links` are the roles it talks to.
+    `files` is the limit on open files. `readable_by` is the user whose group may enter `part` and read its
+    group-readable files. `group` is the user whose group replaces the role's own, so the role can read files
+    that are `readable_by` that user. `capabilities` lists the `privileges.SUPERVISOR_CAPABILITIES` that the
+    role keeps. `secret` is a file that the role's user may not read; it is opened before the privileges are
+    dropped, and the last argument of `entry` is its descriptor or None. `inputs` are files and folders of the
+    operator, which the supervisor opens for the role if the role's user may not reach them. `sandbox` has the
+    permitted system calls, and the files and ports besides the role's part and the system. `ended_early` is
+    the role's `oom_score_adj` (0 to 1000): the kernel kills a higher one earlier if memory is short. `nice`
+    is its niceness: a higher one yields the processor, so that no console delays a stop. A negative one has
+    effect if the supervisor may give it (CAP_SYS_NICE). `slice_ns` is the length of its turns at the
+    processor (0: the kernel's): a process with short turns waits less for each. `receiver` is the only other
+    machine that the firewall lets the user reach.
 
-    A feature's role runs if the settings of features let it (`configured`), and a `paired` one only on one of two
-    appliances.
+    A feature's role runs if the settings of features let it (`configured`), and a `paired` one only on one of
+    two appliances.
     """
 
     name: str
@@ -127,5 +128,5 @@ class Role:
 
     @property
     def serves_robot(self) -> bool:
-        """The role may run only while this appliance is active; a pause stops it."""
+        """Whether the role may run only while this appliance is active; a pause stops it."""
         return not (self.outlives_takeover or self.stands_by)

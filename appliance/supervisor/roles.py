@@ -29,7 +29,7 @@ ROS_PROGRAMS = {ROSMASTER: "python3-rosmaster", ROSOUT: "rosout"}
 
 
 def _of_ros(facts: Facts, part: str, master: str) -> dict[str, str]:
-    """ROS_IP makes rosmaster listen on loopback only."""
+    """Return the environment of a ROS program; ROS_IP makes rosmaster listen on loopback only."""
     return {
         "ROS_IP": "127.0.0.1",
         "ROS_MASTER_URI": master,
@@ -121,7 +121,7 @@ ROLES = (
     ),
     *(role for role in _OF_FEATURES if role.after is not None or role.on_demand),
 )  # fmt: skip
-"""In the order of their start."""
+"""The rows in the order of their start."""
 
 
 def roles_of(
@@ -130,7 +130,7 @@ def roles_of(
     api: bool = True,
     paired: bool = False,
 ) -> tuple[Role, ...]:
-    """Raises `StartError` if a ROS program is missing."""
+    """Return the rows to start. Raises `StartError` if a ROS program is missing."""
     require_programs(ROS_PROGRAMS)
     wanted = {"api": api}
     return tuple(

@@ -21,7 +21,7 @@ _REQUEST = (
 
 
 async def answers(port: int, account: Account, inside: AbstractContextManager[None], seconds: float) -> bool:
-    """`rosmaster` listens on this loopback port.
+    """Whether `rosmaster` answers on this loopback port.
 
     `inside` enters rosmaster's network namespace while the socket is made.
     """

@@ -51,11 +51,12 @@ def run_appliance(
     pairing: Pairing | None = None,
     waits: Callable[[], None] = lambda: None,
 ) -> None:
-    """Raises `StartError` if the appliance cannot start or go on.
+    """Run the appliance. Raises `StartError` if it cannot start or continue.
 
-    `ready` is called once, when nodes may connect; it gets control's message and the settings with all ports chosen.
-    With `pairing` the appliance is one of two, and `waits` is called once when it could serve. `node_ports` is the
-    policy's `[Ports] range`: the firewall limits connections to it, and `netns` forwards it.
+    `ready` is called once, when nodes may connect; it gets control's message and the settings with all ports
+    chosen. With `pairing` the appliance is one of two, and `waits` is called once when it could serve.
+    `node_ports` is the policy's `[Ports] range`: the firewall limits connections to it, and `netns` forwards
+    it.
     """
     if settings.isolation == "none":
         log.warning(
@@ -83,7 +84,7 @@ def run_appliance(
 
 
 def _weigh(pairing: Pairing) -> int:
-    """No load may delay the gate of one of two appliances."""
+    """Return the priority for the gate of one of two appliances, which no load may delay."""
     raised = raise_priority(-pairing.nice)
     if not raised:
         log.warning(
@@ -150,7 +151,7 @@ def _run(
 
 
 def _ports_of_rosout(settings: Settings, node_ports: range) -> range:
-    """The kernel's local port range has none of these ports."""
+    """Return ports for rosout that are outside of the kernel's local port range."""
     chosen = local_port_range()
     taken = [settings.listen_address[1], settings.rosmaster_port]
     taken += [settings.api_address[1]] if settings.api_address else []
@@ -162,7 +163,6 @@ def _ports_of_rosout(settings: Settings, node_ports: range) -> range:
 
 
 def _with_ports(settings: Settings) -> Settings:
-    """Choose every port that must be known before the first process starts."""
     host, port = settings.listen_address
     if port == 0 and settings.isolation != "none":
         port = free_port()
@@ -173,7 +173,7 @@ def _with_ports(settings: Settings) -> Settings:
 
 
 def _api_with_port(settings: Settings) -> str:
-    """If the default port is in use, warn and choose a free one."""
+    """Return the address of REST; if the default port is in use, warn and choose a free one."""
     if settings.api_address is None:
         return settings.api
     host, port = settings.api_address

@@ -7,7 +7,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class RoleChanges:
-    """`activate(epoch)` and `passivate()` begin and end the service.
+    """The changes of the role; `activate(epoch)` and `passivate()` begin and end the service.
 
     `suspend()` stops it, with all state kept, until `resume()`; it returns False if that is not possible now.
     """
@@ -19,10 +19,10 @@ class RoleChanges:
 
 
 class ServiceGate:
-    """A single appliance may always serve, in epoch 0.
+    """The gate of a single appliance, which may always serve, in epoch 0.
 
-    `accepts` has the messages of roles that the gate decides by. Operators get `paused` as the answer while the
-    service is suspended, and `ended` while this appliance stops serving.
+    `accepts` has the messages of roles by which the gate decides. Operators get `paused` as the answer while
+    the service is suspended, and `ended` while this appliance stops serving.
     """
 
     accepts: Mapping[str, tuple[type, ...]] = {}
@@ -47,9 +47,10 @@ class ServiceGate:
 class Pairing:
     """One of two appliances, before it starts.
 
-    `robot` is an address of the robot. Only `other` may send to `port`. `files` are written for the processes: names,
-    users, contents. The supervisor gets the priority `nice`. `fixed_authority` is why the authority of hosts cannot
-    be replaced. `event` and `text` are printed when this appliance could serve, and `ready` is its state for systemd.
+    `robot` is an address of the robot. Only `other` may send to `port`. `files` are written for the
+    processes: names, users, contents. The supervisor gets the priority `nice`. `fixed_authority` is why the
+    authority of hosts cannot be replaced. `event` and `text` are printed when this appliance could serve,
+    with the state `ready` for systemd.
     """
 
     robot: str

@@ -17,7 +17,7 @@ _MORE = "EXTEND_TIMEOUT_USEC=120000000\n"
 
 
 class ServiceManager:
-    """Does nothing without systemd's socket."""
+    """Notifies systemd; does nothing without systemd's socket."""
 
     def __init__(self, address: str | None, watchdog_seconds: float | None) -> None:
         self._address = None if address is None else address.replace("@", "\0", 1)
@@ -26,7 +26,7 @@ class ServiceManager:
 
     @classmethod
     def of(cls, environment: MutableMapping[str, str]) -> "ServiceManager":
-        """Remove the socket and the watchdog from the environment, so that no child notifies systemd."""
+        """Return the manager, and remove the socket and the watchdog from the environment, which children inherit."""
         said = {
             name: environment.pop(name, None) for name in ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
         }
@@ -45,7 +45,7 @@ class ServiceManager:
 
     @asynccontextmanager
     async def watched(self) -> AsyncIterator[None]:
-        """Notify the watchdog twice per interval."""
+        """Notify the watchdog twice per interval during the block."""
         task = asyncio.create_task(self._live())
         try:
             yield
@@ -69,7 +69,6 @@ class ServiceManager:
 
 
 def _seconds(said: Mapping[str, str | None]) -> float | None:
-    """None if the watchdog is for another process or not a number."""
     text, pid = said["WATCHDOG_USEC"], said["WATCHDOG_PID"]
     if text is None or not text.isdigit() or int(text) == 0 or (pid is not None and pid != str(os.getpid())):
         return None

@@ -18,7 +18,7 @@ log = structlog.get_logger()
 
 
 async def end_all(slots: Sequence[ProcessSlot], process_died: asyncio.Event) -> None:
-    """Processes that outlive control come last.
+    """End all processes; those that outlive control come last.
 
     `process_died` is set after each death, when its slot is free. No process may start during the shutdown.
     """

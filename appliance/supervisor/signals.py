@@ -14,7 +14,7 @@ _ENDING = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGHUP})
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Except within `heard`, then ignore the signals. Main thread only."""
+    """Hold the signals except within `heard`, and then ignore them. Main thread only."""
     before = block()
     try:
         yield
@@ -35,5 +35,5 @@ def heard() -> Iterator[None]:
 
 
 def block() -> set[int]:
-    """The thread's children block them too; return the previously blocked signals."""
+    """Block the signals in this thread and its children; return the previously blocked signals."""
     return {int(number) for number in signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)}

@@ -49,7 +49,7 @@ def foreign(path: Path) -> str | None:
 
 
 def _has_lock(path: Path) -> bool:
-    """In a shared folder, any user may create a lock file, so its owner must be the folder's."""
+    """Whether the folder's owner made a lock file: in a shared folder, any user may create one."""
     try:
         lock = (path / _LOCK).lstat()
     except FileNotFoundError:
@@ -58,7 +58,7 @@ def _has_lock(path: Path) -> bool:
 
 
 class StateDirectory:
-    """Holds the lock until `close`."""
+    """The directory, whose lock is held until `close`."""
 
     def __init__(self, path: Path) -> None:
         """Create the directory if needed. Raises `StartError`."""
@@ -82,7 +82,7 @@ class StateDirectory:
         return self.path / "run" / "config.json"
 
     def prepare(self, roles: Collection[Role]) -> None:
-        """Remove unfinished files of killed writers.
+        """Create the parts, and remove unfinished files of killed writers.
 
         Raises `StartError` if a part belongs to another user, or its owner cannot be changed.
         """
@@ -117,7 +117,7 @@ class StateDirectory:
         write_whole(self.config, text.encode(), 0o644)
 
     def write_files(self, files: Iterable[tuple[str, str, bytes]]) -> None:
-        """Each file (name, user, contents) is readable by its user only.
+        """Write files (name, user, contents) that only their users can read.
 
         Remove those of an earlier start, which may have been killed.
         """
@@ -131,7 +131,6 @@ class StateDirectory:
             self._written.append(name)
 
     def open_admin_socket(self) -> socket.socket:
-        """An old socket is replaced."""
         path = self.path / ADMIN_SOCKET
         path.unlink(missing_ok=True)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -188,7 +187,7 @@ class StateDirectory:
 
 
 def _hand_over(path: Path, uid: int, gid: int, mode: int) -> None:
-    """Act as the folder's owner; otherwise the kernel drops the set-group-id bit."""
+    """Change owner and mode as the folder's owner; otherwise the kernel drops the set-group-id bit."""
     os.chown(path, os.geteuid(), os.getegid())
     path.chmod(mode)
     os.chown(path, uid, gid)

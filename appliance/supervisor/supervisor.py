@@ -86,7 +86,7 @@ log = structlog.get_logger()
 
 
 class ControlReady(msgspec.Struct, frozen=True):
-    """`Ready.detail` of control."""
+    """The `Ready.detail` of control."""
 
     master: str
     revision: int
@@ -115,10 +115,11 @@ class Supervisor:
         stands_by: Callable[[], None] = lambda: None,
         gate: Callable[[RoleChanges], ServiceGate] = ServiceGate,
     ) -> None:
-        """`ready` is called once when nodes may connect; it may raise `StartError`.
+        """Make the supervisor; `ready` is called once when nodes may connect, and may raise `StartError`.
 
-        `stands_by` is called once when the appliance only waits for its `gate`. `listeners` stay open while a process
-        restarts, so connections wait. Without `memory`, the state of monitors is lost when relays die.
+        `stands_by` is called once when the appliance only waits for its `gate`. `listeners` stay open while a
+        process restarts, so connections wait. Without `memory`, the state of monitors is lost when relays
+        die.
         """
         self._facts = facts
         self.slots = [
@@ -153,7 +154,7 @@ class Supervisor:
     async def run(self) -> None:
         """Run until SIGTERM or SIGINT; SIGHUP reloads the policy.
 
-        Raises `StartError` if the appliance cannot start or go on; all processes are then stopped.
+        Raises `StartError` if the appliance cannot start or continue; all processes are then stopped.
         """
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(_log_fault)
@@ -182,7 +183,7 @@ class Supervisor:
                 self._memory.close()
 
     def stop(self, failure: str | None = None) -> None:
-        """Without `failure`, this is an orderly end."""
+        """End the run, in order unless there is a `failure`."""
         if not self.stopping.is_set():
             self.failure = failure
             self.stopping.set()
@@ -201,7 +202,6 @@ class Supervisor:
         self._spawn(self.until_ready())
 
     async def until_answering(self, slot: ProcessSlot) -> None:
-        """Keep waiting if the process restarts."""
         began = clock.now()
         while self._gets_on(began, [slot]) and not self.stopping.is_set():
             process = slot.process
@@ -214,7 +214,7 @@ class Supervisor:
         self.stop(f"rosmaster does not answer on 127.0.0.1:{self._facts.rosmaster_port}; check the log")
 
     async def until_ready(self) -> None:
-        """Give up when processes make no progress."""
+        """Wait until the appliance serves; give up when processes make no progress."""
         began = clock.now()
         while not self.is_ready and not self.stopping.is_set():
             with suppress(TimeoutError):
@@ -233,7 +233,7 @@ class Supervisor:
                 log.info("still starting", waits_for=words, seconds=waited)
 
     def _gets_on(self, began: float, slots: list[ProcessSlot]) -> bool:
-        """A start may continue for some minutes, then up to a limit while processes make progress."""
+        """Whether a start may continue: for some minutes, then up to a limit while processes make progress."""
         waited = clock.now() - began
         if waited < _START_SECONDS:
             return True
@@ -241,7 +241,6 @@ class Supervisor:
         return waited < LONGEST_START_SECONDS and still < FIRST_ANSWER_SECONDS
 
     def start(self, slot: ProcessSlot) -> None:
-        """After a failure try again with growing delays."""
         slot.due = None
         if self._gate.suspended and slot.role.serves_robot:
             slot.due = asyncio.get_running_loop().call_later(_SUSPENDED_SECONDS, self.start, slot)
@@ -325,7 +324,7 @@ class Supervisor:
                 self.control_said(process, message, descriptors)
 
     def _sandboxed(self, process: ProcessHandle, sandbox: messages.Walled) -> None:
-        """The report is accepted only as the process's first message."""
+        """Note the limits of a process, which are accepted only as its first message."""
         if process.sandbox is not None:
             self._violated(process, "reported its sandbox twice")
             return
@@ -378,7 +377,7 @@ class Supervisor:
                 self.stop()
 
     def _free_log(self, processes: list[int]) -> None:
-        """Kill the audit log readers that hold a writer's lock: a correct reader never holds one.
+        """Kill the readers that hold a writer's lock of the audit log; a correct reader never holds one.
 
         If the holder is unknown to the kernel (-1) or not a child, kill all readers.
         """
@@ -424,7 +423,6 @@ class Supervisor:
     # --- one of two appliances ----------------------------------------------------------------------------
 
     def _note_parked(self) -> None:
-        """Announce once that a waiting appliance could serve."""
         self._leave_answers()
         for slot in self.slots:
             if slot.role.stands_by and slot.is_free:
@@ -453,10 +451,10 @@ class Supervisor:
                 slot.process.kill()
 
     def _suspend(self) -> bool:
-        """Return False if a process is only starting.
+        """Suspend the service; return False if a process is only starting.
 
-        A control that stood by does not count as starting, so a lapse soon after the activation does not end the
-        appliance.
+        A control that stood by does not count as starting, so a lapse soon after the activation does not end
+        the appliance.
         """
         serving = [(slot, slot.process) for slot in self.slots if slot.role.serves_robot]
         if any(slot.is_starting for slot, process in serving if process is not None):
@@ -513,7 +511,7 @@ class Supervisor:
             process.send(messages.Announced())
 
     def _answer(self, process: ProcessHandle, work: Coroutine[Any, Any, None]) -> None:
-        """Too many requests at once count as a violation."""
+        """Do work for a process; too many requests at once count as a violation."""
         if self._unanswered >= _MOST_UNANSWERED:
             work.close()
             self._violated(process, f"sent more than {_MOST_UNANSWERED} requests at once")
@@ -647,7 +645,7 @@ class Supervisor:
         self._start_later(slot)
 
     def _ended(self, slot: ProcessSlot) -> None:
-        """The end of a role on demand does not count as a restart."""
+        """Note the end of a process; the end of a role on demand does not count as a restart."""
         log.info("process ended", role=slot.role.name)
         slot.starts -= 1
         slot.short_runs = 0

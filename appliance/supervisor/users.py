@@ -38,7 +38,7 @@ class Account:
 
 
 def account_of(user: str, group: str | None = None) -> Account:
-    """`group` names the user whose group replaces the role's own.
+    """Return the account of a role's user; `group` names the user whose group replaces the role's own.
 
     Raises `KeyError` for a user without a role.
     """

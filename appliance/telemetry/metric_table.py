@@ -103,7 +103,6 @@ METRICS = (
 
 
 def markdown() -> str:
-    """Return the generated part of docs/reference/metrics.md."""
     lines = ["| metric | kind | labels | meaning |", "|---|---|---|---|"]
     lines += [
         f"| `{row.name}` | {row.kind} | {', '.join(f'`{label}`' for label in row.labels) or '-'} | {row.help} |"

@@ -14,7 +14,7 @@ from rosrv_fleet.tokens import FleetRole, OperatorToken, OperatorTokens
 PEER_CERTIFICATE = "peer_certificate"
 """The key in the ASGI scope's `state` with the verified client certificate (DER)."""
 IS_ROBOT = "is_robot"
-"""The key in `state` that says whether this is the certificate of an enrolled robot."""
+"""The key in `state` that tells whether this is the certificate of an enrolled robot."""
 COOKIE = "__Host-rosrv-fleet"
 """The console's cookie: sent only over TLS and to this host, and hidden from scripts."""
 
@@ -22,8 +22,6 @@ COOKIE = "__Host-rosrv-fleet"
 def name_of(
     identify: Callable[[Request], Awaitable[Robot | OperatorToken]],
 ) -> Callable[[Request], Awaitable[str]]:
-    """Return the dependency that identifies the same caller, by name."""
-
     async def named(request: Request) -> str:
         return (await identify(request)).name
 
@@ -31,7 +29,6 @@ def name_of(
 
 
 def certificate_of(request: Request) -> bytes | None:
-    """Return the verified client certificate (DER) of a request, if there is one."""
     found: bytes | None = request.scope.get("state", {}).get(PEER_CERTIFICATE)
     return found
 
@@ -52,7 +49,6 @@ def robot_of(robots: Robots) -> Callable[[Request], Awaitable[Robot]]:
 
 
 def token_of(request: Request) -> str:
-    """Return the token of a request, not verified; empty if it has none."""
     scheme, _, bearer = request.headers.get("authorization", "").partition(" ")
     text = bearer if scheme.lower() == "bearer" else request.cookies.get(COOKIE, "")
     return text.strip()

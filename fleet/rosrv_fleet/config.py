@@ -88,7 +88,7 @@ class RetentionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
 
 class BundlesConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The bundles that robots get. `folder` is the one of `rosrv-fleet bundle publish`.
+    """The bundles that robots get. `folder` is the folder of `rosrv-fleet bundle publish`.
 
     `timestamp_key` is the file `timestamp.pem` of the operator's repository.
     """

@@ -1,12 +1,14 @@
-"""Limit the open connections: of each robot, of each address without a robot's certificate, and of all together.
+"""Limit the open connections: of each robot, of each address without a robot's certificate, and of all
+together.
 
-A connection is counted from `accept` to `close`, so also during its TLS handshake. It counts for its address (IPv6: its
-/64 network) until a robot's certificate is known, then for the robot. A connection above a limit is closed immediately.
+A connection is counted from `accept` to `close`, with its TLS handshake. It counts for its address (IPv6: its
+/64 network) until a robot's certificate is known, then for the robot. A connection above a limit is closed
+immediately.
 
-An address is *proven* once a robot or an operator connected from it. All other addresses together get at most half of
-the connections. If they want more, one of the address with most makes room for an address with less; so do they if the
-proven addresses and the robots want more. Handshakes and requests without a robot or an operator also have a share:
-those of all other addresses together, in equal parts, and those of each proven address (`Shares`).
+An address is *proven* once a robot or an operator connected from it. All other addresses together get at most
+half of the connections. If they want more, or if the proven addresses and the robots want more, a connection
+of the unproven address with most is closed. Handshakes and requests without a robot or an operator also have
+a share: those of all other addresses together, in equal parts, and those of each proven address (`Shares`).
 """
 
 import asyncio
@@ -40,7 +42,7 @@ class TooFewFilesError(OSError):
 
 
 class Shares:
-    """The rate of something costly that any client may request, by address. Only for one thread."""
+    """The rate of a costly operation that any client may request, by address. Only for one thread."""
 
     def __init__(self) -> None:
         # By address, unless its whole share is left: the time of its last request, and the rest of its share then.
@@ -143,7 +145,6 @@ class ClientConnections:
         return True
 
     def prove(self, owner: str) -> None:
-        """Note that a robot or an operator connected from an address (`owner_of`)."""
         self._proven[owner] = None
         self._proven.move_to_end(owner)
         if len(self._proven) > _MOST_PROVEN:
@@ -158,7 +159,7 @@ class ClientConnections:
         return owner in self._proven
 
     def _made_room(self, owner: str, proven: bool) -> bool:
-        """Close a connection of the address that is not proven and has most; False if this one would have as many."""
+        """Close a connection of the unproven address that has most; False if this address would have as many."""
         most = max(self._others, key=lambda one: len(self._others[one]), default=None)
         if most is None or (not proven and len(self._others[most]) <= len(self._others.get(owner, ())) + 1):
             return False

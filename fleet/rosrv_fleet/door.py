@@ -1,6 +1,7 @@
 """Answer requests of robots and operators, and of all other clients within the share of their address.
 
-This comes before every route, so a login, a wrong token or the health check costs an address its own share only.
+The door comes before every route, so a login, a wrong token or the health check costs an address its own
+share only.
 """
 
 from starlette.requests import Request

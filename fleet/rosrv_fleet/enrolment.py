@@ -59,7 +59,6 @@ class RobotAppliance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
     @property
     def certificate_ends(self) -> float:
-        """Return when its certificate ends, in seconds since the epoch."""
         return x509.load_pem_x509_certificate(self.certificate.encode()).not_valid_after_utc.timestamp()
 
     @property
@@ -68,16 +67,15 @@ class RobotAppliance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 
     @property
     def fingerprint(self) -> str:
-        """Return the SHA-256 of its certificate, in hexadecimal."""
         return hashlib.sha256(ssl.PEM_cert_to_DER_cert(self.certificate)).hexdigest()
 
 
 class Robot(RobotAppliance, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """An enrolled robot: its name, its appliance, and with a standby the other one, by name, in `others`.
 
-    Each appliance has a log, a key and a certificate of its own; the name and the group are the robot's. A removed
-    appliance stays in `others`, because its segments are still verified. `group` is `SITE/GROUP`, or empty: the robot
-    gets no bundles. `removed` is that of the robot.
+    Each appliance has a log, a key and a certificate of its own; the name and the group are the robot's. A
+    removed appliance stays in `others`, because its segments are still verified. `group` is `SITE/GROUP`, or
+    empty: the robot gets no bundles. `removed` is when the robot was removed.
     """
 
     name: str
@@ -91,7 +89,6 @@ class Robot(RobotAppliance, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     @property
     def connecting(self) -> dict[str, RobotAppliance]:
-        """Return the appliances that may connect, by name."""
         if self.removed is not None:
             return {}
         return {name: one for name, one in self.appliances.items() if one.removed is None}
@@ -158,7 +155,7 @@ def renewed(robot: Robot, appliance: str, certificate: str) -> Robot:
 
 
 def without_appliance(robot: Robot, appliance: str) -> Robot:
-    """Return a robot of which one appliance may connect no more. Raises `EnrolmentError`."""
+    """Return a robot without the right of one appliance to connect. Raises `EnrolmentError`."""
     left = {name: one for name, one in robot.connecting.items() if name != appliance}
     if len(left) != 1 or len(robot.connecting) != _MOST_APPLIANCES:
         raise EnrolmentError(
@@ -212,9 +209,10 @@ def _log_key(pem: bytes) -> str:
 
 
 def _certificate(pem: bytes) -> str:
-    """Return a certificate (PEM) if all that the collector reads of it later can be read.
+    """Return a certificate (PEM) if all its parts that the collector uses can be read.
 
-    A certificate is parsed only where it is read, and TLS has another parser: what passes here must fail nowhere else.
+    A certificate is parsed only where it is read, and TLS has another parser, so a certificate that passes
+    here must fail nowhere else.
     """
     try:
         found = x509.load_pem_x509_certificate(pem)

@@ -1,4 +1,4 @@
-"""Name what failed in the collector's background work, which continues after every failure."""
+"""Name the part that failed in the collector's background work, which continues after every failure."""
 
 from concurrent.futures.process import BrokenProcessPool
 
@@ -14,7 +14,7 @@ _log = structlog.get_logger()
 
 
 def failure_of(error: Exception) -> str:
-    """Return which part failed and why. An error that no part raises is a defect; its traceback is logged."""
+    """Return the part that failed, and the reason. An error of no part is a defect, logged with its traceback."""
     reason = str(error).strip() or type(error).__name__
     for kind, part in _PARTS:
         if isinstance(error, kind):

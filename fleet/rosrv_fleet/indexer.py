@@ -81,12 +81,11 @@ class Indexer:
             waking.set()
 
     def stop(self) -> None:
-        """End `run` after the present segment."""
         self._ending.set()
         self.wake()
 
     def run(self, lane: str) -> None:
-        """Index what waits in a lane, until `stop`; a database that is down is tried again."""
+        """Index the waiting segments of a lane, until `stop`; a database that is down is tried again."""
         while not self._ending.is_set():
             self._wake[lane].clear()
             try:
@@ -189,10 +188,10 @@ def index(
     keys: Collection[bytes],
     config: FleetConfig,
 ) -> bool:
-    """Write one segment and its records to the index, unless they are there; return whether.
+    """Write one segment and its records to the index, and return True, unless they are there.
 
-    A segment of a day that the index does not keep is not written. Raises `psycopg.Error`; for an unreadable segment
-    `OSError`, `EOFError`, `zlib.error` and `SegmentError`.
+    A segment of a day that the index does not keep is not written. Raises `psycopg.Error`; for an unreadable
+    segment `OSError`, `EOFError`, `zlib.error` and `SegmentError`.
     """
     received = store.received(place)
     day = datetime.fromtimestamp(received // _SECOND, UTC).date()

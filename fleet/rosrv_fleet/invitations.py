@@ -71,7 +71,7 @@ class Invitations:
         return pending, token
 
     def withdraw(self, name: str) -> None:
-        """Remove the invitations of a robot, used ones too. Raises `OSError`."""
+        """Remove the invitations of a robot, even used ones. Raises `OSError`."""
         with changing(self._folder):
             kept = map(_read, self._folder.glob("*.json"))
             if any(pending is not None and pending.name == name for pending in kept):
@@ -87,10 +87,10 @@ class Invitations:
 
     @contextmanager
     def using(self, token: str, request: bytes) -> Iterator[PendingRobot]:
-        """Use a token for a request, and enrol its robot in the block; `request` of the result: it is repeated.
+        """Use a token for a request, and enrol its robot in the block; `request` is set if the request is repeated.
 
-        If the block raises `EnrolmentError`, another request may use the token. Raises `InvalidInvitationError` and
-        `OSError`.
+        If the block raises `EnrolmentError`, another request may use the token. Raises
+        `InvalidInvitationError` and `OSError`.
         """
         digest = hashlib.sha256(request).hexdigest()
         with changing(self._folder):
@@ -118,7 +118,6 @@ class Invitations:
 
 
 def _read(file: Path) -> PendingRobot | None:
-    """Return an invitation; None if the file is missing, damaged or unreadable, which affects no other invitation."""
     try:
         return msgspec.json.decode(file.read_bytes(), type=PendingRobot)
     except (OSError, ValueError):

@@ -53,9 +53,9 @@ def push_router(collector: Collector) -> APIRouter:
     ) -> Response:
         """Return the newest stored checkpoint of the robot's log with a number up to `upto`; number 0: none.
 
-        `hashes` has more than one hash if the robot signed several checkpoints with this number, and none if the disk
-        has damaged the segment; then the robot sends it again. With `idle` the robot states that it is there, and has
-        nothing to push.
+        `hashes` has more than one hash if the robot signed several checkpoints with this number, and none if
+        the disk has damaged the segment; then the robot sends it again. With `idle` the robot reports that it
+        has nothing to push.
         """
         if idle:
             heard(request, robot)
@@ -149,7 +149,6 @@ class _Uploads:
             self._busy.discard(robot.name)
 
     async def _receive(self, request: Request, file: IO[bytes], cost: _Cost) -> None:
-        """Copy the body to a file within the limits."""
         try:
             async with asyncio.timeout(self._limits.upload_seconds):
                 async for chunk in request.stream():

@@ -1,8 +1,8 @@
 """Limit the bytes of each robot in a day, and pause a robot after refused uploads.
 
-The used bytes are on the disk, one file for each robot, so that a restart gives no robot a new quota. They decrease
-evenly, by the quota in a day, down to those that a robot has saved (below 0): a robot that was off may send its backlog
-faster. A new robot has saved none. The files are not synced: a power cut may lose the last changes.
+The used bytes are on the disk, one file for each robot, so that a restart gives no robot a new quota. They
+decrease evenly, by the quota in a day, to below 0: a robot that was off may send its backlog faster. A new
+robot has saved none. The files are not synced: a power cut may lose the last changes.
 """
 
 from collections.abc import Callable
@@ -34,7 +34,7 @@ class OverQuotaError(Exception):
 class UsedBytes(msgspec.Struct, frozen=True):
     """The bytes that a robot has used at a time (seconds since the epoch): compressed and uncompressed ones.
 
-    Negative ones are saved.
+    Negative numbers are saved bytes.
     """
 
     time: float = 0.0

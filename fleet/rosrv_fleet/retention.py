@@ -63,7 +63,7 @@ class Pruner:
         self._ending.set()
 
     def step(self) -> None:
-        """Remove the data that is too old now; a damaged log stays, and is reported.
+        """Remove data that is too old; a damaged log stays, and is reported.
 
         Raises `psycopg.Error` and `OSError`.
         """

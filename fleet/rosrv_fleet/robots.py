@@ -73,7 +73,7 @@ class Robots:
         return next(iter(self.unreadable.values()), None)
 
     def all(self) -> dict[str, Robot]:
-        """Return the robots by name. Raises `EnrolmentError` for an unreadable file: for what needs every robot."""
+        """Return the robots by name, if every file is readable. Raises `EnrolmentError` for an unreadable file."""
         known = self.known()
         if self.trouble is not None:
             raise EnrolmentError(self.trouble)
@@ -168,10 +168,11 @@ class Robots:
         *,
         again: bool = False,
     ) -> Robot:
-        """Enrol an invited robot or its second appliance, or give an enrolled one with the same log key a certificate.
+        """Enrol an invited robot or its second appliance, or replace the certificate of an enrolled one with
+        the same log key.
 
-        Without a `group`, an enrolled robot keeps its group. `again`: the robot repeats its request; nothing changes if
-        it has this certificate already. Raises `EnrolmentError` and `OSError`.
+        Without a `group`, an enrolled robot keeps its group. `again`: the robot repeats its request; nothing
+        changes if it has this certificate already. Raises `EnrolmentError` and `OSError`.
         """
         with changing(self.folder):
             known = self.all().get(name)
@@ -265,6 +266,5 @@ def _read(file: Path, known: Robot | None) -> Robot:
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder that only its owner may enter."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     os.chmod(folder, 0o700)  # noqa: PTH101  `mkdir` obeys the umask only for the last folder

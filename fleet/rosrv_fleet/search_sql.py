@@ -141,7 +141,7 @@ def _escaped(text: str) -> str:
 
 
 def regex_of(glob: str) -> str:
-    """Return the regular expression of PostgreSQL that matches what SQLite's GLOB matches. Raises `FilterError`."""
+    """Return PostgreSQL's regular expression for a pattern of SQLite's GLOB. Raises `FilterError`."""
     parts, at = ["^"], 0
     while at < len(glob):
         sign = glob[at]

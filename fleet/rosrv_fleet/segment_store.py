@@ -126,7 +126,6 @@ class SegmentStore:
             )
 
     def incoming(self) -> IO[bytes]:
-        """Return a new file for an upload; the caller closes and removes it."""
         return tempfile.NamedTemporaryFile(dir=self._folder / "incoming", delete=False)
 
     def path(self, place: SegmentPlace) -> Path:
@@ -213,7 +212,7 @@ class SegmentStore:
         return None if found is None else (arrived, _place(robot, found))
 
     def settle(self, place: SegmentPlace, header: SegmentHeader) -> None:
-        """Complete a stored segment that a killed collector may have left half done. Raises `OSError`."""
+        """Complete the files of a stored segment after a killed collector. Raises `OSError`."""
         with self._lock(place.robot):
             self._settle(place, header)
 
@@ -252,7 +251,6 @@ class SegmentStore:
         raise OSError(errno.EAGAIN, "another thread removed the folder each time", str(folder))
 
     def _unmark(self, kind: str, place: SegmentPlace) -> bool:
-        """Remove a marker, and the robot's folder if it is empty; return whether there was a marker."""
         marker = self._folder / kind / place.robot / place.mark
         try:
             marker.unlink()
@@ -350,7 +348,7 @@ class SegmentStore:
             return True
 
     def try_again(self) -> None:
-        """Let the segments wait for the index that it could not have before; they stay reported. Raises `OSError`."""
+        """Let the segments that the index could not have wait for it again; they stay reported. Raises `OSError`."""
         for robot in self.robots_with("damaged"):
             for place in self.marked("damaged", robot, sys.maxsize):
                 self._touch("large", place)
@@ -362,7 +360,7 @@ class SegmentStore:
                 self.indexed(place)
 
     def removal(self, robot: str, log: str) -> RemovalNote | None:
-        """Return the note of the segments of a log that retention removed; None: none were.
+        """Return the note of the segments of a log that retention removed; None: no segment was removed.
 
         Raises `OSError`.
         """

@@ -13,7 +13,7 @@ _DAYS = 3650  # every robot pins it, and must join again after a change
 
 
 class ServerCertificateError(Exception):
-    """The collector's certificate is missing or unusable for robots; the message has the remedy."""
+    """The collector's certificate is missing or unusable for robots. The message has the remedy."""
 
 
 def make_certificate(config: FleetConfig, address: str | None) -> bool:

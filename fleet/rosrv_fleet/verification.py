@@ -48,7 +48,7 @@ def prove(store: SegmentStore, robot: Robot, segment_bytes: int) -> list[LogProo
 
 
 def _prove_log(store: SegmentStore, robot: Robot, log: str, segment_bytes: int) -> LogProof:
-    """Prove a log; again, if segments were missing that retention has just removed. It writes its note before."""
+    """Prove a log, and again if retention has just removed segments. Retention writes its note before."""
     for _attempt in range(_MOST_ATTEMPTS):
         note, damage = _removal(store, robot, log)
         proof = _proof_after(note, store, robot, log, segment_bytes)
@@ -60,7 +60,6 @@ def _prove_log(store: SegmentStore, robot: Robot, log: str, segment_bytes: int) 
 
 
 def _removal(store: SegmentStore, robot: Robot, log: str) -> tuple[RemovalNote | None, str]:
-    """Return the note of removed segments, if there is one, and its damage; empty for none."""
     try:
         return store.removal(robot.name, log), ""
     except OSError as error:

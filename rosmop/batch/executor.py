@@ -30,7 +30,7 @@ class Executor(Protocol):
     def submit(self, number: int, job: bytes) -> None: ...
 
     def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:
-        """Wait until at least one submitted job has ended, and return those that have."""
+        """Wait until at least one submitted job has ended, and return the ended jobs."""
 
     def close(self) -> None: ...
 

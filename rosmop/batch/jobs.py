@@ -81,7 +81,7 @@ _SECONDS, _SECONDS_PER_MB = 600.0, 10.0  # of processor time
 
 
 class _TooLong(BaseException):
-    """A job takes too long. No reader of damaged files handles it by accident."""
+    """Raised when a job takes too long; no reader of damaged files handles it by accident."""
 
 
 class _Envelope(msgspec.Struct, frozen=True):
@@ -102,7 +102,7 @@ def unpacked(result: bytes) -> Result | Failure:
 
 
 def work(job: bytes) -> bytes:
-    """Every error becomes a `Failure`, so one recording never ends the work on others."""
+    """Return the result of a job. Every error becomes a `Failure`, so one recording never ends the work on others."""
     result: Result | Failure
     try:
         envelope = msgspec.msgpack.decode(job, type=_Envelope)

@@ -83,7 +83,6 @@ class ResumeJournal:
             raise JournalError(f"cannot write {self._path}: {error.strerror}") from error
 
     def _read(self) -> None:
-        """Index the lines, and cut off a part of a line at the end."""
         with os.fdopen(os.dup(self._file.fileno()), "rb") as file:
             head = file.readline(len(_HEAD))
             if not _HEAD.startswith(head):

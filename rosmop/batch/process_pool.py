@@ -1,7 +1,7 @@
 """Execute jobs in processes of this machine. A process that dies takes only its own job with it.
 
-`concurrent.futures` gives up all jobs if one process dies, and does not report which job it had. Here each process has
-a pipe of its own. Jobs and results are bytes, so nothing is unpickled.
+`concurrent.futures` gives up all jobs if one process dies, and does not report which job it had. Here each
+process has its own pipe. Jobs and results are bytes, so nothing is unpickled.
 """
 
 import ctypes
@@ -92,7 +92,6 @@ def _reason(status: int | None) -> str:
 
 
 def _serve(work: Work, pipe: Connection, parent: int) -> None:
-    """Execute jobs until the parent closes the pipe or dies."""
     ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
     if os.getppid() != parent:
         return

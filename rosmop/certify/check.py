@@ -80,8 +80,7 @@ def certify(logic: str, formula: str, events: Sequence[str], tables: AutomatonTa
 
 
 def _look_at_form(logic: str, events: Sequence[str], tables: AutomatonTables) -> None:
-    """Reject tables that are not an automaton. A negative state is invalid, because Python would index it from the
-    end.
+    """Reject tables that are not an automaton. A negative state would index from the end in Python.
 
     Only `tfsm` has time limits.
     """
@@ -120,7 +119,7 @@ def _follow(
 ) -> int:
     """Visit all pairs; `verdicts_of(before, after, event)` returns the verdicts of the definition for a step.
 
-    `silently(before, state)` returns the result of passing time, if time has an effect.
+    `silently(before, state)` returns the result of passing time, if time matters.
     """
     first = start, tables.initial
     came: dict[tuple[S, int], tuple[tuple[S, int], str] | None] = {first: None}
@@ -252,7 +251,7 @@ def _check_endless(
 
 
 def _check_machine(formula: str, events: Sequence[str], tables: AutomatonTables) -> int:
-    """Check a state machine. Time limits, and the states they lead to, must be as written."""
+    """Check a state machine; its time limits, and their next states, must be as written."""
     machine = StateMachineFollower(formula, events)
 
     def silently(before: str, state: int) -> str | None:

@@ -50,18 +50,17 @@ class ExpectedResult:
 
     @property
     def answer(self) -> int:
-        """The expected answer, without the positions of frames."""
         flags = TOLD * bool(self.verdicts) | SOONER * self.sooner | LEFT * self.left
         return len(self.effects) << 32 | flags
 
 
 class LeftToEngineError(Exception):
-    """The walk leaves the message to the engine."""
+    """Raised if the walk leaves the message to the engine."""
 
 
 @dataclass(frozen=True)
 class ExpectedHandler:
-    """A handler: its verdict is None if it is not compiled."""
+    """A handler; its verdict is None if it is not compiled."""
 
     category: str
     verdict: int | None
@@ -71,7 +70,7 @@ class ExpectedHandler:
 
 @dataclass(frozen=True)
 class PropertyStep:
-    """A property that an event steps; its number is None if it is not in the module."""
+    """A property that an event steps; its number is None if the module does not have it."""
 
     number: int | None
     compiled: CompiledProperty

@@ -40,7 +40,6 @@ class WordReader:
         self.take()
 
     def take(self) -> str:
-        """Return the next word, or an empty string at the end."""
         before = self.word
         match = _TOKEN.match(self._text, self._at)
         if match is None:  # the pattern matches any text
@@ -58,7 +57,6 @@ class WordReader:
         return before
 
     def _fits(self, sign: str, at: int) -> bool:
-        """A sign that ends with a letter must be a whole word."""
         end = at + len(sign)
         if not self._text.startswith(sign, at):
             return False
@@ -154,7 +152,6 @@ def _operand(words: WordReader, events: Sequence[str], grammar: Grammar, depth: 
 
 
 def _unbounded(words: WordReader, grammar: Grammar) -> None:
-    """Skip the bounds of an mtl operator if they have no effect."""
     if grammar is MTL and words.accept("["):
         if words.duration() != 0:
             raise UnsupportedFormulaError("a bound of time")

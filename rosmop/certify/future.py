@@ -22,7 +22,9 @@ FALSE: State = frozenset()
 
 
 class FutureFollower:
-    """Follow a formula over numbered letters, one at each position. More than `work` clauses raise `WorkLimitError`."""
+    """Follows a formula over numbered letters, one at each position. More than `work` clauses raise
+    `WorkLimitError`.
+    """
 
     def __init__(self, letters: int, work: int) -> None:
         self._letters = range(letters)
@@ -78,7 +80,6 @@ class FutureFollower:
         return self.step(self._now(formula), letter)
 
     def _now(self, formula: Node) -> State:
-        """Return, as clauses, a formula that must hold from the next position on."""
         operator, operands = formula[0], formula[1:]
         if operator == "and":
             return self._all([self._now(operand) for operand in operands])  # type: ignore[arg-type]  # formulas

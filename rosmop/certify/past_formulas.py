@@ -8,7 +8,7 @@ State = tuple[bool, ...]
 
 
 class PastFollower:
-    """Follow a past formula. A state is the memory of each operator that looks back."""
+    """Follows a past formula. A state is the memory of each operator that looks back."""
 
     def __init__(self, formula: Node) -> None:
         self._parts: dict[Node, int] = {}

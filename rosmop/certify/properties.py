@@ -1,6 +1,4 @@
-"""Certify the compiled properties of specifications; only this module connects the logics' compilers to the
-certifier.
-"""
+"""Certify the compiled properties of specifications. Only this module connects the logics to the certifier."""
 
 from collections.abc import Iterable
 

@@ -96,7 +96,6 @@ def _leb(value: int) -> bytes:
 
 
 def _i32(value: int) -> bytes:
-    """Encode a number in five bytes, with its sign bit clear."""
     return b"\x41" + bytes(value >> shift & 0x7F | 0x80 for shift in (0, 7, 14, 21)) + bytes((value >> 28,))
 
 

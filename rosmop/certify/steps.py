@@ -59,7 +59,7 @@ _FRAME = bytes(range(7, 23))
 
 
 class StepDiffersError(Exception):
-    """The steps of the module differ from the automaton; the text says where."""
+    """The steps of the module differ from the automaton; the text has the place."""
 
 
 def check_steps(compiled: Compiled, module: WasmModule) -> int:
@@ -142,7 +142,7 @@ def _pairs(topic: ExpectedTopic) -> Iterator[tuple[StepCase, int | None, bool]]:
 
 
 def _handling(one: PropertyStep) -> tuple[int, int] | None:
-    """Return a state from which the event leads to a handler, with the number of the property."""
+    """Return a state from which the event leads to a handler, with the number of the property, or None."""
     if one.number is None or not isinstance(one.compiled, FiniteProperty):
         return None
     handled, automaton = {each.category for each in one.handlers}, one.compiled.automaton
@@ -153,7 +153,7 @@ def _handling(one: PropertyStep) -> tuple[int, int] | None:
 
 
 def _answers(one: PropertyStep, bits: int) -> dict[int, int]:
-    """A handler that may not drop gets no drop."""
+    """Return the results of handlers; one that may not drop gets no drop."""
     bits |= HAPPENED | CHANGED
     return {
         each.function: bits if each.drops else bits & ~DROPPED
@@ -191,7 +191,7 @@ class _Bench:
             self._memory[at : at + 20] = struct.pack("<I", len(_FRAME)) + _FRAME
 
     def run(self, case: StepCase, number: int | None, *, everywhere: bool) -> int:
-        """Return the number of tried states. Raises `StepDiffersError`."""
+        """Run a case and return the number of tried states. Raises `StepDiffersError`."""
         one = None if number is None else self._topic.properties[number]
         states = 1 if one is None else one.states if everywhere else min(one.states, _FEW)
         for first in range(0, states, self._most):
@@ -226,7 +226,7 @@ class _Bench:
         self._count(case, one, expected)
 
     def _waits_no_more(self, number: int, state: Any, case: StepCase) -> bool:
-        """Return whether the property's deadline would have passed before the message."""
+        """Whether the property's deadline would have passed before the message."""
         tables = self._topic.properties[number].compiled
         if not isinstance(tables, ClockedProperty) or tables.waits[state[0]] is None:
             return False
@@ -262,7 +262,6 @@ class _Bench:
         given: tuple[int, ...],
         expected: ExpectedResult,
     ) -> int:
-        """Return the position where the notes of the next try begin."""
         answer, who, what, cell, end, at = given
         notes = list(NOTE.iter_unpack(self._memory[at:end]))
         begins = [self._frames + 20 * frame for frame in range(4)]

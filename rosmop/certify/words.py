@@ -15,7 +15,7 @@ Parts = tuple[object, ...] | frozenset[int]
 
 
 class ExpressionDerivatives:
-    """A state is an expression's number. `work` limits the parts of all derivatives together."""
+    """Follows an expression; a state is an expression's number. `work` limits the parts of all derivatives together."""
 
     def __init__(self, expression: Node, work: int) -> None:
         self._work = work
@@ -29,7 +29,6 @@ class ExpressionDerivatives:
         self.initial, _ = self._read(expression)
 
     def matches(self, state: int) -> bool:
-        """Return whether the trace that led here is in the language."""
         return self._matching[state]
 
     def step(self, state: int, event: str) -> int:

@@ -20,7 +20,7 @@ from rosmop.types import value_types
 
 
 def require_place(target: Value, what: str) -> Lvalue:
-    """Rejects constants and values without a place."""
+    """Return the place of a value. Rejects constants and values without a place."""
     if target.place is None:
         raise SpecificationError.at(target.position, f"{what} needs a variable, a field or an element")
     variable = root(target)
@@ -51,7 +51,6 @@ def note_copy(target: Value, value: Value) -> None:
 
 
 def store(scope: FunctionScope, target: Value, value: nodes.Expression) -> nodes.Expression:
-    """Return an expression that assigns `value`; its result is the assigned value."""
     stored = _store(scope, require_place(target, "an assignment"), value)
     return marked(mark(scope, target), stored)
 
@@ -101,7 +100,7 @@ def _store(scope: FunctionScope, place: Lvalue, value: nodes.Expression) -> node
 
 
 def _store_part(scope: FunctionScope, place: Lvalue, value: nodes.Expression) -> nodes.Expression:
-    """Strings and times do not change in place, so a changed part stores the whole."""
+    """Return an expression that stores the whole, because strings and times do not change in place."""
     assert isinstance(place, CharacterLvalue | TimePartLvalue)  # the remaining kinds of places
     inner, base = require_place(place.base, "an assignment"), place.base.form
     if isinstance(place, TimePartLvalue):

@@ -336,7 +336,6 @@ def _moment(kind: value_types.Type, values: Sequence[Value], site: int) -> nodes
 
 
 def limits_of(kind: value_types.Type) -> Mapping[str, int | float]:
-    """Return the members of `std::numeric_limits`."""
     if isinstance(kind, value_types.IntegerType):
         return {"min": kind.least, "max": kind.most, "lowest": kind.least}
     if isinstance(kind, value_types.FloatingType):

@@ -90,7 +90,7 @@ def _bringing(compiled: CompiledProperty, graph: VerdictGraph, category: str) ->
 
 
 def topics_of_remedy(names: SpecificationNames, compiled: CompiledProperty) -> list[str]:
-    """Raises `SpecificationError` if the remedy is not suitable."""
+    """Return the topics of a property's remedy. Raises `SpecificationError` if the remedy is not suitable."""
     name = compiled.remedy
     if name is None:
         return []

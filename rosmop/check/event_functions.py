@@ -232,7 +232,6 @@ def constant_of_field(scope: FunctionScope, binding: tree.Binding, field: Type) 
 
 
 def _held(constant: bool | int | float | bytes, field: Type) -> bool | int | float | bytes | None:
-    """Return None if the field cannot hold the constant."""
     if isinstance(field, value_types.StringType):
         return constant if isinstance(constant, bytes) else None
     if isinstance(constant, bytes) or not value_types.is_number(field):
@@ -254,7 +253,7 @@ def _held(constant: bool | int | float | bytes, field: Type) -> bool | int | flo
 def _body(
     scope: FunctionScope, event: tree.EventDefinition, trigger: tree.MessageTrigger
 ) -> tuple[list[nodes.Statement], list[nodes.Statement], list[nodes.Statement]]:
-    """Compile the `when`, the action and the rest first, because they determine which fields are needed."""
+    """Compile the body of an event; `when`, the action and the rest come first: they determine the needed fields."""
     when = trigger.when
     with scope.nested() as conditions:
         if when is not None:
@@ -280,7 +279,9 @@ def _assemble(
     bound: list[PatternField],
     body: tuple[list[nodes.Statement], list[nodes.Statement], list[nodes.Statement]],
 ) -> tuple[int, bool]:
-    """Return the number of statements before the action, and whether facts about the event are kept."""
+    """Assemble an event's function; return the number of statements before the action, and whether facts
+    about the event are kept.
+    """
     conditions, action, after = body
     read_fields(scope, bound)  # at a site without parameters, because they have no values yet
     site = scope.lines.site = scope.site(event)

@@ -35,7 +35,7 @@ _MAX_DIGITS = 400
 
 
 def value_of(scope: FunctionScope, node: tree.Expression) -> Value:
-    """Rejects an expression that has no meaning."""
+    """Compile an expression. Rejects one that has no meaning."""
     return _KINDS[type(node)](scope, node)
 
 
@@ -95,7 +95,6 @@ def _integer(scope: FunctionScope, node: tree.NumberLiteral, text: str, suffix: 
 
 
 def folded(operands: tuple[Value, ...], make: Callable[..., Value]) -> Value:
-    """Return a constant if all operands are constant numbers."""
     if not all(isinstance(operand.constant, int | float) for operand in operands):
         return make(*operands)
     known = [
@@ -226,7 +225,6 @@ def _assign(scope: FunctionScope, node: tree.Assignment) -> Value:
 
 
 def assignment(scope: FunctionScope, node: tree.Assignment) -> tuple[order.First, Value, nodes.Expression]:
-    """Return the statements to evaluate first, the target and the value."""
     whole = node.target
     while isinstance(whole, tree.MemberAccess | tree.IndexExpression):
         whole = whole.base
@@ -252,7 +250,7 @@ def assignment(scope: FunctionScope, node: tree.Assignment) -> tuple[order.First
 
 
 def _assigned(scope: FunctionScope, target: Value, value: Value, site: int) -> nodes.Expression:
-    """As in C++, a string can be assigned a character."""
+    """Compile an assignment; as in C++, a string can be assigned a character."""
     if isinstance(target.type, value_types.StringType) and value.type == value_types.CHAR:
         return nodes.Call(value_types.STRING, "t_byte", (value.form,))
     assignments.note_copy(target, value)

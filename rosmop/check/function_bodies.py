@@ -79,7 +79,7 @@ def _known(
     kind: value_types.Type,
     value_of: Callable[[FunctionScope, tree.TypeName, tree.Declarator, value_types.Type], _T | None],
 ) -> _T | None:
-    """Return None if the value is not known yet. Compiling it reports its errors."""
+    """Return a value, or None if it is not known yet. Compiling it reports its errors."""
     try:
         return value_of(scope, declaration.type, declarator, kind)
     except SpecificationError:
@@ -117,7 +117,6 @@ def _start_scope(shared: CompilationContext, names: SpecificationNames) -> Funct
 def _constants(
     shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
 ) -> FunctionScope:
-    """Write the static initialisation of C++: literals for constants, and zero for other variables."""
     scope = _start_scope(shared, names)
     for parameter in names.parameters.values():
         scope.written.add(parameter.code)
@@ -139,7 +138,7 @@ def _constants(
 
 
 def _constant(scope: FunctionScope, declarator: tree.Declarator) -> Value | None:
-    """Compiling the first value reports its errors."""
+    """Compile a first value, which reports its errors; return it if it is constant."""
     if declarator.is_array or declarator.value is None or isinstance(declarator.value, tree.InitializerList):
         return None
     try:
@@ -201,7 +200,6 @@ def _calls(names: SpecificationNames) -> dict[str, set[str]]:
 
 
 def topics_of(names: SpecificationNames, function: str) -> list[str]:
-    """Return the topics to which a function publishes, itself or through other functions."""
     reached = _reached({function}, _calls(names))
     found = (node for name in reached for node in tree.walk(names.functions[name].node.body))
     return sorted({node.topic for node in found if isinstance(node, tree.PublishStatement)})

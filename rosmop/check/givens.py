@@ -76,7 +76,6 @@ def _number(kind: value_types.Type, text: str, position: Position) -> int | floa
 
 
 def with_topics(specification: tree.Specification, given: Mapping[str, str]) -> tree.Specification:
-    """Return a specification with topics in the place of their given names."""
     topics = {one.name: one.topic for one in specification.givens if isinstance(one, tree.TopicDeclaration)}
     topics |= {name: topic for name, topic in given.items() if name in topics}
     renamed: tree.Specification = _renamed(specification, topics) if topics else specification
@@ -117,7 +116,7 @@ def given_topics(
 
 
 def with_given(identity: bytes, topics: tuple[GivenTopic, ...]) -> bytes:
-    """The state of a specification belongs to its text and to the topics that replace defaults."""
+    """Return the identity of a specification whose topics replace defaults, so that its state belongs to both."""
     changed = [(one.name, one.topic) for one in topics if one.topic != one.default]
     return sha256(identity + repr(changed).encode()).digest() if changed else identity
 

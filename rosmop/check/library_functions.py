@@ -207,7 +207,6 @@ def _has_floats(scope: FunctionScope, kind: Type) -> bool:
 
 
 def _instance(scope: FunctionScope, node: tree.FunctionDefinition, kinds: Sequence[Type]) -> HelperFunction:
-    """The body of the function for these types is compiled with the specification."""
     is_any = [parameter.type.name == ("auto",) for parameter in node.parameters]
     key = (node.name, *(kind for kind, any_type in zip(kinds, is_any, strict=True) if any_type))
     instances = scope.names.instances

@@ -1,7 +1,7 @@
 """Find fields in the bytes of a message.
 
-Offsets that are the same in every message are computed here. Only positions behind a string or an array of variable
-length are computed for each message, once for all fields that need them.
+Offsets that are the same in every message are computed here. Only positions after a string or an array of
+variable length are computed for each message, once for all fields that need them.
 """
 
 from rosmop.form import nodes
@@ -18,7 +18,7 @@ _PARTS_OF_TIME = {"sec": 0, "nsec": 4}
 
 
 def type_of_path(messages: MessageTypes, record: str, path: tuple[tree.PathStep, ...]) -> Type:
-    """The error for an invalid path suggests the nearest name."""
+    """Return the type of a path. The error for an invalid path suggests the nearest name."""
     kind: Type = value_types.RecordType(record)
     for step in path:
         kind = _step(messages, kind, step)
@@ -57,7 +57,7 @@ class MessageCursor:
         self._elements: dict[tuple[int, int], MessageCursor | Spot] = {}
 
     def start_of(self, part: int) -> Spot:
-        """Write the statements that find the preceding parts."""
+        """Return the position of a part, after writing the statements that find the preceding parts."""
         while len(self._starts) <= part:
             index = len(self._starts) - 1
             self._starts.append(self._locator.behind(self._layout.parts[index], self._starts[index]))
@@ -67,7 +67,7 @@ class MessageCursor:
         return self.start_of(len(self._layout.parts))
 
     def find(self, path: tuple[tree.PathStep, ...]) -> Spot | None:
-        """Write the checks of indices. Return None for a message without fields."""
+        """Return the position of a path, after writing the checks of indices; None for a message without fields."""
         names = []
         for position, step in enumerate(path):
             names.append(step.name)
@@ -144,7 +144,7 @@ class FieldLocator:
         return Spot(end, 0)
 
     def element(self, item: FixedField | ArrayPart, start: Spot, step: tree.PathStep) -> Spot:
-        """If the element does not exist, the event does not happen."""
+        """Return the position of an element; if it does not exist, the event does not happen."""
         index = step.index or 0
         if isinstance(item, FixedField):
             return start.plus(index * (item.size // (item.count or 1)))

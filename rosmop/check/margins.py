@@ -1,5 +1,4 @@
-"""Note how close comparisons of numbers came: the values of both sides when they were nearest, while true and while
-false.
+"""Note how close comparisons of numbers came: both sides when they were nearest, while true and while false.
 
 The comparison is replaced by an expression that also notes both sides. This expression has the same value, compares
 the sides in the same type as C++, and charges nothing. Comparisons in `when`, first values and `init` are not noted,
@@ -19,7 +18,7 @@ from rosmop.text import tree
 from rosmop.types import value_types
 
 MOST_NOTED = 32
-"""Later comparisons of the specification are not noted."""
+"""The most comparisons of a specification that are noted."""
 
 _COMPARED = frozenset({"<", "<=", ">", ">="})
 _TRUE, _FALSE = (nodes.Literal(value_types.BOOL, truth) for truth in (True, False))
@@ -63,7 +62,6 @@ def noted(
 
 
 def _note(now: list[nodes.Expression], variables: tuple[str, str]) -> nodes.Expression:
-    """Store both sides if they are nearer to each other than the stored ones."""
     before = [nodes.Read(value_types.DOUBLE, name) for name in variables]
     nearer = nodes.Compare("<", _distance(*now), _distance(*before), -1)
     kept = (nodes.Assign(value_types.DOUBLE, name, side) for name, side in zip(variables, now, strict=True))

@@ -49,7 +49,7 @@ def writes(scope: FunctionScope, written: list[PatternField]) -> tuple[nodes.Wri
 
 
 def _slots(scope: FunctionScope, field: PatternField) -> list[int | str]:
-    """The parts of a time keep their names (`sec`, `nsec`); other path steps are indices."""
+    """Return the slots of a field; the parts of a time keep their names (`sec`, `nsec`), other steps are indices."""
     kind: Type = value_types.RecordType(scope.message_type or "")
     path: list[int | str] = []
     for step in field.binding.path:
@@ -147,7 +147,7 @@ def check_overlaps(bound: list[PatternField], written: list[PatternField]) -> No
 
 
 def _overlap(one: tree.Binding, other: tree.Binding) -> bool:
-    """An array without an index means all its elements."""
+    """Whether two bindings overlap; an array without an index means all its elements."""
     return all(
         step.name == beside.name and (step.index == beside.index or None in (step.index, beside.index))
         for step, beside in zip(one.path, other.path, strict=False)

@@ -26,7 +26,6 @@ First = list[nodes.Expression]
 
 
 def after(first: Sequence[nodes.Expression], value: Value) -> Value:
-    """Return a value that is evaluated after other expressions."""
     if not first:
         return value
     whole = nodes.Sequence(value.type, (*first, value.form), -1)
@@ -74,7 +73,6 @@ def _read(kind: Type, place: Lvalue) -> nodes.Expression:
 
 
 def arguments(scope: FunctionScope, values: Sequence[Value]) -> tuple[First, list[Value]]:
-    """Evaluate arguments that have effects in order."""
     if sum(not isinstance(value.form, nodes.Literal) for value in values) < 2:
         return [], list(values)
     return _in_turn(scope, values)
@@ -98,7 +96,7 @@ def _is_variable(target: Value) -> bool:
 
 
 def of_change(scope: FunctionScope, target: Value, value: Value) -> tuple[First, Value, Value]:
-    """Both are read after all indices are known."""
+    """Return a target and a value that are both read after all indices are known."""
     if target.pure and value.pure:
         return [], target, value
     if value_types.is_number(value.type):  # for a class, only the place is evaluated first

@@ -22,7 +22,7 @@ _TEXTS = (value_types.StringType, value_types.CharactersType)
 
 
 def formatted(scope: FunctionScope, template: Value, arguments: Sequence[Value]) -> nodes.Expression:
-    """Rejects conversions that do not fit their arguments."""
+    """Compile a format and its arguments. Rejects conversions that do not fit their arguments."""
     if not isinstance(template.constant, bytes):
         if arguments or not isinstance(template.type, _TEXTS):
             raise SpecificationError.at(
@@ -65,7 +65,6 @@ def formatted(scope: FunctionScope, template: Value, arguments: Sequence[Value])
 
 
 def _with_widths(found: re.Match[bytes], waiting: list[Value]) -> re.Match[bytes]:
-    """Replace `*` in a conversion with its arguments, as in C."""
     flags, width, precision, size, letter = (part or b"" for part in found.groups())
     if width == b"*" and (number := _literal_width(waiting)) is not None:
         flags, width = (flags, b"%d" % number) if number >= 0 else (flags + b"-", b"%d" % -number)
@@ -77,7 +76,6 @@ def _with_widths(found: re.Match[bytes], waiting: list[Value]) -> re.Match[bytes
 
 
 def _literal_width(waiting: list[Value]) -> int | None:
-    """Return the next argument if it is a constant integer."""
     if not waiting or type(waiting[0].constant) is not int:
         return None
     return waiting.pop(0).constant  # type: ignore[return-value] # checked above
@@ -127,7 +125,9 @@ def _conversion(
 
 
 def _integer(letter: bytes, size: bytes | None, value: Value) -> nodes.Expression:
-    """Without a size the number has the width of the value. A floating-point value is truncated."""
+    """Compile an integer conversion; without a size the number has the width of the value. A floating-point
+    value is truncated.
+    """
     kind = value_types.promoted(value.type)
     bits = kind.bits if isinstance(kind, value_types.IntegerType) else 64
     bits = {b"hh": 8, b"h": 16, None: bits}.get(size, 64)
@@ -140,7 +140,7 @@ def _integer(letter: bytes, size: bytes | None, value: Value) -> nodes.Expressio
 def _integer_head(
     flags: bytes, width: bytes, precision: bytes | None, letter: bytes, value: nodes.Expression
 ) -> tuple[bytes, nodes.Expression]:
-    """Return the Python format and the argument. Where C differs from Python, format the text as C does."""
+    """Return the Python format and the argument; where C differs from Python, the text is formatted as in C."""
     if letter in _UNSIGNED:
         flags = flags.replace(b"+", b"").replace(b" ", b"")
     if precision is not None:

@@ -48,7 +48,6 @@ def _plain(node: Any) -> object:
 
 
 def _names(root: object) -> Iterator[str]:
-    """A name of a type is `pkg/T`, `pkg::T`, or two separate strings."""
     waiting = [root]
     while waiting:
         node = waiting.pop()

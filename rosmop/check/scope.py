@@ -60,7 +60,7 @@ class SpecificationNames:
     variables: dict[str, Variable] = field(default_factory=dict)
     functions: dict[str, HelperFunction] = field(default_factory=dict)
     parameters: dict[str, Variable] = field(default_factory=dict)
-    """These are also variables."""
+    """The parameters of slices, which are also variables."""
     misdeclared: set[str] = field(default_factory=set)
     """Names of variables and functions with rejected declarations; using them is not reported again."""
     events: list[str] = field(default_factory=list)
@@ -74,7 +74,6 @@ class SpecificationNames:
     is_library: bool = False
 
     def changed_by(self, name: str) -> frozenset[str]:
-        """Include the variables that called functions assign."""
         waiting, seen, found = [name], {name}, frozenset[str]()
         while waiting:
             function = self.functions[waiting.pop()]
@@ -224,7 +223,7 @@ class FunctionScope:
         return variable
 
     def find(self, name: str, position: Position) -> Variable | None:
-        """Note the use of the variable, which may belong to another specification."""
+        """Return a variable, and note its use; it may belong to another specification."""
         variable, owner = self._known(name, position)
         if owner is not None:
             self.names.uses.add(owner)
@@ -326,7 +325,7 @@ class FunctionScope:
 
 
 def names_in(node: object) -> Iterator[str]:
-    """Names in nested statements are not included."""
+    """Yield the names in a node, without those in nested statements."""
     waiting = [node]
     while waiting:
         current = waiting.pop()

@@ -27,7 +27,7 @@ _ACTS = (nodes.Log, nodes.Throttle, nodes.Drop, nodes.StopMessage, nodes.Publish
 def declare_parameters(
     shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
 ) -> None:
-    """Parameters are constant variables with a value for each slice."""
+    """Declare the parameters as constant variables with a value for each slice."""
     for parameter in specification.parameters:
         try:
             kind = resolve(parameter.type, shared.messages)
@@ -112,7 +112,7 @@ def binds(names: SpecificationNames, event: tree.EventDefinition) -> tuple[int, 
 
 
 def creates(specification: tree.Specification, event: tree.EventDefinition) -> bool:
-    """Without a `creation event`, a slice may begin with any event."""
+    """Whether a slice may begin with an event: without a `creation event`, with any."""
 
     def marked(event: tree.EventDefinition) -> bool:
         return any(modifier.parts == ("creation",) for modifier in event.modifiers)
@@ -121,7 +121,7 @@ def creates(specification: tree.Specification, event: tree.EventDefinition) -> b
 
 
 def acts(function: nodes.Function, shared: CompilationContext) -> bool:
-    """Return whether the action does more than change the slice's own variables."""
+    """Whether the action does more than change the slice's own variables."""
     if not shared.unsliced.isdisjoint(function.shared):
         return True
     return any(
@@ -133,7 +133,6 @@ def acts(function: nodes.Function, shared: CompilationContext) -> bool:
 
 
 def unsliceable(compiled: CompiledProperty) -> str | None:
-    """Return why slices cannot run a property, or None if they can."""
     if isinstance(compiled, PastProperty) and compiled.timed:
         return (
             "a formula with several time bounds, or with one that neither begins at 0 nor ends at `inf`, cannot be "

@@ -69,7 +69,7 @@ def compile_files(
     margins: bool = False,
     topics: Topics = MappingProxyType({}),
 ) -> Compiled:
-    """Raises `SpecificationError` with all errors.
+    """Compile the files. Raises `SpecificationError` with all errors.
 
     With `margins`, comparisons of numbers are noted (`margins.py`). `topics` replace the topics in the files.
     """
@@ -144,7 +144,7 @@ def _compile_all(
 
 
 def _rewritten(shared: CompilationContext, specification: tree.Specification) -> tree.Specification:
-    """A specification with an invalid reference loses all such patterns."""
+    """Return a specification with rewritten patterns; one with an invalid reference loses all such patterns."""
     rewritten = _noted(shared, partial(with_references, specification))
     return without_references(specification) if rewritten is None else rewritten
 
@@ -263,7 +263,6 @@ def _seen_changes(names: SpecificationNames) -> Iterator[Diagnostic]:
 
 
 def _noted(shared: CompilationContext, action: Callable[[], _T]) -> _T | None:
-    """Add an error of `action` to the findings, and return None."""
     try:
         return action()
     except SpecificationError as error:

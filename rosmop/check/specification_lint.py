@@ -21,7 +21,7 @@ _WITHOUT_UNIT = re.compile(
     r"\b((?:within|timeout)\s+(\d+(?:\.\d+)?))(?![\d.]|\s*[num]?s\b|\s*(?:m|h|min|us)\b)"
 )
 _BOUND_WITHOUT_UNIT = re.compile(r"[\[,]\s*((\d+(?:\.\d+)?))(?=\s*[,\]])")
-"""A bound of time of `mtl`, such as in `once[0,500]`."""
+"""A bound of time of `mtl` without a unit, as in `once[0,500]`."""
 _WORD = re.compile(r"[A-Za-z_][A-Za-z_0-9]*+")
 
 
@@ -63,7 +63,6 @@ def lint_property(compiled: CompiledProperty, node: tree.Property) -> list[Diagn
 def kept_slices(
     name: str, events: Sequence[EventCode], properties: Sequence[PropertyCode], nodes: Sequence[tree.Property]
 ) -> list[Diagnostic]:
-    """Warn about timers and properties that keep slices forever."""
     found = [
         Diagnostic(
             event.position,
@@ -91,7 +90,6 @@ def kept_slices(
 
 
 def _for_good(compiled: CompiledProperty) -> set[str]:
-    """Return the categories of states that are never left."""
     verdicts: Sequence[Categories]
     if isinstance(compiled, FiniteProperty):
         automaton = compiled.automaton
@@ -111,7 +109,9 @@ def _for_good(compiled: CompiledProperty) -> set[str]:
 
 
 def unused_events(specification: tree.Specification, properties: Sequence[_HasProperty]) -> list[Diagnostic]:
-    """`default` counts as a use of every event. Without properties nothing is reported."""
+    """Return warnings of unused events; `default` counts as a use of every event. Without properties nothing
+    is reported.
+    """
     if not properties:
         return []
     named = {word for code in properties for word in _WORD.findall(code.property.formula)}
@@ -158,7 +158,7 @@ def _assigned(condition: tree.Expression) -> Iterator[Diagnostic]:
 
 
 def _acts(expression: tree.Expression) -> bool:
-    """Each call may have an effect."""
+    """Whether an expression may have an effect; each call may."""
     acting = (tree.Assignment, tree.IncrementExpression, tree.CallExpression, tree.NewExpression)
     return stream_of(expression) is not None or any(
         isinstance(node, acting) for node in tree.walk(expression)

@@ -55,7 +55,7 @@ Function = Callable[[Arguments], Value]
 
 
 def find_function(parts: tuple[str, ...], *, is_library: bool = False) -> Function | None:
-    """The name may begin with `std::`. `is_library`: the call is in a library function."""
+    """Return a function by its name, which may begin with `std::`. `is_library`: the call is in a library function."""
     if parts[0] == "std" and len(parts) == 2:
         parts = parts[1:]
     if len(parts) != 1:
@@ -113,7 +113,7 @@ def _rounded(name: str) -> Function:
 
 
 def _absolute_of_long(call: Arguments) -> Value:
-    """`labs` takes any number here."""
+    """Compile `labs`, which takes any number here."""
     for value in call.values:
         require_number(value, "`labs`")
     call.values = [Value(number(value.form, value_types.LONG), value.position) for value in call.values]
@@ -304,7 +304,6 @@ def _prints_at_most(call: Arguments) -> Value:
 def _printed(
     call: Arguments, target: Value, function: str, text: nodes.Expression, *arguments: nodes.Expression
 ) -> Value:
-    """Return the length of the text that is written to the buffer."""
     made = nodes.Read(value_types.STRING, call.scope.temporary())
     filled = _stored(call, target, function, made, *arguments)
     length = nodes.Call(value_types.INT, "h_len", (made,))

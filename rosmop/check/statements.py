@@ -27,7 +27,7 @@ from roswire import names
 from roswire.errors import DefinitionError
 
 LARGE = 4096
-"""A local variable of this many bytes is charged at its declaration."""
+"""The size in bytes from which a local variable is charged at its declaration."""
 
 MOST_TABLE = 64 << 10
 """The maximum number of bytes of a `const` array whose elements are part of the code."""
@@ -102,7 +102,7 @@ def table(
 def known(
     scope: FunctionScope, name: tree.TypeName, declarator: tree.Declarator, kind: value_types.Type
 ) -> bool | int | float | None:
-    """Array sizes and cases need the value. Return None unless it is a `const` literal."""
+    """Return the value of a `const` literal, which array sizes and cases need, or None."""
     if not name.constant or not value_types.is_number(kind) or declarator.is_array:
         return None
     node = declarator.value

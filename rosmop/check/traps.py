@@ -168,7 +168,7 @@ def _bounds(
 def _unordered(
     condition: tree.Expression, names: frozenset[str] | set[str]
 ) -> Iterator[tree.BinaryExpression]:
-    """Skip conditions with a negation, which finds NaN."""
+    """Yield comparisons that NaN passes, without conditions with a negation, which finds NaN."""
     parts = [node for node in tree.walk(condition) if isinstance(node, tree.Expression)]
     if any(isinstance(node, tree.UnaryExpression) and node.operator == "!" for node in parts):
         return

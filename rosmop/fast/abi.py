@@ -27,7 +27,7 @@ MOST_KEPT = 1024
 MOST_KEPT_ARRAY = 16 << 10
 
 BEYOND = 0xFFFFFFFF
-"""Replaces the length of a string or array that is longer."""
+"""The value in place of the length of a string or array that is longer."""
 
 
 def kept_size(kind: Type) -> int:
@@ -87,8 +87,7 @@ class Cells:
 
 @dataclass(frozen=True)
 class TopicCode:
-    """The code for one topic: its export, whether it may drop or change messages, and the address of the counters of
-    events.
+    """The code for a topic: its export, whether it may drop or change messages, and the address of its counters.
 
     `verdicts` has for each verdict the indices of an event, of its step of a property, and of the handler. `log` is the
     address of the log of patches. `undo` has the addresses of variables, and the addresses of their values before the

@@ -259,7 +259,7 @@ class ArithmeticCodegen(FunctionBuilder):
         return self._limited(node.type, self._of_parts(old + self._seconds(), value))
 
     def _nanoseconds(self) -> bytes:
-        """Nanoseconds are never negative."""
+        """Return the nanoseconds of a time, which are never negative."""
         code, value = self._set("moment", I64), self._get("moment", I64)
         whole = self._get("whole", I64)
         code += value + constant(I64, BILLION) + I64_REM_S + self._set("whole", I64)
@@ -308,7 +308,6 @@ def to_floating(source: int, target: int, *, signed: bool) -> bytes:
 
 
 def _narrowed(target: value_types.IntegerType) -> bytes:
-    """Wrap a 32-bit number; the code is empty if the type is not narrower."""
     if target.bits >= 32:
         return b""
     if target.signed:

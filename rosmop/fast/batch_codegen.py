@@ -242,7 +242,7 @@ def _assembled(
     constants: Mapping[bytes, int],
     memory: int,
 ) -> bytes:
-    """Functions are given by parameter types, result type and code; constants by address."""
+    """Assemble a module; functions are given by parameter types, result type and code; constants by address."""
     types = [function_type(given, result) for given, result, _ in functions]
     exported = [text(name) + EXPORTED_FUNCTION + unsigned(number) for name, number in exports.items()]
     pages = unsigned(memory // PAGE)
@@ -590,7 +590,7 @@ class TopicCodegen:
         return code + again + END
 
     def _advance_clock(self, number: int, clock: nodes.PropertyClock, event: int, table: int) -> bytes:
-        """`ClockedRun` and `ClockedSteps` define the steps."""
+        """Advance a property's clock, whose steps `ClockedRun` and `ClockedSteps` define."""
         state, (since, now, count) = (
             self._states[number],
             range(self._clocks[number], self._clocks[number] + 3),
@@ -669,7 +669,6 @@ class TopicCodegen:
         return code + last + local_get(_NEXT) + i32_store(12)
 
     def _suppressed(self) -> bytes:
-        """Restore the states of the properties that suppress the message."""
         code = b"".join(
             _set(local, load(I32, self._state(number)))
             for number, local in self._states.items()

@@ -25,7 +25,7 @@ class CertifiedSet(NamedTuple):
 
 
 def certified(compiled: Compiled) -> CertifiedSet:
-    """Equal sets give equal bytes.
+    """Certify and serialize a set; equal sets give equal bytes.
 
     Raises `SpecificationError` if an automaton differs from its formula, which is a defect.
     """

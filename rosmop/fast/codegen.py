@@ -162,7 +162,7 @@ class ModuleCodegen(MemoryLayout):
         self.left.setdefault(function, []).append(error)
 
     def event(self, name: str, channel: str = "") -> WasmFunction:
-        """Raises `NotCompiledError`."""
+        """Write an event's function. Raises `NotCompiledError`."""
         function = self.functions[name]
         return self.function(function, {"at": I32, "size": I32}, I32, function.context, channel=channel)
 
@@ -197,7 +197,7 @@ class ModuleCodegen(MemoryLayout):
         return self._numbers[key].number
 
     def routine_of(self, write: Callable[..., bytes]) -> int | None:
-        """Return the number of the function that this writes without arguments; None if the module has none."""
+        """Return the number of the function that `write` writes without arguments; None if the module has none."""
         written = self._numbers.get((write,))
         return None if written is None else written.number
 
@@ -207,7 +207,6 @@ class ModuleCodegen(MemoryLayout):
         return cells.settle
 
     def _added(self, parameters: tuple[int, ...], code: bytes, result: int = I32) -> WasmFunction:
-        """Add a function that the intermediate form does not contain."""
         written = WasmFunction(
             len(self.written), parameters, result, code, frozenset(), 0,
             drops=False, brief=True, passes=True, says=False, early=False, changes_elements=False,
@@ -255,7 +254,7 @@ class _FunctionCodegen(StringCodegen):
             self._local(name, I32)
 
     def written(self) -> WasmFunction:
-        """Raises `NotCompiledError`."""
+        """Write the function. Raises `NotCompiledError`."""
         body = self._block(self._function.body)
         if isinstance(self._function, nodes.Skipper):
             body += self._position(self._function.end) + RETURN
@@ -380,7 +379,7 @@ class _FunctionCodegen(StringCodegen):
         return self._when(many, lambda: self._allocated(self._length()))
 
     def _pending(self, _node: nodes.Pending) -> bytes:
-        """Only `Whole` uses this list, and it is not compiled."""
+        """Write nothing for the list of fields, which only `Whole` uses, and `Whole` is not compiled."""
         return b""
 
     def _drop(self, _node: nodes.Drop) -> bytes:
@@ -388,7 +387,7 @@ class _FunctionCodegen(StringCodegen):
         return constant(I32, 1) + self._set("dropped")
 
     def _stop(self, node: nodes.StopMessage) -> bytes:
-        """A frame keeps its size."""
+        """Replace the message by the safe one, of the same size."""
         safe = next((one for one in node.safes if one.topic == self._channel), None)
         if safe is None:
             raise NotCompiledError("publishes safe messages")
@@ -399,7 +398,7 @@ class _FunctionCodegen(StringCodegen):
         return self._when(differs, self._elsewhere) + constant(I32, 1) + self._set("replaced")
 
     def _put_safe(self, safe: nodes.SafeMessage, site: int) -> bytes:
-        """Keep `seq` and `stamp` of the message."""
+        """Write the safe message, but keep `seq` and `stamp` of the message."""
         code, offset = b"", safe_messages.HEAD if safe.stamped else 0
         self._early = self._early or offset < EARLY
         while offset < len(safe.data):
@@ -532,7 +531,7 @@ class _FunctionCodegen(StringCodegen):
         return store(machine, self._writer.variable(node.name, node.type), value)
 
     def _named_in_place(self, node: nodes.Assign) -> bytes:
-        """A local variable names a vector or message within the current message; nothing is copied."""
+        """Give a vector or message within the current message a name; nothing is copied."""
         source, shared = root_of(node.value), self._writer.shared
         if not source or source in shared or node.name in shared:
             raise NotCompiledError.of(node.type)
@@ -556,7 +555,7 @@ class _FunctionCodegen(StringCodegen):
         return code + self._noted_line(line, cost) + stores + constant(I32, 0)
 
     def _noted_line(self, line: OutputLine, cost: bytes) -> bytes:
-        """The local variable `line` is the address of the stored head."""
+        """Note a line of output; the local variable `line` is the address of the stored head."""
         known = self._layout.lines
         code = load(I32, SAID) + self._set("line")
         end = self._get("line") + constant(I32, line.size) + I32_ADD
@@ -586,7 +585,6 @@ class _FunctionCodegen(StringCodegen):
         return first, line + value + wide + i64_store(at), b""
 
     def _throttle(self, node: nodes.Throttle) -> bytes:
-        """Leave the message to Python if its output is due."""
         seconds = self._value(node.seconds) + to_floating(
             machine_type(node.seconds.type), F64, signed=is_signed(node.seconds.type)
         )
@@ -761,7 +759,7 @@ class _FunctionCodegen(StringCodegen):
         return code + answer + RETURN
 
     def _handed(self, name: str, node: nodes.Expression) -> bytes:
-        """Numbered local variables get the value of the call and the values of the references."""
+        """Call a function, and assign its value and the values of the references to numbered local variables."""
         if not isinstance(node, nodes.Invoke):
             raise NotCompiledError.of(node.type)
         code, references = self._called(node)

@@ -45,7 +45,7 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 MOST_TEXTS = 256
-"""A message with more strings in an array is left to the interpreter."""
+"""The most strings in an array; a message with more is left to the interpreter."""
 
 _LOADS = {
     "?": i32_load8_u, "b": i32_load8_s, "B": i32_load8_u, "h": i32_load16_s, "H": i32_load16_u,

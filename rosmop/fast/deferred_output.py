@@ -87,7 +87,7 @@ def is_text(node: nodes.Expression) -> bool:
 
 
 def _goes_on(node: nodes.Call) -> bool:
-    """Formatting cannot fault if the precision is a constant within bounds."""
+    """Whether formatting cannot fault, because the precision is a constant within bounds."""
     if node.function not in FAULTING:
         return True
     digits = node.arguments[1]

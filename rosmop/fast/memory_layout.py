@@ -11,7 +11,7 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 LINES = 64 << 10
-"""A message whose line of output does not fit in these bytes is left."""
+"""The bytes for the lines of output; a message whose line does not fit in these bytes is left."""
 
 
 class NotCompiledError(Exception):
@@ -38,7 +38,7 @@ def reason_of(error: NotCompiledError | RecursionError) -> NotCompiledError:
 
 
 def machine_type(kind: Type) -> int:
-    """Raises `NotCompiledError`."""
+    """Return the machine type of values. Raises `NotCompiledError`."""
     if isinstance(kind, value_types.BoolType) or (
         isinstance(kind, value_types.IntegerType) and kind.bits <= 32
     ):
@@ -88,7 +88,9 @@ class MemoryLayout:
         return cells.variables.setdefault(name, (place, kind))[0]
 
     def size(self, kind: Type) -> int:
-        """Raises `NotCompiledError` if the values of a type have different sizes in a message."""
+        """Return the size of values. Raises `NotCompiledError` if the values of a type have different sizes
+        in a message.
+        """
         code = struct_code(kind)
         if code is not None:
             return struct_size(code)
@@ -99,7 +101,7 @@ class MemoryLayout:
         raise NotCompiledError.of(kind)
 
     def offset(self, kind: Type, number: int) -> int:
-        """Raises `NotCompiledError` if a field has different offsets."""
+        """Return the offset of a field. Raises `NotCompiledError` if it differs between messages."""
         if not isinstance(kind, value_types.RecordType):
             raise NotCompiledError.of(kind)
         return sum(map(self.size, self._values.fields(kind)[:number]))

@@ -58,7 +58,7 @@ _DECODER = msgspec.msgpack.Decoder(Compiled, dec_hook=_made)
 
 
 def encoded(compiled: Compiled) -> bytes:
-    """Equal sets give equal bytes."""
+    """Serialize a set; equal sets give equal bytes."""
     definitions = compiled.messages.definitions
     reached = {name for one in compiled.specifications for name in one.reached}
     reached |= {one.type for one in compiled.publications}
@@ -78,16 +78,16 @@ def encoded(compiled: Compiled) -> bytes:
 
 
 def decoded(data: bytes) -> Compiled:
-    """Raises `msgspec.ValidationError`."""
+    """Return the set in these bytes. Raises `msgspec.ValidationError`."""
     return _DECODER.decode(data)
 
 
 def encoded_part(part: SetPart) -> bytes:
-    """Equal parts give equal bytes."""
+    """Serialize a part; equal parts give equal bytes."""
     return msgspec.msgpack.encode((msgspec.Raw(encoded(part.compiled)), part.module))
 
 
 def decoded_part(data: bytes) -> SetPart:
-    """Raises `msgspec.ValidationError`."""
+    """Return the part in these bytes. Raises `msgspec.ValidationError`."""
     compiled, module = _PARTS.decode(data)
     return SetPart(_DECODER.decode(compiled), module)

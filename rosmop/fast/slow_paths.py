@@ -26,7 +26,7 @@ class SlowPath:
 
 
 def slow_paths(compiled: Compiled) -> list[SlowPath]:
-    """Messages with a fault or with due output are always left, and not listed."""
+    """Return the messages that are left, without those with a fault or with due output, which are always left."""
     module = written_of(compiled)
     found: dict[SlowPath, None] = {}
     channels = dict.fromkeys(
@@ -85,7 +85,7 @@ def _of_property(code: PropertyCode) -> str:
 
 
 def _called(compiled: Compiled, function: str) -> list[str]:
-    """Include the functions that it calls, and the skippers that it uses."""
+    """Return a function and those that it calls, with the skippers that they use."""
     names = [function]
     for name in names:
         body = compiled.functions[name].body if name in compiled.functions else ()

@@ -85,7 +85,6 @@ class StringCodegen(MessageAccess):
         return super()._elements(node)
 
     def _address_of_span(self, node: nodes.Expression) -> int | None:
-        """Return where address and length are stored, or None."""
         if isinstance(node, nodes.SenderName):
             return self._layout.sender(self._context) + 8 * (node.part == "caller")
         if isinstance(node, nodes.Read) and node.name in self._layout.shared and kept_size(node.type):
@@ -109,7 +108,6 @@ class StringCodegen(MessageAccess):
         return code, self._get(place), self._get(count, I64)
 
     def _chosen(self, node: nodes.Conditional) -> tuple[bytes, bytes, bytes]:
-        """The other string is not evaluated."""
         test = self._value(node.test)
         place, count = (f"{what} {len(self._locals)}" for what in ("place", "count"))
         self._local(place, I32)
@@ -187,7 +185,7 @@ class StringCodegen(MessageAccess):
 
 
 def turns(leave: bytes, *turn: bytes) -> bytes:
-    """The loop ends when `leave` is true, or when an iteration leaves its block."""
+    """Write a loop that ends when `leave` is true, or when an iteration leaves its block."""
     return BLOCK + LOOP + leave + br_if(1) + b"".join(turn) + br(0) + END + END
 
 

@@ -15,7 +15,7 @@ FUNCTION_TYPE = b"\x60"
 EXPORTED_FUNCTION = b"\x00"
 EXPORTED_MEMORY = b"\x02\x00"
 LIMITED = b"\x01"
-"""A memory with a maximum size."""
+"""The flag of a memory with a maximum size."""
 ACTIVE = b"\x00"
 
 NOTHING = b"\x40"
@@ -93,7 +93,7 @@ def function_type(parameters: Sequence[int], result: int) -> bytes:
 
 
 def function(made: Sequence[tuple[int, int]], code: bytes) -> bytes:
-    """Locals are pairs of number and type; `code` has no final `END`."""
+    """Encode a function. Locals are pairs of number and type; `code` has no final `END`."""
     whole = row([unsigned(count) + bytes((machine,)) for count, machine in made]) + code + END
     return unsigned(len(whole)) + whole
 
@@ -128,7 +128,6 @@ def if_result(machine: int) -> bytes:
 
 
 def constant(machine: int, value: float) -> bytes:
-    """An integer wraps."""
     if machine in (I32, I64):
         bits = 32 if machine == I32 else 64
         whole = int(value) & (1 << bits) - 1

@@ -1,4 +1,4 @@
-"""Runs one WebAssembly module: access to its memory and functions, with bounds on both.
+"""Run one WebAssembly module, with bounds on its memory and its work.
 
 Theory of operation:
 
@@ -28,7 +28,7 @@ from typing import Any
 PAGE = 1 << 16
 
 VERSION = "50."
-"""The versions of wasmtime that have these functions and layouts."""
+"""The version of wasmtime that has these functions and layouts."""
 
 _FUEL_AT_START = 1_000_000
 _TABLE_ELEMENTS = 10_000
@@ -41,7 +41,7 @@ _OFF = ("component_model", "custom_page_sizes", "exceptions", "function_referenc
         "relaxed_simd", "simd", "stack_switching", "tail_call", "threads", "wide_arithmetic")  # fmt: skip
 
 Call = Callable[..., int | None]
-"""Uses the remaining fuel (`WasmInstance.refuel`)."""
+"""A function of an instance, which uses the remaining fuel (`WasmInstance.refuel`)."""
 
 
 class WasmError(Exception):
@@ -99,7 +99,9 @@ class WasmInstance:
 
     @property
     def memory(self) -> memoryview:
-        """Writable. Read it again after the memory has grown. Raises `WasmError` if closed."""
+        """Return the memory, which is writable. Read it again after it has grown. Raises `WasmError` if the
+        instance is closed.
+        """
         asked = self._asked()
         size = load().wasmtime_memory_data_size(*asked)
         if size != len(self._view):
@@ -129,7 +131,6 @@ class WasmInstance:
         return function(*arguments)
 
     def function(self, name: str | int) -> Call:
-        """For frequent calls; see `call`."""
         try:
             return self._functions[name]
         except KeyError:
@@ -144,11 +145,11 @@ class WasmInstance:
         return self._natives[name]
 
     def refuel(self, fuel: int) -> None:
-        """Raises `WasmError` if closed."""
+        """Set the fuel of the next calls. Raises `WasmError` if the instance is closed."""
         _check(load().wasmtime_context_set_fuel(self._asked()[0], fuel))
 
     def close(self) -> None:
-        """The memory is freed with its last view."""
+        """Close the instance; the memory is freed with its last view."""
         self._functions, self._view, self._store = {}, memoryview(b""), None
 
     def _asked(self) -> tuple[int, Any]:
@@ -166,7 +167,7 @@ class _Vector(ctypes.Structure):
 
 
 class _Store:
-    """Owns wasmtime's objects of an instance and frees them with the last reference."""
+    """Owns wasmtime's objects of an instance, which are freed with the last reference."""
 
     def __init__(self, engine: int, limit: int) -> None:
         self._library = load()
@@ -249,7 +250,6 @@ def _bits(limit: int) -> int:
 
 @cache
 def _engine(bits: int) -> int:
-    """An engine serves all instances with a limit of up to 2**bits bytes."""
     settings = {
         **dict.fromkeys((f"wasm_{feature}" for feature in _OFF), 0),
         "shared_memory": 0,
@@ -269,7 +269,7 @@ def _engine(bits: int) -> int:
 
 
 def _bound(store: _Store, export: _Export) -> Call | None:
-    """Return None if the function has arguments or results other than integers.
+    """Return a callable for an export, or None if it has arguments or results other than integers.
 
     Arguments and result are in slots of 16 bytes. The wrapper must free a returned trap or error.
     """
@@ -317,7 +317,7 @@ def _addresses(store: _Store, export: _Export) -> tuple[int, int, int, object]:
 
 
 def failure(error: int, trap: int) -> Exception:
-    """Return the exception, and free the error or trap (0: none)."""
+    """Return the exception of an error or trap (0: none), and free it."""
     try:
         _check(error or None)
     except WasmError as found:
@@ -326,7 +326,7 @@ def failure(error: int, trap: int) -> Exception:
 
 
 def _kinds(vector: Any) -> list[Any]:
-    """A kind that is not an integer becomes None."""
+    """Return the kinds of a function's parameters or results; a kind that is not an integer becomes None."""
     found = vector.contents
     return [_KINDS.get(load().wasm_valtype_kind(found.data[number])) for number in range(found.size)]
 

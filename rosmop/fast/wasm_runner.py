@@ -147,7 +147,7 @@ class ModuleState:
             _SPANS.pack_into(self._memory, address, *words)
 
     def _unprepare(self) -> None:
-        """The memory differs from the `packed` form of all options."""
+        """Note that the memory differs from the `packed` form of all options."""
         self.prepared = None
         _PREPARED.pack_into(self._memory, self._source, *[-1] * 4)
 
@@ -181,7 +181,7 @@ class ModuleState:
 
     @property
     def parts(self) -> list[tuple[int, int]] | None:
-        """Address and size of each part, or None if the state is more than numbers."""
+        """Return address and size of each part, or None if the state is more than numbers."""
         if not self.size:
             return None if self._strings else []
         return [(self._base, self._cells.size), *((address, _CLOCK.size) for address in self._clocked)]
@@ -191,7 +191,7 @@ class ModuleState:
         return self._source
 
     def hasten(self) -> None:
-        """There is an earlier deadline, so compute the next one again."""
+        """Compute the next deadline again, because there is an earlier one."""
         self.leave()
         self._due(anew=True)
 
@@ -231,7 +231,7 @@ def packed(prepared: BatchOptions) -> bytes:
 
 
 def _entered(memory: memoryview, value: Any, buffer: int, kind: Type) -> int:
-    """Return the address, with the length from bit 32 on."""
+    """Write a string or array, and return its address, with the length from bit 32 on."""
     if len(value) > most_kept(kind):
         return BEYOND << 32
     if isinstance(kind, value_types.VectorType):
@@ -242,9 +242,7 @@ def _entered(memory: memoryview, value: Any, buffer: int, kind: Type) -> int:
 
 
 def _left(memory: memoryview, word: int, before: Any, kind: Type) -> Any:
-    """Read the string or array whose address and length are in `word`, or return `before` if the module does not keep
-    it.
-    """
+    """Read the string or array whose address and length are in `word`, or return `before` if it is not kept."""
     at, count = word & _ADDRESS, word >> 32
     if count == BEYOND:
         return before
@@ -495,7 +493,6 @@ class WasmLane:
     def _process_beginning(
         self, frame: memoryview, shown: int, time_ns: int, prepared: BatchOptions
     ) -> BatchResult | None:
-        """The module gets only the first `shown` bytes."""
         size, before = min(len(frame), shown), prepared.changed.copy()
         area = self._memory[self._frames : self._frames + size]
         area[4:] = frame[4:size]
@@ -545,7 +542,6 @@ class WasmLane:
             self._settle()
 
     def _counted(self) -> tuple[Sequence[int], Sequence[int]]:
-        """Return the drops of each event and the number of each verdict since the last call."""
         counts = self._later.unpack_from(self._memory, self._feed.counters + self._counts.size)
         before, self._before = self._before, counts
         more = [now - then for now, then in zip(counts, before, strict=True)]
@@ -571,7 +567,6 @@ class WasmFastPath:
     def lanes(
         self, compiled: Compiled, interpreter: Interpreter, monitors: Sequence[MonitorInstance], due: NextDue
     ) -> Lanes:
-        """Instantiate the module, and set `home` of its monitors."""
         module = self._module
         if not module.feeds:
             return Lanes()

@@ -30,11 +30,11 @@ class EventCode:
     service_type: str | None = None
     period_ns: int | None = None
     binds: tuple[int, ...] = ()
-    """Numbers of the specification's parameters."""
+    """The numbers of the specification's parameters that the event binds."""
     key: str = ""
     """The function that returns the values of these parameters, for an event on messages."""
     creates: bool = False
-    """A slice may begin with it."""
+    """Whether a slice may begin with the event."""
     plain: bool = False
     """The event has neither an action nor a `when`, so its key alone decides."""
     acts: bool = False
@@ -42,7 +42,7 @@ class EventCode:
 
     @property
     def channel(self) -> str | None:
-        """The topic, or the part of a service (see `channel_of`), or None for a timer."""
+        """Return the topic, or the part of a service (see `channel_of`), or None for a timer."""
         return self.topic if self.topic is None or self.part is None else channel_of(self.topic, self.part)
 
 
@@ -169,7 +169,7 @@ class SpecificationCode:
     """Comparisons whose margins are noted."""
     slicing: Slicing | None = None
     begins: bool = False
-    """If its state is lost, it restarts instead of holding its topics."""
+    """Whether the specification restarts if its state is lost, instead of holding its topics."""
     safes: tuple[nodes.SafeMessage, ...] = ()
     givens: tuple[Given, ...] = ()
     given_topics: tuple[GivenTopic, ...] = ()
@@ -191,7 +191,7 @@ class Compiled:
     calls: tuple[Publication, ...] = ()
 
     def alone(self, names: Collection[str]) -> "Compiled":
-        """Like `part`, but the result does not depend on other specifications."""
+        """Return a set like `part`, which does not depend on other specifications."""
         part = self.part(names)
         functions = {name: each for name, each in self.functions.items() if Symbols.owner(name) in names}
         safes = tuple(one.safes for one in part.specifications)
@@ -215,7 +215,7 @@ class Compiled:
         return [group for group in sharing(uses) if not group.isdisjoint(names)]
 
     def without(self, names: Collection[str]) -> "Compiled":
-        """Also remove the specifications that share variables with `names`."""
+        """Return the set without `names`, and without specifications that share variables with them."""
         gone = {name for group in self.groups(names) for name in group}
         return self.part({one.name for one in self.specifications} - gone)
 
@@ -234,7 +234,6 @@ class Compiled:
 
     @property
     def stamped(self) -> frozenset[str]:
-        """The topics whose messages begin with a `std_msgs/Header`."""
         events = [
             event
             for specification in self.specifications

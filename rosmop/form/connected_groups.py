@@ -34,7 +34,7 @@ def connected(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
 
 
 def channel_of(service: str, part: str) -> str:
-    """The name of the `request` or `response` of a service, in place of a topic; it contains a blank, as no topic
-    does.
+    """Return the name of the `request` or `response` of a service, in place of a topic; it contains a blank,
+    as no topic does.
     """
     return f"{service} {part}"

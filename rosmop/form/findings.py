@@ -30,7 +30,7 @@ class Position:
 
 
 def line_of(text: str, number: int) -> str:
-    """Lines count from 1; the comment is removed."""
+    """Return a line by its number (from 1), without its comment."""
     lines = text.splitlines()[number - 1 : number]
     return lines[0].partition("//")[0].strip() if lines else ""
 

@@ -27,10 +27,10 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 CHARGED = 1024
-"""In messages of at least this number of bytes, decoding an array or the whole message is charged."""
+"""The bytes from which decoding an array or the whole message is charged."""
 
 SHORT = 64
-"""Comparing with a string of at most this many bytes costs no more than other instructions."""
+"""The bytes up to which comparing with a string costs no more than other instructions."""
 
 
 class FormNode(msgspec.Struct, frozen=True, tag=True, tag_field="node", array_like=True):
@@ -58,7 +58,7 @@ class Read(FormNode, frozen=True):
 
 
 class Assign(FormNode, frozen=True):
-    """The result of the expression is the assigned value."""
+    """An assignment; the result is the assigned value."""
 
     type: Type
     name: str
@@ -140,7 +140,7 @@ class CompareTexts(FormNode, frozen=True):
 
 
 class Logical(FormNode, frozen=True):
-    """The right operand is evaluated only if the left one does not decide the result."""
+    """`and` or `or`; the right operand is evaluated only if the left one does not decide the result."""
 
     operator: str
     left: "Expression"
@@ -369,7 +369,7 @@ class Break(FormNode, frozen=True):
 
 
 class Continue(FormNode, frozen=True):
-    """Goes on with the innermost loop."""
+    """Continue with the next iteration of the innermost loop."""
 
     site: int
 
@@ -498,7 +498,7 @@ class Count(FormNode, frozen=True):
 
 
 class AfterElements(FormNode, frozen=True):
-    """Name the position after `count` elements (a number, or a named one) of `size` bytes each."""
+    """Name the position after `count` elements (a number, or a named count) of `size` bytes each."""
 
     site: int
     name: str
@@ -555,8 +555,7 @@ class Require(FormNode, frozen=True):
 
 
 class Write(FormNode, frozen=True):
-    """Assign a value (of the field's type) to a field if `flag` is set; `end` names the end of a field of variable
-    size.
+    """Assign a value (of the field's type) to a field if `flag` is set; `end` names the end of a variable field.
 
     `path` is its path in the message: numbers of fields and elements, and `sec` or `nsec` at the end.
     """
@@ -716,7 +715,6 @@ PURE = "lib"
 
 
 def acts(root: Expression) -> bool:
-    """Return whether evaluation has an effect."""
     return any(
         isinstance(node, Assign | Log | Throttle)
         or (isinstance(node, Invoke) and not node.function.startswith(PURE))

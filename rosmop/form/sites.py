@@ -12,7 +12,9 @@ from rosmop.types.value_types import Type
 
 @dataclass(frozen=True, slots=True)
 class SiteVariable:
-    """`code` is the name in the form. The value of a `steady` variable never changes in place."""
+    """A variable that a report shows; `code` is its name in the form. The value of a `steady` variable never
+    changes in place.
+    """
 
     name: str
     code: str
@@ -29,7 +31,7 @@ class Site:
 
     @property
     def compared(self) -> list[SiteVariable]:
-        """The variables of a condition that can explain it later, because their values do not change in place."""
+        """Return the variables of a condition that can explain it later: their values do not change in place."""
         return [variable for variable in self.variables if variable.steady]
 
 
@@ -61,7 +63,7 @@ class Symbols:
 
 
 def showing(kind: Type) -> Callable[[Any], object]:
-    """Values are shown in reports of faults as JSON."""
+    """Return a function that makes values JSON for reports of faults."""
     if isinstance(kind, value_types.StringType | value_types.CharactersType):
         return lambda value: _short(value[:200].split(b"\0")[0].decode("utf-8", "replace"))
     if isinstance(kind, value_types.TimeType | value_types.DurationType):

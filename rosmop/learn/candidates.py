@@ -18,7 +18,7 @@ from rosmop.learn.topics import TopicContent, TopicRhythm
 
 QUIET_HOURS = 10.0
 MOST = {"range": 10, "constant": 12, "values": 6, "rate": 6, "unchanged": 6, "moves": 2, "order": 2}
-"""The limit for one topic and kind. Other kinds have at most one condition for each field."""
+"""The most conditions for one topic and kind. Other kinds have at most one condition for each field."""
 
 _FEWEST = 20  # the minimum number of messages for a statement about all messages
 _FEWEST_SET = 10
@@ -62,7 +62,7 @@ class Candidate:
     events: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     """For an order of topics: topic and pattern of each event."""
     alarms: int = 0
-    """On the held-out recordings."""
+    """The number of alarms on the held-out recordings."""
     widened: str = ""
 
     @property
@@ -95,7 +95,7 @@ class LearntFacts:
 
     @property
     def short(self) -> Mapping[str, str]:
-        """A unique name for each topic, made of its last words."""
+        """Return a unique name for each topic, made of its last words."""
         paths = {topic: identifier(topic).replace("_", ".") for topic in self.contents}
         names = short_names(paths.values())
         return {topic: names[path] for topic, path in paths.items()}
@@ -117,7 +117,7 @@ class LearntFacts:
 
 
 _WHOLE_NUMBERS = (-(1 << 63), (1 << 63) - 1), (-(1 << 63), (1 << 64) - 1)
-"""Least and greatest bound of signed and unsigned fields."""
+"""The least and the greatest bound of signed and unsigned fields."""
 
 # Path, element and length of an array, and the statistics of its values
 _Place = tuple[str, int | None, int | None, Series]

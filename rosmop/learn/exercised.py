@@ -66,7 +66,7 @@ def covered(texts: Mapping[str, str], definitions: Definitions, recording: Recor
 
 
 def merged(one: Sequence[int], other: Sequence[int]) -> list[int]:
-    """The order of recordings makes no difference."""
+    """Return the sum of counts; the order of recordings makes no difference."""
     return [a + b for a, b in zip(one, other, strict=True)]
 
 
@@ -224,7 +224,7 @@ class _Run:
 
     @property
     def as_new(self) -> bool:
-        """False, so that no watched run is stepped as a test."""
+        """Return False, so that no watched run is stepped as a test."""
         return False
 
     def step(self, event: int, time_ns: int) -> Categories:

@@ -14,7 +14,9 @@ from roswire.message_layout import ArrayPart, FixedField, FixedPart, MessageLayo
 from roswire.message_text import PRIMITIVES
 
 MOST_ELEMENTS = 20_000
-"""Longer arrays are represented by their length: a monitor that reads each of their elements would be too slow."""
+"""The longest array that is read; a longer one is represented by its length, because a monitor that reads it
+would be too slow.
+"""
 
 _LENGTH = struct.Struct("<I")
 _BYTES = frozenset({"uint8", "int8", "char", "byte", "bool"})
@@ -34,12 +36,10 @@ class Fields:
     def __init__(self, layout: MessageLayout) -> None:
         self._parts = [_reader(part) for part in layout.parts]
         self.types = dict(_types(layout))
-        """The primitive types of the fields that are read, with `[]` for arrays; `length` if only the length is
-        read.
-        """
+        """The primitive types of the fields that are read, `[]` for arrays; `length` if only the length is read."""
 
     def read(self, data: bytes) -> dict[str, Value]:
-        """Raises `MessageError`."""
+        """Return the fields of a message. Raises `MessageError`."""
         values: dict[str, Value] = {}
         position = 0
         try:

@@ -44,7 +44,7 @@ _WINDOWS = 24  # the minimum number for all recordings together
 
 @dataclass(frozen=True)
 class LearningResult:
-    """The result of learning. `alarms` are those on the held-out recordings."""
+    """The result of learning; `alarms` are the alarms on the held-out recordings."""
 
     text: str
     candidates: tuple[Candidate, ...]
@@ -62,7 +62,9 @@ class LearningResult:
 def learn(
     recordings: Sequence[RecordingFacts], definitions: Definitions, held_out: float, run: Run
 ) -> LearningResult:
-    """Hold out the fraction `held_out`; `run` executes the passes. Raises `LearningError`."""
+    """Learn from recordings, of which the fraction `held_out` is held out; `run` executes the passes. Raises
+    `LearningError`.
+    """
     return _Learner(recordings, definitions, held_out, run).learnt()
 
 

@@ -82,7 +82,7 @@ class ContentFacts(msgspec.Struct, frozen=True, tag=True):
 
 
 class AlarmFacts(msgspec.Struct, frozen=True, tag=True):
-    """By candidate, if it has alarms."""
+    """The alarms by candidate, for candidates that have some."""
 
     alarms: dict[int, int] = {}
 
@@ -95,7 +95,7 @@ AnyStep = TimeStep | ContentStep | AlarmStep
 
 
 def facts_of(step: AnyStep, source: RecordingSource, definitions: Definitions) -> Facts:
-    """Raises `LearningError`."""
+    """Execute a step. Raises `LearningError`."""
     if isinstance(step, TimeStep):
         return _times(step, source)
     if isinstance(step, ContentStep):
@@ -152,8 +152,6 @@ def _warned(outcome: Outcome, says: Mapping[str, list[tuple[int, str]]]) -> Iter
 
 
 def run_here(sources: Sequence[RecordingSource], definitions: Definitions) -> "Run":
-    """Return a function that executes steps in this process."""
-
     def run(steps: list[AnyStep]) -> Iterator[tuple[int, Facts | LearningError]]:
         for number, step in enumerate(steps):
             try:

@@ -16,7 +16,7 @@ class RecordingFacts(Protocol):
 
     @property
     def name(self) -> str:
-        """For messages to the user."""
+        """Return the recording's name for messages to the user."""
 
     @property
     def began(self) -> int: ...

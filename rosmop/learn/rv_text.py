@@ -30,7 +30,7 @@ def rounded_down(value: float, width: float) -> str:
 
 
 def number(value: float) -> str:
-    """An integer stays an integer."""
+    """Write a number; an integer stays an integer."""
     text = repr(value)
     if isinstance(value, int) and value >= 1 << 63:
         return f"{text}u"  # only an unsigned type holds it
@@ -38,7 +38,6 @@ def number(value: float) -> str:
 
 
 def literal(value: object) -> str | None:
-    """Return None if the language cannot write the value."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
@@ -51,7 +50,7 @@ def quoted(text: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """Spaces replace line ends, and other control characters are escaped."""
+    """Return a text in one line: spaces replace line ends, and other control characters are escaped."""
     words = " ".join(text.split())
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in words)
 

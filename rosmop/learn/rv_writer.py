@@ -14,7 +14,6 @@ _WIDTH = 104  # the maximum number of columns of a statement
 def specifications(
     candidates: Sequence[Candidate], known: LearntFacts
 ) -> Iterator[tuple[str, str, list[Candidate]]]:
-    """Yield name, text and candidates."""
     taken: set[str] = set()
     own = [candidate for candidate in candidates if not candidate.events]
     for topic, group in groupby(own, key=lambda candidate: candidate.topic):
@@ -143,7 +142,7 @@ def _once(pieces: Iterable[str]) -> list[str]:
 
 
 def _filled(row: Candidate, texts: Iterable[str], names: Mapping[str, str]) -> list[str]:
-    """Statements about an array element run only if the element exists."""
+    """Return the statements of a candidate; those about an array element run only if the element exists."""
     value = _short(row, names)
     name = value
     if row.element is not None:

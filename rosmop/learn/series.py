@@ -33,7 +33,6 @@ class HighestValues(msgspec.Struct):
     of: dict[int, float] = {}
 
     def add(self, value: float, window: int) -> None:
-        """The value must not be NaN."""
         if value > self.of.get(window, -math.inf):
             self.of[window] = value
 
@@ -81,7 +80,7 @@ class ValueSeries(msgspec.Struct):
 
     @property
     def closed(self) -> bool:
-        """A new value is unlikely, because no value was seen in only one window (Good and Turing's estimate)."""
+        """Whether a new value is unlikely: no value was seen in only one window (Good and Turing's estimate)."""
         return bool(self.windows) and min(self.windows.values()) > 1
 
 
@@ -103,17 +102,17 @@ class Series(msgspec.Struct):
     rates: HighestValues = msgspec.field(default_factory=HighestValues)
     stays: HighestValues = msgspec.field(default_factory=HighestValues)
     last: float | None = None
-    """Reset at the end of a recording, like its time and the time since which it is the same."""
+    """The last value in a recording; its end resets it, like its time and the time since which it is the same."""
     time: float = 0.0
     since: float = 0.0
 
     def end(self) -> None:
-        """The values of the next recording are independent of these."""
+        """End a recording; the values of the next one are independent of its values."""
         self.last, self.time, self.since = None, 0.0, 0.0
         self.values.end()
 
     def merged(self, other: "Series") -> "Series":
-        """Both series must have ended."""
+        """Return the series together; both must have ended."""
         return Series(
             self.period, self.count + other.count, self.changed + other.changed, self.nan or other.nan,
             self.infinite or other.infinite, self.highs.merged(other.highs), self.lows.merged(other.lows),
@@ -121,7 +120,7 @@ class Series(msgspec.Struct):
         )  # fmt: skip
 
     def add(self, value: float | int, seconds: float, window: int) -> None:
-        """Only whole numbers may be an enumeration."""
+        """Add a number; only whole numbers may be an enumeration."""
         self.count += 1
         if not self.values.many and not isinstance(value, float):
             self.values.add(value, window)
@@ -145,7 +144,7 @@ class Series(msgspec.Struct):
             self.infinite = True
 
     def add_array(self, low: float, high: float, nan: bool, infinite: bool, window: int) -> None:
-        """The extremes are those of the finite elements."""
+        """Add an array; the extremes are those of its finite elements."""
         self.count += 1
         self.nan |= nan
         self.infinite |= infinite

@@ -13,7 +13,7 @@ import msgspec
 from rosmop.learn.series import HighestValues, merged_rows
 
 MOST_TOPICS = 24
-"""Topics with more messages are preferred."""
+"""The most topics; those with more messages are preferred."""
 
 _SURE = 1e-6  # the probability that any of all pairs looks like an order by chance
 _FEWEST = 20  # the minimum number of messages for an order
@@ -28,10 +28,10 @@ class TopicPair(msgspec.Struct):
     requires: bool = True
     turns: bool = True
     first: int | None = None
-    """The first message without a later second-topic message; like the next ones, until the recording ends."""
+    """The first message without a later message of the second topic, until the recording ends."""
     last: int | None = None
     seconds: int = 0
-    """Second-topic messages since the last first-topic message."""
+    """The number of messages of the second topic since the last message of the first."""
     started: bool = False
 
     def end(self) -> None:

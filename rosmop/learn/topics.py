@@ -10,10 +10,10 @@ from rosmop.learn.field_values import Fields
 from rosmop.learn.series import HighestValues, Series, ValueSeries, merged_rows
 
 MOST_SINGLE = 6
-"""Arrays that always have the same length, up to this one, have a series for each element."""
+"""The longest array of constant length that has a series for each element."""
 
 MOST_GAPS = 5000
-"""The median of all recordings is calculated from this number of gaps."""
+"""The number of gaps from which the median of all recordings is calculated."""
 
 _IN_STEP = 60.0  # seconds from a stamp to its reception; longer times mean clocks of different robots
 
@@ -48,7 +48,7 @@ class TopicRhythm(msgspec.Struct):
         self.last = None
 
     def merged(self, other: "TopicRhythm") -> "TopicRhythm":
-        """Both must have ended and be of different parts."""
+        """Return the rhythms together; both must have ended and be of different parts."""
         return TopicRhythm(
             self.count + other.count, self.recordings | other.recordings, self.gaps.merged(other.gaps),
             {**self.some, **other.some},
@@ -56,13 +56,12 @@ class TopicRhythm(msgspec.Struct):
 
     @property
     def period(self) -> float:
-        """The usual interval in seconds; a nanosecond if it is unknown."""
+        """Return the usual interval in seconds, or a nanosecond if it is unknown."""
         gaps = [gap for some in self.some.values() for gap in some]
         return max(statistics.median(gaps) if gaps else 0.0, 1.0) / 10**9
 
     @property
     def interval(self) -> float:
-        """The seconds in which messages are counted."""
         return float(max(1, round(5 * self.period)))
 
 
@@ -71,7 +70,7 @@ class TopicContent(msgspec.Struct):
 
     numbers: dict[str, Series] = {}
     elements: dict[str, list[Series]] = {}
-    """Only for arrays that always have the same, small length."""
+    """The series of arrays that always have the same, small length."""
     sets: dict[str, ValueSeries] = {}
     lengths: dict[str, ValueSeries] = {}
     moves: dict[str, dict[tuple[Any, Any], int]] = {}
@@ -80,7 +79,7 @@ class TopicContent(msgspec.Struct):
     leads: HighestValues = msgspec.field(default_factory=HighestValues)
     counts: HighestValues = msgspec.field(default_factory=HighestValues)
     backward: bool = False
-    """Some message had an earlier stamp than the previous one."""
+    """Whether some message had an earlier stamp than the previous one."""
 
     def merged(self, other: "TopicContent") -> "TopicContent":
         result = TopicContent(
@@ -144,7 +143,7 @@ class TopicContentReader:
         return content
 
     def add(self, data: bytes, time: int, window: int) -> None:
-        """Raises `MessageError`."""
+        """Add a message. Raises `MessageError`."""
         seconds = time / 10**9
         for path, value in self._fields.read(data).items():
             kind = self._types[path]

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 MAX_STATES = 10_000
 MAX_TRANSITIONS = 500_000
-"""Minimising takes about 300 bytes per transition."""
+"""The most transitions; minimising takes about 300 bytes for each."""
 
 State = TypeVar("State", bound=Hashable)
 

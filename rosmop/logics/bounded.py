@@ -36,7 +36,7 @@ from rosmop.logics.past_monitors import FOREVER, VERDICTS, PastInstruction, Past
 MOST_OPEN = 10_000
 
 MOST_OPEN_IN_SLICE = 1_000
-"""There may be many slices of a parametric specification."""
+"""The most waiting events of a slice, because a parametric specification may have many slices."""
 
 _LATER = ("until", "next")
 
@@ -60,7 +60,6 @@ class FormulaCell:
         self.operands: tuple[Value, ...] = ()
 
     def touch(self) -> None:
-        """Save the content before a change, unless it is already saved."""
         if self not in self.journal:
             self.journal[self] = self.saved()
 
@@ -80,7 +79,7 @@ class FormulaCell:
         return self.value is None and bool(self.tells or self.users)
 
     def hear(self, value: bool) -> bool | None:
-        """Return None if the value is still open."""
+        """Take the value of an operand; return the cell's value, or None if it is still open."""
         self.touch()
         self.missing -= 1
         if self.kind == "not":
@@ -100,7 +99,7 @@ def _known(value: Value) -> bool | None:
 
 
 def _use(value: Value, user: "FormulaCell | _Operator") -> bool:
-    """Return whether the value is open; then notify the user when it is known."""
+    """Return whether the value is open, and then have the user notified when it is known."""
     if isinstance(value, FormulaCell) and value.value is None:
         value.touch()
         value.users.append(user)
@@ -146,7 +145,7 @@ class _Row:
 
 
 class _Operator(ABC):
-    """For each event, `ask` comes before `take`; `pass_by` comes between events."""
+    """An operator; for each event, `ask` comes before `take`, and `pass_by` comes between events."""
 
     def __init__(self, run: "BoundedRun", number: int, instruction: PastInstruction) -> None:
         self.run, self.number = run, number
@@ -462,7 +461,7 @@ class _OpenPreviously(_Operator):
 
 
 class _Next(_Operator):
-    """`before` has the rows of the previous event, `rows` the rows of the current event."""
+    """`next`; `before` has the rows of the previous event, `rows` the rows of the current event."""
 
     def __init__(self, run: "BoundedRun", number: int, instruction: PastInstruction) -> None:
         super().__init__(run, number, instruction)
@@ -536,7 +535,9 @@ class BoundedProperty(CompiledProperty):
         return found
 
     def _decided_late(self) -> set[str]:
-        """An `until` or `next` fails when its bound expires: that is `violation`, or `validation` if it is negated."""
+        """Return the categories that are decided late: an `until` or `next` fails when its bound expires,
+        which is `violation`, or `validation` if it is negated.
+        """
         signs: dict[int, set[bool]] = {self.program.result: {False}}
         for number in sorted(self.later, reverse=True):
             instruction = self.program.instructions[number]
@@ -550,7 +551,7 @@ class BoundedProperty(CompiledProperty):
         return {VERDICTS[sign] for signs_of in found for sign in signs_of}
 
     def blocking_refused(self, category: str) -> str | None:
-        """A deadline may decide the category without a message."""
+        """Return a refusal, because a deadline may decide the category without a message."""
         super().blocking_refused(category)
         if category not in self._failing:
             return None
@@ -569,7 +570,7 @@ _KINDS: dict[str, type[_Operator]] = {
 
 
 _FORWARD = (_Until, _OpenUntil, _Next)
-"""They keep nothing but waiting events (`rows`)."""
+"""The operators that keep nothing but waiting events (`rows`)."""
 
 
 class BoundedRun:
@@ -592,13 +593,12 @@ class BoundedRun:
 
     @property
     def deadline(self) -> int | None:
-        """The first bound on which a verdict depends."""
         found = (operator.deadline for operator in self.operators.values())
         return min((deadline for deadline in found if deadline is not None), default=None)
 
     @property
     def as_new(self) -> bool:
-        """No event waits, and the part about the past is in its initial state."""
+        """Whether no event waits and the part about the past is in its initial state."""
         operators = self.operators.values()
         return (
             all(type(operator) in _FORWARD and not operator.rows for operator in operators)
@@ -692,7 +692,7 @@ class BoundedRun:
         return cell if cell.missing else _together(kind, cell.operands)
 
     def decide(self, cell: FormulaCell | None, value: bool) -> None:
-        """A cell is None if it is unused."""
+        """Decide a cell, unless it is None because it is unused."""
         if cell is not None and cell.value is None:
             cell.touch()
             cell.value = value

@@ -28,7 +28,7 @@ _Node = TypeVar("_Node", bound=Hashable)
 
 MAX_OBLIGATION_SETS = 20_000
 MAX_WORK = 1_500_000
-"""The limit of all obligation sets together, including dropped ones."""
+"""The limit of all obligation sets together, with dropped ones."""
 
 
 class TooLargeError(Exception):
@@ -111,7 +111,7 @@ class Automata:
         return self._product((right, frozenset((*left, *stay))))
 
     def _transitions(self, state: Obligations, letter: int) -> Sets:
-        """Keep larger sets, because acceptance needs them."""
+        """Return the transitions, even larger sets, because acceptance needs them."""
         known = self._steps.get((state, letter))
         if known is None:
             targets: set[Obligations] = {0}
@@ -173,7 +173,6 @@ class Automata:
                 self._live[state] = verdict
 
     def after(self, states: Sets, letters: int) -> Sets:
-        """``letters`` is a bit set. Return only states that accept some word."""
         return self._smallest(
             target
             for state in states
@@ -212,7 +211,7 @@ def _members(bits: int) -> list[int]:
 def strong_components(
     nodes: Iterable[_Node], successors: Callable[[_Node], Iterable[_Node]]
 ) -> list[list[_Node]]:
-    """Each component comes after those that it leads to (Tarjan)."""
+    """Return the components, each after those that it leads to (Tarjan)."""
     index: dict[_Node, int] = {}
     low: dict[_Node, int] = {}
     open_nodes: dict[_Node, None] = {}

@@ -50,10 +50,10 @@ _REFUSED = {
 def compile_property(
     logic: str, formula: str, events: Sequence[str], origin: Position, logic_position: Position | None = None
 ) -> CompiledProperty:
-    """Raises `FormulaError`.
+    """Compile a property. Raises `FormulaError`.
 
-    The case of ``logic`` does not matter. ``events`` are in source order, each name once. ``origin`` is the position
-    of the formula, and ``logic_position`` is the position of the logic's name (default: ``origin``).
+    The case of ``logic`` does not matter. ``events`` are in source order, each name once. ``origin`` is the
+    position of the formula, and ``logic_position`` is the position of the logic's name (default: ``origin``).
     """
     found = LOGICS.get(logic.lower())
     if found is None:

@@ -27,7 +27,7 @@ FAIL: Categories = ("fail",)
 UNDECIDED: Categories = ()
 
 MAX_TABLE_FRAMES = 500
-"""Limits the search for a finite table."""
+"""The limit of the search for a finite table."""
 
 
 class GrammarProperty(CompiledProperty):
@@ -42,7 +42,7 @@ class GrammarProperty(CompiledProperty):
 
 
 class GrammarRun(UntimedRun):
-    """The frame is None after a failure."""
+    """A run of a grammar; the frame is None after a failure."""
 
     __slots__ = ("_step", "frame")
 
@@ -51,7 +51,7 @@ class GrammarRun(UntimedRun):
         self.frame: EarleySet | None = recogniser.initial
 
     def step(self, event: int, _time_ns: int) -> Categories:
-        """If it raises `RunFaultError`, the run is unchanged."""
+        """Step an event. If this raises `RunFaultError`, the run is unchanged."""
         if self.frame is None:
             return FAIL
         after = self._step(self.frame, event)
@@ -69,7 +69,6 @@ class GrammarRun(UntimedRun):
 
 
 def compile_cfg(source: Source) -> CompiledProperty:
-    """Raises `FormulaError`."""
     grammar = prepare(read_grammar(source))
     automaton = _table(EarleyRecogniser(grammar), len(source.events))
     if automaton is not None:

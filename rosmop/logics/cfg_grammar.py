@@ -28,7 +28,7 @@ class Grammar:
 
 
 def read_grammar(source: Source) -> Grammar:
-    """Raises `FormulaError`."""
+    """Return the grammar as written. Raises `FormulaError`."""
     return _GrammarReader(source).grammar()
 
 
@@ -193,7 +193,6 @@ def _flat_repetitions(grammar: Grammar) -> list[Rule]:
 
 
 def _closure(rules: list[Rule], terminals: int) -> set[int]:
-    """Return the nonterminals that derive some word."""
     found: set[int] = set()
     users: dict[int, list[int]] = {}
     missing = []
@@ -218,7 +217,7 @@ def _closure(rules: list[Rule], terminals: int) -> set[int]:
 
 
 def _substantial(rules: list[Rule], terminals: int) -> set[int]:
-    """All rules must be productive."""
+    """Return the nonterminals that derive more than the empty word; all rules must be productive."""
     users: dict[int, list[int]] = {}
     waiting = []
     for head, body in rules:
@@ -252,6 +251,5 @@ def _reachable(start: int, rules: list[Rule]) -> set[int]:
 
 
 def nullable_symbols(grammar: Grammar) -> frozenset[int]:
-    """Return the nonterminals that derive the empty word."""
     rules = [rule for rule in grammar.rules if all(symbol >= grammar.terminals for symbol in rule[1])]
     return frozenset(_closure(rules, grammar.terminals))

@@ -27,7 +27,6 @@ class Diagram:
 
 
 def diagram_of(compiled: CompiledProperty) -> Diagram | None:
-    """Return None if the monitor is not finite."""
     graph = graph_of(compiled)
     if graph is None:
         return None

@@ -140,7 +140,6 @@ class ExpressionTable:
 
 
 def compile_ere(source: Source) -> FiniteProperty:
-    """Raises `FormulaError`."""
     reader = _ExpressionReader(source)
     automaton = _match_automaton(source, reader)
     return FiniteProperty(source, ("match", "fail"), with_fail(automaton))

@@ -26,7 +26,7 @@ BOOLEAN_SIGNS = ("(", ")", "!", "&&", "/\\", "||", "\\/", "++", "^", "=>", "->",
 
 @dataclass(frozen=True)
 class Formula:
-    """An ``event`` has a ``name``, a timed operator ``bounds``."""
+    """A formula; an ``event`` has a ``name``, a timed operator ``bounds``."""
 
     operator: str
     operands: tuple["Formula", ...] = ()
@@ -67,7 +67,7 @@ class Syntax:
 
 
 def read_formula(source: Source, syntax: Syntax) -> Formula:
-    """Raises `FormulaError`."""
+    """Return the formula as written. Raises `FormulaError`."""
     reader = _FormulaReader(source, syntax)
     formula = reader.formula(0)
     reader.end()
@@ -191,5 +191,5 @@ class _FormulaReader:
 
 
 def boolean_levels(temporal: Sequence[Level]) -> tuple[Level, ...]:
-    """Implications do not chain."""
+    """Return the levels of boolean operators after temporal ones; implications do not chain."""
     return (*temporal, Level(AND, "flat"), Level(XOR, "flat"), Level(OR, "flat"), Level(IMPLIES, "once"))

@@ -26,7 +26,7 @@ class StateText:
 
 @dataclass
 class StateMachineText:
-    """``order`` are the states in source order."""
+    """A machine as written; ``order`` are the states in source order."""
 
     states: dict[str, StateText]
     aliases: dict[str, list[str]]
@@ -44,13 +44,11 @@ class StateMachineText:
 
 
 def compile_fsm(source: Source) -> FiniteProperty:
-    """Raises `FormulaError`."""
     machine = read_state_machine(source, timed=False)
     return FiniteProperty(source, machine.categories(), machine_automaton(source, machine))
 
 
 def machine_automaton(source: Source, machine: StateMachineText) -> Automaton:
-    """State ``i`` is ``machine.order[i]``."""
     order = machine.order
     number = {name: index for index, name in enumerate(order)}
     fail = number[FAIL]
@@ -64,7 +62,7 @@ def machine_automaton(source: Source, machine: StateMachineText) -> Automaton:
 
 
 def read_state_machine(source: Source, *, timed: bool) -> StateMachineText:
-    """Raises `FormulaError` with all errors."""
+    """Return the machine as written. Raises `FormulaError` with all errors."""
     reader = TokenReader(source, ("->", "[", "]", "=", ","))
     machine = StateMachineText({}, {})
     used: list[FormulaToken] = []
@@ -158,7 +156,7 @@ def _read_alias(reader: TokenReader, machine: StateMachineText, used: list[Formu
 
 
 def _more_members(reader: TokenReader) -> bool:
-    """Commas are optional, as in MOP; the next alias or a misplaced state ends the list."""
+    """Whether the list goes on; commas are optional, as in MOP; the next alias or a misplaced state ends it."""
     return reader.token.kind == "name" and reader.token.text != "alias" and reader.ahead(1).kind != "["
 
 

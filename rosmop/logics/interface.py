@@ -50,11 +50,11 @@ class Run(Protocol):
 
     @property
     def as_new(self) -> bool:
-        """The run will behave like a fresh run; False if this is not known."""
+        """Whether the run will behave like a fresh run; False if this is not known."""
 
     @property
     def deadline(self) -> int | None:
-        """The last time (ns) at which an event is in time, or None if the run waits for nothing."""
+        """Return the last time (ns) at which an event is in time, or None if the run waits for nothing."""
 
     def step(self, event: int, time_ns: int) -> Categories: ...
 
@@ -87,7 +87,7 @@ class Source:
     events: tuple[str, ...]
     origin: Position
     suppresses: bool = False
-    """A dropped message does not count (`Logic.suppresses`)."""
+    """Whether a dropped message does not count (`Logic.suppresses`)."""
 
     def finding(self, offset: int, text: str) -> Diagnostic:
         return Diagnostic(self.origin.within(self.text, min(offset, len(self.text))), "error", text)
@@ -97,20 +97,20 @@ class Source:
 
 
 class CompiledProperty(ABC):
-    """``categories`` are the names that may have handlers."""
+    """A compiled property; ``categories`` are the names that may have handlers."""
 
     timed = False
-    """Without this, no run has a deadline."""
+    """Whether runs may have a deadline."""
 
     expiry = "deadline"
     """The name of a passed deadline in records (``timeout`` for machines)."""
 
     made_of: tuple[Any, ...]
-    """Another process makes the same property from these arguments."""
+    """The arguments from which another process makes the same property."""
 
     @property
     def suppresses(self) -> bool:
-        """A dropped message does not count: its steps are undone."""
+        """Whether a dropped message does not count, so its steps are undone."""
         return self.source.suppresses
 
     remedy: str | None = None
@@ -143,7 +143,7 @@ class CompiledProperty(ABC):
 
 
 class FiniteProperty(CompiledProperty):
-    """Its monitor is a finite automaton.
+    """A property whose monitor is a finite automaton.
 
     ``automaton.verdicts[state]`` are the categories after a step into ``state``; a fresh run is in
     ``automaton.initial``.
@@ -170,7 +170,7 @@ class UntimedRun:
 
     @property
     def as_new(self) -> bool:
-        """False: this is not known here."""
+        """Return False, because this is not known here."""
         return False
 
     def expire(self) -> Categories:
@@ -213,11 +213,11 @@ class FiniteRun(UntimedRun):
 
 
 Move = tuple[int, bool]
-"""The next state, and whether the clock restarts."""
+"""A move: the next state, and whether the clock restarts."""
 
 
 class Wait(NamedTuple):
-    """After ``after`` nanoseconds on the clock, the move and the categories."""
+    """A wait: after ``after`` nanoseconds on the clock, the move and the categories."""
 
     after: int
     move: Move
@@ -225,10 +225,11 @@ class Wait(NamedTuple):
 
 
 class ClockedProperty(CompiledProperty):
-    """Its monitor is an automaton with one clock.
+    """A property whose monitor is an automaton with one clock.
 
-    ``moves[state][event]`` is the move at an event. ``late`` has the same table for events more than ``within`` ns
-    after the clock started. ``verdicts`` are the categories after an event that leads to a state.
+    ``moves[state][event]`` is the move at an event. ``late`` has the same table for events more than
+    ``within`` ns after the clock started. ``verdicts`` are the categories after an event that leads to a
+    state.
     """
 
     timed = True
@@ -265,7 +266,7 @@ class ClockedRun:
 
     @property
     def as_new(self) -> bool:
-        """The clock does not matter in the initial state."""
+        """Whether the run is in its initial state, in which the clock does not matter."""
         state, tables = self.state, self._tables
         return (
             state == tables.initial
@@ -319,15 +320,15 @@ class Logic:
 
     compile: Compiler
     properties: tuple[type[CompiledProperty], ...] = (FiniteProperty,)
-    """The arguments of their constructors can be serialised."""
+    """The classes of properties; the arguments of their constructors can be serialised."""
     suppresses: bool = False
-    """A dropped message does not count. Other logics count each event whose action passes the message."""
+    """Whether a dropped message does not count. Other logics count each event whose action passes the message."""
     failure: str | None = None
     """The category of failure.
 
     `check` warns about a property that always fails at the first event.
     """
     has_states: bool = False
-    """Coverage counts states, and formulas may write `default` for all events."""
+    """Whether coverage counts states, and formulas may write `default` for all events."""
     implicit_events: tuple[str, ...] = ()
-    """Events that a property uses although its formula does not name them."""
+    """The events that a property uses although its formula does not name them."""

@@ -13,7 +13,7 @@ from rosmop.logics.interface import FormulaError, Source
 
 MAX_CHARACTERS = 100_000
 MAX_DURATION_NS = 10**18
-"""About 31 years; longer bounds are rejected as mistakes."""
+"""The longest bound, about 31 years; longer bounds are rejected as mistakes."""
 MAX_NUMBER_DIGITS = 30
 
 UNITS_NS = {
@@ -29,7 +29,7 @@ UNITS_NS = {
 
 @dataclass(frozen=True)
 class FormulaToken:
-    """Its kind is the sign, ``name``, ``number`` or ``end``."""
+    """A token; its kind is the sign, ``name``, ``number`` or ``end``."""
 
     kind: str
     text: str
@@ -37,7 +37,7 @@ class FormulaToken:
 
 
 def tokenize(source: Source, signs: Sequence[str]) -> list[FormulaToken]:
-    """The longest matching sign is taken; the last token is ``end``."""
+    """Return the tokens; the longest matching sign is taken, and the last token is ``end``."""
     if len(source.text) > MAX_CHARACTERS:
         raise source.error(
             0, f"a formula of more than {MAX_CHARACTERS} characters; split it into several properties"
@@ -69,7 +69,7 @@ def tokenize(source: Source, signs: Sequence[str]) -> list[FormulaToken]:
 
 
 def _sign_pattern(sign: str) -> str:
-    """A sign that ends with a letter (``~o``) must end where the word ends."""
+    """Return a pattern for a sign; one that ends with a letter (``~o``) must end where the word ends."""
     return re.escape(sign) + (r"(?![A-Za-z_0-9])" if sign[-1].isalnum() else "")
 
 
@@ -111,7 +111,7 @@ class TokenReader:
         return self._tokens[min(self._next + count, len(self._tokens) - 1)]
 
     def take(self) -> FormulaToken:
-        """The end can be read repeatedly."""
+        """Return the next token; the end can be read repeatedly."""
         token = self._tokens[self._next]
         if token.kind != "end":
             self._next += 1
@@ -133,7 +133,7 @@ class TokenReader:
         return self.source.error(self.token.offset, f"expected {what}, found {describe(self.token)}")
 
     def note(self, token: FormulaToken, text: str) -> None:
-        """One pass finds as many errors as possible."""
+        """Note an error, so that one pass finds as many errors as possible."""
         if len(self.findings) < 20:
             self.findings.append(self.source.finding(token.offset, text))
 

@@ -48,11 +48,10 @@ _PAST = {"previously", "dual previously", "historically", "once", "since", "dual
 _FUTURE = {"next", "always", "eventually", "until", "release"}
 VERDICTS = ("violation", "validation")
 MOST_LETTERS = 1024
-"""Each operator about the past doubles the classes of events."""
+"""The most letters; each operator about the past doubles the classes of events."""
 
 
 def compile_ltl(source: Source) -> FiniteProperty:
-    """Raises `FormulaError`."""
     formula = read_formula(source, SYNTAX)
     _refuse_past_alone(source, formula)
     named = event_names(formula)
@@ -87,7 +86,7 @@ def compile_ltl(source: Source) -> FiniteProperty:
 
 
 def _settled(for_it: Sets, against_it: Sets) -> tuple[Sets, Sets]:
-    """Once the verdict is certain, the other side gets a common placeholder."""
+    """Return both sides; once the verdict is certain, the other side gets a common placeholder."""
     if not for_it:
         return frozenset(), _SOMETHING
     if not against_it:
@@ -119,7 +118,6 @@ class _Past:
         return Formula(operator, operands, formula.name)
 
     def _proposition(self, operator: str, operands: tuple[Formula, ...]) -> Formula:
-        """Replace `previously x` or `x since y`, and constrain the proposition."""
         formula = Formula(operator, operands)
         if formula in self.propositions:
             return Formula("event", name=self.propositions[formula])

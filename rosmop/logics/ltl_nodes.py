@@ -19,7 +19,7 @@ class FormulaNodes:
         self._nodes: list[tuple[str, tuple[int, ...]]] = []
 
     def __getitem__(self, node: int) -> tuple[str, tuple[int, ...]]:
-        """The second item is a bit set for a ``letters`` node, otherwise the operands."""
+        """Return the kind of a node, and its letters (a bit set) or operands."""
         return self._nodes[node]
 
     def _intern(self, kind: str, parts: tuple[int, ...]) -> int:
@@ -36,7 +36,7 @@ class FormulaNodes:
         return parts[0] if kind == "letters" else None
 
     def join(self, kind: str, operands: Iterable[int]) -> int:
-        """Flatten, and merge letters into one operand."""
+        """Return a flat node, in which letters are one operand."""
         mask = self.everything if kind == "and" else 0
         absorbing = 0 if kind == "and" else self.everything
         parts: set[int] = set()
@@ -60,13 +60,13 @@ class FormulaNodes:
         return operand if self._mask(operand) in (0, self.everything) else self._intern("next", (operand,))
 
     def until(self, left: int, right: int) -> int:
-        """``right`` holds at some position, and ``left`` at all positions before it."""
+        """Return a node by which ``right`` holds at some position, and ``left`` at all positions before it."""
         if self._mask(right) in (0, self.everything) or self._mask(left) == 0 or left == right:
             return right
         return self._intern("until", (left, right))
 
     def release(self, left: int, right: int) -> int:
-        """``right`` holds up to and including the first position of ``left``, or always."""
+        """Return a node by which ``right`` holds up to and including the first position of ``left``, or always."""
         if self._mask(right) in (0, self.everything) or self._mask(left) == self.everything or left == right:
             return right
         return self._intern("release", (left, right))
@@ -109,7 +109,7 @@ class FormulaTranslation:
         return self._nodes.letters(mask if positive else everything & ~mask)
 
     def _temporal(self, operator: str, parts: list[int], positive: bool) -> int:
-        """The parts are already negated if necessary."""
+        """Return the node of a temporal operator, whose parts are already negated if necessary."""
         nodes = self._nodes
         if operator == "next":
             return nodes.next(parts[0])
@@ -121,7 +121,6 @@ class FormulaTranslation:
         return nodes.until(parts[0], parts[1]) if strong else nodes.release(parts[0], parts[1])
 
     def _parity(self, operands: tuple[Formula, ...], odd: bool) -> int:
-        """Return the node that holds if an odd (or even) number of operands hold."""
         nodes = self._nodes
         yes, no = self.node(operands[0], True), self.node(operands[0], False)
         for operand in operands[1:]:

@@ -38,7 +38,6 @@ SYNTAX = Syntax(
 
 
 def compile_mtl(source: Source) -> CompiledProperty:
-    """Raises `FormulaError`."""
     formula = read_formula(source, SYNTAX)
     future = [node for node in nodes(formula) if node.operator in FUTURE]
     for node in future:

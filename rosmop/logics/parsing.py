@@ -26,18 +26,17 @@ from rosmop.logics.cfg_grammar import Grammar, nullable_symbols
 from rosmop.logics.interface import RunFaultError
 
 MAX_WIDTH = 4_000
-"""Only ambiguous grammars come close to this number of continuations of a frame."""
+"""The most continuations of a frame; only ambiguous grammars come close to it."""
 MAX_STEP_WORK = 300_000
 """The items that one step may complete, in a fraction of a second."""
 MAX_DEPTH = 1_000_000
-"""The nesting of the trace."""
+"""The deepest nesting of the trace."""
 KEPT_SHAPE_WIDTH = 8
 KEPT_SHAPE_ITEMS = 400
 KEPT_ENTRIES = 20_000
 
 Entry = tuple[int, int]
-"""An item, and a reference: the number of a continuation of the frame, or -1-A for the frame itself and
-symbol A."""
+"""An item, and a reference: the number of a continuation of the frame, or -1-A for the frame itself and symbol A."""
 
 
 class EarleyShape:
@@ -59,7 +58,7 @@ Step = tuple[EarleyShape, tuple[int, ...]]
 
 
 class EarleySet:
-    """``depth`` counts the frames below that wait."""
+    """An Earley set; ``depth`` counts the frames below that wait."""
 
     __slots__ = ("conts", "depth", "shape")
 
@@ -109,7 +108,7 @@ class EarleyRecogniser:
     # ---- one event
 
     def step(self, frame: EarleySet, event: int) -> tuple[EarleySet, bool] | None:
-        """Return whether the trace is in the language, or None if no continuation can be in it."""
+        """Return the next frame and whether the trace is in the language, or None if no continuation can be in it."""
         scanned = self._scan(frame.shape, event)
         if scanned is None:
             return None
@@ -145,7 +144,7 @@ class EarleyRecogniser:
     def _complete_wide(
         self, shape: EarleyShape, conts: Conts, before: EarleySet, *, accepted: bool
     ) -> tuple[EarleyShape, Conts, bool]:
-        """The large frames of ambiguous grammars use no tables."""
+        """Complete continuations without tables, for the large frames of ambiguous grammars."""
         items = {(item, conts[reference]) for item, reference in shape.items}
         waiting = [conts[reference] for reference in shape.done]
         completed = set(waiting)
@@ -215,9 +214,7 @@ class EarleyRecogniser:
         return known
 
     def _closure(self, shape: EarleyShape) -> tuple[dict[int, set[Entry]], dict[int, set[Entry]]]:
-        """Return, for each nonterminal and event, the items that wait for it (including predicted ones), advanced by
-        it.
-        """
+        """Return, for each nonterminal and event, the items that wait for it (also predicted ones), advanced by it."""
         if shape.waiters is not None:
             return shape.waiters
         waiters: dict[int, set[Entry]] = {}
@@ -241,7 +238,7 @@ class EarleyRecogniser:
         return shape.waiters
 
     def _skip_nullable(self, item: int) -> list[int]:
-        """Include the items after each next symbol that may be empty."""
+        """Return an item with the items after each next symbol that may be empty."""
         items = [item]
         while self._next[item] in self._nullable:
             item += 1
@@ -249,7 +246,7 @@ class EarleyRecogniser:
         return items
 
     def _complete(self, shape: EarleyShape, entries: set[Entry]) -> Step:
-        """Completed continuations outside the frame are ``done``."""
+        """Complete the items; completed continuations outside the frame are ``done``."""
         waiters, _ = self._closure(shape)
         items: set[Entry] = set()
         done: set[int] = set()
@@ -287,7 +284,7 @@ class EarleyRecogniser:
     def _join(
         self, shape: EarleyShape, conts: Conts, index: int, other: EarleyShape, others: Conts
     ) -> tuple[EarleyShape, Conts]:
-        """Return the union, without ``index`` in ``done``."""
+        """Return the union of two sets, without ``index`` in ``done``."""
         place = {cont: number for number, cont in enumerate(conts)}
         mapping = tuple(place.get(cont, -1) for cont in others)
         key = (shape, index, other, mapping)
@@ -307,7 +304,7 @@ class EarleyRecogniser:
 
 
 def _deepest(done: tuple[int, ...], conts: Conts) -> int:
-    """Completing the deepest continuation completes only less deep ones."""
+    """Return the deepest continuation, whose completion completes only less deep ones."""
     deepest, depth = done[0], -2
     if len(done) > 1:
         for index in done:

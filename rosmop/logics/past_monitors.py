@@ -37,9 +37,9 @@ VERDICTS = ("violation", "validation")
 ANEW = "anew"
 TOLD: tuple[Categories, Categories] = VERDICTS[:1], VERDICTS[1:]
 MAX_TABLE_WORK = 2_000_000
-"""Limits the work of building a table."""
+"""The limit of the work of building a table."""
 MAX_FOLDED = 50_000
-"""Larger programs are not folded."""
+"""The largest program that is folded."""
 FOREVER = 10**30
 
 
@@ -117,7 +117,7 @@ class PastProgram:
 
 
 _OF_ONE = {"once": "since", "historically": "since", "eventually": "until", "always": "until"}
-"""These equal another operator with `true` as its left operand."""
+"""Operators that equal another one with `true` as its left operand."""
 
 
 Operation = tuple[str, int, int, int, int]
@@ -154,7 +154,6 @@ class FoldedProgram:
         return [False, True, *kept, *[False] * (self.size - 2 - len(kept))]
 
     def take(self, values: list[Any], event: int, now: int) -> tuple[int, ...]:
-        """Return the places of the requested values."""
         operations, results = self.residues[event]
         compute(operations, values, event, now)
         return results
@@ -177,7 +176,6 @@ def compute(operations: Sequence[Operation], values: list[Any], event: int, now:
 
 
 def fold(program: PastProgram, wanted: Sequence[int]) -> FoldedProgram:
-    """Return a program that computes these instructions."""
     needed = {*wanted}
     for number in range(max(wanted), -1, -1):
         if number in needed:
@@ -235,7 +233,7 @@ class _Fold:
         return tuple(reversed(left)), results
 
     def _place(self, number: int, instruction: PastInstruction) -> int:
-        """A place below 2 is a constant."""
+        """Return the place of a value; a place below 2 is a constant."""
         operands = [self._places[operand] for operand in instruction.operands]
         operator, kept = instruction.plain, self._kept.get(number, 0)
         if operator == "event" and self._event is None:

@@ -1,5 +1,4 @@
-"""``pattern``: properties in near-English, after Dwyer's scopes and patterns, with the meaning of HPL (Santos et
-al.).
+"""``pattern``: properties in near-English, after Dwyer's scopes and patterns, with HPL's meaning (Santos et al.).
 
 ``globally: no c``, ``after a: some c within 2s``, ``until b: c causes d``, ``after a until b: c requires d within
 1s``, ``… c forbids d``.
@@ -73,7 +72,7 @@ class Pattern:
         return "quiet" if self.opens is None else "waiting"
 
     def after_event(self, mode: Mode, event: int, *, late: bool) -> Mode:
-        """``late``: more than ``within_ns`` after the start of the mode's clock."""
+        """Return the next mode. ``late``: more than ``within_ns`` after the start of the mode's clock."""
         if mode == "waiting":
             return "quiet" if event == self.opens else "waiting"
         if mode in ("over", "violated"):
@@ -93,7 +92,9 @@ class Pattern:
         return "quiet" if second and self.kind == "causes" else mode
 
     def restarts_clock(self, before: Mode, event: int, mode: Mode) -> bool:
-        """The clock runs from the opening of the scope, the oldest unanswered event, or the latest event."""
+        """Whether the clock restarts: it runs from the opening of the scope, the oldest unanswered event, or
+        the latest event.
+        """
         if before == "waiting":
             return mode == "quiet"
         if mode != "stirred":
@@ -192,7 +193,7 @@ class TimedPattern(ClockedProperty):
         return tuple(table)
 
     def blocking_refused(self, category: str) -> str | None:
-        """A deadline may decide the category without a message."""
+        """Return a refusal, because a deadline may decide the category without a message."""
         super().blocking_refused(category)
         kind = self.pattern.kind
         comes_along = kind == "no" or self.pattern.enforced
@@ -202,7 +203,6 @@ class TimedPattern(ClockedProperty):
 
 
 def compile_pattern(source: Source) -> CompiledProperty:
-    """Raises `FormulaError`."""
     reader = TokenReader(source, (":", "(", ")"))
     opens, closes = _read_scope(reader)
     reader.expect(":", "`:` after the scope")

@@ -32,7 +32,6 @@ class _State:
 
 
 def dot_of(properties: Sequence[CompiledProperty]) -> str | None:
-    """Return one `digraph` after the other, or None if there are none."""
     graphs = [graph for graph in map(to_dot, properties) if graph is not None]
     return "\n".join(graphs) if graphs else None
 

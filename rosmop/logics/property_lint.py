@@ -16,7 +16,7 @@ from rosmop.logics.pattern import TimedPattern
 from rosmop.logics.tfsm import TimedStateMachine
 
 TIME = "<time>"
-"""In traces: a deadline or a time bound passes."""
+"""In traces, a deadline or a time bound that passes."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class PropertyFact:
 
 @dataclass(frozen=True)
 class VerdictGraph:
-    """``verdicts`` are the categories on entering each state."""
+    """A graph of states; ``verdicts`` are the categories on entering each."""
 
     initial: int
     edges: tuple[tuple[tuple[tuple[str, ...], int], ...], ...]
@@ -62,9 +62,9 @@ def analyse(compiled: CompiledProperty, handled: Sequence[str]) -> list[Property
 
 
 def shortest_trace_to(compiled: CompiledProperty, category: str) -> tuple[str, ...] | None:
-    """Return None if no trace is known.
+    """Return a shortest trace to a category, or None if none is known.
 
-    ``TIME`` among them means that a deadline or a time bound passes.
+    ``TIME`` in it means that a deadline or a time bound passes.
     """
     graph = graph_of(compiled)
     return None if graph is None else _shortest_traces(graph).get(category)
@@ -87,7 +87,7 @@ def _shortest_traces(graph: VerdictGraph) -> dict[str, tuple[str, ...]]:
 
 
 def graph_of(compiled: CompiledProperty) -> VerdictGraph | None:
-    """Return None if the states are not known to be finite."""
+    """Return the graph, or None if the states are not known to be finite."""
     if isinstance(compiled, FiniteProperty):
         automaton = compiled.automaton
         labels = [(event,) for event in compiled.events]
@@ -103,7 +103,7 @@ def graph_of(compiled: CompiledProperty) -> VerdictGraph | None:
 
 
 def _past_graph(compiled: ClockedPastProperty) -> VerdictGraph:
-    """Each state occurs twice: before and after the time bound has passed."""
+    """Return a graph with each state twice: before and after the time bound has passed."""
     size = len(compiled.moves)
     late = [
         [
@@ -124,7 +124,7 @@ def _past_graph(compiled: ClockedPastProperty) -> VerdictGraph:
 
 
 def _machine_graph(compiled: TimedStateMachine) -> VerdictGraph:
-    """Besides the start, each state occurs twice: entered by an event, and by a timeout."""
+    """Return a graph with each state except the start twice: entered by an event, and by a timeout."""
     base = compiled.automaton
     size = len(base)
     silent = compiled.silence_ns is not None
@@ -144,7 +144,7 @@ def _machine_graph(compiled: TimedStateMachine) -> VerdictGraph:
 
 
 def _pattern_graph(compiled: TimedPattern) -> VerdictGraph:
-    """With a remedy, each mode has a second node: entered by the remedy.
+    """Return a graph; with a remedy, each mode has a second node, which the remedy enters.
 
     In a mode without a deadline, an event may still come too late for the time bound.
     """

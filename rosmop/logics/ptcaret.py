@@ -53,7 +53,6 @@ SYNTAX = Syntax(
 
 
 def compile_ptcaret(source: Source) -> CompiledProperty:
-    """Raises `FormulaError`."""
     formula = plain(read_formula(source, SYNTAX))
     missing = [name for name in (BEGIN, END) if name not in source.events]
     if missing and any(node.operator.startswith("abstract ") for node in nodes(formula)):
@@ -68,7 +67,7 @@ def compile_ptcaret(source: Source) -> CompiledProperty:
 
 
 class CaretProperty(CompiledProperty):
-    """Its stack has the state of the abstract operators for each open call."""
+    """A property whose stack has the state of the abstract operators for each open call."""
 
     def __init__(self, source: Source, folded: FoldedProgram) -> None:
         super().__init__(source, VERDICTS)
@@ -81,7 +80,7 @@ class CaretProperty(CompiledProperty):
 
 
 class CaretRun(UntimedRun):
-    """Its values, and for each open call the values about the abstract past from before it."""
+    """A run: its values, and for each open call the values about the abstract past from before it."""
 
     __slots__ = ("_compiled", "_stack", "_values")
 
@@ -96,7 +95,7 @@ class CaretRun(UntimedRun):
         return made
 
     def step(self, event: int, _time_ns: int) -> Categories:
-        """If it raises `RunFaultError`, the run is unchanged."""
+        """Step an event. If this raises `RunFaultError`, the run is unchanged."""
         compiled, values, stack = self._compiled, self._values, self._stack
         abstract = compiled.folded.abstract
         if event == compiled.begin:
@@ -118,7 +117,6 @@ class CaretRun(UntimedRun):
 
 
 def plain(formula: Formula) -> Formula:
-    """Expand the derived operators."""
     operands = tuple(plain(operand) for operand in formula.operands)
     operator, _, where = formula.operator.partition(" ")
     if operator == "stack-since":
@@ -140,7 +138,6 @@ def plain(formula: Formula) -> Formula:
 
 
 def _stack_since(where: str, left: Formula, right: Formula) -> Formula:
-    """Expand `left Ss@where right` as in MOP's plugin."""
     begin, call = Formula("event", name=BEGIN), Formula("event", name=CALL)
     both = Formula("or", (begin, call))
     guard = {"b": begin, "c": call, "bc": both}[where]

@@ -22,5 +22,4 @@ SYNTAX = Syntax(
 
 
 def compile_ptltl(source: Source) -> CompiledProperty:
-    """Raises `FormulaError`."""
     return compile_past(source, read_formula(source, SYNTAX))

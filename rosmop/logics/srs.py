@@ -27,9 +27,7 @@ Sixteen comparisons of symbols count as one move.
 
 @dataclass(frozen=True)
 class RewriteRule:
-    """A rule ``left -> right`` or ``left -> verdict``. ``begins`` and ``ends`` bind it to the string's beginning or
-    end.
-    """
+    """A rule ``left -> right`` or ``left -> verdict``. ``begins`` and ``ends`` bind it to the string's ends."""
 
     left: tuple[int, ...]
     right: tuple[int, ...]
@@ -39,7 +37,7 @@ class RewriteRule:
 
 
 class RewritingProperty(CompiledProperty):
-    """Symbols are numbers, events first."""
+    """A property for a rewriting system; symbols are numbers, events first."""
 
     def __init__(self, source: Source, rules: Sequence[RewriteRule]) -> None:
         super().__init__(source, CATEGORIES)
@@ -57,7 +55,7 @@ class RewritingProperty(CompiledProperty):
 
 
 class RewritingRun(UntimedRun):
-    """Its string, or its final verdict. Between two events no rule applies."""
+    """A run: its string, or its final verdict. Between two events no rule applies."""
 
     __slots__ = ("_property", "string", "verdict")
 
@@ -67,7 +65,7 @@ class RewritingRun(UntimedRun):
         self.verdict: Categories = ()
 
     def step(self, event: int, _time_ns: int) -> Categories:
-        """If it raises `RunFaultError`, the run is unchanged."""
+        """Step an event. If this raises `RunFaultError`, the run is unchanged."""
         if not self.verdict:
             self.string, self.verdict = self._rewritten([*self.string, event])
         return self.verdict
@@ -79,7 +77,7 @@ class RewritingRun(UntimedRun):
         self.string, self.verdict = saved
 
     def _rewritten(self, string: list[int]) -> tuple[list[int], Categories]:
-        """Invariant: no rule matches before `place`."""
+        """Return the rewritten string and its verdict. Invariant: no rule matches before `place`."""
         longest, work = self._property.longest, MAX_WORK
         place = max(0, len(string) - longest)
         while place < len(string):
@@ -114,7 +112,6 @@ def _matching(rules: Sequence[RewriteRule], string: list[int], place: int) -> tu
 
 
 def compile_srs(source: Source) -> RewritingProperty:
-    """Raises `FormulaError`."""
     reader = TokenReader(source, ("->", "^", "$", ".", "#"))
     numbers = {name: number for number, name in enumerate(source.events)}
     rules = [_read_rule(reader, numbers)]

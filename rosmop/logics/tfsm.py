@@ -50,14 +50,15 @@ class TimedStateMachine(ClockedProperty):
             self.waits = (*silent, *[None] * size)
 
     def categories_after(self, event: int) -> frozenset[str]:
-        """``timeout`` is not included, because it needs no event."""
+        """Return the categories after an event, without ``timeout``, which needs no event."""
         verdicts = self.automaton.verdicts
         return frozenset(name for row in self.automaton.table for name in verdicts[row[event]])
 
     def blocking_refused(self, category: str) -> str | None:
-        """``timeout`` comes without a message.
+        """Return a refusal for ``timeout``, which comes without a message.
 
-        Other categories may drop the message, because an event may stay in a state that only a timeout enters.
+        Other categories may drop the message, because an event may stay in a state that only a timeout
+        enters.
         """
         super().blocking_refused(category)
         if category == TIMEOUT:
@@ -66,7 +67,6 @@ class TimedStateMachine(ClockedProperty):
 
 
 def compile_tfsm(source: Source) -> TimedStateMachine:
-    """Raises `FormulaError`."""
     machine = read_state_machine(source, timed=True)
     number = {name: index for index, name in enumerate(machine.order)}
     timeouts: list[tuple[int, int] | None] = [

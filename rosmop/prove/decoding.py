@@ -25,7 +25,7 @@ class WasmInstruction:
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """Types are "i32", "f64", …."""
+    """A decoded function; types are "i32", "f64", …."""
 
     parameters: tuple[str, ...]
     result: str
@@ -51,7 +51,7 @@ _TRUNCATED = """i32.trunc_sat_f32_s i32.trunc_sat_f32_u i32.trunc_sat_f64_s i32.
 
 
 def _plain() -> dict[int, str]:
-    """The opcodes are in WebAssembly 1.0, section 5.4."""
+    """Return the opcodes (WebAssembly 1.0, section 5.4)."""
     found = {
         0x00: "unreachable",
         0x0F: "return",
@@ -125,7 +125,6 @@ class Reader:
             found.append(self.instruction(code))
 
     def instruction(self, code: int) -> WasmInstruction:
-        """Read the rest of the instruction `code`."""
         if code in PLAIN:
             return WasmInstruction(PLAIN[code])
         if code in MEMORY:
@@ -154,10 +153,10 @@ class Reader:
 
 
 def functions_of(module: bytes) -> list[Code]:
-    """The module must not have imports.
+    """Return the functions of a module without imports.
 
-    Raises `UnknownInstructionError`, `KeyError` for an unknown type, and `IndexError` where the module ends too
-    early.
+    Raises `UnknownInstructionError`, `KeyError` for an unknown type, and `IndexError` where the module ends
+    too early.
     """
     reader = Reader(module)
     reader.take(8)

@@ -58,7 +58,7 @@ from rosmop.types.value_types import Type
 EQUAL = "equal"
 IN_PYTHON = "not compiled: Python evaluates the messages of this topic"
 PATIENCE = 30.0
-"""The default for each event, in seconds."""
+"""The default time for each event, in seconds."""
 
 _NOW, _REST = 16, 32  # addresses of the time and of the number of bytes that are not shown
 _HAPPENED, _DROPPED, _CHANGED, _ELSEWHERE, _REPLACED = 1, 2, 4, 8, 32
@@ -289,7 +289,6 @@ def _example(model: Any) -> str:
 
 
 def _text(name: str, address: int, cells: dict[int, Term]) -> TextTerm:
-    """Return a string whose address and length are in these cells."""
     place, length = (z3.BitVec(f"{part} of {name}", 32) for part in ("address", "length"))
     cells |= {address: place, address + 4: length}
     return TextTerm(place, z3.ZeroExt(32, length))

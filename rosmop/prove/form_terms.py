@@ -79,7 +79,7 @@ _LOOPS: Mapping[type[nodes.FormNode], str] = MappingProxyType(
         nodes.Skip: "a field comes after strings or arrays in an array",
     }
 )
-"""Why the number of steps depends on the message."""
+"""The reasons why the number of steps depends on the message."""
 
 
 class UnknownError(Exception):
@@ -105,7 +105,6 @@ def _text(view: _View) -> Term:
 
 
 def _word(value: Term, kind: Type) -> Term:
-    """Numbers are stored like this in a line of output."""
     if isinstance(kind, value_types.FloatingType):
         return z3.fpToIEEEBV(value if kind.bits == 64 else z3.fpFPToFP(NEAREST, value, DOUBLE))
     bits = as_bits(value) if z3.is_bool(value) else value
@@ -143,7 +142,7 @@ class FormTerms:
         self._shared: Sequence[str] = self._function.shared
 
     def result(self) -> FormResult:
-        """Raises `NotProvedError` for a loop."""
+        """Return the result of the event. Raises `NotProvedError` for a loop."""
         begin, no = self._beginning, z3.BoolVal(False)
         budget = begin.budgets[self._function.context]
         slots: dict[Any, Any] = {_MESSAGE: begin.message, _DROPPED: no, _REPLACED: no, _CHANGED: no}
@@ -256,7 +255,7 @@ class FormTerms:
         state.slots[_REPLACED] = z3.BoolVal(True)
 
     def _put_safe(self, safe: nodes.SafeMessage, state: State) -> None:
-        """Keep `seq` and `stamp` of the header."""
+        """Write the safe message, but keep `seq` and `stamp` of the header."""
         message, changed = state.slots[_MESSAGE], state.slots[_CHANGED]
         place = SAFE_HEAD if safe.stamped else 0
         while place < len(
@@ -271,7 +270,6 @@ class FormTerms:
         state.slots |= {_MESSAGE: message, _CHANGED: changed}
 
     def _log(self, node: nodes.Log, state: State) -> None:
-        """Charge the highest possible cost."""
         line = OutputLine("", node)
         cost, words = integer(line.cost, 64), []
         for expression in line.values:
@@ -301,7 +299,7 @@ class FormTerms:
         state.slots[_SAID] = begin + (offset + 7 & ~7)
 
     def _pending(self, node: nodes.Pending, state: State) -> None:
-        """Only `Whole` uses this list, and it is not compiled."""
+        """Do nothing for the list of fields, which only `Whole` uses, and `Whole` is not compiled."""
 
     def _require(self, node: nodes.Require, state: State) -> None:
         test = self._value(node.test, state)
@@ -429,7 +427,6 @@ class FormTerms:
             state.slots[_CHANGED] = either(state.slots[_CHANGED], differs)
 
     def _packed(self, value: Term, kind: Type, state: State) -> Term:
-        """The bits of a NaN are left to Python."""
         if isinstance(kind, value_types.FloatingType):
             self._leave_to_python(state, z3.fpIsNaN(value))
             return z3.fpToIEEEBV(value)
@@ -498,7 +495,6 @@ class FormTerms:
         return value if own in state.slots else self._kept(value, state)
 
     def _kept(self, value: Any, state: State) -> Any:
-        """Leave the message to Python if a string is longer than the module keeps."""
         if isinstance(value, TextTerm):
             self._leave_to_python(state, z3.UGT(value.count, MOST_KEPT))
         return value
@@ -535,7 +531,7 @@ class FormTerms:
         return wrapped(value if width(target) == value.size() else z3.Extract(31, 0, value), target)
 
     def _truncated(self, value: Term, target: value_types.IntegerType) -> Term:
-        """Truncate toward zero, within the limits of the type.
+        """Truncate a number toward zero, within the limits of the type.
 
         Types narrower than 32 bits are first limited as `int`.
         """
@@ -599,8 +595,8 @@ class FormTerms:
         return self._of_parts(node.type, seconds, rest, state)
 
     def _of_parts(self, kind: Type, seconds: Term, rest: Term, state: State) -> Term:
-        """Seconds beyond 2**33 are out of range for all allowed nanoseconds. Below that limit, the sum in 72 bits
-        shows whether the sum in 64 bits overflows.
+        """Return a time. Seconds beyond 2**33 are out of range for all allowed nanoseconds; below, the sum in
+        72 bits shows whether the sum in 64 bits overflows.
         """
         far = either(seconds >= 1 << 33, seconds <= -(1 << 33), rest >= 1 << 62, rest <= -(1 << 62))
         known = state.where(far)
@@ -689,7 +685,6 @@ class FormTerms:
         return self._beginning.now
 
     def _throttle(self, node: nodes.Throttle, state: State) -> Any:
-        """Leave the message to Python if the output is due."""
         last = self._beginning.throttles.get((self._function.context, node.site))
         if last is None:
             raise UnknownError("output with a rate limit")

@@ -128,7 +128,7 @@ class ModuleExecution:
         self._number = number
 
     def done(self) -> ModuleResult:
-        """Raises `DiffersError` and `NotProvedError`."""
+        """Return the result of the function. Raises `DiffersError` and `NotProvedError`."""
         state = self._state
         bits = _bits(self._call(self._number, [Pointer("message", integer(0, 32)), self._size], state))
         cells = {
@@ -142,7 +142,7 @@ class ModuleExecution:
         )  # fmt: skip
 
     def _call(self, number: int, arguments: Sequence[Any], state: State) -> Any:
-        """`state` becomes the state after the call."""
+        """Call a function; `state` becomes the state after the call."""
         code = self._functions[number]
         self._frames += 1
         outer = self._frame, self._returned

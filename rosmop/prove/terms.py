@@ -13,24 +13,24 @@ from typing import Any
 import z3
 
 Term = Any
-"""Z3 has no Python types."""
+"""A term; z3 has no Python types."""
 
 DOUBLE, SINGLE = z3.Float64(), z3.Float32()
 NEAREST = z3.RNE()
 AT = z3.BitVec("at", 32)
-"""Address of the message in the memory."""
+"""The address of the message in the memory."""
 FRAME = z3.BitVec("position", 32)
 
 
 MISMATCH = z3.Function("mismatch", *[z3.BitVecSort(32)] * 4)
-"""The place of the first difference of two strings (addresses and length), or the length. It is not translated."""
+"""The place of the first difference of two strings (addresses and length), or the length; not translated."""
 SECONDS = z3.Function("seconds", z3.BitVecSort(64), DOUBLE)
-"""A time as seconds. It is not translated."""
+"""A time as seconds; not translated."""
 
 
 @dataclass(frozen=True)
 class TextTerm:
-    """A string outside the message: address (32 bits) and length (64 bits). Nothing else is known of its bytes."""
+    """A string outside the message: address (32 bits) and length (64 bits). Its bytes are not known."""
 
     place: Term
     count: Term
@@ -56,7 +56,7 @@ def integer(value: int, bits: int) -> Term:
 
 
 def floating(value: float, bits: int) -> Term:
-    """The constant is exact to the last bit."""
+    """Return a constant that is exact to the last bit."""
     number = int.from_bytes(struct.pack("<d" if bits == 64 else "<f", value), "little")
     return z3.simplify(z3.fpBVToFP(integer(number, bits), DOUBLE if bits == 64 else SINGLE))
 
@@ -114,13 +114,11 @@ def as_bits(truth: Term, bits: int = 32) -> Term:
 
 
 def number_at(message: Term, position: Term, size: int) -> Term:
-    """The number is little-endian."""
     every = [z3.Select(message, position + integer(more, 32) if more else position) for more in range(size)]
     return every[0] if size == 1 else z3.Concat(*reversed(every))
 
 
 def with_number(message: Term, position: Term, value: Term) -> Term:
-    """Write `value` in little-endian order."""
     for more in range(value.size() // 8):
         place = position + integer(more, 32) if more else position
         message = z3.Store(message, place, z3.Extract(8 * more + 7, 8 * more, value))
@@ -128,7 +126,7 @@ def with_number(message: Term, position: Term, value: Term) -> Term:
 
 
 def with_sign(value: Term, sign: Term) -> Term:
-    """`copysign`; the sign of a NaN is not known."""
+    """Return `copysign` of two terms; the sign of a NaN is not known."""
     return z3.If(z3.fpIsNegative(sign), z3.fpNeg(z3.fpAbs(value)), z3.fpAbs(value))
 
 
@@ -152,7 +150,7 @@ class State:
 
 
 def merged(test: Term, yes: State, no: State) -> dict[Any, Any]:
-    """A branch that has ended has no values."""
+    """Return the values of two branches together; one that has ended has no values."""
     if z3.is_false(no.alive):
         return yes.slots
     if z3.is_false(yes.alive):

@@ -52,7 +52,7 @@ class _Content(NamedTuple):
 
 
 class BoundedReader(Reader):
-    """Raises `ReaderError` and `ValueError` beyond a limit."""
+    """A reader of a bag; raises `ReaderError` and `ValueError` beyond a limit."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(regular_files.BoundedPath(path))
@@ -70,10 +70,10 @@ class BoundedReader(Reader):
         return sum(sum(info.connection_counts.values()) for info in self.chunk_infos)
 
     def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
-        """`in_order` reads the index of a chunk when its time has come."""
+        """Read no index: `in_order` reads that of a chunk when its time has come."""
 
     def in_order(self) -> Iterator[tuple[Connection, int, bytes]]:
-        """Yield nanoseconds and bytes: by time, then by position in the file."""
+        """Yield connection, time (ns) and bytes of messages, by time, then by position in the file."""
         connections = {connection.id: connection for connection in self.connections}
         self._entries = 0
         self._unread.clear()

@@ -54,7 +54,7 @@ class BoundedMcap:
         self._file.close()
 
     def in_order(self) -> Iterator[tuple[Connection, int, bytes]]:
-        """Yield nanoseconds and bytes: by time, then by position in the file."""
+        """Yield connection, time (ns) and bytes of messages, by time, then by position in the file."""
         connections = {connection.id: connection for connection in self.connections}
         waiting: list[tuple[int, int, int, int, bytes]] = []
         held = 0
@@ -163,7 +163,6 @@ def _unpacked(chunk: Chunk) -> bytes:
 
 
 def _md5sum(kind: str, text: str) -> str:
-    """Return a string that is not an md5sum if the definition cannot be read."""
     try:
         return Definitions.from_full_text(kind, text).md5sum(kind)
     except DefinitionError:

@@ -27,17 +27,17 @@ _DAMAGE = (
 
 
 class RecordingError(Exception):
-    """The text names the recording and the reason."""
+    """A recording cannot be used; the text names it and the reason."""
 
 
 def ros_type(name: str) -> str:
-    """The reader writes `package/msg/Type`."""
+    """Return the ROS name of a type, for which the reader writes `package/msg/Type`."""
     package, _, kind = name.partition("/")
     return f"{package}/{kind.rpartition('/')[2]}"
 
 
 def open_recording(path: Path) -> Reader:
-    """Raises `RecordingError`."""
+    """Open a recording. Raises `RecordingError`."""
     is_mcap = False
     try:
         if path.is_file():
@@ -59,7 +59,7 @@ def open_recording(path: Path) -> Reader:
 
 
 def messages_of(reader: Reader) -> Iterator[tuple[Connection, int, bytes]]:
-    """Yield times in nanoseconds.
+    """Yield the messages with times in nanoseconds.
 
     Raises `RecordingError` for a damaged file.
     """
@@ -74,7 +74,7 @@ def _text_of(error: Exception) -> str:
 
 
 def definitions_of(reader: Reader) -> Definitions:
-    """Definitions that cannot be parsed are left out."""
+    """Return the definitions in a recording, without those that cannot be parsed."""
     found: dict[str, MessageDefinition] = {}
     sent = dict.fromkeys((ros_type(row.msgtype), row.msgdef.data) for row in reader.connections)
     for name, text in sent:
@@ -116,7 +116,7 @@ class RecordedFile:
                     raise RecordingError(f"{path}: {connection.topic} carries both {other} and {kind}")
 
     def messages(self) -> Iterator[tuple[str, int, bytes]]:
-        """Yield times in nanoseconds. Raises `RecordingError`."""
+        """Yield the messages with times in nanoseconds. Raises `RecordingError`."""
         with closing(open_recording(self._path)) as reader:
             for connection, time_ns, data in messages_of(reader):
                 if connection.topic in self.topics:

@@ -8,7 +8,7 @@ from pathlib import Path, PosixPath
 from typing import BinaryIO
 
 LARGEST_CHUNK = 256 << 20
-"""In bytes, for one read, and for an unpacked chunk."""
+"""The most bytes of one read, and of an unpacked chunk."""
 _LONGEST_LINE = 64
 _NULL = os.makedev(1, 3)  # /dev/null: an empty file
 _KINDS = {
@@ -41,10 +41,10 @@ def open_regular(path: Path) -> BufferedReader:
 
 
 class _BoundedFile(BufferedReader):
-    """Each read is limited."""
+    """A file whose reads are limited."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Raises `ValueError` beyond `LARGEST_CHUNK` bytes."""
+        """Read bytes. Raises `ValueError` beyond `LARGEST_CHUNK` bytes."""
         if size is None or not 0 <= size <= LARGEST_CHUNK:
             raise ValueError(f"it has a record of more than {LARGEST_CHUNK} bytes.")
         return super().read(size)
@@ -57,5 +57,5 @@ class BoundedPath(PosixPath):
     """The path of a regular file that is read in bounded pieces."""
 
     def open(self, *_mode: object) -> BinaryIO:  # type: ignore[override] # readers of recordings ask for bytes
-        """Raises `OSError`."""
+        """Open the file for reading. Raises `OSError`."""
         return _BoundedFile(open_regular(Path(self)).detach())

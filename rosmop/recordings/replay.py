@@ -38,10 +38,10 @@ _Header = tuple[str, str, str, str, str | None, int | None]
 
 
 class OutputBag:
-    """Raises `RecordingError`.
+    """A new bag. Raises `RecordingError`.
 
-    Tools order messages of the same time by their connections. So a message before or after one of a monitor gets a
-    later time than the earlier of the two, if need be by a nanosecond.
+    Tools order messages of the same time by their connections. So a message before or after one of a monitor
+    gets a later time than the earlier of the two, if need be by a nanosecond.
     """
 
     def __init__(self, path: Path, definitions: Definitions) -> None:
@@ -99,7 +99,7 @@ def replay(
     topics: Sequence[str] = ("*",),
     span: tuple[int, int] = (0, 1 << 63),
 ) -> Iterator[ReplayStep]:
-    """The order and the clock are those of the bag.
+    """Run monitors on a bag, in its order and by its clock.
 
     `topics` are patterns; `span` is the first and last time in nanoseconds since the epoch.
     """
@@ -147,7 +147,7 @@ def _steps(step: ReplayStep) -> Iterator[ReplayStep]:
 
 
 class _Caller:
-    """A recording does not have the host."""
+    """The sender of a recorded message, whose host is not recorded."""
 
     name = ""
 
@@ -156,7 +156,7 @@ class _Caller:
 
 
 class _ExplainOnce:
-    """In each second, the first verdict of each category and binding of a property is explained."""
+    """Explains, in each second, the first verdict of each category and binding of a property."""
 
     def __init__(self) -> None:
         self.now = 0
@@ -189,7 +189,7 @@ def _outcome(  # noqa: PLR0917  a message and its facts
 
 
 def _after(started: Outcome, outcome: Outcome) -> Outcome:
-    """The output of `init` comes before the first message."""
+    """Return both outcomes together: the output of `init` comes before the first message."""
     shift = len(started.published)
     outcome.judged = {**started.judged, **{shift + number: one for number, one in outcome.judged.items()}}
     outcome.handling = {
@@ -202,7 +202,6 @@ def _after(started: Outcome, outcome: Outcome) -> Outcome:
 
 
 def _refusal(monitors: MonitorSet, connection: Connection) -> str | None:
-    """Return why the monitors drop messages of a connection, or None."""
     wanted = monitors.topics.get(connection.topic)
     if wanted is None:
         return None

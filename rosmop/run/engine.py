@@ -57,7 +57,7 @@ from rosmop.runtime.wire import Buffer, WireMessage
 from roswire.definitions import Definitions
 
 GivenValues = Mapping[str, Mapping[str, bool | int | float | str]]
-"""By specification and name."""
+"""Given values by specification and name."""
 
 _CHANGED = "its text, or the definition of a message, has changed, and its state is lost"
 
@@ -341,13 +341,13 @@ class MonitorSet:
         )
 
     def _is_true(self, monitor: MonitorInstance, variable: str) -> bool:
-        """The state of its monitor stays where it is."""
+        """Whether a variable is true, without moving the state of its monitor."""
         if monitor.home is not None:
             return monitor.home.is_true(variable)
         return bool(self.interpreter.variables[variable])
 
     def type_of(self, topic: str, *, shadowed: bool = False) -> str | None:
-        """Return None without enabled events. Shadow mode counts only if `shadowed`."""
+        """Return the message type of a topic, or None without enabled events. Shadow mode counts only if `shadowed`."""
         steps = self.steps.get(topic, ())
         return next((step.event.type for step in steps if shadowed or not isinstance(step, _Tap)), None)
 
@@ -355,7 +355,7 @@ class MonitorSet:
         return self.compiled.is_stamped(self.type_of(topic, shadowed=True))
 
     def service_type_of(self, service: str, *, shadowed: bool = False) -> str | None:
-        """Return None without enabled events. Shadow mode counts only if `shadowed`."""
+        """Return the type of a service, or None without enabled events. Shadow mode counts only if `shadowed`."""
         for part in ("request", "response"):
             for step in self.steps.get(channel_of(service, part), ()):
                 if shadowed or not isinstance(step, _Tap):
@@ -371,7 +371,7 @@ class MonitorSet:
             part.interpreter.turn.limit(clock, seconds)
 
     def hurry(self, part: float) -> None:
-        """Messages may take this fraction of the time of `limit_time`."""
+        """Limit messages to this fraction of the time of `limit_time`."""
         self.interpreter.turn.part = part
 
     @property
@@ -400,7 +400,7 @@ class MonitorSet:
 
     @property
     def area(self) -> memoryview | None:
-        """Memory to receive frames in, so that lanes need no copy; None without lanes."""
+        """Return memory to receive frames in, so that lanes need no copy; None without lanes."""
         return self._lanes.area
 
     def contexts(self, topic: str) -> tuple[Context, ...]:
@@ -411,18 +411,20 @@ class MonitorSet:
         return self._lanes.of_topic.get(topic) if topic in self.steps and not self.taps(topic) else None
 
     def lane_ready(self, lane: FastLane, time_ns: int) -> bool:
-        """Nothing may be due, no monitor may wait for its first message, and none may have failed to start."""
+        """Whether a lane may process messages: nothing is due, no monitor waits for its first message, and
+        none has failed to start.
+        """
         return not self._agenda.has_come(time_ns) and not self._broken and lane.ready()
 
     def monitor(self, name: str) -> MonitorInstance:
-        """Raises `KeyError`."""
+        """Return a monitor by its name. Raises `KeyError`."""
         for monitor in self._monitors:
             if monitor.name == name:
                 return monitor
         raise KeyError(name)
 
     def value(self, name: str, variable: str) -> Any:
-        """Raises `KeyError`."""
+        """Return the value of a variable. Raises `KeyError`."""
         monitor = self.monitor(name)
         monitor.move_to_python()
         return self.interpreter.variables[monitor.code.variables[variable]]
@@ -435,7 +437,7 @@ class MonitorSet:
 
     @staticmethod
     def topics_of(monitors: Iterable[MonitorInstance]) -> frozenset[str]:
-        """Services are included."""
+        """Return the topics and services of monitors."""
         return frozenset(
             step.event.topic for monitor in monitors for step in monitor.steps if step.event.topic
         )
@@ -466,7 +468,7 @@ class MonitorSet:
         return self._with_shadows(outcome, [shadow.start(time_ns, expected) for shadow in self.shadows])
 
     def kept_groups(self) -> "list[KeptGroup]":
-        """Their state can be kept outside the process; from now on, changes of slices are noted."""
+        """Return the groups whose state can be kept outside the process; changes of slices are noted from now on."""
         return [
             KeptGroup(group, self.interpreter.variables, self._types, _slice_parts(group))
             for group in self.groups
@@ -516,8 +518,8 @@ class MonitorSet:
         return self._with_shadows(outcome, [shadow.start(time_ns) for shadow in self.shadows])
 
     def hold_lost(self, monitor: MonitorInstance, why: str) -> None:
-        """A monitor that has restarted without its state holds its topics if it is declared `hold`, or if its actions
-        depend on a state and it is not declared `begin`.
+        """Let a monitor that has restarted without its state hold its topics if it is declared `hold`, or if
+        its actions depend on a state and it is not declared `begin`.
         """
         if self.holds_if_lost(monitor.code):
             self.hold(monitor, why)
@@ -543,7 +545,7 @@ class MonitorSet:
         return code.hold or (code.name in self._guards.names and not code.begins)
 
     def identity(self, code: SpecificationCode) -> bytes:
-        """A state belongs to the text, and to the definitions of its message types."""
+        """Return the identity of a state, which belongs to the text, and to the definitions of its message types."""
         return code.identity + self._types[code.name]
 
     def _start(
@@ -622,7 +624,7 @@ class MonitorSet:
         return outcome
 
     def has_departed(self, monitor: MonitorInstance) -> bool:
-        """Return whether a monitor that guards topics may have left its initial state."""
+        """Whether a monitor that guards topics may have left its initial state."""
         if monitor.name not in self._guards.names:
             return False
         beginning = self._beginnings.get(monitor.name)
@@ -634,9 +636,10 @@ class MonitorSet:
         return outcome
 
     def switch(self, enabled: Mapping[str, bool], time_ns: int) -> tuple[MonitorInstance, ...]:
-        """Unknown names are ignored. Return the monitors that changed.
+        """Enable or disable monitors, ignoring unknown names; return the monitors that changed.
 
-        The time while a monitor is disabled does not count: its timers, and its properties with time bounds, restart.
+        The time while a monitor is disabled does not count: its timers, and its properties with time bounds,
+        restart.
         """
         changed = [monitor for shadow in self.shadows for monitor in shadow.switch(enabled, time_ns)]
         for monitor in self._monitors:
@@ -664,7 +667,7 @@ class MonitorSet:
     def give(self, values: GivenValues) -> None:
         """Set given constants, by specification and name; the others get their defaults. The state stays.
 
-        Unknown names, and values outside their ranges, are ignored: the caller has checked them.
+        Unknown names, and values outside their ranges, are ignored, because the caller has checked them.
         """
         for part in (self, *self.shadows):
             for monitor in part._monitors:
@@ -736,7 +739,7 @@ class MonitorSet:
 
     @property
     def next_due(self) -> int | None:
-        """The time of the next tick or deadline."""
+        """Return the time of the next tick or deadline."""
         return self._agenda.due
 
     def advance(self, time_ns: int) -> list[Outcome]:
@@ -752,10 +755,11 @@ class MonitorSet:
             self._judge_published(outcome)
 
     def _judge_published(self, outcome: Outcome) -> None:
-        """Give published messages to the monitors behind their publisher, and theirs to those behind them.
+        """Give published messages to the monitors after their publisher, and theirs to later ones.
 
-        A message that a remedy publishes at a deadline also goes to its own monitor if that is `ordered`. There is
-        still no loop: each other message goes only further back, and its deadlines are later than a message.
+        A message that a remedy publishes at a deadline also goes to its own monitor if that is `ordered`.
+        There is still no loop: each other message goes only further back, and its deadlines are later than a
+        message.
         """
         judged: dict[int, Outcome] = {}
         for number, message in enumerate(outcome.published):
@@ -773,10 +777,10 @@ class MonitorSet:
             outcome.judged = judged
 
     def _after_faults(self, outcome: Outcome) -> None:
-        """A monitor cannot judge if an event that keeps its state up to date has faulted.
+        """Note monitors that cannot judge, because an event that keeps their state up to date has faulted.
 
-        If it is declared `begin`, it starts again; otherwise it keeps its state and holds its topics (not in shadow
-        mode).
+        If it is declared `begin`, a monitor starts again; otherwise it keeps its state and holds its topics
+        (not in shadow mode).
         """
         for fault in outcome.faults if self.on_fault == "drop" else ():
             monitors = [

@@ -37,15 +37,13 @@ OnFault = Literal["drop", "pass"]
 Asked = Callable[[Verdict, int], bool]
 
 EXPLAINED = 3
-"""The limit of explained verdicts of slices for one message, or for one call with deadlines: each takes a
-millisecond.
-"""
+"""The most explained verdicts of slices for one message, or for one call with deadlines; each takes a millisecond."""
 
 SLICE_SECONDS = 50e-6
-"""More processor time of a message for each slice concerned."""
+"""The additional processor time of a message for each slice concerned."""
 
 TICK_BUDGET = 2_000
-"""For each slice, if a tick concerns several."""
+"""The instructions for each slice, if a tick concerns several."""
 
 
 class MonitorExecution:
@@ -65,7 +63,7 @@ class MonitorExecution:
         self._bound: Bound | None = None
         self._explains = True
         self._taking_back: dict[int, Callable[[], None]] = {}
-        """Undo functions for the steps of the current message, by run or slice."""
+        """The functions that undo the steps of the current message, by run or slice."""
         self._trailed: dict[MonitorInstance, int] = {}
         """The number of trail entries that the current message made."""
         self._copies = False
@@ -73,8 +71,8 @@ class MonitorExecution:
         self._passed: int | None = None
 
     def begin(self, monitors: Sequence[MonitorInstance], time_ns: int) -> Outcome:
-        """Stages (constants, first values, `init`) are common, because a monitor may read another monitor's
-        variables.
+        """Start monitors in common stages (constants, first values, `init`), because a monitor may read
+        another's variables.
         """
         outcome = Outcome(time=time_ns)
         self._turn.now, self._turn.until = time_ns, inf  # no time limit: operators wait for it
@@ -141,7 +139,7 @@ class MonitorExecution:
         self._finish(message, writers, outcome)
 
     def tick(self, step: Step, time_ns: int) -> Outcome:
-        """The caller must call `collect`."""
+        """Process a tick; the caller must call `collect`."""
         self._sender, self._function = NOBODY, None
         self._taking_back.clear()
         step.monitor.move_to_python()
@@ -171,7 +169,7 @@ class MonitorExecution:
         return outcome
 
     def send_safe(self, monitor: MonitorInstance, sender: SafeSender, time_ns: int) -> Outcome:
-        """All but the first of a series are `repeated`."""
+        """Send a safe message; all but the first of a series are `repeated`."""
         safe = sender.safe
         outcome = Outcome(time=time_ns)
         outcome.timer, outcome.repeated = f"{monitor.name}.safe", sender.due is not None
@@ -215,7 +213,6 @@ class MonitorExecution:
         return outcome
 
     def _expire_in_slice(self, monitor: MonitorInstance, slice_: Slice) -> list[Outcome]:
-        """A slice that lacks a parameter reports nothing."""
         slices = monitor.slices
         assert slices is not None  # noqa: S101  it has a slice
         deadline = slice_.deadline or 0
@@ -261,7 +258,6 @@ class MonitorExecution:
     # One event
 
     def _happen(self, step: Step, message: WireMessage, outcome: Outcome) -> bool:
-        """Return whether the message was dropped."""
         try:
             has_happened = step.function(message)
         except Exception as error:  # noqa: BLE001  any exception is a recorded fault of this action
@@ -283,7 +279,6 @@ class MonitorExecution:
         return False
 
     def _happen_in_slices(self, step: Step, message: WireMessage, outcome: Outcome) -> bool:
-        """Return whether the message was dropped."""
         assert step.key is not None  # noqa: S101  the caller checks this
         try:
             found = step.key(message)
@@ -391,7 +386,6 @@ class MonitorExecution:
         message: WireMessage | None,
         act: Callable[[Outcome, WireMessage | None], bool],
     ) -> Callable[[], None]:
-        """Return a function that stores the state in the slice."""
         slices = step.monitor.slices
         assert slices is not None  # noqa: S101  it has a slice
         if message is not None:
@@ -412,7 +406,7 @@ class MonitorExecution:
         message: WireMessage | None,
         act: Callable[[Outcome, WireMessage | None], bool],
     ) -> Callable[[], None]:
-        """A slice that lacks a parameter gets a copy of the message, and its output is discarded."""
+        """Run an event in a slice that lacks a parameter, which gets a copy of the message; its output is discarded."""
         turn, explains = self._turn, self._explains
         lines, published, looked = len(turn.log), len(turn.published), {**turn.looked}
         copied = message and WireMessage(bytes(message.buffer), message.time, message.channel)
@@ -431,7 +425,6 @@ class MonitorExecution:
         message: WireMessage | None,
         act: Callable[[Outcome, WireMessage | None], bool],
     ) -> Callable[[], None]:
-        """Return a function that stores the state in the slice."""
         slices = monitor.slices
         assert slices is not None  # noqa: S101  it has a slice
         for running, run in zip(monitor.properties, slices.select(slice_), strict=True):
@@ -449,7 +442,6 @@ class MonitorExecution:
         message: WireMessage | None,
         outcome: Outcome,
     ) -> None:
-        """Report a binding that cannot have a slice as a fault."""
         monitor = step.monitor
         monitor.faults += 1
         text = f"{why}: {step.name} is not monitored for this binding"
@@ -478,8 +470,10 @@ class MonitorExecution:
             outcome.changed_at = tuple([sites[site].position for _, at in writers for site in at])
 
     def _first(self, monitor: MonitorInstance, message: WireMessage, outcome: Outcome) -> bool:
-        """Return whether the monitor drops its first message, or a message on a topic that it holds, without judging
-        it. It passes the safe message.
+        """Return whether the monitor drops its first message, or a message on a topic that it holds, without
+        judging it.
+
+        It passes the safe message.
         """
         if monitor.held:
             why = f" ({monitor.why_held})" if monitor.why_held else ""
@@ -533,7 +527,6 @@ class MonitorExecution:
         self._trailed[monitor] = self._trailed.get(monitor, 0) + 1
 
     def _take_back(self) -> None:
-        """Undo the steps of formulas at this message, the last one first."""
         for take_back in reversed(self._taking_back.values()):
             take_back()
         for monitor, entries in self._trailed.items():
@@ -550,7 +543,7 @@ class MonitorExecution:
         *,
         in_order_told: bool = False,
     ) -> None:
-        """Handlers run in source order, or after a deadline in the given order."""
+        """Run the handlers in source order, or after a deadline in the given order."""
         handlers = [(category, handler) for category, handler in running.handlers if category in categories]
         if in_order_told:
             handlers.sort(key=lambda pair: categories.index(pair[0]))
@@ -599,7 +592,6 @@ class MonitorExecution:
             self._block(monitor, message, outcome)
 
     def _block(self, monitor: MonitorInstance, message: WireMessage | None, outcome: Outcome) -> None:
-        """Drop the message after a fault, or replace it by the safe one."""
         if message is None or self.on_fault != "drop":
             return
         sender = monitor.safes.get(message.channel or "")
@@ -610,7 +602,7 @@ class MonitorExecution:
         outcome.fatal = outcome.faults[-1]
 
     def _replaced(self, message: WireMessage) -> None:
-        """Go on with the safe message: for formulas, the replaced message has not happened.
+        """Continue with the safe message: for formulas, the replaced message has not happened.
 
         If earlier monitors have used up the time of the message, later ones have the same time again.
         """
@@ -658,7 +650,6 @@ class MonitorExecution:
 
 
 def _fault_of(error: Exception, interpreter: Interpreter, monitor: str, otherwise: Position) -> Fault:
-    """`otherwise` is the position if no better one is known."""
     failed = interpreter.failed if error is interpreter.failed.error else LastFailure()
     interpreter.failed = LastFailure()  # the error refers to its callers, and so to much other data
     site = interpreter.sites[failed.site] if failed.site >= 0 else Site(otherwise)

@@ -35,20 +35,20 @@ from rosmop.logics.interface import (
 from rosmop.run.outcomes import NOBODY, EventOccurrence, Explanation, MessageSender
 
 TRAIL = 4096
-"""For all slices of a parametric specification together."""
+"""The events that are kept for all slices of a parametric specification together."""
 
 KEPT = 64
-"""The minimum for a property without tables; the maximum is twice this number."""
+"""The least number of events that are kept for a property without tables; the maximum is twice this number."""
 
 FUTURE_KEPT = 1024
-"""For `mtl` about the future."""
+"""The events that are kept for `mtl` about the future."""
 
 ENTRY = struct.Struct("<qqI4x")
-"""Time (ns) when a state was left; source of the sender; its kind (from bit 24) and the event; its number."""
+"""An entry: time (ns) when a state was left; source of the sender; its kind (from bit 24) and the event; its number."""
 
 RUNS, RING = 4, 256
-"""Runs and steps kept for a property with a clock, twice those needed: the entries of a message that the module
-leaves to the engine overwrite no needed entry.
+"""The runs and steps kept for a property with a clock, twice the needed ones, so that the entries of a
+message that the module leaves to the engine overwrite no needed entry.
 """
 
 _COUNT = struct.Struct("<q")
@@ -105,10 +105,10 @@ class Exits:
         return run.expire()
 
     def begin(self, time_ns: int) -> None:
-        """A path from the initial state never has earlier events."""
+        """Do nothing, because a path from the initial state never has earlier events."""
 
     def mark(self) -> None:
-        """A path from the initial state never has an undone step."""
+        """Do nothing, because a path from the initial state never has an undone step."""
 
     def take_back(self, mark: object) -> None: ...
 
@@ -116,7 +116,7 @@ class Exits:
         self.room, self.owner = room[: len(self.room)], owner
 
     def forget(self, run: Any, _time_ns: int) -> None:
-        """Forget everything: the run continues a run of another process."""
+        """Forget everything, because the run continues a run of another process."""
         self._at = run.state
         for state in range(len(self._automaton)):
             ENTRY.pack_into(self.room, ENTRY.size * state, 0, _EVENT, 0)
@@ -135,7 +135,6 @@ class Exits:
         return Explanation(self._named(_shortest(self._automaton, way, category) if fewest else way), fewest)
 
     def _way(self) -> list[EventOccurrence] | None:
-        """Return the events from the initial state to the last step."""
         found: list[EventOccurrence] = []
         state = self._automaton.initial
         while state != self._at:
@@ -162,7 +161,7 @@ class Exits:
 def _shortest(
     automaton: Automaton, way: Sequence[EventOccurrence], category: str
 ) -> Sequence[EventOccurrence]:
-    """If there are several choices, return the latest events."""
+    """Return a shortest path to the category, with the latest events if there are several."""
     best: dict[int, tuple[int, ...]] = {automaton.initial: ()}
     fewest: tuple[int, ...] = ()
     mine: tuple[int, ...] = ()
@@ -196,7 +195,7 @@ class Steps:
         self.begin(time_ns)
 
     def begin(self, time_ns: int) -> None:
-        """Forget everything: the run has restarted."""
+        """Forget everything, because the run has restarted."""
         self._started = time_ns
         self._steps: list[EventOccurrence] = []
         self._before: Run | None = None
@@ -210,14 +209,14 @@ class Steps:
         del self._steps[size:]
 
     def step(self, run: Run, event: int, time_ns: int, sender: MessageSender) -> Categories:
-        """Raises `RunFaultError`."""
+        """Step the run and keep the event. Raises `RunFaultError`."""
         self._make_room(run)
         categories = run.step(event, time_ns)
         self._steps.append(EventOccurrence(event, time_ns, sender))
         return categories
 
     def forget(self, run: Run, time_ns: int) -> None:
-        """The run continues a run of another process, so explain only from the present state on."""
+        """Explain only from the present state on, because the run continues a run of another process."""
         self.begin(time_ns)
         self._before = None if isinstance(run, BoundedRun) else copy.copy(run)
 
@@ -233,7 +232,6 @@ class Steps:
         return earlier
 
     def _kept(self) -> tuple[Sequence[EventOccurrence], Run | None]:
-        """Return the last steps, and the run before them if there were earlier ones."""
         return self._steps, self._before
 
     def _make_room(self, run: Run) -> None:
@@ -407,10 +405,10 @@ def of_slice(
     category: str,
     passed: int | None = None,
 ) -> Explanation | None:
-    """Return the events that caused a verdict in the slice of a binding (parameters by number): the last one, or the
-    deadline that has `passed`, gave the verdict.
+    """Return the events that caused a verdict in the slice of a binding (parameters by number).
 
-    Return None if it is unknown whether a needed event happened in this slice.
+    The last event, or the deadline that has `passed`, gave the verdict. None if it is unknown whether a
+    needed event happened in this slice.
     """
     own: dict[EventOccurrence, bool] = {}
     happened: list[EventOccurrence] = []

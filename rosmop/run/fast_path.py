@@ -16,7 +16,7 @@ from rosmop.runtime.action_context import LogLine
 from rosmop.runtime.wire import Buffer
 
 MESSAGE_FUEL = FUEL_PER_SECOND // 100
-"""`process_one` may get a different limit."""
+"""The fuel of a message; `process_one` may get a different limit."""
 
 
 class BatchResult(NamedTuple):
@@ -39,10 +39,11 @@ class BatchResult(NamedTuple):
 
 
 class BatchOptions(NamedTuple):
-    """Valid for all batches of a topic until the state of the engine changes.
+    """The options of all batches of a topic until the state of the engine changes.
 
     `told`, `enabled` and `counted` are bits for the module; `told` also has a bit for whether messages may be
-    changed. Batches count in `changed` how many messages each set of events has changed (see `FastLane.writers`).
+    changed. Batches count in `changed` how many messages each set of events has changed (see
+    `FastLane.writers`).
     """
 
     source: int
@@ -89,20 +90,20 @@ class NativeCall(NamedTuple):
 
 
 class NextDue(Protocol):
-    """Returns the time of the next tick or deadline (ns), or None."""
+    """A function that returns the time of the next tick or deadline (ns), or None."""
 
     def __call__(self, *, anew: bool) -> int | None:
-        """With `anew`, compute it again, because there may be an earlier deadline."""
+        """Return the time. With `anew`, compute it again, because there may be an earlier deadline."""
 
 
 class FastLane(Protocol):
     """Processes the messages of one topic, or part of a service, many at a time."""
 
     events: tuple[tuple[str], ...]
-    """For each event: the value of `Outcome.events` if it happens alone."""
+    """The value of `Outcome.events` for each event, if it happens alone."""
 
     monitors: tuple[str, ...]
-    """For each event."""
+    """The monitor of each event."""
 
     drops: bool
 
@@ -115,10 +116,10 @@ class FastLane(Protocol):
         """Return `Outcome.changed_by` for a set of events: bit N stands for event N."""
 
     def happened(self) -> Sequence[int]:
-        """The events since the last call."""
+        """Return the events since the last call."""
 
     def ready(self) -> bool:
-        """No monitor waits for its first message, or holds its topics."""
+        """Whether no monitor waits for its first message, or holds its topics."""
 
     def prepare(
         self,
@@ -129,10 +130,10 @@ class FastLane(Protocol):
         source: int = 0,
         changed: dict[int, int] | None = None,
     ) -> BatchOptions:
-        """The options are valid until the next action of the engine.
+        """Return options that are valid until the next action of the engine.
 
-        If `loud`, no message may be changed. `told` lists the events that may not drop a message, `counted` the
-        verdicts that are only counted.
+        If `loud`, no message may be changed. `told` lists the events that may not drop a message, `counted`
+        the verdicts that are only counted.
         """
 
     def process_batch(  # noqa: PLR0917  called for every batch: calls and keywords would cost a tenth of it
@@ -173,10 +174,11 @@ class FastLane(Protocol):
     def process_message(
         self, message: Buffer, time_ns: int, prepared: BatchOptions, fuel: int = MESSAGE_FUEL
     ) -> Outcome | None:
-        """Return None if the message is left to the engine. Verdicts are not explained, and positions of changes are
-        not reported.
+        """Process a message; return None if it is left to the engine. Verdicts are not explained, and
+        positions of changes are not reported.
 
-        The conditions are those of `process_batch`. Use separate options for this method, and do not call `happened`.
+        The conditions are those of `process_batch`. Use separate options for this method, and do not call
+        `happened`.
         """
 
 
@@ -193,4 +195,6 @@ class FastPath(Protocol):
     def lanes(
         self, compiled: Compiled, interpreter: Interpreter, monitors: Sequence[MonitorInstance], due: NextDue
     ) -> Lanes:
-        """Set `home` of each monitor whose state a lane takes over. The engine processes a topic without a lane."""
+        """Return the lanes, and set `home` of each monitor whose state a lane takes over. The engine
+        processes a topic without a lane.
+        """

@@ -14,10 +14,10 @@ from rosmop.types import value_types
 
 @dataclass(frozen=True, slots=True)
 class Guards:
-    """`depending` has, for each specification, the guards that depend on its state.
+    """The guards; `depending` has, for each specification, the guards that depend on its state.
 
-    A fault in the function of an event in `judging` only drops the event's own message, because the guards that
-    depend on the event act on its topic alone: no subscriber saw what the state lacks.
+    A fault in the function of an event in `judging` only drops the event's own message, because the guards
+    that depend on the event act on its topic alone: no subscriber saw what the state lacks.
     """
 
     names: frozenset[str]
@@ -54,7 +54,6 @@ def guards_of(compiled: Compiled) -> Guards:
 
 
 def _used(codes: Mapping[str, SpecificationCode], name: str) -> Iterator[str]:
-    """Yield the specification itself, and all whose variables it uses, directly or indirectly."""
     waiting, found = [name], set[str]()
     while waiting:
         name = waiting.pop()

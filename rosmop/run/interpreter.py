@@ -88,7 +88,6 @@ class Interpreter:
         contexts: Mapping[str, str],
         messages: MessageTypes,
     ) -> None:
-        """`contexts` has the names of the specifications by context."""
         self.sites = sites
         self.turn = Turn()
         self.variables: dict[str, Any] = {}
@@ -113,11 +112,12 @@ class Interpreter:
         self._made.clear()
 
     def value(self, name: str, variables: Mapping[str, Any]) -> Any:
-        """`variables` are those of a call. Raises `KeyError`."""
+        """Return the value of a variable; `variables` are those of a call. Raises `KeyError`."""
         return variables[name] if name in variables else self.variables[name]
 
     def function(self, name: str) -> Callable[..., Any]:
-        """The function takes a message, or None if the event has none; for its result see `nodes.Function`.
+        """Return a function of a message, or of None if the event has none; for its result see
+        `nodes.Function`.
 
         The function raises the error that stops it; `failed` has the details.
         """
@@ -171,7 +171,7 @@ class Interpreter:
 
 
 def constant_of(node: nodes.Expression) -> bool | int | float:
-    """The expression has no variables. Raises `FaultError`."""
+    """Return the value of an expression without variables. Raises `FaultError`."""
     nowhere = nodes.Function("", "", (), ())
     maker = _Maker(_nobody(), nowhere)
     value: bool | int | float = maker.value(node)({})
@@ -272,7 +272,7 @@ class _Maker:
         return run if node.no else run_yes
 
     def _branch(self, site: int, statements: Sequence[nodes.Statement]) -> _Run:
-        """The condition of a branch is noted if the branch drops, changes or publishes a message."""
+        """Note the condition of a branch, if the branch drops, changes or publishes a message."""
         block = self.block(statements)
         if not any(isinstance(node, nodes.Drop | nodes.StopMessage | nodes.Publish) or self._marks_field(node)
                    for node in nodes.walk(tuple(statements))):  # fmt: skip
@@ -286,7 +286,6 @@ class _Maker:
         return run
 
     def _look(self, site: int) -> _Run:
-        """Note the values that a condition compared when it was met."""
         turn = self._interpreter.turn
         compared = [self._variable(variable.code) for variable in self._interpreter.sites[site].compared]
 
@@ -545,7 +544,7 @@ class _Maker:
         return lambda _: None
 
     def _write_back(self, node: nodes.WriteBack) -> _Run:
-        """Fields of variable size can fault, so they are encoded before the first byte is written."""
+        """Write the fields; those of variable size can fault, so they are encoded before the first byte is written."""
         marks, writes = tuple(self._marks), []
         for write in sorted(node.writes, key=lambda write: write.end is None):
             value, encode = self.value(write.value), self._values.encoder(write.value.type)
@@ -613,7 +612,7 @@ class _Maker:
         return isinstance(value, nodes.Literal) and value.value is True
 
     def _assigned(self, node: nodes.Assign) -> _Value:
-        """The flag of a field holds the set of sites that have assigned to the field, as bits."""
+        """Note which sites have assigned to a field, as bits in the flag of the field."""
         if not self._marks_field(node):
             return self.value(node.value)
         if self._at not in self._marks:
@@ -854,7 +853,7 @@ def _is_shared(name: str) -> bool:
 def conversion(  # noqa: PLR0911  one for each kind
     source: Type, target: Type
 ) -> Callable[[Any], Any] | None:
-    """Returns None if nothing changes."""
+    """Return a conversion, or None if nothing changes."""
     if source == target:
         return None
     if isinstance(target, value_types.BoolType):

@@ -1,6 +1,4 @@
-"""Measure how close comparisons of numbers came during the replay of a recording. Monitors in force do not measure
-this.
-"""
+"""Measure how close comparisons of numbers came during a replay. Monitors in force do not measure this."""
 
 import math
 from collections.abc import Iterator, Sequence

@@ -19,7 +19,7 @@ from rosmop.runtime.action_context import Context
 from rosmop.runtime.wire import WireMessage
 
 FAILING_AFTER = 10
-"""A monitor with this many faults is shown as failing."""
+"""The number of faults from which a monitor is shown as failing."""
 
 
 class CellNames(msgspec.Struct, frozen=True, array_like=True):
@@ -47,10 +47,10 @@ class StateHolder(Protocol):
     def is_true(self, name: str) -> bool: ...
 
     size: int
-    """Bytes of `cells`; 0 if the state is not only numbers."""
+    """The bytes of `cells`; 0 if the state is not only numbers."""
 
     left: bool
-    """The state has been in Python since it was last saved."""
+    """Whether the state has been in Python since it was last saved."""
 
     def cells(self) -> bytes | None:
         """Return the state in the module's memory: empty if it has been in Python since the last save, and None if it
@@ -122,11 +122,11 @@ class Step:
     name: str
     function: Callable[[WireMessage | None], bool]
     first: bool = False
-    """The first step of its monitor on its topic."""
+    """Whether this is the first step of its monitor on its topic."""
     past: int = 0
     told: int | None = None
     key: Callable[[WireMessage], Any] | None = None
-    """Returns the parameters that a message binds."""
+    """The function that returns the parameters that a message binds."""
 
 
 @dataclass(eq=False, slots=True)
@@ -159,16 +159,16 @@ class MonitorInstance:
     enabled: bool = True
     held: bool = False
     why_held: str = ""
-    """Why its state was lost, if it therefore holds its topics."""
+    """Why the state was lost, if the monitor therefore holds its topics."""
     broken: bool = False
-    """Its first values or `init` faulted, so it has no valid state."""
+    """Whether first values or `init` faulted, so that there is no valid state."""
     faults: int = 0
     seen: bool = False
-    """A message for any of its events has come."""
+    """Whether a message for any of its events has come."""
     home: StateHolder | None = None
-    """Set if the state may be in a module."""
+    """The holder of the state, if it may be in a module."""
     slices: Slices | None = None
-    """`properties` has the runs of the slice used last."""
+    """The slices; `properties` has the runs of the slice used last."""
     slice: Slice | None = None
     group: MonitorGroup | None = None
     """The monitors whose state changes together with its own."""
@@ -187,7 +187,7 @@ class MonitorInstance:
         return self.broken or self.faults >= FAILING_AFTER
 
     def picture(self) -> str | None:
-        """As SVG; None if no automaton is finite."""
+        """Return the automata as SVG, or None if none is finite."""
         from rosmop.logics.picture import svg_of  # noqa: PLC0415  only tools draw
 
         return svg_of([code.property for code in self.code.properties])
@@ -217,7 +217,7 @@ class MonitorInstance:
             self.group.changed = True
 
     def move_to_python(self) -> None:
-        """Call this before Python reads the state of this monitor, or of other monitors on its topics."""
+        """Move the state to Python, before Python reads it or that of other monitors on its topics."""
         if self.home is not None:
             self.home.leave()
 
@@ -229,7 +229,7 @@ def monitors_of(
     slices: int,
     holder_of: HolderOf,
 ) -> tuple[MonitorInstance, ...]:
-    """Each has at most `slices` slices, which are charged to `holder_of(source)`."""
+    """Return the monitors of a set; each has at most `slices` slices, which are charged to `holder_of(source)`."""
     return tuple(_monitor(interpreter, code, time_ns, slices, holder_of) for code in compiled.specifications)
 
 

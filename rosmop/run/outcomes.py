@@ -1,5 +1,4 @@
-"""Outcomes of messages, ticks and deadlines: as values, as data (for a record, the CLI and REST), and as lines of
-text.
+"""Outcomes of messages, ticks and deadlines: as values, as data (records, the CLI, REST), and as text.
 
 Data about causes are limited in size, and use the words of the specification. `who` names the source of a message.
 """
@@ -19,18 +18,18 @@ from rosmop.runtime.action_context import Published as Published  # noqa: PLC041
 from rosmop.runtime.wire import Buffer
 
 _EACH_END = 5
-"""The number of first events, and of last events, that are listed; the events between are only counted."""
+"""The number of first events, and of last events, that are listed; the others are only counted."""
 
 Result = Literal["passed", "changed", "dropped"]
 
 SHADOW_BUDGET = 100_000
-"""Some tens of milliseconds for one message, for which other messages wait."""
+"""The instructions for one message, some tens of milliseconds, for which other messages wait."""
 
 FUEL_PER_SECOND = 1_500_000_000
-"""A module takes about a second for these instructions."""
+"""The instructions for which a module takes about a second."""
 
 DROPPED = -1
-"""Stands for the drop in `Outcome.handling`."""
+"""The key of the drop in `Outcome.handling`."""
 
 
 class MessageSender(NamedTuple):
@@ -42,7 +41,7 @@ class MessageSender(NamedTuple):
 
 
 Who = Callable[[int], Mapping[str, Any]]
-"""Returns data about a source (`MessageSender.source`)."""
+"""A function that returns data about a source (`MessageSender.source`)."""
 
 NOBODY = MessageSender()
 NO_NUMBER, SEQ = range(2)
@@ -50,7 +49,7 @@ NO_NUMBER, SEQ = range(2)
 
 
 class EventOccurrence(NamedTuple):
-    """`event` is its number in the specification; `state` is the one after it, if any."""
+    """An event that happened; `event` is its number in the specification, `state` the state after it, if any."""
 
     event: int
     time: int
@@ -107,7 +106,7 @@ def named(verdict: Verdict) -> str:
 
 
 def bound(verdict: Verdict) -> str:
-    """Text to append to the name of the property; empty without parameters."""
+    """Return the text to append to the name of the property; empty without parameters."""
     if not verdict.binding:
         return ""
     return f" with {', '.join(f'{name} = {value}' for name, value in verdict.binding.items())}"
@@ -193,7 +192,7 @@ class Outcome:
 
     @property
     def conditions(self) -> dict[str, dict[str, object]]:
-        """The positions of conditions that were met, with the values that they compared."""
+        """Return the positions of conditions that were met, with the values that they compared."""
         return {
             str(site.position): {
                 each.name: showing(each.type)(value)
@@ -227,7 +226,7 @@ class Margin(NamedTuple):
 
     @property
     def threshold_at(self) -> float | None:
-        """The constant at which the result would have changed."""
+        """Return the constant at which the result would have changed."""
         return None if self.threshold is None else (self.right, self.left)[self.threshold]
 
 
@@ -292,7 +291,7 @@ def _led(outcome: Outcome, who: Who, handled: Verdict | None = None) -> dict[str
 
 
 def why_of(verdict: Verdict, who: Who) -> dict[str, Any]:
-    """Return an empty mapping if the explanation was not requested or is unknown."""
+    """Return the explanation as data; empty if it was not requested or is unknown."""
     why = verdict.why
     if why is None:
         return {}

@@ -54,19 +54,19 @@ from rosmop.types import value_types
 LIMIT = 100_000
 
 GROWING_LIMIT = 1_000
-"""If a run needs more than the state of an automaton (`cfg`, `srs`, `ptcaret`, `mtl` about the future)."""
+"""The most slices if a run needs more than an automaton (`cfg`, `srs`, `ptcaret`, `mtl` about the future)."""
 
 TOGETHER_LIMIT = 250
-"""If an event or a tick may concern all slices at once: each takes 2 µs, or 20 µs with a verdict."""
+"""The most slices if an event or a tick may concern all of them: each takes 2 µs, or 20 µs with a verdict."""
 
 MAX_BINDING = 256
-"""For all strings of a binding together."""
+"""The most bytes of all strings of a binding together."""
 
 Key = tuple[Any, ...]
-"""True, and the values of the bound parameters, in their order."""
+"""A key: True, and the values of the bound parameters, in their order."""
 
 Binding = tuple[int, Key]
-"""The bound parameters as a set of bits, and their values."""
+"""A binding: the bound parameters as a set of bits, and their values."""
 
 _NAN = float("nan")  # dictionaries find this one object again, although NaN is not equal to itself
 
@@ -87,7 +87,7 @@ class Slice:
     gone: bool = False
     due: int | None = None
     turn: int = 0
-    """The number of its entry in the heap; at equal times, the smallest number comes first."""
+    """The number of the slice's entry in the heap; at equal times, the smallest number comes first."""
 
     @property
     def deadline(self) -> int | None:
@@ -135,7 +135,7 @@ class Slices:
         self.refused: Mapping[str, object] | None = None
         """The binding of the last event that cannot have a slice."""
         self.why = ""
-        """The reason why it cannot."""
+        """The reason for the refusal."""
         self.changed: dict[Binding, Holder] | None = None
         """Bindings whose state has changed since it was last saved, with their hosts; None if it is not saved."""
         self.behind: list[Slice] = []
@@ -192,7 +192,7 @@ class Slices:
         ]
 
     def begin(self, properties: Sequence[PropertyCode], runs: tuple[Run, ...]) -> None:
-        """New slices begin with the present state of the specification."""
+        """Begin new slices with the present state of the specification from now on."""
         self._look_at(properties)
         zero = tuple(self._namespace[code] for _, code, _ in self._parameters)
         values = self.own()
@@ -244,7 +244,7 @@ class Slices:
         return self._whole.get(key)
 
     def quiet(self, event: int, slice_: Slice) -> Sequence[int] | None:
-        """Return None if the event has another effect than new states."""
+        """Return the next states, or None if the event has another effect than new states."""
         calm = self._calm[event]
         if calm is None or not slice_.kept:
             return None
@@ -345,7 +345,6 @@ class Slices:
         return Slice(domain, key, runs, parent.values, self._holder)
 
     def _full(self) -> str:
-        """Return why the host cannot have another slice."""
         if self._holder is None:
             return f"more than {self.limit} slices"
         held = self.quota.held(self._holder)
@@ -433,7 +432,7 @@ class Slices:
         return self._deadlines[0][2]
 
     def _await(self, slice_: Slice) -> None:
-        """The heap needs an entry at the slice's deadline or earlier."""
+        """Add an entry to the heap at the slice's deadline, unless there is an earlier one."""
         deadline = slice_.deadline
         if deadline is None or (slice_.due is not None and slice_.due <= deadline):
             return
@@ -481,7 +480,7 @@ class Slices:
         return self._first
 
     def state(self, binding: Binding) -> Slice | None:
-        """Return None if the slice has ended. Raises `KeyError` for an unknown binding."""
+        """Return the slice of a binding, or None if it has ended. Raises `KeyError` for an unknown binding."""
         domain, key = binding
         return self._known[domain].slices[key]
 
@@ -598,7 +597,6 @@ class Slices:
             self._note(slice_)
 
     def _remember(self, domain: int, key: Key, holder: Holder) -> None:
-        """An ended binding is remembered until the host has too many of them."""
         while not self._ended.fits(holder, 1):
             if not self._ended.held(holder):
                 if key in self._known[domain].slices:
@@ -626,7 +624,7 @@ class Slices:
 
 
 def of_nan(key: Key) -> Key:
-    """One object replaces all NaNs, so that the key is found again."""
+    """Return a key in which one object replaces all NaNs, so that the key is found again."""
     return tuple(_NAN if value != value else value for value in key)  # noqa: PLR0124  NaN
 
 
@@ -647,7 +645,6 @@ def _key(values: Mapping[int, Any], domain: int) -> Key:
 
 
 def _joined(domains: Iterator[int]) -> list[int]:
-    """Return the possible sets of bound parameters, of one event or of several together."""
     found: set[int] = set()
     for domain in domains:
         found |= {domain, *(domain | other for other in found)}
@@ -655,7 +652,6 @@ def _joined(domains: Iterator[int]) -> list[int]:
 
 
 def _calm(code: PropertyCode, event: int, lost: frozenset[int], renews: bool) -> list[int]:
-    """Return the next state for each state; -1 if a handler runs or the slice may end."""
     assert isinstance(code.property, FiniteProperty)  # noqa: S101  the caller checks this
     automaton, handled = code.property.automaton, {*code.order}
     return [
@@ -669,7 +665,6 @@ def _calm(code: PropertyCode, event: int, lost: frozenset[int], renews: bool) ->
 
 
 def _lost(code: PropertyCode) -> frozenset[int]:
-    """Return the states from which no handler can run any more."""
     steps = _steps(code.property)
     handled = {*code.order}
     hopeful: set[int] = set()
@@ -685,7 +680,7 @@ def _lost(code: PropertyCode) -> frozenset[int]:
 
 
 def _steps(compiled: CompiledProperty) -> list[list[tuple[int, Categories]]]:
-    """Include the next states at deadlines."""
+    """Return the next states and categories of each state, with those at deadlines."""
     if isinstance(compiled, FiniteProperty):
         automaton = compiled.automaton
         return [[(target, automaton.verdicts[target]) for target in row] for row in automaton.table]
@@ -699,7 +694,7 @@ def _steps(compiled: CompiledProperty) -> list[list[tuple[int, Categories]]]:
 
 
 def _renews(events: Sequence[EventCode], properties: Sequence[PropertyCode], everything: int) -> bool:
-    """A slice in its initial state may be forgotten if each event either creates it or does not change it."""
+    """Whether a slice in its initial state may be forgotten: each event either creates it or does not change it."""
     return all(
         _domain(event) == everything
         and (event.creates or (event.plain and all(_stays(one, number) for one in properties)))

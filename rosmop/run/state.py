@@ -27,7 +27,7 @@ from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
 MOST_BYTES = 64 << 10
-"""In bytes, for a group without slices: it is written with each batch that changes it."""
+"""The most bytes of a group without slices, which is written with each batch that changes it."""
 
 _CLOCK = struct.Struct("<qq")
 
@@ -40,7 +40,7 @@ class TimerSnapshot(msgspec.Struct, frozen=True, array_like=True):
 
 
 class MonitorSnapshot(msgspec.Struct, frozen=True, array_like=True):
-    """`identity` and `types` stand for its text and its message definitions."""
+    """The state of a monitor; `identity` and `types` stand for its text and its message definitions."""
 
     name: str
     identity: bytes
@@ -55,11 +55,11 @@ class MonitorSnapshot(msgspec.Struct, frozen=True, array_like=True):
     runs: list[Any]
     variables: dict[str, Any]
     first: tuple[list[Any], list[Any]] = ([], [])
-    """Initial values of parameters, and of the slices' own variables."""
+    """The initial values of parameters, and of the slices' own variables."""
 
 
 def encoded(states: Sequence[MonitorSnapshot]) -> bytes:
-    """Raises `StateTooLargeError`."""
+    """Return the states as bytes. Raises `StateTooLargeError`."""
     data = msgspec.msgpack.encode(states)
     if len(data) > MOST_BYTES:
         raise StateTooLargeError(f"its state has {len(data)} bytes; {MOST_BYTES} are kept")
@@ -67,7 +67,7 @@ def encoded(states: Sequence[MonitorSnapshot]) -> bytes:
 
 
 def refused(why: str) -> bytes:
-    """Replaces a state that cannot be saved."""
+    """Return the bytes that replace a state that cannot be saved."""
     return msgspec.msgpack.encode(why)
 
 
@@ -131,7 +131,7 @@ def _with_cells(states: list[MonitorSnapshot], cells: bytes, names: CellNames) -
 
 
 def kept_monitor(monitor: MonitorInstance, variables: Mapping[str, Any], types: bytes) -> MonitorSnapshot:
-    """Raises `StateTooLargeError`."""
+    """Return the state of a monitor. Raises `StateTooLargeError`."""
     slices = monitor.slices
     first: tuple[list[Any], list[Any]] = ([], [])
     if slices is not None:
@@ -156,7 +156,7 @@ def kept_monitor(monitor: MonitorInstance, variables: Mapping[str, Any], types: 
 
 
 def shape(monitor: MonitorInstance, variables: Mapping[str, Any]) -> bytes:
-    """A state without times can be compared with the initial one."""
+    """Return a state without times, to compare it with the initial one."""
     monitor.move_to_python()
     runs = [
         kept(running.run)[0][:1] if isinstance(running.run, FiniteRun | ClockedRun) else kept(running.run)

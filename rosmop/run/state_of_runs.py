@@ -16,7 +16,7 @@ from rosmop.logics.interface import ClockedRun, CompiledProperty, FiniteRun, Run
 from rosmop.logics.parsing import EarleySet, EarleyShape
 
 MOST_PARTS = 5_000
-"""For one run: more than a hundred times the usual number of objects."""
+"""The most objects of one run, more than a hundred times the usual number."""
 
 _CONTAINERS: Mapping[str, Callable[[list[Any]], Any]] = MappingProxyType(
     {"l": list, "t": tuple, "d": deque, "s": set}
@@ -32,14 +32,14 @@ class StateTooLargeError(Exception):
 
 
 def kept(run: Any) -> list[Any]:
-    """Raises `StateTooLargeError`."""
+    """Return a run as plain data. Raises `StateTooLargeError`."""
     if isinstance(run, FiniteRun | ClockedRun):
         return [[*run.saved()], []]
     return _Writer(run).written()
 
 
 def run_of(compiled: CompiledProperty, data: Any, time_ns: int) -> Run:
-    """Raises `ValueError` for invalid data."""
+    """Return the run in plain data. Raises `ValueError` for invalid data."""
     run = compiled.start(time_ns)
     try:
         _Reader(compiled, run, data).read()
@@ -151,7 +151,7 @@ class _Reader:
             self._fill(run.operators[number], fields)
 
     def _fill_run(self, fields: list[Any]) -> None:
-        """Each value has the type of the new run's value; a grammar's frame may be gone."""
+        """Fill the run; each value has the type of the new run's value, but a grammar's frame may be gone."""
         before = self._run.saved()
         self._fill(self._run, fields)
         for first, value in zip(before, self._run.saved(), strict=True):

@@ -55,7 +55,9 @@ class SliceParts:
         slices.keep()
 
     def changed(self) -> dict[int, bytes]:
-        """Since the last call, by number. A part that cannot be saved is replaced by the reason."""
+        """Return the parts that have changed since the last call, by number. A part that cannot be saved is
+        replaced by the reason.
+        """
         bindings, dirty = self._slices.changed or {}, set()
         self._slices.changed = {}
         for binding, holder in bindings.items():

@@ -25,8 +25,10 @@ _MOST = 8
 
 
 def deciding(source: Source, events: Sequence[int], times: Sequence[int]) -> list[str]:
-    """`events` are the numbers of the events in the source, `times` their times (ns). The result is empty for other
-    logics, and for formulas about the future.
+    """Return the subformulas that decide the formula.
+
+    `events` are the numbers of the events in the source, `times` their times (ns). The result is empty for
+    other logics, and for formulas about the future.
     """
     syntax = _SYNTAXES.get(source.logic)
     if syntax is None or not 0 < len(events) <= _MOST_EVENTS:
@@ -78,7 +80,7 @@ class Meaning:
         return self._known[key]
 
     def _seen(self, at: int) -> list[int]:
-        """Calls that have returned are left out."""
+        """Return the positions before `at`, without calls that have returned."""
         seen: list[int] = []
         for place, event in enumerate(self._events[:at]):
             seen.append(place)
@@ -104,7 +106,6 @@ class Meaning:
         )
 
     def _past(self, operator: str, formula: Formula, places: list[int], *, dual: bool) -> bool:
-        """`dual` negates the operands and the result."""
         low, high = formula.bounds or (0, None)
         *first, last = formula.operands
         now = self._times[places[-1]]
@@ -135,7 +136,7 @@ class _Words:
         self._spelled = {meant: word for words in levels for word, meant in reversed([*words.items()])}
 
     def text(self, formula: Formula) -> str:
-        """Nested operators are in parentheses."""
+        """Return a formula as text, with nested operators in parentheses."""
         if not formula.operands:
             return formula.name or formula.operator
         parts = [

@@ -17,7 +17,7 @@ from rosmop.run.outcomes import Outcome
 Patience = Callable[[], Callable[[], bool]]
 
 MAX_TICKS = 100_000
-"""For one timer between two messages. After a larger jump of the clock the rest is skipped and reported."""
+"""The most ticks of one timer between two messages. After a larger jump of the clock the rest is skipped."""
 
 
 class Agenda:
@@ -32,7 +32,7 @@ class Agenda:
     ) -> None:
         """When something is due, `patience()` returns a function that returns whether the work takes too long."""
         self.due: int | None = None
-        """Time of the next tick or deadline; None if there is none."""
+        """The time of the next tick or deadline, or None."""
         self._monitors = monitors
         self._execution = execution
         self._patience = patience
@@ -54,7 +54,7 @@ class Agenda:
         return self.due is not None and self.due <= time_ns
 
     def schedule(self) -> None:
-        """A deadline passes after its last nanosecond."""
+        """Schedule the next time; a deadline passes after its last nanosecond."""
         if not self._timed:
             return
         timer, deadline = self._next_timer(), self._next_deadline()
@@ -70,7 +70,7 @@ class Agenda:
         self.due = min(times, default=None)
 
     def when_due(self, *, anew: bool) -> int | None:
-        """With `anew`, compute the time again, because lanes may have moved deadlines."""
+        """Return the next time. With `anew`, compute it again, because lanes may have moved deadlines."""
         if anew:
             self.schedule()
         return self.due
@@ -115,7 +115,7 @@ class Agenda:
         return outcomes
 
     def send_safe(self, time_ns: int) -> list[Outcome]:
-        """Each is sent at most once, because those that were missed are of no use."""
+        """Send the safe messages that are due, each at most once, because missed ones are of no use."""
         outcomes = []
         for monitor in self._monitors:
             for sender in monitor.sending(passes=self._execution.on_fault == "pass"):
@@ -164,7 +164,6 @@ class Agenda:
     def _next_deadline(
         self, *, slices: bool = True
     ) -> tuple[int, MonitorInstance, RunningProperty | None] | None:
-        """The property is None for a slice's deadline."""
         found: tuple[int, MonitorInstance, RunningProperty | None] | None = None
         for monitor in self._monitors:
             if monitor.enabled and monitor.slices is not None:

@@ -15,21 +15,21 @@ from math import inf
 from typing import Any, NamedTuple
 
 BUDGET = 1_000_000
-"""For one message."""
+"""The instructions for one message."""
 
 STEP = 250
-"""Instructions between two readings of the processor time."""
+"""The instructions between two readings of the processor time."""
 
 PART = 250
-"""Like `STEP`, for elements of arrays."""
+"""The elements of arrays between two readings of the processor time."""
 
 _AT_ONCE = 10e-9  # seconds: the least that an instruction takes, where many are charged in advance
 
 MAX_BYTES = 16 << 20
-"""In bytes, for all values of a specification together."""
+"""The most bytes of all values of a specification together."""
 
 UNMEASURED = 1 << 20
-"""Bytes that may be allocated between two measurements."""
+"""The bytes that may be allocated between two measurements."""
 
 MAX_CALLS = 100
 """The maximum depth of recursive calls of helper functions."""
@@ -57,7 +57,7 @@ class MalformedError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class LogLine:
-    """`level` is DEBUG, INFO, WARN, ERROR or FATAL."""
+    """A line of output; `level` is DEBUG, INFO, WARN, ERROR or FATAL."""
 
     level: str
     text: str
@@ -65,7 +65,7 @@ class LogLine:
 
 
 def line_of(level: str, text: bytes, monitor: str) -> LogLine:
-    """U+FFFD replaces bytes that are not UTF-8."""
+    """Return a line, with U+FFFD in place of bytes that are not UTF-8."""
     return LogLine(level, text.decode("utf-8", "replace").rstrip("\n"), monitor)
 
 
@@ -87,7 +87,7 @@ class Turn:
     now: int = 0
     source: int = 0
     names: Callable[[int], tuple[bytes, bytes]] = lambda _: (b"", b"")
-    """Returns host and caller of a source (`MessageSender.source`)."""
+    """A function that returns host and caller of a source (`MessageSender.source`)."""
     log: list[LogLine] = field(default_factory=list)
     published: list[Published] = field(default_factory=list)
     looked: dict[int, tuple[Any, ...]] = field(default_factory=dict)
@@ -122,7 +122,7 @@ class Turn:
         )
 
     def exclude(self, make: Callable[[], Any]) -> Any:
-        """Do not charge the time of `make`."""
+        """Call a function without charging its time."""
         if self.clock is None:
             return make()
         began = self.clock()
@@ -154,9 +154,7 @@ class Context:
         measures: Mapping[str, Measure],
         live: Callable[[], Sequence[Mapping[str, object]]],
     ) -> None:
-        """`live` returns the values of the set's variables and of all calls' variables; `measures` has a function for
-        each name.
-        """
+        """Make a context; `live` returns the values of all variables, and `measures` has a function for each name."""
         self.monitor = monitor
         self.turn = turn
         self.most = BUDGET
@@ -195,7 +193,6 @@ class Context:
             self._go_on(-1, ": too many elements precede a field")
 
     def _go_on(self, site: int, otherwise: str) -> None:
-        """Fault if the budget is used up or the time is over."""
         missing = -self.budget
         if missing > self._left:
             self._left = 0
@@ -208,7 +205,7 @@ class Context:
         self.budget += given
 
     def allocate(self, size: int, site: int, replaced: int = 0) -> None:
-        """The `size` new bytes replace `replaced` bytes of a variable."""
+        """Charge for `size` new bytes that replace `replaced` bytes of a variable."""
         if size > MAX_BYTES:
             raise FaultError(site, f"{_TOO_LARGE}: a value of {size} bytes")
         self.spend(size // BYTES_PER_INSTRUCTION, site)

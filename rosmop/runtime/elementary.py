@@ -10,7 +10,7 @@ import math
 from math import copysign, fabs, inf, sqrt
 
 LARGEST = 1048576.0
-"""The C library reduces larger angles."""
+"""The largest angle; the C library reduces larger ones."""
 
 _EIGHTH = 7.85398163397448278999e-01
 _WHOLE = 1.5 * 2.0**52  # adding and subtracting it rounds to a whole number
@@ -29,7 +29,6 @@ def cos(x: float) -> float:
 
 
 def _turned(x: float, quarters: float) -> float:
-    """Add a number of right angles to `x`."""
     # Subtract `turns` right angles in three steps: each has 33 bits of a right angle, and the rest.
     turns = (x * 6.36619772367581382433e-01 + _WHOLE) - _WHOLE
     first = turns * 1.57079632673412561417e00
@@ -78,7 +77,7 @@ def atan2(y: float, x: float) -> float:
 
 
 def _arctangent(x: float) -> float:
-    """`x` is from 0 to 2**60: `atan(v)` for a smaller `v`, and the rest in two parts."""
+    """Return the arctangent of `x` from 0 to 2**60: `atan(v)` for a smaller `v`, and the rest in two parts."""
     high, low, v = 0.0, 0.0, x
     if x >= 39 / 16:
         high, low, v = 1.57079632679489655800, 6.12323399573676603587e-17, -1.0 / x

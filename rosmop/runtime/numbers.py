@@ -15,7 +15,7 @@ _F32_LIMIT = 3.4028235677973366e38  # from this number on, the nearest float is 
 
 
 def f32(value: float) -> float:
-    """The nearest 32-bit float."""
+    """Return the nearest 32-bit float."""
     if -_F32_LIMIT < value < _F32_LIMIT:
         result: float = _F32.unpack(_F32.pack(value))[0]
         return result
@@ -23,8 +23,8 @@ def f32(value: float) -> float:
 
 
 def f32_of_integer(value: int) -> float:
-    """The nearest 32-bit float, rounded only once: a double cannot hold an integer beyond 2**53, so its low bits are
-    first merged into one.
+    """Return the nearest 32-bit float, rounded only once: a double cannot hold an integer beyond 2**53, so
+    its low bits are first merged into one.
     """
     if -_EXACT <= value <= _EXACT:
         return f32(value)
@@ -35,7 +35,7 @@ def f32_of_integer(value: int) -> float:
 
 
 def truncate(value: float, least: int, most: int) -> int:
-    """Truncate, and clamp to the limits; NaN becomes 0."""
+    """Truncate a number, and clamp it to the limits; NaN becomes 0."""
     if value != value:  # noqa: PLR0124  NaN
         return 0
     if value <= least:
@@ -49,7 +49,7 @@ def wrap(value: int, bits: int, signed: bool) -> int:
 
 
 def divide(left: int, right: int, site: int) -> int:
-    """The quotient is rounded toward zero."""
+    """Return the quotient, rounded toward zero."""
     if right == 0:
         raise FaultError(site, "division by zero")
     result = abs(left) // abs(right)
@@ -57,7 +57,7 @@ def divide(left: int, right: int, site: int) -> int:
 
 
 def remainder(left: int, right: int, site: int) -> int:
-    """The result has the sign of `left`."""
+    """Return the remainder, with the sign of `left`."""
     if right == 0:
         raise FaultError(site, "division by zero")
     result = abs(left) % abs(right)
@@ -65,7 +65,7 @@ def remainder(left: int, right: int, site: int) -> int:
 
 
 def ratio(left: float, right: float) -> float:
-    """Division by zero gives infinity or NaN."""
+    """Return the quotient; division by zero gives infinity or NaN."""
     try:
         return left / right
     except ZeroDivisionError:
@@ -111,7 +111,7 @@ def power(base: float, exponent: float) -> float:
 
 
 def round_half_away(value: float) -> float:
-    """Rounds as C's `round`."""
+    """Round as C's `round`."""
     if not math.isfinite(value):
         return value
     whole = math.floor(abs(value))
@@ -119,7 +119,7 @@ def round_half_away(value: float) -> float:
 
 
 def round_half_even(value: float) -> float:
-    """Rounds as C's `rint`."""
+    """Round as C's `rint`."""
     return math.copysign(float(round(value)), value) if math.isfinite(value) else value
 
 
@@ -242,4 +242,4 @@ def _of_floats(name: str, count: int) -> Callable[..., float]:
 FLOAT_MATH: dict[str, Callable[..., float]] = {
     name: _of_floats(name, count) for name, (count, _) in MATH.items()
 }
-"""Their results can differ from rounded doubles, as for `sinf(380738.94)`."""
+"""Functions on 32-bit floats, whose results can differ from rounded doubles, as for `sinf(380738.94)`."""

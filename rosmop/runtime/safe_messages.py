@@ -5,14 +5,14 @@ import struct
 from rosmop.form.nodes import SafeMessage
 
 HEAD = 12
-"""Bytes of `seq` and `stamp` at the beginning of a header."""
+"""The bytes of `seq` and `stamp` at the beginning of a header."""
 
 _STAMP = struct.Struct("<III")
 _MOST_SECONDS = (1 << 32) - 1
 
 
 def is_safe(safe: SafeMessage, buffer: bytes | bytearray | memoryview) -> bool:
-    """`seq` and `stamp` of the header do not count."""
+    """Whether a message is the safe one, apart from `seq` and `stamp` of its header."""
     first = HEAD if safe.stamped else 0
     return len(buffer) == len(safe.data) and buffer[first:] == safe.data[first:]
 

@@ -30,7 +30,7 @@ BILLION = 1_000_000_000
 
 
 def struct_code(kind: Type) -> str | None:
-    """Return None for a type without a fixed size.
+    """Return the code of a type, or None for a type without a fixed size.
 
     A time has two codes: for seconds and for nanoseconds.
     """
@@ -69,7 +69,7 @@ class ValueCodec:
     # Sizes
 
     def width(self, kind: Type) -> int:
-        """In C++, without the contents of strings and vectors."""
+        """Return the size in C++, without the contents of strings and vectors."""
         if isinstance(kind, value_types.IntegerType | value_types.FloatingType):
             return kind.bits // 8
         if isinstance(kind, value_types.RecordType):
@@ -85,7 +85,7 @@ class ValueCodec:
         )
 
     def least(self, kind: Type) -> int:
-        """The encoded size of the shortest value."""
+        """Return the encoded size of the shortest value."""
         code = struct_code(kind)
         if code is not None:
             return struct_size(code)
@@ -132,7 +132,7 @@ class ValueCodec:
         return lambda: zero
 
     def copier(self, kind: Type) -> Callable[[Context, Any, int], Any]:
-        """The result takes context, value and site, and charges for a deep copy."""
+        """Return a function of context, value and site that charges for and returns a deep copy."""
         return self._once(ValueCodec._copier, kind)
 
     def _copier(self, kind: Type) -> Callable[[Context, Any, int], Any]:
@@ -154,7 +154,7 @@ class ValueCodec:
     # In a message
 
     def decoder(self, kind: Type) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
-        """The result takes a position, and returns the value and its end."""
+        """Return a function of a position that returns the value and its end."""
         return (
             wire.text if isinstance(kind, value_types.StringType) else self._once(ValueCodec._decoder, kind)
         )
@@ -206,7 +206,7 @@ class ValueCodec:
         return lambda buffer, start: decode(buffer, start + 4, wire.count(buffer, start, least))
 
     def encoder(self, kind: Type) -> Callable[[Any, bytearray], None]:
-        """The result appends the bytes of a value."""
+        """Return a function that appends the bytes of a value."""
         return (
             wire.put_text
             if isinstance(kind, value_types.StringType)
@@ -264,7 +264,7 @@ class ValueCodec:
 
 
 def zero_of(kind: Type) -> bool | float | bytes | None:
-    """Return None for void."""
+    """Return the zero of a type, or None for void."""
     if isinstance(kind, value_types.BoolType):
         return False
     if isinstance(kind, value_types.FloatingType):
@@ -275,7 +275,7 @@ def zero_of(kind: Type) -> bool | float | bytes | None:
 
 
 def unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequence[Any], int]]:
-    """Two of the codes are nanoseconds."""
+    """Return a function that decodes the codes, two of which are nanoseconds."""
     plain = struct.Struct("<" + "".join(codes))
     unpack, size = plain.unpack_from, plain.size
     if all(len(code) == 1 for code in codes):
@@ -291,7 +291,7 @@ def unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequenc
 
 
 def packer(codes: Sequence[str]) -> Callable[[Sequence[Any]], bytes]:
-    """Two of the codes are nanoseconds."""
+    """Return a function that encodes the codes, two of which are nanoseconds."""
     pack = struct.Struct("<" + "".join(codes)).pack
     if all(len(code) == 1 for code in codes):
         return lambda values: pack(*values)

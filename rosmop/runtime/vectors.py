@@ -21,7 +21,7 @@ def element(values: Values, index: int, site: int) -> Any:
 
 
 def put(values: Values, index: int, value: Any, site: int) -> Any:
-    """`values[index] = value` returns the value."""
+    """Assign `values[index] = value`, and return the value."""
     if 0 <= index < len(values):
         values[index] = value
         return value
@@ -29,7 +29,7 @@ def put(values: Values, index: int, value: Any, site: int) -> Any:
 
 
 def put_slot(record: Values, slot: int, value: Any) -> Any:
-    """Returns the assigned value."""
+    """Assign an element, and return the assigned value."""
     record[slot] = value
     return value
 
@@ -53,7 +53,7 @@ def weighed(context: Context, values: Values, measure: Callable[[Values], int], 
 
 
 def same(left: Any, right: Any) -> bool:
-    """A NaN equals nothing, not even itself."""
+    """Whether values are equal; a NaN equals nothing, not even itself."""
     return left == right and _numbers(left)
 
 
@@ -68,13 +68,13 @@ def pop(values: Values, site: int) -> None:
 
 
 def copied(context: Context, values: Values, width: int, site: int) -> Values:
-    """The elements are numbers, strings or times."""
+    """Return a copy of a vector of numbers, strings or times."""
     context.allocate(len(values) * width, site)
     return values.copy()
 
 
 def copied_deep(context: Context, values: Values, width: int, copy: Callable[..., Any], site: int) -> Values:
-    """The elements are vectors or messages; `copy` copies one."""
+    """Return a copy of a vector of vectors or messages; `copy` copies one."""
     context.allocate(len(values) * width, site)
     return [copy(context, value, site) for value in values]
 
@@ -147,7 +147,7 @@ def filled_with(  # noqa: PLR0917  the arguments are C++'s
 
 
 def fixed(values: Values, count: int, site: int) -> Values:
-    """For an array of fixed length; fault if the number of elements differs."""
+    """Return the values of an array of fixed length; fault if the number of elements differs."""
     if len(values) != count:
         raise FaultError(site, f"{len(values)} elements for an array of exactly {count}")
     return values
@@ -193,7 +193,7 @@ def reverse(context: Context, values: Values, first: int, last: int, site: int) 
 def nearest(context: Context, values: Values, first: int, last: int, site: int) -> float:
     """Return the smallest number from `first` to before `last`, or infinity; NaN is ignored.
 
-    If `first` is after `last`, the elements go on at the beginning.
+    If `first` is after `last`, the range continues at the beginning.
     """
     first, last = (min(max(limit, 0), len(values)) for limit in (first, last))
     least = math.inf

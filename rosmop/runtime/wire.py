@@ -16,7 +16,7 @@ Buffer = bytes | bytearray | memoryview
 
 _LENGTH = struct.Struct("<I")
 MAX_EMPTY = 1_000_000
-"""For an array whose elements have no bytes."""
+"""The most elements of an array whose elements have no bytes."""
 
 _MAX_DECODED = 1_000_000  # the maximum number of elements that are decoded one by one
 FEW = 64  # this number of elements takes less time than one instruction
@@ -36,7 +36,7 @@ def text_end(buffer: Buffer, start: int) -> int:
 
 
 def count(buffer: Buffer, start: int, least: int) -> int:
-    """Each element of the array at `start` has at least `least` bytes."""
+    """Return the number of elements of the array at `start`, each with at least `least` bytes."""
     number: int = _LENGTH.unpack_from(buffer, start)[0]
     if number * least > len(buffer) - start - 4 or (not least and number > MAX_EMPTY):
         raise MalformedError(f"an array of {number} elements in a message of {len(buffer)} bytes")
@@ -119,7 +119,7 @@ def put_numbers(values: list[Any], code: str, out: bytearray) -> None:
 
 
 def put_moments(values: list[int], code: str, out: bytearray) -> None:
-    """Times have the code `I`, durations `i`."""
+    """Append times (code `I`) or durations (`i`)."""
     out += struct.pack(
         f"<{2 * len(values)}{code}", *(part for v in values for part in divmod(v, 1_000_000_000))
     )
@@ -163,7 +163,7 @@ class WireMessage:
 
     @property
     def changed(self) -> bool:
-        """The bytes differ from the received ones."""
+        """Whether the bytes differ from the received ones."""
         if self._replaced is not None:
             return bytes(self.buffer) != self._replaced
         if self.written is None:
@@ -197,7 +197,7 @@ class WireMessage:
         self.buffer[start:end] = new  # type: ignore[index]  # it is a bytearray or a writable memoryview
 
     def splice(self, edits: list[tuple[int, int, bytes, int]]) -> None:
-        """An edit has start, end, new bytes and bits; see `patch`."""
+        """Replace parts of the message; an edit has start, end, new bytes and bits (see `patch`)."""
         if all(len(new) == end - start for start, end, new, _ in edits):
             for start, _, new, by in edits:
                 self.patch(start, new, by)
@@ -221,7 +221,7 @@ class WireMessage:
         self.stopped = site
 
     def _original(self) -> bytes:
-        """The buffer must still have the same length."""
+        """Return the received bytes, if the buffer still has the same length."""
         if not self.written:
             return bytes(self.buffer)
         original = bytearray(self.buffer)

@@ -27,7 +27,6 @@ def definitions() -> Definitions:
 
 
 def message(kind: str, **fields: object) -> bytes:
-    """From another library's encoder; missing fields are zero, and `a__b` is the path `a.b`."""
     return bytes(STORE.serialize_ros1(_value(_long(kind), _tree(fields)), _long(kind)))
 
 

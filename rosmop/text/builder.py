@@ -32,11 +32,11 @@ _GIVEN = re.compile(
 _DURATION = re.compile(r"(\d++(?:\.\d*+)?|\.\d++)\s*+([A-Za-z]*+)\Z")
 MIN_PERIOD_NS = 10**6
 MAX_PERIOD_NS = 10**18
-"""About 31 years."""
+"""The longest period, about 31 years."""
 
 
 class _LiteralError(Exception):
-    """The text says what to write instead."""
+    """A literal is invalid; the text has the correct form."""
 
 
 class _Unsaid:
@@ -51,8 +51,6 @@ def _binary(operator: str) -> Callable[..., tree.BinaryExpression]:
 
 
 def _made(kind: Callable[..., _T], first: int = 0, **more: bool) -> Callable[..., _T]:
-    """The children from `first` on are the fields of the node."""
-
     def build(self: "TreeBuilder", meta: Meta, *children: Any) -> _T:
         given = (str(child) if isinstance(child, Token) else child for child in children[first:])
         return kind(self.at(meta), *given, **more)
@@ -70,7 +68,7 @@ def _unsaid(_builder: "TreeBuilder", _: Meta, *_children: Any) -> _Unsaid:
 
 @v_args(inline=True, meta=True)
 class TreeBuilder(Transformer_NonRecursive[Token, Any]):
-    """`findings` lists the invalid literals."""
+    """Builds the tree; `findings` lists the invalid literals."""
 
     def __init__(self, file: str, text: str) -> None:
         super().__init__()
@@ -526,7 +524,6 @@ def _resource(name: Any, kind: Any) -> tuple[str, str]:
 
 
 def _duration_ns(text: str) -> int:
-    """A duration is `100ms`, `0.5 s` or `2` (seconds)."""
     found = _DURATION.match(text)
     if found is None or len(found[1]) > 30:
         raise _LiteralError("this is not a duration; write for example `100ms`, `0.5s` or `2m`")

@@ -50,7 +50,7 @@ FORBIDDEN = {
     "or": "write `||`",
     "not": "write `!`",
 }
-"""Words of C++ outside the language, and what to write instead."""
+"""Words of C++ outside the language, and their replacements."""
 
 RESERVED = frozenset({
     "if", "else", "while", "do", "for", "switch", "case", "default", "break", "continue", "return", "const",

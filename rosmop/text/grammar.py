@@ -9,7 +9,7 @@ a declaration.
 from rosmop.logics.catalogue import LOGICS
 
 _GAP = r"(?:\s|\/\/[^\n]*\n|\/\*(?:[^*]|\*(?!\/))*\*\/)"
-"""It can match in only one way, so the lexer never backtracks."""
+"""White space and comments; it can match in only one way, so the lexer never backtracks."""
 
 _WORD = "(?:creation|static|unsynchronized|decentralized|perthread|suffix)"
 """MOP's modifiers of `event`."""
@@ -243,7 +243,7 @@ PREAMBLE.10: /#(\\\r?\n|[^\n])*/
 """
 
 _NEXT = rf"(?<!\w)(?:(?i:{'|'.join(LOGICS)}|dl)\s*:(?!:)|(?:{_WORD}\s+)*event\s+[A-Za-z_]\w*\s*\()"
-"""A formula without handlers ends before another property, or an event."""
+"""The end of a formula without handlers: another property, or an event."""
 
 GRAMMAR = (
     _GRAMMAR.replace("<CONDITION>", _CONDITION)

@@ -19,7 +19,7 @@ MAX_CHARACTERS = 128 * 1024
 MAX_DEPTH = 100
 
 _NO_TEXT = re.compile("[\ud800-\udfff]")
-"""Surrogates replace bytes that are not UTF-8."""
+"""Surrogates, which replace bytes that are not UTF-8."""
 
 # Lines of the C++ preprocessor are ignored where the meaning stays the same.
 _PREPROCESSED = re.compile(
@@ -40,7 +40,7 @@ class _ForbiddenWordError(Exception):
 
 
 def parse(text: str, file: str) -> tree.SpecificationFile:
-    """`file` is the name in positions. Raises `SpecificationError`."""
+    """Parse a text; `file` is its name in positions. Raises `SpecificationError`."""
     start = Position(file, 1, 1)
     if len(text) > MAX_CHARACTERS:
         raise SpecificationError.at(
@@ -86,7 +86,7 @@ def _parse(text: str, file: str) -> Tree[Token]:
 
 
 def _ended_early(text: str, offset: int) -> int | None:
-    """A name such as `/*/cmd_vel` begins a comment; return where the last comment before an error ends in one."""
+    """Return where the last comment before an error ends if a name such as `/*/cmd_vel` began it, or None."""
     comments = [piece for piece in _PREPROCESSED.finditer(text, 0, offset) if piece["comment"]]
     last = comments[-1] if comments else None
     if last is None or not last[0].startswith("/*") or not last[0][2:].endswith("/*/"):
@@ -95,7 +95,7 @@ def _ended_early(text: str, offset: int) -> int | None:
 
 
 def start_of(file: str, text: str, offset: int) -> Position:
-    """The end of the text is the position after the last non-blank character."""
+    """Return the position of an offset; the end of the text is the position after the last non-blank character."""
     if offset >= len(text):
         offset = len(text.rstrip())
     return Position(file, 1, 1).within(text, offset)
@@ -128,7 +128,7 @@ def _allow(token: Token) -> Token:
 
 @lru_cache(maxsize=1)
 def _parser() -> Lark:
-    """It is built at the first use and keeps no state between files."""
+    """Return the parser, which is built at the first use and keeps no state between files."""
     return Lark(
         GRAMMAR,
         start="file",

@@ -141,7 +141,7 @@ class ConditionalExpression(Expression):
 
 @dataclass(frozen=True)
 class CommaExpression(Expression):
-    """`a, b`: the value is that of the last expression."""
+    """`a, b`: the value is the value of the last expression."""
 
     items: tuple[Expression, ...]
 
@@ -405,7 +405,7 @@ class TimerTrigger(SyntaxNode):
 
 @dataclass(frozen=True)
 class EventDefinition(SyntaxNode):
-    """`after` is what follows an action that does not drop the message."""
+    """An event; `after` are the statements that follow an action that does not drop the message."""
 
     modifiers: tuple[Name, ...]
     name: str

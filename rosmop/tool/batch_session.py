@@ -42,7 +42,7 @@ class RecordingsOptions:
 
     @property
     def single(self) -> Path | None:
-        """The recording, if it is the only one and no option concerns many."""
+        """Return the recording, if it is the only one and no option concerns many."""
         many = self.sets or self.workers or self.on or self.resume or self.report
         return self.bags[0] if len(self.bags) == 1 and not many else None
 
@@ -78,7 +78,7 @@ class BatchSession:
             raise self.program.usage_error(failures[0].text)
 
     def failed_rows(self, failures: Iterable[tuple[int, Failure]]) -> list[dict[str, object]]:
-        """Print each reason on standard error."""
+        """Return a row for each failure, and print its reason on standard error."""
         rows: list[dict[str, object]] = []
         for number, failure in failures:
             uri = self.recordings[number].uri

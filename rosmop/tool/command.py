@@ -35,7 +35,7 @@ from rosmop.tool.renamed_options import RenamedCommand
 
 
 def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
-    """The docstring of each command is its help after the summary."""
+    """Return the commands; the docstring of each is its help after the summary."""
 
     def check(
         files: Files,

@@ -15,12 +15,12 @@ from rosmop.recordings.regular_files import open_regular
 from rosmop.tool.terminal import printable
 
 MAX_FILE = 64 << 20
-"""In bytes, for a file that is read whole."""
+"""The most bytes of a file that is read whole."""
 
 
 @dataclass(frozen=True)
 class CommandContext:
-    """`name` begins each message.
+    """The context of a command; `name` begins each message.
 
     `write` replaces a file, or raises `OSError`.
     """
@@ -29,7 +29,7 @@ class CommandContext:
     write: Callable[[Path, bytes | mmap], object]
 
     def read(self, path: Path) -> bytes:
-        """Reads a regular file of at most `MAX_FILE` bytes. Raises `OSError`."""
+        """Read a regular file of at most `MAX_FILE` bytes. Raises `OSError`."""
         with open_regular(path) as file:
             data = file.read(MAX_FILE + 1)
         if len(data) > MAX_FILE:
@@ -37,7 +37,7 @@ class CommandContext:
         return data
 
     def read_text(self, path: Path) -> str:
-        """Line ends become LF, and invalid UTF-8 bytes surrogates. Raises `OSError`."""
+        """Read a text; line ends become LF, and invalid UTF-8 bytes surrogates. Raises `OSError`."""
         with io.TextIOWrapper(io.BytesIO(self.read(path)), "utf-8", "surrogateescape") as text:
             return text.read()
 

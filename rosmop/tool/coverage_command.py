@@ -28,7 +28,6 @@ def coverage(
     fail_under: float,
     as_json: bool,
 ) -> int:
-    """Return the exit status."""
     try:
         specifications = read_for_recordings(program, files, folders)
         items = items_of(specifications.texts)
@@ -61,7 +60,6 @@ def coverage(
 def _covered(
     session: BatchSession, specifications: Specifications, items: list[CoverageItem]
 ) -> tuple[dict[CoverageItem, int], list[dict[str, object]]]:
-    """Return the counts of all recordings, and a row for each failed one, which is also printed."""
     jobs = [CoverageJob(recording, specifications) for recording in session.recordings]
     counts = [0] * len(items)
     failures: dict[int, Failure] = {}

@@ -56,7 +56,6 @@ def learn_monitors(
 
 
 def _surveys(session: BatchSession, topics: list[str]) -> tuple[list[tuple[int, Survey]], dict[int, Failure]]:
-    """Return headers and failures by the number of the recording."""
     jobs = [SurveyJob(recording, topics) for recording in session.recordings]
     surveys: list[tuple[int, Survey]] = []
     failures: dict[int, Failure] = {}
@@ -73,7 +72,7 @@ def _surveys(session: BatchSession, topics: list[str]) -> tuple[list[tuple[int, 
 
 
 def _definitions(program: CommandContext, surveys: Sequence[Survey]) -> Definitions:
-    """Rejects recordings with different definitions of one type."""
+    """Return the definitions in recordings. Rejects recordings with different definitions of one type."""
     recorded = Definitions({})
     for survey in surveys:
         own = definitions_by_type(survey.definitions)

@@ -22,7 +22,9 @@ def say_finding(finding: Diagnostic, *, as_json: bool) -> None:
 def record(
     outcome: Outcome, index: int | None = None, topic: str | None = None, publisher: str = ""
 ) -> dict[str, object]:
-    """A message is one of the recording, or of a monitor; without a topic, it is a tick or deadline."""
+    """Return an outcome as data; its message is from the recording or from a monitor, and without a topic, it
+    is a tick or deadline.
+    """
     head: dict[str, object] = {"timer": outcome.timer}
     if topic is not None:
         head = {"publisher": publisher, "topic": topic} if publisher else {"index": index, "topic": topic}
@@ -69,7 +71,7 @@ def _fault(fault: Fault) -> dict[str, object]:
 def lines(
     outcome: Outcome, index: int | None = None, topic: str | None = None, publisher: str = ""
 ) -> Iterator[str]:
-    """A message without an outcome to report has no lines."""
+    """Yield the lines of an outcome; a message without an outcome to report has none."""
     seconds = f"{outcome.time / BILLION:.3f}"
     number = f"published by {publisher}:" if publisher else f"#{index}"
     head = f"{seconds} {outcome.timer}" if topic is None else f"{seconds} {number} {topic}"

@@ -10,7 +10,7 @@ FORMER_OPTIONS: Mapping[str, str] = {"--out": "--output", "--expires": "--for", 
 
 
 def renamed(command: Any, args: list[str]) -> list[str]:
-    """Replace former names that the command does not know, and say so."""
+    """Replace former names that the command does not know, with a remark."""
     known = {option for parameter in command.params for option in parameter.opts}
     given: list[str] = []
     for position, word in enumerate(args):
@@ -27,7 +27,7 @@ def renamed(command: Any, args: list[str]) -> list[str]:
 
 
 class RenamedCommand(TyperCommand):
-    """Accepts former names of its options."""
+    """A command that accepts former names of its options."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         return super().parse_args(ctx, renamed(self, args))

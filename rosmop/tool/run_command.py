@@ -55,7 +55,6 @@ def run_batch(
     margins: bool = False,
     strict: bool = True,
 ) -> int:
-    """Return the exit status."""
     # Each recording has its rows, so the same places are kept with and without --json.
     jobs = [
         ReplayJob(recording, specifications, topics or ["*"], EVER, MOST_IN_ROWS, margins, strict)

@@ -41,7 +41,7 @@ PRIMITIVES: Mapping[str, Type] = MappingProxyType(
 
 @dataclass(frozen=True)
 class FieldSlot:
-    """`index` is that in the list of the message's values."""
+    """A field; `index` is its index in the list of the message's values."""
 
     index: int
     name: str
@@ -50,7 +50,7 @@ class FieldSlot:
 
 
 class UnknownNameError(Exception):
-    """The text suggests a similar name."""
+    """A name is unknown; the text suggests a similar one."""
 
 
 class MessageTypes:
@@ -61,7 +61,7 @@ class MessageTypes:
         self._slots: dict[str, dict[str, FieldSlot]] = {}
 
     def definition(self, name: str) -> MessageDefinition:
-        """Raises `UnknownNameError` unless the definition is complete and usable."""
+        """Return a complete and usable definition. Raises `UnknownNameError`."""
         try:
             self.definitions.layout(name)
             return self.definitions.message(name)
@@ -74,7 +74,7 @@ class MessageTypes:
             ) from None
 
     def slots(self, name: str) -> dict[str, FieldSlot]:
-        """By name, in the order of the definition."""
+        """Return the fields by name, in the order of the definition."""
         if name not in self._slots:
             fields = self.definition(name).fields
             self._slots[name] = {
@@ -84,7 +84,7 @@ class MessageTypes:
         return self._slots[name]
 
     def slot(self, name: str, field: str) -> FieldSlot:
-        """Raises `UnknownNameError` with the nearest name."""
+        """Return a field. Raises `UnknownNameError` with the nearest name."""
         slots = self.slots(name)
         if field not in slots:
             paths = self._paths_to(name, field)
@@ -94,14 +94,14 @@ class MessageTypes:
         return slots[field]
 
     def constant(self, name: str, constant: str) -> Constant:
-        """Raises `UnknownNameError`."""
+        """Return a constant. Raises `UnknownNameError`."""
         constants = {known.name: known for known in self.definition(name).constants}
         if constant not in constants:
             raise UnknownNameError(f"{name} has no constant {shown(constant)}{nearest(constant, constants)}")
         return constants[constant]
 
     def _paths_to(self, name: str, field: str) -> list[str]:
-        """The paths have two or three steps."""
+        """Return the paths of two or three steps to a field of this name."""
         level = [("", name)]
         for _ in range(3):
             found = []

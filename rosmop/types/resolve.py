@@ -45,12 +45,12 @@ _SHORT_NAMES = {short: f"unsigned {short[1:]}" for short in ("uint", "ushort", "
 
 
 def named_type(parts: tuple[str, ...]) -> Type | None:
-    """Return None for a message type (others: `std::string`, `size_t`, `ros::Time`)."""
+    """Return the type of a name such as `std::string`, `size_t` or `ros::Time`; None for a message type."""
     return _NAMED.get(parts[1:] if parts[0] == "std" and len(parts) > 1 else parts)
 
 
 def resolve(name: tree.TypeName, messages: MessageTypes) -> Type:
-    """Raises `SpecificationError`; `auto` is not resolved here."""
+    """Return the type of a name. Raises `SpecificationError`; `auto` is not resolved here."""
     if name.element is not None:
         element = resolve(name.element, messages)
         if element in (value_types.VOID, value_types.CHARACTERS):
@@ -104,7 +104,6 @@ def _message(name: tree.TypeName, messages: MessageTypes) -> Type:
 
 
 def _meant(parts: tuple[str, ...], messages: MessageTypes) -> str:
-    """Return advice on an unknown type that is not written as a message type."""
     advice = instead(parts)
     if advice is not None:
         return f"; {advice}"
@@ -116,7 +115,7 @@ def _meant(parts: tuple[str, ...], messages: MessageTypes) -> str:
 
 
 def record(position: Position, name: str, messages: MessageTypes) -> value_types.RecordType:
-    """Raises `SpecificationError`."""
+    """Return a message type. Raises `SpecificationError`."""
     try:
         messages.definition(name)
     except UnknownNameError as error:

@@ -13,7 +13,7 @@ def _tag(name: str) -> str:
 
 
 class _Kind(msgspec.Struct, frozen=True, tag=_tag, tag_field="kind", array_like=True):
-    """The tag is the class name without `Type`."""
+    """A type; its tag is the class name without `Type`."""
 
 
 class VoidType(_Kind, frozen=True):
@@ -38,7 +38,7 @@ class BoolType(_Kind, frozen=True):
 
 
 class IntegerType(_Kind, frozen=True):
-    """`name` is only for error messages: `long` and `long long` are the same type."""
+    """An integer type; `name` is only for error messages, because `long` and `long long` are the same type."""
 
     bits: int
     signed: bool
@@ -157,7 +157,7 @@ def is_number(kind: Type) -> bool:
 
 
 def is_scalar(kind: Type) -> bool:
-    """Values of this type never change in place, so they need no copy."""
+    """Whether values of this type never change in place, so that they need no copy."""
     return not isinstance(kind, VectorType | RecordType)
 
 
@@ -183,7 +183,7 @@ def common(left: Type, right: Type) -> Type:
 
 
 def convertible(source: Type, target: Type) -> bool:
-    """A value of one type can be assigned to a variable of the other."""
+    """Whether a value of one type can be assigned to a variable of the other."""
     if is_number(source) and is_number(target):
         return True
     if isinstance(target, StringType | CharactersType):
@@ -195,7 +195,7 @@ def convertible(source: Type, target: Type) -> bool:
 
 
 def same_elements(one: Type, other: Type) -> bool:
-    """ROS encodes vectors of both element types alike: bytes, characters and booleans each take one byte."""
+    """Whether ROS encodes vectors of both element types alike: bytes, characters and booleans each take one byte."""
     bytes_alike = all(isinstance(kind, BoolType) or (isinstance(kind, IntegerType) and kind.bits == 8)
                       for kind in (one, other))  # fmt: skip
     if bytes_alike:

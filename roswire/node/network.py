@@ -11,11 +11,11 @@ from typing import Any, Protocol
 from roswire.errors import RosError
 
 BUFFER_BYTES = 1 << 19
-"""The number of received bytes at which a connection stops reading is twice this number."""
+"""Half the number of received bytes at which a connection stops reading."""
 
 
 class NodeCallError(RosError):
-    """The text says which call of the master, a node or a service, and why it has no usable result."""
+    """A call of the master, a node or a service has no usable result; the text has the call and the reason."""
 
 
 class PeerUnreachableError(NodeCallError):
@@ -23,11 +23,11 @@ class PeerUnreachableError(NodeCallError):
 
 
 class MasterDenialError(NodeCallError):
-    """The text is the master's."""
+    """The master denied a call; the text is the master's."""
 
 
 class ServiceFailedError(NodeCallError):
-    """The text is the service's."""
+    """A service failed; the text is the service's."""
 
 
 class ByteWriter(Protocol):
@@ -36,7 +36,7 @@ class ByteWriter(Protocol):
     def write(self, data: bytes) -> None: ...
 
     async def drain(self) -> None:
-        """Waits until the peer has room for more.
+        """Wait until the peer has room for more.
 
         Raises `OSError` if the connection has ended.
         """
@@ -48,7 +48,7 @@ Serve = Callable[[asyncio.StreamReader, ByteWriter], Awaitable[None]]
 
 
 class ListeningServer(Protocol):
-    """It listens at the source address."""
+    """A server that listens at the source address."""
 
     @property
     def port(self) -> int: ...
@@ -63,10 +63,10 @@ class NodeNetwork(Protocol):
     def source(self) -> str: ...
 
     async def connect(self, host: str, port: int) -> tuple[asyncio.StreamReader, ByteWriter]:
-        """Raises `OSError`."""
+        """Open a connection. Raises `OSError`."""
 
     async def serve(self, serve: Serve) -> ListeningServer:
-        """Listens at a free port.
+        """Listen at a free port.
 
         Raises `OSError`.
         """
@@ -117,7 +117,7 @@ class OwnedTasks:
             task.add_done_callback(self._tasks.discard)
 
     async def close(self) -> None:
-        """Returns when all tasks have ended."""
+        """Cancel the tasks, and return when all have ended."""
         tasks = [task for task in self._tasks if task is not asyncio.current_task()]
         for task in tasks:
             task.cancel()

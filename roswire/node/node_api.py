@@ -8,7 +8,7 @@ from roswire.node.topics import NodePublication, NodeSubscription
 from roswire.xmlrpc import MethodCall, Value
 
 ParameterChanged = Callable[[str, Value], None]
-"""Takes the key that changed, and its new value; `{}` if it was deleted."""
+"""A function that takes the key that changed, and its new value; `{}` if it was deleted."""
 
 _DONE: list[Value] = [1, "", 0]
 
@@ -17,12 +17,10 @@ class NodeTables(Protocol):
     """The tables of a node, which the API reads."""
 
     @property
-    def publishers(self) -> Mapping[str, NodePublication]:
-        """The key is the topic."""
+    def publishers(self) -> Mapping[str, NodePublication]: ...
 
     @property
-    def subscribers(self) -> Mapping[str, NodeSubscription]:
-        """The key is the topic."""
+    def subscribers(self) -> Mapping[str, NodeSubscription]: ...
 
     @property
     def services(self) -> Mapping[str, ServiceServer]: ...
@@ -37,7 +35,7 @@ class NodeTables(Protocol):
 
 
 class NodeApi:
-    """A call with other parameters than the API defines gets an error, and changes nothing."""
+    """The API of a node. A call with other parameters than the API defines gets an error, and changes nothing."""
 
     def __init__(self, node: NodeTables, master: str, pid: int, shut_down: Callable[[str], None]) -> None:
         self._node = node

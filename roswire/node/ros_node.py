@@ -45,10 +45,10 @@ _Kind = Literal["publisher", "subscriber", "service", "parameter"]
 
 
 class RosNode:
-    """`name` is canonical, `master` is a URI.
+    """A node; `name` is canonical, `master` is a URI.
 
-    `shut_down` is called with the reason if the master ends the node, for example because another node has its name.
-    `memory` bounds the messages that wait for other nodes; by default, the node has one of its own.
+    `shut_down` is called with the reason if the master ends the node, for example because another node has
+    its name. `memory` bounds the messages that wait for other nodes; by default, the node has one of its own.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class RosNode:
         self._locks: WeakValueDictionary[tuple[_Kind, str], asyncio.Lock] = WeakValueDictionary()
 
     async def start(self) -> None:
-        """Raises `OSError` if the source address cannot be used."""
+        """Listen at the source address. Raises `OSError` if it cannot be used."""
         for serve in (self._serve_api, self._serve_tcpros):
             self._servers.append(await self._network.serve(serve))
         self._uri = node_uri(self._network.source, self._servers[0].port)
@@ -91,7 +91,7 @@ class RosNode:
         return self._network.source, self._servers[1].port
 
     async def close(self) -> None:
-        """Unregisters everything, as far as the master answers soon."""
+        """Unregister everything, as far as the master answers soon, and end."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_CLOSE_SECONDS):
                 await self._unregister_all()
@@ -116,7 +116,7 @@ class RosNode:
     # --- the master ---
 
     async def master(self, method: str, *params: Value) -> Value:
-        """Raises `MasterDenialError` with the master's reason, or another `RosError`."""
+        """Call the master. Raises `MasterDenialError` with the master's reason, or another `RosError`."""
         return await self._call_master(self.name, method, *params)
 
     async def _call_master(self, caller_id: str, method: str, *params: Value) -> Value:
@@ -140,7 +140,9 @@ class RosNode:
     async def subscribe(
         self, topic: str, received: Received, wanted: MessageType = ANY_TYPE
     ) -> NodeSubscription:
-        """Raises ValueError if the node already has a subscription, and `RosError` if the master denies it."""
+        """Subscribe to a topic. Raises ValueError if the node already has a subscription, and `RosError` if
+        the master denies it.
+        """
         async with self._lock("subscriber", topic):
             if topic in self.subscribers:
                 raise ValueError(f"{self.name} already subscribes to {topic}")
@@ -157,13 +159,13 @@ class RosNode:
             return subscriber
 
     def repeat(self, topic: str, received: Received) -> None:
-        """`received` gets the last message of each latched publisher."""
+        """Give `received` the last message of each latched publisher."""
         self.subscribers[topic].repeat(received)
         if topic in self.publishers:
             self.publishers[topic].repeat(received)
 
     def follow(self, subscriber: NodeSubscription, uris: Sequence[Value]) -> None:
-        """The node's own messages take no connection."""
+        """Connect to the publishers of a topic; the node's own messages take no connection."""
         subscriber.update([uri for uri in uris if isinstance(uri, str) and uri != self._uri])
 
     async def unsubscribe(self, topic: str) -> None:
@@ -175,7 +177,7 @@ class RosNode:
     async def advertise(
         self, topic: str, kind: MessageType, *, latched: bool, queue: int, replay: float = 0.0
     ) -> NodePublication:
-        """`queue` is the number of messages that may wait for each subscriber.
+        """Publish a topic; `queue` is the number of messages that may wait for each subscriber.
 
         Subscribers that connect within `replay` seconds get the messages that were published until then.
 
@@ -201,7 +203,7 @@ class RosNode:
             return publisher
 
     async def advertise_again(self, topic: str) -> None:
-        """The result shows whether the master still grants the publication.
+        """Register a publication again, to find out whether the master still grants it.
 
         Raises `RosError`.
         """
@@ -216,7 +218,8 @@ class RosNode:
     # --- parameters ---
 
     async def subscribe_parameter(self, key: str, changed: ParameterChanged) -> None:
-        """`changed` is called for each new value of the canonical key, or of a key below.
+        """Subscribe to a parameter; `changed` is called for each new value of the canonical key, or of a key
+        below.
 
         Raises ValueError if the node already subscribes to it, and `RosError` if the master denies it.
         """
@@ -237,10 +240,10 @@ class RosNode:
                 del self.parameters[key]
 
     async def set_parameter(self, name: str, value: Value) -> None:
-        """A master sends the node that sets a parameter no update. So the call has its own name, and subscriptions of
-        this node get all values in the order of the master.
+        """Set a parameter. Raises `RosError`.
 
-        Raises `RosError`.
+        A master sends the node that sets a parameter no update. So the call has its own name, and
+        subscriptions of this node get all values in the order of the master.
         """
         key = resolve_parameter(name, self.name)
         await self._call_master(f"{self.name}/parameters", "setParam", key, value)
@@ -250,7 +253,7 @@ class RosNode:
     async def offer(
         self, service: str, kind: ServiceType, answer: Callable[[bytes], Awaitable[bytes]]
     ) -> ServiceServer:
-        """Raises ValueError if the node already offers it, and `RosError` if the master denies it."""
+        """Offer a service. Raises ValueError if the node already offers it, and `RosError` if the master denies it."""
         async with self._lock("service", service):
             if service in self.services:
                 raise ValueError(f"{self.name} already offers {service}")
@@ -269,14 +272,14 @@ class RosNode:
                 del self.services[service]
 
     async def probe_service(self, service: str) -> dict[str, str]:
-        """The header has `type` and `md5sum`.
+        """Return the connection header of a service, with `type` and `md5sum`.
 
         Raises `RosError`.
         """
         return await probe_service(self._link, service, await self._service_uri(service))
 
     async def call_service(self, service: str, md5sum: str, request: bytes, seconds: float) -> bytes:
-        """Returns the serialised response.
+        """Call a service, and return the serialised response.
 
         Raises `ServiceFailedError` with the service's reason, or another `RosError`.
         """
@@ -301,7 +304,6 @@ class RosNode:
                 await self._serve_header(reader, writer)
 
     def _accept(self, writer: ByteWriter) -> bool:
-        """The node then owns the connection's task."""
         if len(self._tasks) >= self._limits.connections:
             writer.close()
             return False
@@ -334,6 +336,6 @@ class RosNode:
         return lock
 
     async def _forget(self, method: str, *params: Value) -> None:
-        """A master that is gone has forgotten the registration, or will notice the end of the node."""
+        """Unregister; a master that has ended has forgotten the registration, or will notice the end of the node."""
         with contextlib.suppress(RosError):
             await self.master(method, *params)

@@ -19,7 +19,7 @@ _READ_BYTES = 1 << 16
 
 @dataclass(frozen=True, slots=True)
 class NodeLimits:
-    """Times are in seconds."""
+    """The limits of a node; times are in seconds."""
 
     message_bytes: int = 64 << 20
     connections: int = 256  # from other nodes, to its topics, services and API
@@ -31,7 +31,7 @@ class NodeLimits:
 
 @dataclass(frozen=True, slots=True)
 class MessageType:
-    """`definition` is the full text."""
+    """A message type; `definition` is the full text."""
 
     name: str
     md5sum: str
@@ -39,17 +39,17 @@ class MessageType:
 
     @classmethod
     def defined(cls, definitions: Definitions, name: str) -> "MessageType":
-        """Raises `DefinitionError`."""
+        """Return the message type of a name. Raises `DefinitionError`."""
         return cls(name, definitions.md5sum(name), definitions.full_text(name))
 
 
 ANY_TYPE = MessageType(ANY, ANY, "")
-"""A subscriber with it accepts every type."""
+"""The type of a subscriber that accepts every type."""
 
 
 async def read_frame(reader: asyncio.StreamReader, limit: int) -> bytes:
-    """Raises `LimitExceededError` as soon as the announced length exceeds the limit, and `OSError` if the connection
-    ends.
+    """Return a frame. Raises `LimitExceededError` as soon as the announced length exceeds the limit, and
+    `OSError` if the connection ends.
     """
     try:
         return await reader.readexactly(_size(await reader.readexactly(_LENGTH.size), 0, limit))
@@ -67,7 +67,7 @@ class FrameReader:
         self._large = False  # whether the last frame was
 
     async def next(self) -> list[bytes]:
-        """Return the next frames, at least one. Raises what `read_frame` raises."""
+        """Return the next frames, at least one. Raises the errors of `read_frame`."""
         try:
             if self._large and not self._begun:
                 return [self._noted(await read_frame(self._reader, self._limit))]
@@ -116,7 +116,7 @@ def _ended() -> ConnectionResetError:
 
 
 async def read_header(reader: asyncio.StreamReader, seconds: float) -> dict[str, str]:
-    """Raises `ProtocolError`, or `OSError` if the connection ends or the time limit passes."""
+    """Return a header. Raises `ProtocolError`, or `OSError` if the connection ends or the time limit passes."""
     async with asyncio.timeout(seconds):
         return decode_header(await read_frame(reader, HEADER_LIMIT))
 
@@ -124,7 +124,7 @@ async def read_header(reader: asyncio.StreamReader, seconds: float) -> dict[str,
 async def exchange_headers(
     reader: asyncio.StreamReader, writer: ByteWriter, header: Mapping[str, str], seconds: float
 ) -> dict[str, str]:
-    """Returns the answer.
+    """Send a header and return the answer.
 
     Raises `ProtocolError` with the peer's reason if it rejects the connection, or `OSError`.
     """
@@ -136,6 +136,6 @@ async def exchange_headers(
 
 
 def refuse(writer: ByteWriter, reason: str) -> None:
-    """The peer's node logs the reason."""
+    """Refuse a connection with a reason, which the peer's node logs."""
     writer.write(encode_header({"error": reason}))
     writer.close()

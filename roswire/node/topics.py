@@ -26,7 +26,7 @@ from roswire.tcpros import encode_frame, encode_header
 from roswire.uris import parse_node_uri
 
 Received = Callable[[bytes, Mapping[str, str]], None]
-"""Takes the bytes of a message, and the connection header of its publisher."""
+"""A function that takes the bytes of a message, and the connection header of its publisher."""
 
 _FIRST_PAUSE = (
     0.1  # seconds between two attempts to reach a publisher; the pause doubles up to the second number
@@ -72,7 +72,7 @@ class NodeLink:
 
 
 class NodeSubscription:
-    """One connection for each publisher, opened again whenever it ends.
+    """A subscription: one connection for each publisher, opened again whenever it ends.
 
     `problems` has the reason for each publisher that cannot be reached.
     """
@@ -93,7 +93,7 @@ class NodeSubscription:
         ] = {}  # number and hash of each latched publisher's last message
 
     def update(self, uris: Sequence[str]) -> None:
-        """Drops publishers that are not in the list."""
+        """Connect to the publishers in the list, and drop all others."""
         self.updates += 1
         wanted = dict.fromkeys(uris[: self._link.limits.publishers])
         for uri in [uri for uri in self._followed if uri not in wanted]:
@@ -104,12 +104,12 @@ class NodeSubscription:
                 self._followed[uri] = self._tasks.start(self._follow(uri))
 
     async def headers(self) -> list[Mapping[str, str]]:
-        """Waits until one publisher has connected."""
+        """Return the headers of publishers, once one has connected."""
         await self._connection.wait()
         return [*self.connected.values()]
 
     def hear_own(self, body: bytes, header: Mapping[str, str]) -> None:
-        """Other types than the wanted one are ignored."""
+        """Hear a message of this node; types other than the wanted one are ignored."""
         if self.wanted.md5sum in (ANY, header["md5sum"]):
             self._received(body, header)
 
@@ -217,12 +217,13 @@ class NodeSubscription:
 
 
 class NodePublication:
-    """At most `queue` messages wait for each subscriber; `dropped` counts the older ones that are dropped.
+    """A publication; `queue` messages wait for each subscriber, and `dropped` counts older ones that are
+    dropped.
 
-    At most `queue` messages wait for each subscriber; if more come, the oldest are dropped, as `dropped` counts. A
-    latched publication sends its last message to each new subscriber. Subscribers connect some time after the
-    registration; those that connect within `replay` seconds get the messages that were published until then. `own`
-    returns the node's own subscription to the topic: as with rospy and roscpp, its messages take no connection.
+    A latched publication sends its last message to each new subscriber. Subscribers connect some time after
+    the registration; those that connect within `replay` seconds get the messages that were published until
+    then. `own` returns the node's own subscription to the topic: as with rospy and roscpp, its messages take
+    no connection.
     """
 
     def __init__(
@@ -282,13 +283,13 @@ class NodePublication:
             own.hear_own(body, self._header)
 
     def repeat(self, received: Received) -> None:
-        """Only if the publication is latched."""
+        """Give `received` the last message, if the publication is latched."""
         if self.latched:
             for frame in self._kept.frames:
                 received(frame[4:], self._header)  # without its length
 
     def replay_from_now(self) -> None:
-        """Forgets earlier messages."""
+        """Forget earlier messages, and keep new ones for subscribers that connect soon."""
         loop = asyncio.get_running_loop()
         self._kept.clear()
         self._replay_until = loop.time() + self._replay
@@ -302,7 +303,7 @@ class NodePublication:
     async def serve(
         self, reader: asyncio.StreamReader, writer: ByteWriter, header: Mapping[str, str]
     ) -> None:
-        """From the subscriber's header on, until the connection ends."""
+        """Serve a subscriber from its header on, until the connection ends."""
         if header.get("md5sum") not in (ANY, self.type.md5sum):
             refuse(
                 writer,
@@ -407,7 +408,7 @@ class _SendQueue:
         self._queues.queues.discard(self)
 
     async def send_to(self, writer: ByteWriter) -> None:
-        """This runs until the connection ends."""
+        """Send the queue until the connection ends."""
         try:
             while True:
                 await self._ready.wait()

@@ -44,7 +44,7 @@ async def call_xmlrpc(
     seconds: float,
     limits: XmlRpcLimits = DEFAULT_LIMITS,
 ) -> Value:
-    """The connection is new.
+    """Call a method over a new connection, and return its value.
 
     Raises `PeerUnreachableError`, or another `RosError` if the answer is not usable.
     """
@@ -93,7 +93,7 @@ class _Message:
 
 
 def _value(status: int, answer: bytes, limits: XmlRpcLimits) -> Value:
-    """A status other than 200 may come with the reason as a fault."""
+    """Return the value of an answer; a status other than 200 may come with the reason as a fault."""
     try:
         value = parse_response(answer, limits)
     except FaultReceived:
@@ -133,7 +133,7 @@ def _feed(parser: "httptools.HttpResponseParser | httptools.HttpRequestParser", 
 async def serve_xmlrpc(
     reader: asyncio.StreamReader, writer: ByteWriter, answer: Callable[[MethodCall], Awaitable[Value]]
 ) -> None:
-    """In order, until the peer ends the connection, is idle, or breaks the protocol."""
+    """Answer calls in order, until the peer ends the connection, is idle, or breaks the protocol."""
     message = _Message()
     parser = httptools.HttpRequestParser(message)
     received = 0  # bytes since the last complete request

@@ -25,7 +25,7 @@ _DOUBLE = rb"-?[0-9]++(?:\.[0-9]++)?(?:e[-+]?[0-9]++)?"
 
 
 def _scalar(group: bytes = b"(?:") -> bytes:
-    """The group for each kind of content has a name that begins with `group`."""
+    """Return the pattern of a scalar; the name of the group for each kind of content begins with `group`."""
     kinds = (
         (b"string", _TEXT), (b"int", _INTEGER), (b"i4", _INTEGER), (b"boolean", b"[01]"), (b"double", _DOUBLE)
     )  # fmt: skip
@@ -44,7 +44,7 @@ def _spaced(*parts: bytes) -> re.Pattern[bytes]:
 
 
 def _list_in(group: bytes) -> bytes:
-    """The last item may itself be a list of scalars.
+    """Return the pattern of a list whose last item may be a list of scalars.
 
     The name of each group begins with `group`.
     """
@@ -85,9 +85,9 @@ _STRUCT_END = re.compile(b"</struct>" + _SPACE + b"</value>" + _SPACE)
 
 
 def read_common_call(body: bytes, limits: XmlRpcLimits) -> tuple[str, list[Value]] | None:
-    """None unless all parameters are scalars.
+    """Return the method and the parameters; None unless all parameters are scalars.
 
-    For a multicall, returns the parameters of all parts.
+    For a multicall, the parameters are those of all parts.
     """
     if not _fits(body, limits):
         return None
@@ -99,7 +99,7 @@ def read_common_call(body: bytes, limits: XmlRpcLimits) -> tuple[str, list[Value
 
 
 def read_common_answer(body: bytes, limits: XmlRpcLimits) -> list[Value] | None:
-    """None unless each answer is a list of scalars whose last item may be such a list."""
+    """Return the answers; None unless each is a list of scalars whose last item may be such a list."""
     if not _fits(body, limits):
         return None
     found = _ANSWER.match(body) if len(body) <= _LONGEST else None
@@ -114,7 +114,7 @@ def _several(
     patterns: tuple[re.Pattern[bytes], re.Pattern[bytes], re.Pattern[bytes]],
     read: Callable[[re.Match[bytes]], Value],
 ) -> list[Value] | None:
-    """None unless the document has at least one part and nothing else between its head and end."""
+    """Return the parts of a document; None unless it has at least one, and nothing else between its head and end."""
     head, part, end = patterns
     found = head.match(body)
     if found is None:
@@ -132,7 +132,7 @@ def _several(
 
 
 def _struct(body: bytes, begin: int, limits: XmlRpcLimits) -> tuple[Value, int]:
-    """Returns the struct as `reader` does, and its end.
+    """Return the struct as `reader` does, and its end.
 
     Raises `PeerError` if there is no struct.
 

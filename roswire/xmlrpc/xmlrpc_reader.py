@@ -80,7 +80,7 @@ _NO_SPACE = str.maketrans("", "", _SPACE)
 
 
 class XmlRpcDocument:
-    """After it is read, `method`, `values` and `is_fault` have its contents."""
+    """Reads a document; afterwards `method`, `values` and `is_fault` have its contents."""
 
     __slots__ = ("_depth", "_elements", "_expat", "_follow", "_keys", "_limits", "_stack", "_state", "_text",
                  "_value", "is_fault", "method", "values")  # fmt: skip
@@ -116,11 +116,11 @@ class XmlRpcDocument:
             del self._expat  # the parser refers to this object; this breaks the cycle
 
     def _parse(self, body: bytes) -> None:
-        """Feeds the parser in pieces, and rejects a tag that is longer than a piece.
+        """Feed the parser in pieces, and reject a tag that is longer than a piece.
 
-        When a handler raises, expat still reads the rest of its piece and keeps a stack of the elements there. An
-        unfinished tag is scanned again with the next piece, and its attributes are collected. Small pieces and short
-        tags keep all three costs low.
+        When a handler raises, expat still reads the rest of its piece and keeps a stack of the elements
+        there. An unfinished tag is scanned again with the next piece, and its attributes are collected. Small
+        pieces and short tags keep all three costs low.
         """
         parser = self._expat
         if len(body) <= _PIECE:
@@ -198,7 +198,7 @@ class XmlRpcDocument:
         return string
 
     def _scalar(self) -> str:
-        """A longer one would hold the interpreter while it is matched."""
+        """Return the text of a scalar, which is limited because a pattern is matched to it without interruption."""
         text = self._string()
         if len(text) > _LONGEST_SCALAR:
             raise self._error(
@@ -264,7 +264,7 @@ class XmlRpcDocument:
         return self._state if self._state != "full" else "an element that is complete"
 
     def _pass_space(self) -> None:
-        """Only whitespace may be between elements, and ROS clients write a line feed there."""
+        """Skip whitespace between elements, where only it may be; ROS clients write a line feed there."""
         if self._text != _LINE_FEED:
             text = "".join(self._text).strip(_SPACE)
             if text:

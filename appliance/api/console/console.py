@@ -8,9 +8,9 @@ Invariants:
    system.
 3. The headers restrict the page to this origin, for loading and for connections, and to its own scripts. A string never
    becomes markup (Trusted Types).
-4. The page names its files by addresses that contain a hash of their content, so browsers keep them without asking. All
-   modules are one script, all style sheets one, both made here: a missing file or name ends the start of the API. A
-   script of a feature that `import()` names is a file of its own, which a browser loads when the page needs it.
+4. The page names its files by addresses that contain a hash of their content, so browsers keep them without asking.
+   All modules are one script, all style sheets one, both made here: a missing file or name ends the start of the API.
+   A script that a feature loads with `import()` is a file of its own.
 """
 
 import gzip
@@ -64,7 +64,7 @@ class _File(NamedTuple):
 
 
 def routes(settings: Settings) -> APIRouter:
-    """The routes are not part of the contract. Raise `ModuleError` if the modules cannot be joined."""
+    """Return the routes, which are not part of the contract. Raise `ModuleError` if the modules cannot be joined."""
     router = APIRouter(include_in_schema=False)
     served = _collect((files(__package__) / name for name in _SERVED), "")
     for feature in FEATURES:
@@ -81,7 +81,7 @@ def routes(settings: Settings) -> APIRouter:
     }
 
     def named(found: re.Match[str]) -> str:
-        """Return the lasting address of a file."""
+        """Return the address, with a hash, of the file that the match names."""
         name = found[1]
         if name not in served:
             raise ModuleError(f"the console names {_PREFIX}{name}, which does not exist")
@@ -128,7 +128,6 @@ def routes(settings: Settings) -> APIRouter:
 
 
 def views() -> tuple[str, ...]:
-    """The names are those in their addresses."""
     parts = (part for feature in FEATURES for part in feature.console if part.place == "view")
     return (*_VIEWS, *(part.title.lower() for part in parts))
 

@@ -1,6 +1,6 @@
 """Join the console's modules into one script, and its style sheets into one.
 
-The sources stay plain modules, and no build tool is needed. In exchange they use a small part of the module syntax:
+The sources stay plain modules without a build tool, so they use a small part of the module syntax:
 
 - `import { a, b as c } from "./x.js";`, in a feature also from `"#console/x.js"`, a module of the console; from an
   absolute address, which stays a separate file;
@@ -57,7 +57,9 @@ class _Token(NamedTuple):
 
 
 def join_modules(sources: Mapping[str, str], entry: str) -> str:
-    """The sources are keyed by their paths, such as `js/main.js`. Raise `ModuleError`."""
+    """Return the script of `entry` and all its imports. `sources` maps paths, such as `js/main.js`, to texts.
+    Raise `ModuleError`.
+    """
     joining = _Joining(sources)
     joining.include(entry)
     return joining.script()
@@ -76,10 +78,10 @@ def join_late_modules(sources: Mapping[str, str], entry: str) -> str:
 
 
 def join_styles(sources: Mapping[str, str], entry: str, within: tuple[str, ...] = ()) -> str:
-    """Comments and indentation are removed.
+    """Return one style sheet, without comments and indentation.
 
-    `within` are the files whose imports led to the entry. Raise `ModuleError` for a missing file, a cycle, and an
-    import of another form.
+    `within` are the files whose imports led to the entry. Raise `ModuleError` for a missing file, a cycle,
+    and an import of another form.
     """
     if entry not in sources:
         raise ModuleError(f"there is no file {entry}")
@@ -183,7 +185,6 @@ class _Joining:
 
 
 def _tightened(pieces: list[_Token]) -> str:
-    """Remove spaces that separate nothing."""
     kept: list[_Token] = []
     gap = ""
     for piece in pieces:
@@ -199,7 +200,7 @@ def _tightened(pieces: list[_Token]) -> str:
 
 
 def _apart(before: str, after: str) -> bool:
-    """The tokens of one line stay two tokens without a space between them."""
+    """Whether the tokens `before` and `after` stay two tokens without a space between them."""
     return before in _SEPARATING or after in _SEPARATING
 
 
@@ -227,7 +228,6 @@ def _path(of: str, address: str) -> str:
 
 
 def _tokens(path: str, text: str) -> Iterator[_Token]:
-    """Comments and spaces become one space or line break."""
     brackets: list[str] = []
     at, line, before = 0, 1, _Token("mark", ";", 1, outermost=True)
     while at < len(text):

@@ -2,7 +2,7 @@
 
 Invariants:
 
-1. At most `_MOST_OPEN` requests are open; a further request is rejected here and costs control nothing.
+1. At most `_MOST_OPEN` requests are open; further ones are rejected here.
 2. A request ends with its answer, with the end of the link, or after a time limit.
 3. A notice (`tell`) never waits. While the control process is away, the last `_MOST_KEPT` notices are kept for the
    next control process; lost notices are counted and logged.
@@ -48,9 +48,9 @@ _UNKNOWN = (
 
 
 class ControlAwayError(Exception):
-    """The text gives the client the reason.
+    """Control gave no answer; the text gives the client the reason.
 
-    `active`: the address of the active appliance, if control only answers that this one is the standby.
+    `active` is the address of the active appliance, if this one is the standby.
     """
 
     def __init__(self, reason: str, active: str = "") -> None:
@@ -67,9 +67,7 @@ def _made(
 
 
 class ControlLink:
-    """`tokens_stated(tokens)` gets the tokens that are valid from now on; `lost()` is called when control
-    disconnects.
-    """
+    """`tokens_stated(tokens)` gets the tokens that are valid from now on; `lost()` is called when control is gone."""
 
     def __init__(self, tokens_stated: Callable[[list[TokenKept]], None], lost: Callable[[], None]) -> None:
         self._tokens_stated = tokens_stated
@@ -102,10 +100,10 @@ class ControlLink:
     async def ask(
         self, request: AdminRequest[A], bearer: Bearer | None, seconds: float | None = None
     ) -> AdminAnswer[A]:
-        """Raises `ControlAwayError`.
+        """Return control's answer. Raises `ControlAwayError`.
 
-        A request is withdrawn if the client disconnects, or if it has not taken effect after `seconds` (None: the
-        operation's own limit).
+        A request is withdrawn if the client disconnects, or if it has not taken effect after `seconds` (None:
+        the operation's own limit).
         """
         if seconds is None:
             operation = operation_of(request)
@@ -135,7 +133,7 @@ class ControlLink:
     async def _asked(
         self, request: AdminRequest[Any], bearer: Bearer | None, until: float, longest: float
     ) -> bytes:
-        """The request is withdrawn when its client disconnects. Raises as `Link.ask`."""
+        """Return the encoded answer. The request is withdrawn when its client disconnects. Raises as `Link.ask`."""
         number = 0
 
         def question(given: int) -> RequestMade:
@@ -159,7 +157,7 @@ class ControlLink:
         return answer
 
     async def hand_over(self, door: str, ticket: str, peer: str, descriptor: int) -> tuple[int, str]:
-        """Return the status and why the WebSocket is refused, or an empty text. Raises `ControlAwayError`."""
+        """Return the status, and the reason for refusing the WebSocket or an empty text. Raises `ControlAwayError`."""
         if self.paused:
             raise ControlAwayError(self.paused)
         try:
@@ -171,7 +169,7 @@ class ControlLink:
         return answer.status, answer.reason
 
     def token_used(self, token: str) -> None:
-        """Without control, a later use is reported."""
+        """Report the use of a token. While control is away the report is dropped, and a later use is reported."""
         with contextlib.suppress(ChannelFullError):
             self._link.send(TokenUsed(token))
 

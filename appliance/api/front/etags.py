@@ -29,7 +29,7 @@ class ConditionalGet:
 
 
 class _Answer:
-    """The start is delayed until the first part of the body is known."""
+    """Delays the start until the first part of the body is known."""
 
     def __init__(self, known: str, send: Send) -> None:
         self._known = {tag.strip().removeprefix("W/") for tag in known.split(",")}

@@ -30,7 +30,7 @@ def routes(services: Services) -> Routes:
         return Health("live")
 
     async def ready() -> Health:
-        """Whether nodes are served: 503 while they are not; no token needed, so it does not say why."""
+        """Whether nodes are served: 503 while they are not. Without a token, so the answer does not give the reason."""
         if services.control.paused:
             raise ProblemError(
                 503, "not-served", "nodes are not served: the appliance is paused", retry_after=1

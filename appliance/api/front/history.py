@@ -66,7 +66,7 @@ class SampleHistory:
         self.seen = LastSample(0, None, None, _AWAY)
 
     def samples(self, most: int) -> list[Sample]:
-        """The samples are evenly spaced, the newest last."""
+        """Return at most `most` evenly spaced samples, the newest last."""
         kept = list(self._samples)
         step = -(-len(kept) // most)
         return kept[::-1][::step][::-1] if step > 1 else kept
@@ -81,13 +81,12 @@ class SampleHistory:
             self._followers -= 1
 
     async def after(self, number: int) -> LastSample:
-        """Wait for a sample newer than this number."""
         async with self._news:
             await self._news.wait_for(lambda: self.seen.number > number)
             return self.seen
 
     async def again(self, seconds: float) -> LastSample:
-        """If sampling takes longer than `seconds`, return the last sample.
+        """Sample again; if that takes longer than `seconds`, return the last sample.
 
         Control is queried at most once in `LEAST_SECONDS`.
         """
@@ -130,7 +129,6 @@ class SampleHistory:
 
 
 async def measures_of(control: ControlLink) -> Measures:
-    """Sends `MetricsWanted`. Raises `ControlAwayError`."""
     answer = await control.ask(MetricsWanted(), None)
     if not answer.ok:
         raise ControlAwayError(answer.error, answer.active)

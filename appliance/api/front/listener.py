@@ -1,7 +1,6 @@
 """Accept connections of REST with `rpc/front`, which RVMaster also uses; uvicorn serves them.
 
-uvicorn's configuration, a public interface, makes each connection's protocol for HTTP and ASGI. This protocol gets the
-bytes that the front accepts. Invariants besides those of `rpc/front`:
+Invariants besides those of `rpc/front`:
 
 1. A connection is entered in the connection table before anything (such as TLS) is set up for it. If the table is full,
    the connection is closed at once.
@@ -10,8 +9,8 @@ bytes that the front accepts. Invariants besides those of `rpc/front`:
    connection of a known peer may be closed only for another known peer, and only after it has waited for a second.
 3. Connections are opened (with TLS: the handshake begins) in the order of the processor time that their peers have
    used. All unknown peers count as one peer.
-4. The deadline for the head of the next request starts with the first byte after an answer. So neither an empty line
-   nor the rest of a body keeps a connection open.
+4. The deadline for the head of the next request starts with the first byte after an answer, so neither an empty
+   line nor the rest of a body keeps a connection open.
 """
 
 import asyncio
@@ -45,7 +44,7 @@ _CONNECTION = "rosrv.connection"  # the key of the connection in a request's sta
 
 
 class _Connection(Front, asyncio.Protocol):
-    """Bytes that the front accepts go to uvicorn's protocol."""
+    """Passes the bytes that the front accepts to uvicorn's protocol."""
 
     most_waiting = 16
     _uvicorn = asyncio.Protocol()  # does nothing until uvicorn's protocol replaces it
@@ -138,7 +137,7 @@ class _Connection(Front, asyncio.Protocol):
         self.connection_table.file(self, Stage.UNFINISHED if begun else Stage.IDLE)
 
     def reject(self, _status: bytes, what: str) -> None:
-        """Closing at once with unread bytes would lose the answer."""
+        """Send the status, and discard what the peer still sends: closing with unread bytes would lose the answer."""
         self.closing = True
         self.transport.pause_reading()
         said = f"The peer {what}.\n".encode()
@@ -152,7 +151,7 @@ class _Connection(Front, asyncio.Protocol):
 
 
 def _class_of(quota_class: Callable[[str], QuotaClass], host: Address) -> str:
-    """All unknown peers share one key for processor time."""
+    """Return the key for processor time, which all unknown peers share."""
     peer = peer_key(str(host))
     return "" if quota_class(peer) is QuotaClass.UNKNOWN else peer
 
@@ -208,12 +207,11 @@ class Listener:
             self._begin(self._websockets.pass_on(passage, head))
 
     def protocol_of(self, connection: _Connection) -> asyncio.Protocol:
-        """Uvicorn's server makes it in the same way."""
+        """Make the protocol in the way that uvicorn's server does."""
         make = cast(Callable[..., asyncio.Protocol], self._config.http_protocol_class)
         return make(config=self._config, server_state=self._state, app_state={_CONNECTION: connection})
 
     async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Notify the connection when the answer is sent."""
         connection: _Connection = scope["state"].pop(_CONNECTION)
 
         async def sending(message: Message) -> None:
@@ -233,7 +231,7 @@ class Listener:
         self._begin(self.connection_table.sweep())
 
     async def stop(self) -> None:
-        """Open requests may finish for a second."""
+        """Stop after open requests had a second to finish."""
         if self._acceptor is not None:
             self._acceptor.close()
         tasks = list(self._tasks)

@@ -20,7 +20,7 @@ _OF_A_SECOND = 1_000_000  # a float has no more digits
 
 
 def in_full(value: Any) -> Any:
-    """Return a value that msgspec can encode, with the RFC 3339 text of each time."""
+    """Return the value with the RFC 3339 text of each time, as msgspec can encode it."""
     if isinstance(value, msgspec.Struct):
         units = _units(type(value))
         if units is None:
@@ -39,7 +39,7 @@ def in_full(value: Any) -> Any:
 
 
 def describe(schema: dict[str, Any]) -> None:
-    """Each RFC 3339 field follows its time."""
+    """Add an RFC 3339 field after each time of a schema."""
     fields: dict[str, Any] = {}
     for name, field in schema.get("properties", {}).items():
         fields[name] = field
@@ -53,7 +53,7 @@ def describe(schema: dict[str, Any]) -> None:
 
 
 def given(text: str) -> int:
-    """Return nanoseconds since the epoch. Raises `ProblemError` (422)."""
+    """Parse a time of a request to nanoseconds since the epoch. Raises `ProblemError` (422)."""
     try:
         return parse_timestamp(text, clock.wall_ns())
     except (OverflowError, ValueError) as error:

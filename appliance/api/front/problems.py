@@ -91,16 +91,15 @@ class ProblemError(Exception):
 
 
 def too_many(kind: str, detail: str, seconds: float) -> ProblemError:
-    """The status is 429."""
     return ProblemError(429, kind, detail, retry_after=int(seconds) + 1)
 
 
 def bad_input(wrong: list[BadInput], *, besides: str = "") -> ProblemError:
-    """Status 422; `besides` is added to the detail."""
+    """Return a problem of status 422; `besides` is added to the detail."""
     detail = "; ".join(f"{problem.where}: {problem.text}" for problem in wrong[:5])
     return ProblemError(422, "bad-input", detail + besides, errors=wrong)
 
 
 def defect(error: Exception) -> ProblemError:
-    """The problem has the kind, and nothing about the cause."""
+    """Return a problem that has the kind of the error, and nothing about its cause."""
     return ProblemError(500, "defect", f"a defect of rosrv, please report it: {type(error).__name__}")

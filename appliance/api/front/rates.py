@@ -26,7 +26,7 @@ def peer_key(host: str) -> str:
 
 
 class Buckets:
-    """`burst` at once, `per_second` on average."""
+    """Token buckets that permit `burst` requests at once and `per_second` on average."""
 
     def __init__(self, per_second: float, burst: float, *, peers: int = 4096) -> None:
         self._per_second = per_second

@@ -2,7 +2,7 @@
 
 Order: rate → Host → Origin → size of the body → token. Invariants:
 
-1. A request that fails a check costs no more than reading its headers: no route, body parser or control handles it.
+1. A request that fails a check costs no more than reading its headers.
 2. Only `PUBLIC` paths and the console's own files are served without a token. Without a token, an unknown path gets
    the same answer as a known path.
 3. A page of another site cannot misuse the browser of a person who can reach the appliance: a foreign name as Host
@@ -79,7 +79,7 @@ class RequestGate:
         tunnels: ipaddress.IPv4Network | None = None,
         networks: Iterable[Network] = (),
     ) -> None:
-        """Hosts in `tunnels` that are in none of `networks` may only renew their certificates."""
+        """Restrict hosts in `tunnels` that are in none of `networks` to the renewal of their certificates."""
         self._app = app
         self._tunnels = tunnels
         self._networks = tuple(networks)
@@ -171,7 +171,7 @@ class RequestGate:
 
 
 def asked_of(scope: Scope, headers: Headers, body: bytes) -> ClientRequest:
-    """The request in the form in which control verifies its signature."""
+    """Return the request in the form in which control verifies its signature."""
     query = scope["query_string"].decode("latin-1")
     return ClientRequest(
         host=scope["client"][0],

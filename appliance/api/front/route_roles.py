@@ -18,7 +18,7 @@ _SCHEME = HTTPBearer(auto_error=False, description="A token made by `rosrv token
 class _Requires:
     """Return the bearer, who must have at least the role `least`.
 
-    It is asynchronous, like each dependency here: FastAPI would call any other in a thread, for every request.
+    Each dependency here is asynchronous, because FastAPI calls others in a thread for every request.
     """
 
     def __init__(self, least: TokenRole) -> None:
@@ -58,7 +58,7 @@ async def _no_viewer(bearer: Viewer) -> Bearer:
 
 
 Reader = Annotated[Bearer, Depends(_no_viewer)]
-"""They may read messages in records: investigators, operators and admins."""
+"""The bearers who may read messages in records: investigators, operators and admins."""
 
 _PROBLEMS = {
     "request": (422, "bad-input"),
@@ -73,12 +73,12 @@ _STANDBY_SECONDS = 2  # until a client may ask a standby again
 
 
 async def ask(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A:
-    """Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
+    """Return control's answer. Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
     return answered(await control.ask(request, bearer))
 
 
 async def ask_optional(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A | None:
-    """None for a rejection, such as a standby's, or without an answer."""
+    """Return control's answer; None for a rejection, such as a standby's, or without an answer."""
     try:
         return await ask(control, request, bearer)
     except (ControlAwayError, ProblemError):
@@ -86,7 +86,7 @@ async def ask_optional(control: ControlLink, request: AdminRequest[A], bearer: B
 
 
 def answered(answer: AdminAnswer[A]) -> A:
-    """Raises `ProblemError` for a rejection."""
+    """Return the value of an answer. Raises `ProblemError` for a rejection."""
     if answer.ok:
         return answer.given()
     if answer.trouble == "standby":

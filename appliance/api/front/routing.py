@@ -27,7 +27,7 @@ _MOST_ERRORS = 50
 
 
 class Tagged(NamedTuple, Generic[A]):
-    """The tag is a revision or tag that becomes the ETag."""
+    """An answer with the revision or tag that becomes its ETag."""
 
     body: A
     tag: int | str
@@ -43,7 +43,7 @@ def answer(body: Any, status: int = 200, tag: int | str | None = None) -> Respon
 
 
 class Contract:
-    """The structs in the contract."""
+    """Collects the structs of the contract."""
 
     def __init__(self) -> None:
         self.kinds: set[Any] = set()
@@ -61,7 +61,6 @@ CONTRACT = Contract()
 
 
 def content(kind: Any) -> dict[str, Any]:
-    """The argument `responses=` of a route."""
     return {_JSON: {"schema": CONTRACT.reference(kind)}}
 
 
@@ -71,14 +70,14 @@ def file(media_type: str, description: str, *, binary: bool = False) -> Response
 
 
 class _Body:
-    """`text` is the field of a body sent as text/plain."""
+    """Parses a body; one sent as text/plain becomes the field `text`."""
 
     def __init__(self, kind: Any, text: str | None) -> None:
         self.kind = kind
         self.text = text
 
     async def __call__(self, request: Request) -> Any:
-        """Raises `ProblemError` (415, 422)."""
+        """Return the parsed body. Raises `ProblemError` (415, 422)."""
         content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
         if content_type == "text/plain" and self.text is not None:
             return self._of_text(_text(await request.body()))
@@ -127,7 +126,7 @@ def _text(data: bytes) -> str:
 
 
 def _all_wrong(given: Any, kind: Any) -> list[BadInput]:
-    """msgspec stops at the first error; return all."""
+    """Return all errors, because msgspec stops at the first one."""
     if not isinstance(given, dict):
         return []
     known = {field.encode_name: field for field in msgspec.structs.fields(kind)}
@@ -156,7 +155,6 @@ def _bad(error: msgspec.ValidationError, where: str = "body", kind: Any = None) 
 
 
 def _choices(kind: Any) -> tuple[str, ...]:
-    """Return the permitted strings of a kind with a fixed set of values."""
     parts = typing.get_args(kind)
     if isinstance(kind, type) and issubclass(kind, enum.StrEnum):
         return tuple(kind)
@@ -166,7 +164,6 @@ def _choices(kind: Any) -> tuple[str, ...]:
 
 
 def _not_json(text: str, error: Exception) -> ProblemError:
-    """Include the place and the message of Python's parser."""
     try:
         json.loads(text)
     except json.JSONDecodeError as found:
@@ -182,7 +179,7 @@ def body(kind: type, *, text: str | None = None) -> Any:
 
 
 class Routes(APIRouter):
-    """Handlers take and return structs."""
+    """Routes whose handlers take and return structs."""
 
     def add_api_route(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
         """Add name, answer, ETag and body to the contract."""

@@ -19,8 +19,9 @@ _SEARCHES = 4
 class Services:
     """`stopping` is set when the process must end.
 
-    `judging` shares the compiling of texts for queries and dry runs among tokens. `ordering` limits the same for
-    orders, so that orders never wait for queries. `searches` and `exports` limit those of the audit log.
+    `judging` shares the compiling of texts for queries and dry runs among tokens. `ordering` limits the same
+    for orders, so that orders never wait for queries. `searches` and `exports` limit searches and exports of
+    the audit log.
     """
 
     settings: Settings

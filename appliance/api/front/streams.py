@@ -1,8 +1,8 @@
 """Limit long answers, which are streams and exports, by quotas.
 
-A long answer counts for its token and for its peer, and each has a quota. So neither a viewer's token with many
-connections nor a machine with many tokens can take the places of others. When the response ends, for any reason, its
-place is free again. `Work` does the same for answers that need much time.
+A long answer counts for its token and for its peer. So neither a viewer's token with many connections nor a
+machine with many tokens can use up the answers of others. `Work` does the same for answers that need much
+time.
 """
 
 import asyncio
@@ -30,7 +30,7 @@ def peer_of(request: Request) -> str:
 
 
 class Streams:
-    """There are `whole` places, with quotas for `tokens` and `peers`."""
+    """Permits `whole` long answers at once, with quotas for `tokens` and `peers`."""
 
     def __init__(self, tokens: QuotaRow, peers: QuotaRow, whole: int) -> None:
         self.roles: dict[str, TokenRole] = {}
@@ -45,7 +45,7 @@ class Streams:
         )
 
     def take(self, bearer: Bearer, peer: str, what: str) -> Callable[[], None]:
-        """Return the function that releases the place. Raises `ProblemError` (503)."""
+        """Begin a long answer; return the function that ends it. Raises `ProblemError` (503)."""
         self.roles[bearer.id] = bearer.role
         busy = self._tokens.refusal(bearer.id) or self._peers.refusal(peer)
         if busy:
@@ -72,7 +72,7 @@ class Streams:
 
 
 class Work:
-    """Slow answers, `whole` at once, in turns of tokens. `what` names them in the refusal."""
+    """Permits `whole` slow answers at once, in turns of tokens. `what` names them in the refusal."""
 
     def __init__(self, what: str, whole: int) -> None:
         self._what = what
@@ -102,14 +102,14 @@ def _class_of(token: tuple[str, TokenRole]) -> QuotaClass:
 
 
 async def in_thread(pieces: Iterator[A]) -> AsyncIterator[A]:
-    """Empty pieces are skipped."""
+    """Yield the pieces that a thread makes, without empty ones."""
     while (piece := await asyncio.to_thread(next, pieces, None)) is not None:
         if piece:
             yield piece
 
 
 class StreamResponse(Response):
-    """Releases its place when it ends."""
+    """Ends its long answer in `Streams` when the response ends."""
 
     def __init__(self, response: Response, give_back: Callable[[], None]) -> None:
         self._response = response

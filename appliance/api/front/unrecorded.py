@@ -6,11 +6,11 @@ from appliance.base.validation_messages import meant
 from appliance.policy.model import Category
 
 CATEGORIES = (*Category, "monitor", "parameter", "publication", "rest", "service", "subscription", "topic")
-"""The policy does not decide all of them."""
+"""The categories of records, including some that the policy does not decide."""
 
 
 def unrecorded(wanted: Filter) -> list[str]:
-    """Return a sentence with the nearest known name; globs are not checked."""
+    """Return a sentence with the nearest known name for each unknown one; globs are not checked."""
     return [
         f"this version records no {what} {name!r}{meant(name, known)}"
         for what, name, known in (("event", wanted.event, EVENTS), ("category", wanted.category, CATEGORIES))

@@ -27,7 +27,7 @@ _LONGEST = 200  # characters of a name or a ticket
 
 
 class WebSocketPassage(asyncio.Protocol):
-    """This protocol has the door's end."""
+    """The protocol of the door's end of the socket pair."""
 
     def __init__(self, client: asyncio.Transport, target: bytes) -> None:
         self.client = client
@@ -52,12 +52,12 @@ class WebSocketPassage(asyncio.Protocol):
                 self.note()
 
     def client_left(self) -> None:
-        """The door first gets what the client sent."""
+        """Close the door's end after it got what the client sent."""
         if self._door is not None:
             self._door.close()
 
     def hold_door(self, *, held: bool) -> None:
-        """The client does not read, or reads again."""
+        """Stop or continue reading from the door, because the client does not read or reads again."""
         if self._door is not None and not self._door.is_closing():
             (self._door.pause_reading if held else self._door.resume_reading)()
 
@@ -75,7 +75,6 @@ class WebSocketPassage(asyncio.Protocol):
             self._door.close()
 
     def begin(self, head: bytes) -> None:
-        """Include what came since the head of the request."""
         if self._door is None:
             return
         self._door.write(head)
@@ -109,7 +108,7 @@ class WebSocketHandover:
         self._gate = gate
 
     async def pass_on(self, passage: WebSocketPassage, head: bytes) -> None:
-        """A refusal has the reason."""
+        """Ask control to hand the WebSocket over; a refusal is answered with its reason."""
         host = passage.peer
         try:
             self._gate.admit_websocket(host, PREFIX.decode())
@@ -140,7 +139,7 @@ class WebSocketHandover:
 
 
 def _entry_of(target: bytes) -> tuple[str, str]:
-    """Raises `ProblemError`."""
+    """Return the door and the ticket in a URL. Raises `ProblemError`."""
     try:
         parts = urlsplit(target.decode("ascii"))
         ticket = parse_qs(parts.query).get("ticket", [""])[0]

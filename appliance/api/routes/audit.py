@@ -140,7 +140,7 @@ OneRecord = Annotated[
 
 
 class LogReader:
-    """The number of threads is limited."""
+    """Reads the log in a limited number of threads."""
 
     def __init__(self, services: Services) -> None:
         self.path = services.audit_log
@@ -148,7 +148,7 @@ class LogReader:
         self._searches = services.searches
 
     async def read(self, bearer: Bearer, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
-        """Wait for a turn. Raises `ProblemError`."""
+        """Wait for a turn, and return the result of the function. Raises `ProblemError`."""
         async with self._searches.turn(bearer):
             return await self.in_thread(function, *arguments, **named)
 
@@ -159,7 +159,7 @@ class LogReader:
         return await self.in_thread(with_networks, wanted, await ask(self._control, PolicyWanted(), bearer))
 
     async def record(self, bearer: Bearer, record_id: str, neighbours: int) -> RecordInContext:
-        """Raises `ProblemError`."""
+        """Return the record and its neighbours. Raises `ProblemError`."""
         shown = await self.read(bearer, show, self.path, record_id, neighbours)
         if shown is None:
             raise ProblemError(404, "unknown", f"there is no record {record_id}")
@@ -203,7 +203,7 @@ def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
         order: Annotated[Literal["newest", "oldest"], Query(description="order of the records")] = "newest",
         equality: WithEquality = False,
     ) -> JSONResponse:
-        """Records that match, a page at a time; for viewers without what messages said (`detail.withheld`)."""
+        """Records that match, a page at a time; for viewers without contents of messages (`detail.withheld`)."""
         newest = order == "newest"
         wanted = await desk.named(bearer, wanted)
         return JSONResponse(
@@ -234,7 +234,8 @@ def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
     ) -> Response:
         """Records as they are made (server-sent events): each is an event `record`, its id the sequence.
 
-        Ends when the token does. A browser that reconnects goes on where it was.
+        The stream ends when the token expires. A browser that reconnects continues after the last record it
+        got.
         """
         wanted = await desk.named(bearer, wanted)
         start = int(last_event_id) if last_event_id is not None else after
@@ -262,7 +263,7 @@ def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
         after: Annotated[int, Query(ge=0, le=10**18, description="only records with a greater number")] = 0,
         limit: Limit = 1000,
     ) -> LogCheckpoints:
-        """Signed checkpoints, to be kept on another machine: `rosrv audit verify --checkpoints` takes them."""
+        """Signed checkpoints to keep on another machine, for `rosrv audit verify --checkpoints`."""
         return LogCheckpoints(await desk.read(bearer, signed_checkpoints, desk.path, after, limit))
 
     @router.get(
@@ -271,8 +272,8 @@ def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
     async def export_audit(request: Request, bearer: Viewer, wanted: Wanted) -> Response:
         """Return all records that match, oldest first, one JSON object a line.
 
-        Each has in `chain` its place in the hash chain, as far as a signed checkpoint. Viewers get records as a search
-        shows them to viewers, without what messages said and without `chain`: only what is whole can be proven.
+        Each has in `chain` its place in the hash chain, as far as a signed checkpoint. Viewers get records
+        without contents of messages and without `chain`, because only complete records can be proven.
         """
         wanted = await desk.named(bearer, wanted)
         found = await desk.read(bearer, _exported, desk.path, wanted, bearer, services.settings.name)
@@ -329,7 +330,6 @@ def _exported(path: pathlib.Path, wanted: Filter, bearer: Bearer, robot: str) ->
 
 
 def _begun(entries: Iterator[_T]) -> Iterator[_T]:
-    """An invalid search fails before the answer begins."""
     first = next(entries, None)
     return iter(()) if first is None else itertools.chain((first,), entries)
 

@@ -29,7 +29,7 @@ def routes(services: Services) -> Routes:
         until: Annotated[str | None, Query(max_length=64, description="before this time")] = None,
         limit: Annotated[int, Query(ge=1, le=LARGEST_SUMMARY, description="largest number of hosts")] = 20,
     ) -> DenialSummary:
-        """The denials of each host: number, first and last time, most frequent rules or reasons, callers."""
+        """The denials of each host: number, first and last time, most frequent rules or reasons, and callers."""
         begin, end = (None if time is None else given(time) for time in (since, until))
         async with one.turn(bearer):
             try:

@@ -69,7 +69,7 @@ def _made(app: FastAPI) -> dict[str, Any]:
 
 
 def _plain(schema: Any) -> Any:
-    """Client generators understand only `maxItems` for a tuple's length."""
+    """Replace forms that client generators do not understand: for a tuple's length they need `maxItems`."""
     if isinstance(schema, list):
         return [_plain(part) for part in schema]
     if not isinstance(schema, dict):
@@ -78,7 +78,7 @@ def _plain(schema: Any) -> Any:
 
 
 def _described(kind: str, schema: dict[str, Any]) -> None:
-    """A field without a description uses that of the kind that it refers to."""
+    """Describe each field that has no description by the kind that it refers to."""
     for name, field in schema.get("properties", {}).items():
         words = WORDS.get(f"{kind}.{name}", WORDS.get(name))
         if words is not None and "$ref" not in field and not is_described(field):
@@ -90,7 +90,6 @@ def is_described(field: dict[str, Any]) -> bool:
 
 
 def _tagged(responses: dict[str, Any]) -> None:
-    """`ConditionalGet` adds these ETags."""
     good = responses["200"]
     if "application/json" in good.get("content", {}) and "ETag" not in good.get("headers", {}):
         good.setdefault("headers", {})["ETag"] = _HASH

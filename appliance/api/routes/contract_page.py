@@ -12,7 +12,7 @@ PATH = "/v1/openapi.html"
 _STYLE = "/console/static/css/contract.css"
 _ROLES = "docs/reference/rest.md"
 _GENERAL = frozenset({"400", "401", "403", "408", "413", "421", "429", "503"})
-"""The page lists once what each call may answer."""
+"""The statuses that every call may answer; the page lists them once."""
 
 _Json = Mapping[str, Any]
 

@@ -20,7 +20,7 @@ _PLACE = re.compile(r"(?s)([^:]*+):([0-9]{1,9}+):([0-9]{1,9}+): (error|warning):
 
 
 def findings_of(texts: list[str]) -> list[Finding]:
-    """Findings that do not have the form `file:line:column: error: text` are skipped."""
+    """Parse findings of the form `file:line:column: error: text`; skip others."""
     return [
         Finding(file=file, line=int(line), column=int(column), severity=severity, text=text)
         for file, line, column, severity, text in (
@@ -30,7 +30,7 @@ def findings_of(texts: list[str]) -> list[Finding]:
 
 
 def refusal(error: str, findings: list[str]) -> ProblemError:
-    """The detail has each finding on a separate line."""
+    """Return a problem whose detail has each finding on a separate line."""
     return ProblemError(
         422,
         "specifications-refused",
@@ -40,7 +40,7 @@ def refusal(error: str, findings: list[str]) -> ProblemError:
 
 
 class Described(NamedTuple):
-    """`uses` are the monitors whose variables it uses; `hold`: it is declared `hold`."""
+    """A specification; `uses` are the monitors whose variables it uses, `hold` whether it is declared `hold`."""
 
     events: list[EventShown]
     properties: list[PropertyShown]
@@ -49,7 +49,7 @@ class Described(NamedTuple):
 
 
 class Compiler:
-    """Keeps the last result, so repeated queries compile only once."""
+    """Compiles specifications, and keeps the last result for repeated queries."""
 
     def __init__(self) -> None:
         self._last: tuple[int, MonitorSet] | None = None
@@ -60,7 +60,7 @@ class Compiler:
         return self._last[1]
 
     def described(self, loaded: Monitors, name: str) -> Described:
-        """Raises `KeyError`."""
+        """Return the specification of a monitor. Raises `KeyError`."""
         monitor = self._set(loaded).monitor(name)
         events = [
             EventShown(
@@ -86,11 +86,11 @@ class Compiler:
         return Described(events, properties, sorted(monitor.code.uses), monitor.code.hold)
 
     def picture(self, loaded: Monitors, name: str) -> str | None:
-        """SVG; None if no automaton is finite. Raises `KeyError`."""
+        """Return the monitor's automata as SVG; None if no automaton is finite. Raises `KeyError`."""
         return self._set(loaded).monitor(name).picture()
 
     def warnings(self, file: str) -> list[Finding]:
-        """The warnings of the last compilation."""
+        """Return the last compilation's warnings for a file."""
         assert self._last is not None  # noqa: S101  callers compile by `described` first
         return findings_of(
             [str(warning) for warning in self._last[1].warnings if warning.position.file == file]

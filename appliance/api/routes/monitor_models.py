@@ -31,7 +31,7 @@ class PropertyShown(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Happened(msgspec.Struct, frozen=True, kw_only=True):
-    """Something a monitor did, as it is in the audit log under this sequence; `count`: more of the same."""
+    """An action of a monitor, in the audit log under this sequence; `count` is the number of equal ones."""
 
     sequence: int
     time: Annotated[str, doc("RFC 3339, UTC, nanoseconds")]
@@ -64,7 +64,7 @@ class History(msgspec.Struct, frozen=True):
 
 
 class Replaced(msgspec.Struct, frozen=True, kw_only=True):
-    """The effect of a change, or of the dry run of one (`loaded` false); `replaced` is the revision before."""
+    """The effect of a change or, if `loaded` is false, of its dry run; `replaced` is the previous revision."""
 
     loaded: bool
     revision: Annotated[int, doc("in force now")]

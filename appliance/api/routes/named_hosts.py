@@ -37,12 +37,12 @@ def labels_of(known: PolicyInForce) -> HostLabels:
 
 
 def host_in_words(known: PolicyInForce | None) -> HostInWords:
-    """Addresses are shown if no policy is known."""
+    """Return the function that names addresses; without a known policy it returns the address."""
     return str if known is None else partial(in_words, labels=names_of(known).labels())
 
 
 def has_name(wanted: Filter) -> bool:
-    """Addresses and globs need no policy."""
+    """Whether the filter names a host, so the policy must be known; addresses and globs need none."""
     if wanted.host is None or not _GLOB.isdisjoint(wanted.host):
         return False
     try:
@@ -56,7 +56,7 @@ def has_name(wanted: Filter) -> bool:
 
 
 def with_networks(wanted: Filter, known: PolicyInForce) -> Filter:
-    """Raises `FilterError` for an unknown name."""
+    """Return the filter with the networks of its host. Raises `FilterError` for an unknown name."""
     try:
         networks = names_of(known).networks(wanted.host or "")
     except UnknownHostNameError as error:

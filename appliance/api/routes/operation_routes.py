@@ -62,7 +62,7 @@ async def _nothing() -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class OperationCall(Generic[Q]):
-    """`body` is the body as sent."""
+    """A call of an operation; `body` is the body as sent."""
 
     services: Services
     operation: Operation
@@ -72,7 +72,7 @@ class OperationCall(Generic[Q]):
     dry_run: bool
 
     async def ask(self, request: AdminRequest[A]) -> A:
-        """Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
+        """Return control's answer. Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
         control = self.services.control
         return self._answered(await control.ask(request, self.bearer))
 
@@ -96,7 +96,7 @@ class Answer:
 
 
 def routes(services: Services, answers: Mapping[str, Answer]) -> Routes:
-    """`answers` has our own answers by operation name."""
+    """Return the routes of all operations; `answers` maps names of operations to answers other than control's."""
     router = Routes()
     assert answers.keys() <= {one.name for one in OPERATIONS}  # noqa: S101  no name is misspelt
     for operation in sorted(OPERATIONS, key=lambda one: "{" in one.path):  # literal paths before parameters
@@ -166,7 +166,7 @@ def _check(
 
 
 def _order(asked: ClientRequest, *, dry_run: bool) -> AdminRequest[Any]:
-    """Raises `ProblemError`."""
+    """Return the order that the request makes. Raises `ProblemError`."""
     try:
         return meant(asked, dry_run=dry_run)
     except BadTagError as error:
@@ -185,7 +185,7 @@ def _answer_type(operation: Operation, own: Answer | None) -> Any:
 
 
 def _of_path(operation: Operation) -> Any:
-    """A list has one element in the path."""
+    """Return the type of the path's parameters; a list has one element in the path."""
     in_path = [(name, field) for name, field in operation.fields().items() if f"{{{name}}}" in operation.path]
     if not in_path:
         return Depends(_nothing)
@@ -200,7 +200,6 @@ def _of_path(operation: Operation) -> Any:
 
 
 def _of_query(operation: Operation) -> Any:
-    """For all operations with this method and path."""
     same = [one for one in OPERATIONS if (one.method, one.path) == (operation.method, operation.path)]
     fields: dict[str, Any] = {
         name: (_in_query(field.type), ... if field.required else field.default)

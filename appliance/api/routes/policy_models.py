@@ -23,7 +23,7 @@ class Change(msgspec.Struct, frozen=True):
 
 
 class Ended(msgspec.Struct, frozen=True):
-    """Something live that the policy ends."""
+    """Something live, such as a connection, that the policy ends."""
 
     host: str
     caller_id: Annotated[str, doc("empty: the client gave no name")]
@@ -33,7 +33,7 @@ class Ended(msgspec.Struct, frozen=True):
 
 
 class Report(msgspec.Struct, frozen=True, kw_only=True):
-    """The effect of a new policy; `loaded` is false after a dry run, and the values that only a load can find are then
+    """The effect of a new policy; `loaded` is false after a dry run, in which values that only a load finds are
     null.
     """
 

@@ -64,7 +64,7 @@ def page_of(
     newest_first: bool,
     equality: bool = False,
 ) -> dict[str, Any]:
-    """The cursor reveals nothing about hidden records."""
+    """Return a page of records; its cursor reveals nothing about hidden records."""
     found: list[LogEntry] = []
     more: str | None = cursor
     count = limit + 1
@@ -82,7 +82,7 @@ def page_of(
 
 
 def streamed(entry: LogEntry, *, equality: bool) -> dict[str, Any]:
-    """With `equality`, include what makes equal records one row."""
+    """Return a record of a stream; with `equality`, it has the fields that make equal records one row."""
     return as_object(entry) | ({"equality": equality_of(entry.record)} if equality else {})
 
 

@@ -65,7 +65,6 @@ class Budget:
         self._left: int | None = None
 
     def charge(self, record: AuditRecord) -> None:
-        """Charge a record to its host; `folded` undoes the charge."""
         host = record.host
         if host is not None and not record.unknown:
             size = weight(record)

@@ -191,7 +191,6 @@ def packed(columns: tuple[object, ...]) -> bytes:
 
 
 def content_hash(columns: tuple[object, ...]) -> bytes:
-    """Return the hash of the values of `StoredColumns`, independent of the preceding records."""
     return hashlib.sha256(packed(columns)).digest()
 
 

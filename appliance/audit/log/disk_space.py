@@ -24,7 +24,7 @@ class DiskSpace:
     def look(self, now: float) -> bool | None:
         """Check the disk, which is due then; return True if space just became scarce, False if scarcity just ended.
 
-        Return None if nothing changed. Raises `OSError`.
+        Raises `OSError`.
         """
         self.due = now + _LOOK_SECONDS
         disk = os.statvfs(self._folder)
@@ -36,7 +36,6 @@ class DiskSpace:
 
     @property
     def scarce(self) -> str | None:
-        """Return the warning while only the reserve is left, or None."""
         if self.left is None:
             return None
         return (

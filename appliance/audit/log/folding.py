@@ -2,8 +2,8 @@
 
 Denials, errors of peers, allowed reads, and records of a host above its budget are folded (`AuditRecord.folds`).
 
-1. The first record of a kind is written in full; every repetition counts in exactly one summary. A record with a
-   `count` counts that many times.
+1. The first record of a kind is written in full; each repetition counts in one summary. A record with a `count` counts
+   that many times.
 2. Memory is limited: the kinds of denials are counted in a pool (`AUDIT_KINDS`). All unknown hosts together have a
    small quota of this pool, so they cannot displace hosts that the policy names. Above a host's quota, all its further
    denials count as one kind. Above the quota of unknown hosts, they all share one kind. The kinds of reads are counted
@@ -154,7 +154,6 @@ class RecordFolder:
         return False
 
     def _denial_key(self, record: AuditRecord, coming: int = 0) -> tuple[Key, str]:
-        """Return the key and scope of a denial's kind, given `coming` pending kinds in its quota."""
         key = kind_of(record)
         if key in self._kinds or not self._denials.refusal(_holder(record), 1 + coming):
             return key, UNKNOWN if record.unknown else KIND

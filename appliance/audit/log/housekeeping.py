@@ -1,7 +1,7 @@
 """Run the background work of a log: checkpoints and their signatures, the full-text index, retention.
 
-1. A failed step is repeated later (`degraded` gives the reason), while records are still written. Only a failure to
-   write records counts as a failure of the log.
+1. A failed step is repeated later (`degraded` gives the reason). Only a failure to write records counts as a failure
+   of the log.
 2. Each step is short: one step of retention, one slice of the index, a limited number of signatures.
 3. Records about a step are passed to `hold`, or appended together with it.
 """
@@ -97,7 +97,6 @@ class Housekeeping:
 
     @property
     def degraded(self) -> str | None:
-        """Return why background work is behind, or None."""
         return self._failing or self.remover.unremoved
 
     def opened(self, writer: ChainWriter) -> None:
@@ -217,7 +216,6 @@ class Housekeeping:
             self.writer.index_text(_LARGEST_SLICE)
 
     def _retain(self) -> None:
-        """Remove one step of old records; the next step is due at once."""
         if self.writer is not None and self.remover.step(self.writer):
             self.unsealed += 1
 

@@ -1,8 +1,8 @@
 """Make record ids: sortable by time, unique, and ascending even if the clock is set back.
 
-An id has 20 lower-case hexadecimal characters: 16 for nanoseconds since the epoch, and 4 random ones. Each source has
-its own random characters, so ids of two processes in the same nanosecond differ. The time part always grows: if the
-clock is set back, it continues from the last id. After a restart, it continues after the last id of the log.
+An id has 20 lower-case hexadecimal characters: 16 for nanoseconds since the epoch, and 4 random ones. The random ones
+differ between sources. The time part always grows: if the clock is set back, and after a restart, it continues from
+the last id.
 """
 
 import secrets

@@ -4,8 +4,7 @@
 2. Records keep their order.
 3. No record is dropped silently. While the log cannot be written (`failed`), up to `queue_limit` records wait. Further
    records are only counted, and the count is recorded later.
-4. `wait_durable` returns when all earlier records are on disk (fsync), or returns why they are not. Folded denials are
-   on disk as a count.
+4. `wait_durable` returns when all earlier records are on disk (fsync), or returns why they are not.
 """
 
 import asyncio
@@ -200,7 +199,6 @@ class AuditLog:
         self._put(partial(self.housekeeping.attempt, keep))
 
     def refused(self, number: int, reason: str) -> None:
-        """Record as an alarm that the signer refused a checkpoint."""
         self._put(partial(self.housekeeping.refused, number, reason))
 
     def removal_approved(self, number: int, text: bytes, signature: bytes, public_key: bytes) -> None:
@@ -302,7 +300,6 @@ class AuditLog:
             self._writer.close()
 
     def _drain(self, now: float) -> bool:
-        """Process a batch of queued items; return whether more are left."""
         queue, offer = self._queue, self._folder.offer
         for _ in range(_LARGEST_BATCH):
             if not queue:

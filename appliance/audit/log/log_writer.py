@@ -103,7 +103,6 @@ class ChainWriter:
     def append(
         self, records: Sequence[AuditRecord], folds: Iterable[tuple[bytes, FoldState | None]] = ()
     ) -> None:
-        """Write records and the counts of folded records to disk in one transaction."""
         self._check_file()
         with self._transaction() as execute:
             sequence, digest, last_id = self._insert(records)
@@ -244,7 +243,6 @@ class ChainWriter:
         return int(self._connection.execute(query, (self.sequence + 1,)).fetchone()[0])
 
     def newest_signed(self) -> bytes:
-        """Return the text of the last signed checkpoint; empty if there is none."""
         query = "SELECT text FROM checkpoint WHERE signature IS NOT NULL ORDER BY number DESC LIMIT 1"
         row = self._connection.execute(query).fetchone()
         return b"" if row is None else bytes(row[0])

@@ -137,7 +137,6 @@ def rule_text(rule: RuleReference | None) -> str | None:
 
 
 def printable(text: str) -> str:
-    """Escape unprintable characters, and double backslashes."""
     if text.isprintable() and "\\" not in text:
         return text
     return "".join(_escape(character) for character in text)

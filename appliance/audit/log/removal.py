@@ -138,7 +138,6 @@ class Remover:
 
 
 def _limit(text: bytes) -> str:
-    """Return the limit in the text of a removal, or raise `ValueError`."""
     match = _LIMIT.search(text)
     if match is None:
         raise ValueError("not the text of a removal")

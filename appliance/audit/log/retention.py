@@ -4,8 +4,8 @@ The oldest records are removed first, in short steps, each up to a (signed) chec
 `records removed`, with the hash after which the chain continues.
 
 An age limit removes all older records. A size limit keeps denials and alarms longer: they are written again at the end
-of the log, with their id and time. At most half of a step is kept, so the log shrinks. Hosts take turns, so a flood
-from one host cannot displace the records of another.
+of the log, with their id and time. At most half of a step is kept. Hosts take turns, so a flood from one host cannot
+displace the records of another.
 """
 
 from collections import OrderedDict
@@ -66,7 +66,6 @@ class RemovedRange(msgspec.Struct, frozen=True, omit_defaults=True):
     signature: str = ""
 
     def statement(self, log: str, limit: str) -> bytes:
-        """Return the text that the signer signs for this removal."""
         sequence, sealed = self.last_sequence, self.last_checkpoint_hash
         return Removal(log, self.last_checkpoint, sequence, self.last_hash, sealed, limit).text()
 

@@ -1,7 +1,7 @@
 """Export signed checkpoints to another machine, and compare the log with these copies.
 
-Root on the appliance has the signer's key and memory, and can rewrite the whole history with valid signatures. Copies
-on another machine are out of root's reach. Therefore:
+Root on the appliance has the signer's key and memory, and can rewrite the whole history with valid signatures.
+Therefore copies are kept on another machine:
 
 1. A copy contains the complete signed text and the signature, so it can be verified anywhere.
 2. A log agrees with a copy if its chain has the copy's hash at the copy's sequence.
@@ -199,7 +199,6 @@ class CopiesVerifier:
         """The values of `removed` in copies."""
 
     def result(self) -> Elsewhere:
-        """Return the number of agreeing copies, and how far they prove the log."""
         last = self._agreeing[-1] if self._agreeing else None
         return Elsewhere(
             checkpoints=len(self._agreeing),

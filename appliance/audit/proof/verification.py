@@ -1,12 +1,12 @@
 """Verify that a log is complete and unchanged, or report which records are missing or changed, and how.
 
-The verifier walks the chain once, from the first record to the last. If a record does not follow from the previous one,
-the verifier tries the next records in other positions. This distinguishes a change, a removal, an insertion and a
-reordering. Then it checks the checkpoints against the chain, the key, and the signer's memory.
+The verifier walks the chain once, from the first record to the last. If a record does not follow from the previous
+one, the verifier tries the next records in other positions, to distinguish a change, a removal, an insertion and a
+reordering.
 
-The log alone cannot show whether records after the last signed checkpoint were cut off or rewritten; `unsealed` is the
-number of records present there. Root can rewrite both the log and the signer's memory. Only checkpoints on another
-machine reveal this.
+The log alone cannot show whether records after the last signed checkpoint were cut off or rewritten;
+`unsealed` is the number of records present there. Root can rewrite both the log and the signer's memory. Only
+checkpoints on another machine reveal this.
 """
 
 import re
@@ -92,7 +92,6 @@ class _Row(NamedTuple):
 
 
 def _row(row: tuple[object, ...]) -> _Row:
-    """Check the types of a row: replaced tables may have any type in any column."""
     sequence, digest, detail = row[0], row[-1], row[_DETAIL]
     if not (isinstance(sequence, int) and isinstance(digest, bytes) and isinstance(detail, bytes)):
         raise sqlite3.DataError("a column has a value of another type than a log's tables hold")

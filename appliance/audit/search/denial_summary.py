@@ -2,7 +2,7 @@
 
 Invariants:
 
-1. A record counts as often as its event happened, so the summary of repetitions counts as their number.
+1. A summary of repetitions counts as their number.
 2. A summary of repetitions that covers many hosts counts for the hosts that it names; the rest is `OTHERS`.
 3. Memory and time are bounded. The newest `MOST_RECORDS` records are read. The oldest hosts beyond `_MOST_HOSTS`, and
    the reasons and callers of a host beyond `_MOST_NAMES`, are counted together as `OTHERS`. Decisions about calls have
@@ -117,7 +117,6 @@ def _newest_first(path: Path, wanted: Filter) -> Iterator[LogEntry]:
 
 
 def summarised(denials: Iterable[LogEntry], limit: int) -> DenialSummary:
-    """Return the summary of denials, given newest first, with at most `limit` hosts."""
     hosts: dict[str, _HostCounts] = {}
     counted_since, last = None, 0
     for number, entry in enumerate(denials):

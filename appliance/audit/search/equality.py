@@ -76,7 +76,7 @@ def plain_reason(record: AuditRecord) -> str:
 
 
 def time_span(record: AuditRecord) -> tuple[int, int]:
-    """Return the times of the first and the last event of a record: a count is recorded some time after its events."""
+    """Return the times of the first and last event of a record, which is made some time after its events."""
     first, last = record.detail.get("first_time"), record.detail.get("last_time")
     return (first, last) if type(first) is int and type(last) is int else (record.time, record.time)
 

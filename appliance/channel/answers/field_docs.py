@@ -1,11 +1,11 @@
-"""Short words for the fields of answers."""
+"""The descriptions of fields that several answers have."""
 
 from typing import Annotated, Any
 
 import msgspec
 
 UNIT = "x-epoch"
-"""The key of a moment's unit in its schema."""
+"""The key of a time's unit in its schema."""
 
 
 def doc(description: str, **bounds: Any) -> msgspec.Meta:
@@ -13,10 +13,10 @@ def doc(description: str, **bounds: Any) -> msgspec.Meta:
 
 
 Moment = Annotated[float, doc("seconds since the epoch", extra_json_schema={UNIT: "seconds"})]
-"""A moment, as answers have it."""
+"""A time in an answer."""
 
 NanoMoment = Annotated[int, doc("nanoseconds since the epoch", extra_json_schema={UNIT: "nanoseconds"})]
-"""A moment of a message, for whom the digits of a float are too few."""
+"""The time of a message, for which the digits of a float are too few."""
 
 RollbackDue = Annotated[Moment | None, doc("when it is rolled back automatically unless confirmed")]
-"""The end of the time in which a change is to be confirmed."""
+"""The time until which a change must be confirmed."""

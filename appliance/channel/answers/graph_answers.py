@@ -1,4 +1,4 @@
-"""The graph: who talks to whom, through the appliance or past it, and how much."""
+"""The graph: connections between nodes, through the appliance or past it, and their traffic."""
 
 from typing import Annotated, Any, Literal
 
@@ -8,7 +8,7 @@ from appliance.channel.answers.field_docs import NanoMoment, doc
 
 
 class Node(msgspec.Struct, frozen=True):
-    """A node; `lost`: it does not answer, its registrations are kept back until it returns."""
+    """A node; `lost`: it does not answer, and its registrations return when it does."""
 
     name: str
     host: str
@@ -90,7 +90,7 @@ class TopicMessage(msgspec.Struct, frozen=True):
 
 
 class TopicMessages(msgspec.Struct, frozen=True):
-    """The next messages of a topic, fewer than asked for where no more came in time."""
+    """The next messages of a topic, fewer than requested if no more came in time."""
 
     topic: str
     type: str

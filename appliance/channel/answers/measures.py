@@ -6,16 +6,16 @@ from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.status import Status
 
 Observed = tuple[list[int], float]
-"""How many were in each bucket of a histogram, and their sum in seconds."""
+"""The counts of a histogram's buckets, and the sum of the values in seconds."""
 
 
 class Measures(msgspec.Struct, frozen=True, kw_only=True):
     """Everything that control measures.
 
-    `decisions` has category, outcome and how often; `calls` the time of calls by name; `relayed` messages, bytes and
-    dropped messages by topic or service; `delayed` buckets and their sum by topic; `monitors` the kind, the monitor and
-    how often; `slices` how many a parametric specification has and may have; `limited` the topic, what of it was
-    limited and how often.
+    The rows are: `decisions` category, outcome and number; `calls` the times of calls by name; `relayed`
+    messages, bytes and dropped messages by topic or service; `delayed` buckets and their sum by topic;
+    `monitors` kind, monitor and number; `slices` the present and the largest number for each parametric
+    specification; `limited` topic, limit and number.
     """
 
     decisions: list[tuple[str, str, int]]

@@ -28,7 +28,7 @@ class GivenState(msgspec.Struct, frozen=True):
 
 
 class MonitorState(msgspec.Struct, frozen=True):
-    """A running monitor; counters since it was loaded or its relay began."""
+    """A running monitor; its counters start when it is loaded or its relay starts."""
 
     name: str
     file: Annotated[str, doc("the specification file that defines it; a file may have several monitors")]
@@ -110,9 +110,7 @@ class GivenSet(msgspec.Struct, frozen=True):
 
 
 class Tried(msgspec.Struct, frozen=True):
-    """The effect that a load would have on the revision in force; `warnings` are lines, `monitors` the resulting
-    monitors.
-    """
+    """The effect of a load on the revision in force; `warnings` are lines, `monitors` the resulting monitors."""
 
     revision: int
     tag: str

@@ -52,7 +52,7 @@ class PolicyInForce(RevisionText, frozen=True, kw_only=True):
 class PolicyKnown(PolicyInForce, frozen=True):
     """A revision, with all data for the comparison with another text.
 
-    `cases` are the policy's tests, None where there are none; `cases_error` is the reason if they cannot be read.
+    `cases` are the policy's tests, or None; `cases_error` is the reason if they cannot be read.
     """
 
     cases_file: str

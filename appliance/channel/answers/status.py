@@ -30,7 +30,7 @@ class ProcessInfo(msgspec.Struct, frozen=True):
 
 
 class FirewallRule(msgspec.Struct, frozen=True):
-    """A rule with what it has matched so far; `in_force` is false if the kernel no longer has it."""
+    """A rule with the packets that it has matched; `in_force` is false if the kernel no longer has it."""
 
     chain: str
     purpose: str
@@ -41,9 +41,10 @@ class FirewallRule(msgspec.Struct, frozen=True):
 
 
 class FirewallState(msgspec.Struct, frozen=True, omit_defaults=True):
-    """The firewall; what this isolation does not have is left out.
+    """The firewall; fields that this isolation does not use are left out.
 
-    `translations` and `obstacles` are chains of other programs on the host, which translate or drop what is forwarded.
+    `translations` and `obstacles` are chains of other programs on the host, which translate or drop forwarded
+    packets.
     """
 
     backend: str | None = None
@@ -57,7 +58,7 @@ class FirewallState(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class PolicyState(msgspec.Struct, frozen=True):
-    """The policy in force; `confirm_by` (seconds since the epoch) is when it goes back unless confirmed."""
+    """The policy in force; it rolls back at `confirm_by` (seconds since the epoch) unless confirmed."""
 
     revision: int
     file: Annotated[str, doc("the file that `reload` reads")]
@@ -123,7 +124,7 @@ class MonitorsState(msgspec.Struct, frozen=True):
 
 
 class ClockState(msgspec.Struct, frozen=True):
-    """Whether the times of records can be believed."""
+    """Whether the times of records are reliable."""
 
     synchronised: Annotated[
         bool | None,
@@ -139,7 +140,7 @@ class ClockState(msgspec.Struct, frozen=True):
 
 
 class AuditState(msgspec.Struct, frozen=True):
-    """How far the audit log is behind, why it cannot be written, and what becomes of requests then."""
+    """How far the audit log is behind, why it cannot be written, and how requests are then answered."""
 
     lag_records: int
     lag_seconds: float
@@ -172,7 +173,7 @@ class BlocksState(msgspec.Struct, frozen=True):
 
 
 class MinuteState(msgspec.Struct, frozen=True):
-    """The last minute's denials and drops. From `attention_at` denials on, an operator should look at them."""
+    """The last minute's denials and drops. From `attention_at` denials on, an operator should check them."""
 
     denials: Annotated[int, doc("decisions to deny; `would deny` is not counted")]
     drops: Annotated[dict[str, int], doc("messages that monitors dropped, by monitor")]

@@ -1,4 +1,4 @@
-"""Access tokens of REST, and what its orders are signed under."""
+"""Access tokens of REST, and the challenges for signing orders."""
 
 from typing import Annotated, Literal
 
@@ -15,7 +15,7 @@ _RANKS: dict[str, int] = {"viewer": 1, "investigator": 1, "operator": 2, "admin"
 
 
 def may(held: str, least: TokenRole) -> bool:
-    """Only investigators have the rights of investigators."""
+    """Whether a role includes another; only investigators have the rights of investigators."""
     return held == least if least == "investigator" else _RANKS[held] >= _RANKS[least]
 
 
@@ -54,7 +54,7 @@ class NewToken(Token, frozen=True, kw_only=True):
 
 
 class RotatedToken(NewToken, frozen=True, kw_only=True):
-    """A new token that replaces the `earlier` ones of its name; they are revoked, or expire after the grace time."""
+    """A new token that replaces the `earlier` tokens of its name, which are revoked or expire after the grace time."""
 
     earlier: list[Token]
 

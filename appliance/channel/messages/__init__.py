@@ -1,13 +1,12 @@
 """Every message that crosses a process boundary of the appliance, by link.
 
-A message is a frozen struct that is tagged with its class name. A link accepts only the messages of its union, so a
-process cannot receive any other kind of message. `descriptors` is the number of file descriptors, which are sent as
-SCM_RIGHTS.
+A message is a frozen struct that is tagged with its class name. A link accepts only the messages of its
+union, so a process cannot receive any other kind of message. `descriptors` is the number of file descriptors,
+which are sent as SCM_RIGHTS.
 
 Strings from unknown hosts (names, header values) are carried as values, and never interpreted on the way.
 
-Every message of these files is automatically in `messages`. The exception is `messages.api`, which imports all
-requests of operators: only the two ends of its link import that module.
+`messages` has the messages of all files except `messages.api`, which imports all requests of operators.
 """
 
 # ruff: noqa: F403  so that a new message need not be listed

@@ -25,10 +25,10 @@ class ClientRequest(msgspec.Struct, frozen=True):
 
 
 class RequestMade(Message):
-    """`number` is that of the answer.
+    """A client's request; its answer repeats `number`.
 
-    `shown` is the token or reading key, empty if none is needed. A change also has `asked`. A request without effect
-    by `until` (seconds of the monotonic clock, which all processes share) is withdrawn.
+    `shown` is the token or reading key, empty if none is needed. A change also has `asked`. A request without
+    effect by `until` (seconds of the monotonic clock, which all processes share) is withdrawn.
     """
 
     number: int
@@ -39,7 +39,7 @@ class RequestMade(Message):
 
 
 class RequestWithdrawn(Message):
-    """The client is gone: its order is withdrawn if it has not taken effect."""
+    """The client disconnected: its order is withdrawn if it has not taken effect."""
 
     number: int
 
@@ -54,7 +54,7 @@ class RequestAnswered(Message):
 class ConnectionPassed(Message):
     """A WebSocket for a door, after TLS. The api has read the head of the request, and sends it again.
 
-    `ticket` is what the client showed.
+    `ticket` is the ticket in the URL.
     """
 
     descriptors: ClassVar[int] = 1
@@ -65,7 +65,7 @@ class ConnectionPassed(Message):
 
 
 class ConnectionAnswered(Message):
-    """Empty, or an HTTP status and why the connection is refused."""
+    """Whether a connection is accepted; otherwise an HTTP status and the reason."""
 
     number: int
     status: int

@@ -6,9 +6,9 @@ from appliance.channel.messages.message import Message
 
 
 class StateOwner(msgspec.Struct, frozen=True):
-    """A monitor, by the digest that its state has. `holds`: it holds its topics if the state is lost.
+    """A monitor, identified by the digest of its state. `holds`: it holds its topics if the state is lost.
 
-    `position` is where the file declares it.
+    `position` is its declaration in the file.
     """
 
     identity: str
@@ -17,13 +17,13 @@ class StateOwner(msgspec.Struct, frozen=True):
 
 
 GivenValue = bool | int | float | str
-"""A string if the parameter is a topic."""
+"""The value of a given constant, or a string with the name of a given topic."""
 
 
 class GivenDeclared(msgspec.Struct, frozen=True):
     """A constant (`kind` is `int`, `double` or `bool`) or a `topic` that is given to a monitor.
 
-    `value` is that of the compiled text, which for a topic may differ from the default.
+    `value` is the value in the compiled text, which for a topic may differ from the default.
     """
 
     name: str
@@ -94,7 +94,7 @@ class ContentsFound(Message):
 
 
 class CompilationRefused(Message):
-    """`findings` has all errors (`file:line:column: error: text`), or the reason."""
+    """The specifications are rejected; `findings` has all errors (`file:line:column: error: text`), or the reason."""
 
     number: int
     findings: list[str]
@@ -116,7 +116,7 @@ class PartsWanted(Message):
 
 
 class PartsMade(Message):
-    """The parts (`rosmop/fast/serialization.py`) are in the order of `PartsWanted`."""
+    """The parts (`rosmop/fast/serialization.py`), in the order of `PartsWanted`."""
 
     number: int
     parts: list[bytes]

@@ -11,13 +11,13 @@ from appliance.channel.messages.tunnels import TunnelsEnclosed, TunnelsWanted
 
 
 class Ping(Message):
-    """Without an answer in 5 s, the child is killed and restarted."""
+    """A child that does not answer within 5 s is killed and restarted."""
 
     number: int
 
 
 class Pong(Message):
-    """Sent from the child's main loop."""
+    """The answer to `Ping` from the child's main loop."""
 
     number: int
 
@@ -86,7 +86,7 @@ class SocketDropped(Message):
 
 
 class SocketRestored(Message):
-    """For a restarted control, or the api (`api`)."""
+    """A kept socket for a restarted control, or for the api (`api`)."""
 
     descriptors: ClassVar[int] = 1
     name: str
@@ -126,7 +126,7 @@ class FirewallReported(Message):
 
 
 class ServicePaused(Message):
-    """For the api: a lapse of the lease has stopped control, or without `reason`, control goes on."""
+    """The lease has lapsed and control is stopped, for the api; without `reason`, control continues."""
 
     reason: str
 
@@ -159,7 +159,7 @@ class RouteFound(Message):
 
 
 class EndpointWanted(Message):
-    """For kits: the address at which hosts of other networks reach the appliance."""
+    """Control asks for the address at which hosts of other networks reach the appliance, for kits."""
 
 
 class EndpointFound(Message):
@@ -197,7 +197,7 @@ class OwnNetworkWanted(Message):
 
 
 class OwnNetworkOpened(Message):
-    """Empty, or the reason of the failure."""
+    """Whether the own network is open; otherwise the reason of the failure."""
 
     reason: str = ""
 

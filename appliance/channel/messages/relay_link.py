@@ -12,7 +12,7 @@ from appliance.channel.messages.message import Message
 
 
 class StateBegan(Message):
-    """Facts that control does not send again before `StateEnded` are withdrawn."""
+    """Control sends the state again; facts that it does not repeat before `StateEnded` are withdrawn."""
 
     epoch: int
 
@@ -24,11 +24,11 @@ class StateEnded(Message):
 
 
 class OrdersAsked(Message):
-    """Sent to learn when all earlier orders are carried out."""
+    """Control asks when all earlier orders are carried out."""
 
 
 class OrdersCarriedOut(Message):
-    """Several `OrdersAsked` are answered in order."""
+    """All orders before an `OrdersAsked` are carried out; several are answered in order."""
 
 
 class NodePlaced(Message):
@@ -52,7 +52,7 @@ class NodeWithdrawn(Message):
 
 
 class FlowLimit(msgspec.Struct, frozen=True, array_like=True):
-    """Limits are per second; 0 means unlimited."""
+    """Limits per second; 0 means unlimited."""
 
     messages: float = 0.0
     bytes: float = 0.0
@@ -62,12 +62,12 @@ UNLIMITED = FlowLimit()
 
 
 class PublicationPlaced(Message):
-    """The type is as registered, `*` if unknown.
+    """A publication; its type is as registered, or `*` if unknown.
 
-    `limit` applies to all publications of the topic on this host. `together` applies to all publications of the
-    topic; hosts, by `counted_as`, share it equally. Sending this message again changes the limits. `named`: the
-    policy names the node's host, not only all hosts (`*`). `silent`: the relay takes no message from the node,
-    because its host does not hold the topic's group (`[Authority]`).
+    `limit` applies to all publications of the topic on this host. `together` applies to all publications of
+    the topic; hosts, by `counted_as`, share it equally. Sending this message again changes the limits.
+    `named`: the policy names the node's host, not only all hosts (`*`). `silent`: the relay drops all
+    messages of the node, because its host does not hold the topic's group (`[Authority]`).
     """
 
     key: str
@@ -81,7 +81,7 @@ class PublicationPlaced(Message):
 
 
 class PublicationWithdrawn(Message):
-    """The relay cuts its connections."""
+    """A publication ended; the relay cuts its connections."""
 
     key: str
     topic: str
@@ -97,16 +97,17 @@ class ServicePlaced(Message):
 
 
 class ServiceWithdrawn(Message):
-    """The relay cuts its connections."""
+    """A service ended; the relay cuts its connections."""
 
     key: str
     service: str
 
 
 class GrantInstalled(Message):
-    """Host and caller id may subscribe, up to a limit.
+    """A host and caller id may subscribe, up to a limit.
 
-    Sending this message again changes the limit. `named`: the policy names the host, not only all hosts (`*`).
+    Sending this message again changes the limit. `named`: the policy names the host, not only all hosts
+    (`*`).
     """
 
     key: str
@@ -127,7 +128,7 @@ class GrantRevoked(Message):
 
 
 class ClientGranted(Message):
-    """Host and caller id may call the service.
+    """A host and caller id may call the service.
 
     `named`: the policy names the host, not only all hosts (`*`). `asks`: control approves each request
     (`ApprovalWanted`). Sending this message again changes both.
@@ -142,7 +143,7 @@ class ClientGranted(Message):
 
 
 class ClientRevoked(Message):
-    """The relay cuts the client's connections to it."""
+    """A client may no longer call a service; the relay cuts its connections to the service."""
 
     key: str
     service: str
@@ -183,13 +184,12 @@ def identity(message: Message) -> tuple[str, ...]:
 
 
 def withdrawal(fact: RelayFact) -> Message:
-    """Return the message that withdraws a fact."""
     word, *about = identity(fact)
     return FACTS[word].withdrawn(*about)
 
 
 class UpstreamWanted(Message):
-    """For the publisher's TCPROS address, control calls its `requestTopic`."""
+    """The relay asks for a publisher's TCPROS address, for which control calls `requestTopic`."""
 
     key: str
     topic: str
@@ -237,7 +237,7 @@ class LatchRefused(Message):
 
 
 NO_GRANT = "no grant for"
-"""Begins the reason of each `ConnectionRefused` for lack of a grant, and no other."""
+"""The reason of each `ConnectionRefused` for lack of a grant, and of no other, begins with this."""
 
 
 class ConnectionOpened(Message):
@@ -252,15 +252,16 @@ class ConnectionOpened(Message):
 
 
 class ConnectionClosed(Message):
-    """`reason` is empty for an orderly end."""
+    """A connection ended; `reason` is empty for an orderly end."""
 
     number: int
     reason: str
 
 
 class ConnectionRefused(Message):
-    """`resource` is the topic or service in the header, and `kind` is "topic" or "service"; both are empty if it
-    names neither.
+    """A connection was refused; `resource` is the topic or service in the header, `kind` is "topic" or "service".
+
+    Both are empty if the header names neither.
     """
 
     key: str
@@ -273,15 +274,16 @@ class ConnectionRefused(Message):
 
 
 DELAY_BOUNDS = (0.00005, 0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.1)
-"""Upper bounds in seconds of the histogram in `TopicTraffic`."""
+"""Upper bounds of the histogram in `TopicTraffic`, in seconds."""
 
 
 class TopicTraffic(msgspec.Struct, frozen=True, array_like=True):
-    """Since the last report.
+    """Traffic since the last report.
 
-    `delays` counts messages by the time from their receipt to the write to the subscribers' sockets. It has a count
-    for each of `DELAY_BOUNDS` and one for longer delays, or is empty if no message was delivered. `delay_seconds` is
-    the sum of all delays. `md5sum` is from the publisher's header; it is empty while unknown, and for services.
+    `delays` counts messages by the time from their receipt to the write to the subscribers' sockets. It has a
+    count for each of `DELAY_BOUNDS` and one for longer delays, or is empty if no message was delivered.
+    `delay_seconds` is the sum of all delays. `md5sum` is from the publisher's header; it is empty while
+    unknown, and for services.
     """
 
     key: str
@@ -312,7 +314,7 @@ class LimitedRow(msgspec.Struct, frozen=True, array_like=True):
 
 
 class MessagesLimited(Message):
-    """Sent at most once a second."""
+    """The messages that limits dropped, reported at most once a second."""
 
     rows: list[LimitedRow]
 
@@ -333,23 +335,23 @@ class TrafficReported(Message):
 class SpecificationsStated(Message):
     """The specifications in force, sent before any topic is placed, and at every change.
 
-    `part` is this relay's part of the compiled specifications (`rosmop/fast/serialization.py`; empty if it has none).
-    `enabled` maps each monitor of this relay to whether its events happen. `restarted`: this relay replaces one that
-    died, so its monitors with the modifier `hold` block their topics. The monitors in `moved` come from another relay
-    and start here; with `hold`, they also block their topics.
+    `part` is this relay's part of the compiled specifications (`rosmop/fast/serialization.py`; empty if it
+    has none). `enabled` maps each monitor of this relay to whether its events happen. `restarted`: this relay
+    replaces one that died, so its monitors with the modifier `hold` block their topics. The monitors in
+    `moved` come from another relay and start here; with `hold`, they also block their topics.
 
-    The answer repeats `statement`, because the same revision may be sent again. `ahead`: the relay carries out later
-    messages only after these specifications are in force or rejected, so no topic is placed before its monitors. The
-    monitors in `shadows` are in shadow mode: they get copies of messages. `slices` is the largest number of slices of
-    a parametric specification.
+    The answer repeats `statement`, because the same revision may be sent again. `ahead`: the relay carries
+    out later messages only after these specifications are in force or rejected, so no topic is placed before
+    its monitors. The monitors in `shadows` are in shadow mode: they get copies of messages. `slices` is the
+    largest number of slices of a parametric specification.
 
-    After a takeover, `left` has the states that the relays of the other appliance left (`StateLeft`), and `left_at`
-    the time of its monitors by then (0: that in the states). `lost` is the reason why other states are lost. In both
-    cases the relay does not use its own memory.
+    After a takeover, `left` has the states that the relays of the other appliance left (`StateLeft`), and
+    `left_at` the time of its monitors by then (0: that in the states). `lost` is the reason why other states
+    are lost. In both cases the relay ignores its own memory.
 
-    `unbuilt` has the monitors that do nothing because their files have errors, with the errors. Unless they are
-    declared `begin`, they hold their topics. `given` has the values of given constants that differ from the text, by
-    monitor and name.
+    `unbuilt` has the monitors that do nothing because their files have errors, with the errors. Unless they
+    are declared `begin`, they hold their topics. `given` has the values of given constants that differ from
+    the text, by monitor and name.
     """
 
     revision: int
@@ -372,8 +374,8 @@ class SpecificationsStated(Message):
 class StateWanted(Message):
     """Control asks a relay for `StateLeft`.
 
-    An appliance that hands over also asks it to drop all messages from now on. `copy`: the relay goes on; it sends its
-    state if that has changed since the last copy, or if `full`.
+    An appliance that hands over also asks it to drop all messages from now on. `copy`: the relay continues;
+    it sends its state if that has changed since the last copy, or if `full`.
     """
 
     number: int
@@ -394,21 +396,21 @@ class StateLeft(Message):
 
 
 class MonitorSwitched(Message):
-    """The switch applies from now on."""
+    """Control enables or disables a monitor."""
 
     name: str
     enabled: bool
 
 
 class MonitorGiven(Message):
-    """Constants that `values` lacks get the default of the text."""
+    """Control sets given constants; those that `values` lacks get the default of the text."""
 
     name: str
     values: dict[str, GivenValue]
 
 
 class MonitorResumed(Message):
-    """The topics that the monitor holds go on."""
+    """Control releases the topics that a monitor holds."""
 
     name: str
 
@@ -416,7 +418,7 @@ class MonitorResumed(Message):
 class StopWanted(Message):
     """The monitors of a topic send their safe messages until a message comes on it.
 
-    Without `begin`, control only asks which monitors have one.
+    Without `begin`, control only asks which monitors have a safe message.
     """
 
     number: int
@@ -470,7 +472,7 @@ class OwnPublished(Message):
 
 
 class OwnServiceCalled(Message):
-    """The client waits for `OwnServiceAnswered`."""
+    """A client called a service of the appliance, and waits for `OwnServiceAnswered`."""
 
     number: int
     service: str
@@ -491,7 +493,7 @@ class OwnServiceAnswered(Message):
 
 
 class ApprovalWanted(Message):
-    """The request waits for `ApprovalAnswered`.
+    """A client's service request waits for `ApprovalAnswered`.
 
     `digest` is the SHA-256 of the request, `shown` its first bytes, and `size` the number of all. `type` is the
     service's type.
@@ -508,14 +510,14 @@ class ApprovalWanted(Message):
 
 
 class ApprovalAnswered(Message):
-    """`refused` has the reason, or is empty."""
+    """A request is approved, or `refused` has the reason."""
 
     number: int
     refused: str
 
 
 class MonitorCallWanted(Message):
-    """The monitor waits for `MonitorCallAnswered`."""
+    """A monitor calls a service, and waits for `MonitorCallAnswered`."""
 
     number: int
     service: str
@@ -569,7 +571,7 @@ class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
 
 
 class MonitorsReported(Message):
-    """Sent in batches, at most a few times a second.
+    """Actions of monitors, sent in batches at most a few times a second.
 
     `lost` is the number of events that were lost while there was no control process.
     """
@@ -579,11 +581,11 @@ class MonitorsReported(Message):
 
 
 class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
-    """Counters since the monitor was loaded, or the relay started.
+    """A monitor's counters since it was loaded, or the relay started.
 
-    A monitor in shadow mode (`shadow`) counts the drops and changes that it would have made. `missed` counts the
-    messages that it would have received if it were in force. A parametric specification has `slices` slices now, and
-    at most `slice_limit`. `withholds`: it withholds a topic from hosts now.
+    A monitor in shadow mode (`shadow`) counts the drops and changes that it would have made. `missed` counts
+    the messages that it would have received if it were in force. A parametric specification has `slices`
+    slices now, and at most `slice_limit`. `withholds`: it withholds a topic from hosts now.
     """
 
     name: str
@@ -604,7 +606,7 @@ class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
 
 
 class MonitorsCounted(Message):
-    """Sent after a change, at most once a second."""
+    """The counters of monitors, sent after a change, at most once a second."""
 
     rows: list[MonitorRow]
 
@@ -625,9 +627,9 @@ class LookEnded(Message):
 
 
 class MessageSeen(Message):
-    """`time` is in nanoseconds since the epoch, the size in bytes.
+    """A message of a tapped topic; `time` is in nanoseconds since the epoch, `size` in bytes.
 
-    Long `fields` are shortened. If there are only the first bytes, `why` is the reason.
+    Long `fields` are shortened. If only the first bytes are sent, `why` is the reason.
     """
 
     number: int

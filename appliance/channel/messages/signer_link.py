@@ -8,7 +8,7 @@ from appliance.channel.messages.message import Message
 
 
 class SignatureWanted(Message):
-    """`text` is an audit checkpoint."""
+    """Control asks for the signature of an audit checkpoint, which is `text`."""
 
     number: int
     text: bytes
@@ -23,7 +23,7 @@ class SignatureMade(Message):
 
 
 class SignatureRefused(Message):
-    """The checkpoint does not follow the last signed one."""
+    """The signer refuses, because the checkpoint does not follow the last signed one."""
 
     number: int
     reason: str
@@ -32,7 +32,7 @@ class SignatureRefused(Message):
 class RemovalWanted(Message):
     """Control asks to remove all records up to a checkpoint.
 
-    `checkpoint` is its text, `newest` that of the last signed one.
+    `checkpoint` is its text, `newest` the text of the last signed checkpoint.
     """
 
     number: int
@@ -50,7 +50,7 @@ class RemovalApproved(Message):
 
 
 class RemovalRefused(Message):
-    """`early`: the settings will permit the removal later."""
+    """The settings do not permit the removal; `early`: they will permit it later."""
 
     number: int
     reason: str
@@ -66,7 +66,7 @@ class AuthorityRequest(Message):
 class AuthorityStated(Message):
     """The certificate (PEM) of the authority whose key the signer has.
 
-    `trouble` says why it cannot use the sealed key of the other appliance's authority; empty if it can, or has none.
+    `trouble` is the reason if the signer cannot use the sealed key of the other appliance's authority.
     """
 
     number: int
@@ -75,10 +75,10 @@ class AuthorityStated(Message):
 
 
 class CertificateWanted(Message):
-    """A request is PKCS #10, in PEM.
+    """Control asks for a certificate; `request` is PKCS #10, in PEM.
 
-    `proof`, if given, must be a signature over the bytes of `request` by the key of the certificate `former` (PEM).
-    The authority must have issued `former` for the same name.
+    `proof`, if given, must be a signature over the bytes of `request` by the key of the certificate `former`
+    (PEM). The authority must have issued `former` for the same name.
     """
 
     number: int
@@ -106,21 +106,21 @@ class CertificateRefused(Message):
 
 
 class RevokedCertificate(msgspec.Struct, frozen=True):
-    """At most 160 bits, and the time of the revocation (seconds since the epoch)."""
+    """A serial number of at most 160 bits, and the time of the revocation (seconds since the epoch)."""
 
     serial: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{1,40}$")]
     moment: Annotated[float, msgspec.Meta(ge=0, le=4_000_000_000)]
 
 
 class RevocationsRequest(Message):
-    """The list has exactly these certificates."""
+    """Control asks for a revocation list of exactly these certificates."""
 
     number: int
     revoked: list[RevokedCertificate]
 
 
 class RevocationsMade(Message):
-    """The list is a CRL in PEM."""
+    """The revocation list, a CRL in PEM."""
 
     number: int
     revocations: bytes

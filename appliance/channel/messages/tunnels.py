@@ -25,7 +25,7 @@ class TunnelsWanted(Message):
 
 
 class TunnelsEnclosed(Message):
-    """The firewall is in force, and ESP runs there; otherwise, see `reason`."""
+    """The firewall is in force and ESP runs, or `reason` is the cause of the failure."""
 
     esp: Esp | None
     reason: str = ""
@@ -39,14 +39,14 @@ class CertificateNeeded(Message):
 
 
 class CharonStarted(Message):
-    """`key_exchange` lists the methods that charon may offer, best first."""
+    """Charon runs; `key_exchange` lists the methods that it may offer, best first."""
 
     version: str
     key_exchange: list[str]
 
 
 class TunnelHost(msgspec.Struct, frozen=True):
-    """A host that may open a tunnel; `address` is its virtual one."""
+    """A host that may open a tunnel; `address` is its address in the tunnel."""
 
     name: str
     address: str
@@ -54,7 +54,7 @@ class TunnelHost(msgspec.Struct, frozen=True):
 
 
 class TunnelsStated(Message):
-    """All that charon needs; certificates and the revocation list are PEM."""
+    """All data that charon needs; certificates and the revocation list are PEM."""
 
     number: int
     esp: Esp
@@ -66,7 +66,7 @@ class TunnelsStated(Message):
 
 
 class TunnelChanged(Message):
-    """`remote` is the real address of the host."""
+    """A tunnel opened or closed; `remote` is the real address of the host."""
 
     name: str
     up: bool
@@ -74,7 +74,7 @@ class TunnelChanged(Message):
 
 
 class TunnelRefused(Message):
-    """A request for a tunnel was refused, or, if not 0, this number of `packets`.
+    """A request for a tunnel was refused or, if not 0, this number of `packets` in a tunnel.
 
     The source address of a tunnel's packet is not verified.
     """

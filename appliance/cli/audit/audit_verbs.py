@@ -198,7 +198,6 @@ def _verified(source: FileLog | RestLog, key: Path | None, checkpoints: Path | N
 
 
 def _print_result(result: Any, printed: Callable[[Any], None], *, as_json_lines: bool) -> None:
-    """Exit with status 1 if there are findings."""
     if as_json_lines:
         write(json.dumps(msgspec.to_builtins(result)))
     else:
@@ -261,7 +260,7 @@ def export(
 
 
 def _filter_of(appliance: Appliance) -> Filter:
-    """The name of a host becomes its networks. Raises `FilterError`."""
+    """Return the filter of the options, with networks instead of a host's name. Raises `FilterError`."""
     wanted = FILTER.value(appliance.params)
     for warning in unrecorded(wanted):
         note(printable(warning))
@@ -271,7 +270,7 @@ def _filter_of(appliance: Appliance) -> Filter:
 
 
 def _known(appliance: Appliance, wanted: Filter) -> PolicyKnown:
-    """The policy has the names of hosts. Raises `FilterError` if no appliance answers."""
+    """Return the policy, which has the names of hosts. Raises `FilterError` if no appliance answers."""
     try:
         answer = appliance.ask(PolicyWanted())
     except NotRunningError:

@@ -29,7 +29,7 @@ _GAP = 2
 
 
 def print_entries(entries: list[LogEntry], host_in_words: HostInWords, *, each: bool = False) -> None:
-    """On a terminal, equal records are one row unless `each`.
+    """Print records; on a terminal, equal records are one row unless `each`.
 
     If the terminal is too narrow, the reason of each row is below it.
     """
@@ -130,7 +130,7 @@ def _elsewhere(found: Elsewhere) -> Iterator[str]:
 
 
 def write(text: str) -> None:
-    """Escape characters that the encoding of standard output lacks."""
+    """Write to standard output, and escape characters that its encoding lacks."""
     encoding = sys.stdout.encoding or "ascii"
     sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")
 
@@ -153,7 +153,7 @@ def _table(rows: list[tuple[Text, ...]]) -> Table:
 
 
 def _below(rows: list[tuple[Text, ...]]) -> Table:
-    """For a narrow terminal: record and event, then the reason, all beside the number."""
+    """Return the table for a narrow terminal: record and event, then the reason, all beside the number."""
     grid = Table.grid(padding=(0, _GAP, 0, 0))
     grid.add_column(no_wrap=True, justify="right", style="bold")
     grid.add_column(overflow="fold")
@@ -195,7 +195,6 @@ def _monitor(record: AuditRecord) -> str | None:
 
 
 def _by(record: AuditRecord) -> str | None:
-    """The holder of a token, or `operator`."""
     who = record.detail.get("who")
     unknown = (
         who == "None" and record.event in FOLDED
@@ -213,7 +212,7 @@ def _joined(*parts: str | None) -> str:
 
 
 def _why(record: AuditRecord) -> str:
-    """Include the rule, unless the reason already names it, and the count of a folded record."""
+    """Return the reason with the count of a folded record, and the rule unless the reason names it."""
     rule = record.rule
     named = rule is None or f"{Path(rule.file).name}:{rule.line}" in record.reason
     why = record.reason if named else f"{record.reason} ({rule_text(record.rule)})"

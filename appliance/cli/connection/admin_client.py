@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 ADMIN_SOCKET = "admin.sock"
 SECONDS = 60.0
-"""In seconds; longer than control's slowest answers (enrolment through charon, compiling specifications)."""
+"""The time limit of an answer, longer than control needs for enrolment through charon or compiling specifications."""
 QUICK_SECONDS = 2.0
-"""In seconds: an appliance that hangs must not keep an operator from reading the log."""
+"""A short time limit, because an appliance that hangs must not keep an operator from reading the log."""
 _GRACE_SECONDS = 10.0
 UNKNOWN = (
     "the change may have taken effect; if it has not by now, it never will. List recent changes:"
@@ -28,11 +28,11 @@ class NotRunningError(Exception):
 
 
 class AccessDeniedError(NotRunningError):
-    """Waiting does not change this."""
+    """The appliance rejects this user or token, so waiting does not help."""
 
 
 class AdminSocket:
-    """Each answer may take `seconds`.
+    """A client of the admin socket; each answer may take `seconds`.
 
     After that time the request is withdrawn, and its outcome may take `grace` seconds.
     """
@@ -43,13 +43,13 @@ class AdminSocket:
         self._grace = grace
 
     def audit(self) -> "FileLog":
-        """The appliance may be stopped."""
+        """Return the log, which can be read even while the appliance is stopped."""
         from appliance.cli.connection.audit_file import FileLog  # noqa: PLC0415  only for the verbs that read it
 
         return FileLog(self.state, self.robot_name)
 
     def robot_name(self) -> str:
-        """Empty if it has none, or no appliance is in service."""
+        """Return the robot's name; empty if it has none, or no appliance is in service."""
         try:
             answer = AdminSocket(self.state, QUICK_SECONDS, 0.1).ask(StatusWanted())
         except NotRunningError:
@@ -57,7 +57,7 @@ class AdminSocket:
         return answer.given().name if answer.ok else ""
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
-        """Raises `NotRunningError`."""
+        """Return the appliance's answer. Raises `NotRunningError`."""
         line = encoded(request)
         path = self.state / ADMIN_SOCKET
         if not self.state.is_dir():
@@ -91,7 +91,7 @@ class AdminSocket:
             raise NotRunningError(f"{path}: an appliance of another version answers: {error}") from None
 
     def _read(self, sock: socket.socket) -> bytes:
-        """At the time limit, withdraw the request and wait for its outcome."""
+        """Read an answer; at the time limit, withdraw the request and wait for its outcome."""
         line = bytearray()
         try:
             _read_line(sock, line)
@@ -103,7 +103,7 @@ class AdminSocket:
 
 
 def encoded(request: AdminRequest[Any]) -> bytes:
-    """Raises `NotRunningError` for text that is not valid UTF-8."""
+    """Return the request as a JSON line. Raises `NotRunningError` for text that is not valid UTF-8."""
     try:
         return msgspec.json.encode(request)
     except UnicodeEncodeError as error:

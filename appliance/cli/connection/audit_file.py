@@ -28,7 +28,7 @@ Progress = Callable[[int], None]
 
 
 class FileLog:
-    """The appliance may be stopped, or this is a copy of its state directory.
+    """Reads the log of a running or stopped appliance, or of a copy of its state directory.
 
     All methods raise `LogUnreadableError`. `robot` returns the name of the robot, empty if it is not known.
     """
@@ -52,7 +52,6 @@ class FileLog:
         return summary_of_log(self.path, wanted, limit)
 
     def show(self, record_id: str, neighbours: int) -> RecordInContext | None:
-        """None if the log has no such record."""
         return show(self.path, record_id, neighbours)
 
     def export(self, wanted: Filter) -> Iterator[LogEntry]:
@@ -76,7 +75,7 @@ class FileLog:
     def verify(
         self, key: bytes | None, copies: Sequence[SignedCheckpoint] | None, progress: Progress
     ) -> Verification:
-        """If the signer's own records are readable, compare the log with them.
+        """Verify the log, and compare it with the signer's own records if they are readable.
 
         `progress` is called with the sequence of the last verified record.
         """
@@ -86,7 +85,6 @@ class FileLog:
         return verify(path, key, signer if may else None, copies, progress)
 
     def checkpoints(self, after: int) -> list[SignedCheckpoint]:
-        """The list is empty at the end of the log."""
         return signed_checkpoints(self.path, after)
 
     def last(self) -> int:

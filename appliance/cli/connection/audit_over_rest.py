@@ -29,7 +29,7 @@ _MOST_FAILURES = 5
 
 
 class RestLog:
-    """Like `FileLog`, but the methods raise `NotRunningError`."""
+    """The methods of `FileLog` over REST; they raise `NotRunningError`."""
 
     def __init__(self, client: RestClient) -> None:
         self._client = client
@@ -78,7 +78,7 @@ class RestLog:
                     yield int(json.loads(line)["sequence"]), line
 
     def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[LogEntry]]:
-        """Reconnect when the connection breaks."""
+        """Yield records as `FileLog` does, and reconnect when the connection breaks."""
         position = self.last()
         if lines:
             yield self.search(wanted, str(position + 1), lines, newest_first=True).entries[::-1]
@@ -127,7 +127,6 @@ class RestLog:
 
     @contextmanager
     def _lines(self, path: str, params: dict[str, Any], seconds: float) -> Iterator[Iterator[str]]:
-        """Translate errors, including those raised inside the block."""
         with (
             self._refusals(),
             self._client.streamed("GET", _PATH + path, params=params, seconds=seconds) as answer,
@@ -136,7 +135,6 @@ class RestLog:
 
     @contextmanager
     def _refusals(self) -> Iterator[None]:
-        """Translate REST's problems and malformed answers."""
         try:
             yield
         except RestProblemError as problem:

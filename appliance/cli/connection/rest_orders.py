@@ -17,14 +17,13 @@ if TYPE_CHECKING:
 
 
 class RestWay:
-    """Takes the same requests and gives the same answers as `AdminSocket`."""
+    """Sends the requests of `AdminSocket` over REST, with the same answers."""
 
     def __init__(self, url: str, token: str | None, authority: Path | None) -> None:
-        """Raises `ValueError` if a token must not be sent to this URL."""
+        """Prepare a client. Raises `ValueError` if a token must not be sent to this URL."""
         self.client = RestClient(url, token, authority)
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
-        """Raises `NotRunningError`."""
         encoded(request)  # rejects text that the socket would also reject
         try:
             return AdminAnswer(True, _carry_out(self.client, request))
@@ -41,7 +40,7 @@ class RestWay:
 
 
 def _carry_out(rest: RestClient, request: AdminRequest[A]) -> A:
-    """Raises `NotRunningError` for a request that REST does not offer."""
+    """Send a request and return the body. Raises `NotRunningError` for a request that REST does not offer."""
     asked: Any = request  # its kind is checked below
     if isinstance(asked, admin.RegistrationsWanted):
         return cast(A, _registrations(_carry_out(rest, admin.GraphWanted())))

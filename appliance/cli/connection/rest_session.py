@@ -45,10 +45,10 @@ class RestProblemError(Exception):
 
 
 class RestClient:
-    """The methods raise `NotRunningError` and `RestProblemError`."""
+    """A client of REST; the methods raise `NotRunningError` and `RestProblemError`."""
 
     def __init__(self, url: str, token: str | None, authority: Path | None) -> None:
-        """Raises `ValueError` if a token must not be sent to this URL."""
+        """Prepare a client. Raises `ValueError` if a token must not be sent to this URL."""
         self.url, secure = _place_of(url)
         self._token = _checked_token(token)
         if authority is not None and not secure:
@@ -76,7 +76,7 @@ class RestClient:
         match: bool = False,
         order: bool = True,
     ) -> dict[str, Any]:
-        """`match`: accept any present revision (`If-Match: *`).
+        """Send a request; return its JSON answer. `match`: accept any present revision (`If-Match: *`).
 
         An `order` is signed unless it is a GET; a dry run is not an order.
         """
@@ -107,7 +107,6 @@ class RestClient:
         headers: Mapping[str, str] | None = None,
         order: bool = True,
     ) -> Iterator[httpx.Response]:
-        """Yield an answer while it arrives."""
         signed = order and method != "GET"
         challenge = str(self.call("GET", "/v1/challenge").get("challenge", "")) if signed else ""
         request = self._client.build_request(
@@ -194,7 +193,7 @@ def _stated(request: httpx.Request, challenge: str) -> bytes:
 
 
 def _place_of(url: str) -> tuple[str, bool]:
-    """Scheme, host and port, and whether it is encrypted. Raises `ValueError`."""
+    """Return scheme, host and port, and whether the scheme is encrypted. Raises `ValueError`."""
     try:
         parts = urlsplit(url)
         host, _port = parts.hostname, parts.port

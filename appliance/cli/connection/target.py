@@ -94,7 +94,7 @@ class Appliance(typer.Context):
 
     @property
     def way(self) -> "AdminSocket | RestWay":
-        """Exits with status 2 for options that exclude each other."""
+        """Return the connection. Exits with status 2 for options that exclude each other."""
         return self._target.way
 
     @property
@@ -115,21 +115,20 @@ class Appliance(typer.Context):
         return self.way.client
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
-        """Raises `NotRunningError`."""
         return self.way.ask(request)
 
     def audit(self) -> "FileLog | RestLog":
-        """With a state directory, the appliance may be stopped."""
+        """Return the log; with a state directory, the appliance may be stopped."""
         return self.way.audit()
 
     @cached_property
     def host_in_words(self) -> "HostInWords":
-        """Addresses are shown if no appliance answers."""
+        """Return the function that names addresses; it returns the address if no appliance answers."""
 
         return named_by(self.way)
 
     def ask_or_exit(self, request: AdminRequest[A]) -> A:
-        """Exits with status 1 for a rejected request, and 2 if no appliance answers."""
+        """Return the answer. Exits with status 1 for a rejected request, and 2 if no appliance answers."""
         try:
             return self.body_or_exit(self.way.ask(request))
         except NotRunningError as error:
@@ -144,7 +143,7 @@ class Appliance(typer.Context):
         return body
 
     def body_or_exit(self, answer: AdminAnswer[A]) -> A:
-        """Print a rejection with its findings and exit with status 1."""
+        """Return the body. For a rejection, print it with its findings and exit with status 1."""
         if answer.ok:
             return answer.given()
         if self.as_json:
@@ -180,14 +179,14 @@ def speaks(verb: Callable[Concatenate[Appliance, _P], None]) -> GroupedVerb:
 
 
 def speaks_here(verb: Callable[Concatenate[Appliance, _P], None]) -> GroupedVerb:
-    """For a verb that REST does not offer: its help has no --api, whose use gets the reason."""
+    """Decorate a verb that REST does not offer: its help lacks --api, whose use is answered with the reason."""
     return GroupedVerb(verb, partial(_ApplianceCommand, over_rest=False))
 
 
 def speaks_with(
     json_help: str, group: OptionGroup[Any] | None = None
 ) -> Callable[[Callable[Concatenate[Appliance, _P], None]], GroupedVerb]:
-    """`group` has options before the verb's own."""
+    """Decorate a verb that prints JSON; the options of `group` are before the verb's own."""
 
     def command(*args: Any, **settings: Any) -> GroupedCommand:
         before = () if group is None else group.options
@@ -220,7 +219,7 @@ def _choose(
         ),
     ] = None,
 ) -> _Target:
-    """Exits with status 2 for options that exclude each other."""
+    """Return the appliance that the options choose. Exits with status 2 for options that exclude each other."""
     sources = {name: context.get_parameter_source(name) for name in ("state", "api", "api_ca")}
     said = {name: "" if source is None else source.name for name, source in sources.items()}
     typed = {name for name, source in said.items() if source == "COMMANDLINE"}

@@ -284,7 +284,6 @@ def _assigned(text: str, form: str) -> tuple[str, str]:
 
 
 def _given_to_monitors(given: list[str]) -> dict[str, dict[str, GivenValue]]:
-    """The keys are the monitor and the name."""
     found: dict[str, dict[str, GivenValue]] = {}
     for text in given:
         path, value = _assigned(text, "--set MONITOR.NAME=VALUE")
@@ -321,7 +320,7 @@ def _switch(appliance: Appliance, order: admin.AdminRequest[Switched], word: str
 
 
 def say_shadow_deadline(confirm_by: float | None) -> None:
-    """Print nothing if the monitors stay in force."""
+    """Print until when monitors must be confirmed; nothing if they stay in force."""
     if confirm_by is not None:
         say(f"back to shadow mode at {moment(confirm_by)} unless you run: rosrv monitor confirm", "yellow")
 

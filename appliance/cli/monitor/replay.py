@@ -104,7 +104,6 @@ def replay_monitor(
 
 
 def _specifications(appliance: Appliance, what: str, folders: Sequence[Path]) -> Specifications:
-    """`what` is a path, or the name of a monitor of the appliance."""
     path = Path(what)
     if path.suffix == ".rv" or path.is_file():
         return read_for_recordings(MONITOR, [path], folders)
@@ -124,7 +123,6 @@ def _specifications(appliance: Appliance, what: str, folders: Sequence[Path]) ->
 
 
 def _topics(specifications: Specifications, patterns: Sequence[str]) -> dict[str, str]:
-    """Types by topic, of the chosen monitor or of all."""
     return {
         topic: kind
         for topic, kind in topics_of(specifications).items()

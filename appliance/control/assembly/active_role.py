@@ -1,6 +1,6 @@
 """The role in which control serves. A feature's hook `may_start` can make control wait for it (`StartGate`).
 
-These classes are those of a single appliance, which serves from its start to its end.
+A single appliance uses these classes and serves from its start to its end.
 """
 
 import asyncio
@@ -29,11 +29,12 @@ STATE_ERRORS = (StateError, PolicyRefusedError, SpecificationsRefusedError, Stor
 
 
 class ActiveRole:
-    """The right to serve, and what follows from it.
+    """The right to serve, and its consequences.
 
-    `paired`: another appliance can serve in place of this one, so it may have written the state. `name` is that of this
-    appliance in its pair, `address` the one at which nodes reach the pair, and `robot` the robot's. `took_over`: this
-    process waited for the role. The link to the api (`api`), with the pin of its certificate, may be open by then.
+    `paired`: another appliance can serve in place of this one, so it may have written the state. `name` is
+    this appliance's name in its pair, `address` the address at which nodes reach the pair, and `robot` the
+    robot's address. `took_over`: this process waited for the role. The link to the api (`api`), with the pin
+    of its certificate, may already be open.
     """
 
     paired = False
@@ -66,7 +67,7 @@ class ActiveRole:
         return False
 
     def on_end_of_gap(self, ended: Callable[[], None]) -> None:
-        """Call this when computers of the robot stop refusing connections."""
+        """Call `ended` when computers of the robot stop refusing connections."""
 
     def close(self) -> None:
         """End the role: a change that is not answered yet gets no answer."""

@@ -1,4 +1,4 @@
-"""Make the core of RVMaster. The core decides calls and changes the graph, but sends no messages."""
+"""Make the core of RVMaster, which decides calls and changes the graph, but sends no messages."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

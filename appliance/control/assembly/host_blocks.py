@@ -46,7 +46,6 @@ class BlockTable:
         return BlocksState(len(ends), min((end for end in ends if end is not None), default=None))
 
     def age_now(self) -> int:
-        """Return the age clock's time, from the last reading and the time since."""
         return self._now + clock.since_boot_ns() - self._seen
 
     def until(self, row: HostBlockRow) -> float | None:
@@ -93,5 +92,4 @@ class BlockTable:
 
 
 def in_utc(seconds: float) -> str:
-    """Return a time (seconds since the epoch) as text, to the second."""
     return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%SZ")

@@ -1,7 +1,7 @@
 """Manage the policy in force: load it, store revisions, roll back, and limit the time of an unconfirmed change.
 
-A new policy passes the gate (`policy_gate.py`) before it takes effect, also at a start. An invalid policy changes
-nothing, and all findings are reported. The store keeps every policy that came into force as a revision.
+A new policy passes the gate (`policy_gate.py`) before it takes effect, also at a start. The store keeps every policy
+that came into force as a revision.
 
 Operators' changes are made one at a time. A change that expects a revision other than the one in force is rejected. A
 change is answered once it is on disk and the relays have carried it out: revoked traffic no longer passes.
@@ -277,7 +277,6 @@ class Policies(Revisions[RevisionRow]):
 
     @property
     def known(self) -> PolicyContext:
-        """Return the present context of policies: hosts, robot and site keys."""
         return PolicyContext(
             dict(self._hosts()),
             self._robot,
@@ -399,7 +398,6 @@ class Policies(Revisions[RevisionRow]):
 
 
 def _losses(policy: Policy, live: Iterable[LiveRight]) -> list[str]:
-    """Return a warning for each host with nodes that keeps none of its rights under this policy."""
     return [
         f"warning: {host} has nodes ({_some(nodes)}) and loses all its rights: if that is a mistake, "
         "`rosrv policy rollback` and name the host in the policy"

@@ -43,7 +43,7 @@ class KeptPolicy(NamedTuple):
 class StartingPolicy(NamedTuple):
     """The policy that a start brings into force, with its signature.
 
-    `refused` is the error of the file, if the revision that was in force before stays in force instead.
+    `refused` is the error of the file, if the revision before it stays in force instead.
     """
 
     policy: Policy
@@ -56,8 +56,8 @@ def policy_at_start(
 ) -> StartingPolicy:
     """Return the policy that a start brings into force. Raises `PolicyRefusedError`.
 
-    It is that of the stored revision `kept`, if it comes first. Otherwise it is that of the file, if the file passes
-    the gate with its test cases, and `kept` if it does not.
+    The stored revision `kept` is used if it comes first, or if the file does not pass the gate with its test
+    cases.
     """
     if kept is not None and kept_first:
         try:
@@ -96,7 +96,6 @@ def judged(text: str, signature: str, file: str, known: PolicyContext) -> Policy
 
 
 def with_cases(known: PolicyContext, file: Path) -> PolicyContext:
-    """Add the test cases from the file beside the policy to a context."""
     cases = file.with_name(f"{file.name}.tests.yaml")
     text = error = None
     try:

@@ -19,9 +19,11 @@ _ANY = 1 << 63
 
 
 class ReceiptFloor:
-    """The last record that retention by age may remove: any, or if `holding`, what another machine has.
+    """The last record that retention by age may remove: any, or if `holding`, the last one that another
+    machine has.
 
-    While only the reserve of the log's disk is free, it is any record. One thread writes, another reads.
+    While only the reserve of the log's disk is free, any record may be removed. One thread writes, another
+    reads.
     """
 
     def __init__(self, state: Path, reserve: int, *, holding: bool) -> None:

@@ -17,10 +17,10 @@ from appliance.channel.messages.api import ApiLink
 ROUTES_AT_ONCE = 32  # the most open route queries; unknown hosts cause them, and the supervisor limits them
 
 Heard = Callable[[Any, tuple[int, ...]], None]
-"""Handle a message of the supervisor and its descriptors."""
+"""A handler of the supervisor's messages and their descriptors."""
 
 Enclosed = Callable[[messages.TunnelsEnclosed], object]
-"""Take the supervisor's answer to `TunnelsWanted`."""
+"""A handler of the supervisor's answer to `TunnelsWanted`."""
 
 _log = structlog.get_logger()
 
@@ -78,7 +78,6 @@ class ControlLifeline:
         self.channel.attach(asyncio.get_running_loop(), self._received, self._closed)
 
     def hear(self, heard: Heard) -> None:
-        """Pass all earlier and all later messages to `heard`."""
         early, self._early, self._heard = self._early, {}, heard
         for said in early.values():
             heard(*said)

@@ -57,7 +57,6 @@ class ClockCheck:
         return ClockState(self._synchronised, behind if behind > _STEP_SECONDS else 0.0, before_program())
 
     async def watch(self) -> None:
-        """Check the clock every ten seconds."""
         while True:
             self.look()
             await asyncio.sleep(_LOOK_SECONDS)

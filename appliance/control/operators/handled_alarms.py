@@ -1,7 +1,7 @@
 """Keep which alarms operators have acknowledged or silenced.
 
-An alarm is a present condition (`channel/alarms.py`). An acknowledged alarm names the operator who takes care of it. A
-silenced alarm is a notice for a time. Both are stored, so they survive a restart and a takeover.
+An alarm is a present condition (`channel/alarms.py`). Acknowledgements and silences survive a
+restart and a takeover.
 
 Invariants:
 1. An acknowledgement ends with its alarm, so the same condition is a new alarm when it comes back.
@@ -43,7 +43,6 @@ class HandledAlarms:
         self._keep({**self._rows, row.kind: row})
 
     def end(self, kind: str) -> bool:
-        """Forget what was stored for an alarm; return whether there was anything."""
         if kind not in self._rows:
             return False
         self._keep({other: row for other, row in self._rows.items() if other != kind})

@@ -1,4 +1,4 @@
-"""The table of methods: the method of control that answers each request of the core."""
+"""The table of the core's request methods."""
 
 from typing import Any
 

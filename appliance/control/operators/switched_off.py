@@ -1,8 +1,8 @@
 """List switched-off protection: monitors that are disabled or in shadow mode, and audit-only sections of the policy.
 
-Switched-off protection is easily forgotten, so it is listed with its age. After `forgotten_after`, it is recorded once,
-as an alarm. If a monitor is to come back automatically, its age grows only if it is still off after that time. Ages
-count the running time of the appliance, so they do not depend on the system clock.
+Each item is listed with its age. After `forgotten_after`, it is recorded once, as an alarm. If a monitor is to come
+back automatically, its age grows only if it is still off after that time. Ages count the running time of the appliance,
+so they do not depend on the system clock.
 """
 
 import asyncio
@@ -64,7 +64,6 @@ class SwitchedOffWatch:
         self._ages = msgspec.json.decode(store.settings().get(_SETTING, "{}"), type=dict[str, _Age])
 
     def rows(self) -> list[SwitchedOff]:
-        """Return all protection that is switched off now."""
         self._look(0.0)
         return [
             msgspec.structs.replace(off, since=age.since, forgotten=age.told)

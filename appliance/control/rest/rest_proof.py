@@ -57,7 +57,6 @@ class Challenges:
         self._taken: dict[str, float] = {}  # accepted challenges, with the time at which they expire
 
     def give(self, now: float) -> str:
-        """Return a new challenge, valid for `SECONDS`."""
         begun = f"{now + SECONDS:.3f}.{secrets.token_urlsafe(16)}"
         return f"{begun}.{self._mac(begun)}"
 
@@ -115,7 +114,6 @@ class RequestAuthenticator:
         self._checking = asyncio.Lock()
 
     def challenge(self) -> Challenge:
-        """Return a new challenge for an order, with its lifetime in seconds."""
         return Challenge(self._challenges.give(clock.now()), SECONDS)
 
     async def asker(self, made: RequestMade) -> str:

@@ -30,7 +30,7 @@ def operate(context: OperatorContext) -> FeaturePart:
 
 
 class AlarmOrders:
-    """`status()` returns the present status, with the handled alarms."""
+    """The operators' requests; `status()` returns the present status, with the handled alarms."""
 
     def __init__(self, handled: HandledAlarms, trail: AuditTrail, status: Callable[[], Status]) -> None:
         self._handled = handled
@@ -41,14 +41,14 @@ class AlarmOrders:
         return self._list()
 
     async def acknowledge(self, request: AlarmAcknowledge, who: str) -> AlarmList:
-        """Raises `UnknownThingError` if there is no such alarm."""
+        """Record who takes care of an alarm. Raises `UnknownThingError` if there is no such alarm."""
         self._must_be_present(request.kind)
         self._handled.put(HandledAlarm(request.kind, who, clock.wall(), None, request.note))
         self._record("alarm acknowledged", f"{request.kind} is acknowledged", request.kind, who, request.note)
         return self._list()
 
     async def silence(self, request: AlarmSilence, who: str) -> AlarmList:
-        """Make an alarm a notice for a time, or end that. Raises `UnknownThingError` and `SenselessError`."""
+        """Make an alarm a notice for a time, or end a silence. Raises `UnknownThingError` and `SenselessError`."""
         kind, seconds = request.kind, request.seconds
         if seconds is None:
             if not self._handled.end(kind):

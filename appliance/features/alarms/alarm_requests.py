@@ -40,7 +40,7 @@ class AlarmsWanted(AdminRequest[AlarmList], frozen=True, tag="alarms"):
     problems={404: "There is no such alarm now."},
 )  # fmt: skip
 class AlarmAcknowledge(AdminRequest[AlarmList], frozen=True, tag="alarm acknowledge"):
-    """Record who takes care of an alarm. It stays an alarm, with that name, until its condition is over."""
+    """Record who takes care of an alarm. It remains an alarm, with that name, until its condition is over."""
 
     kind: str
     note: str = ""
@@ -51,7 +51,7 @@ class AlarmAcknowledge(AdminRequest[AlarmList], frozen=True, tag="alarm acknowle
     problems={404: "There is no such alarm now."},
 )  # fmt: skip
 class AlarmSilence(AdminRequest[AlarmList], frozen=True, tag="alarm silence"):
-    """Make an alarm a notice for a time: `rosrv status` then exits with 0. Without `seconds`, end that."""
+    """Make an alarm a notice for a time: `rosrv status` then exits with 0. Without `seconds`, end its silence."""
 
     kind: str
     seconds: float | None = None

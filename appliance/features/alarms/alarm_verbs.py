@@ -34,7 +34,8 @@ def list_alarms(appliance: Appliance) -> None:
 
 @speaks
 def acknowledge(appliance: Appliance, kind: _Kind, *, note: _Note = "") -> None:
-    """Record that you take care of an alarm. It stays an alarm, with your name, until its condition is over.
+    """Record that you take care of an alarm. It remains an alarm, with your name, until its condition is
+    over.
 
     Example: rosrv alarm acknowledge audit-not-forwarded --note "the receiver is being replaced"
     """

@@ -1,1 +1,1 @@
-"""Approvals: an operator lets a host that the policy lists behind `ask` through, once or for some time."""
+"""Approvals: an operator permits calls of hosts that the policy lists behind `ask`, once or for some time."""

@@ -35,21 +35,21 @@ from appliance.telemetry.audit_trail import NOT_RECORDED, Asker, AuditTrail
 
 CHECK_SECONDS = 0.25
 LEASE_SECONDS = 60.0
-"""The default for a topic or a parameter."""
+"""The default duration of a lease on a topic or a parameter."""
 SILENT_SECONDS = 5.0
 """The silence that ends a lease on a motion outside the groups of `[Authority]`."""
 UNANSWERED_SECONDS = 600.0
-"""The alarm about an unanswered call lasts this long."""
+"""The duration of the alarm about an unanswered call."""
 
 
 class ApprovalOrders:
-    """Orders raise `SenselessError` and `UnknownThingError`.
+    """The operators' orders about approvals; they raise `SenselessError` and `UnknownThingError`.
 
-    `first` is the number of the first held call. `decide_again()` brings the present `approved` into force, and
-    `carried_out(topics)` waits until the relays of topics have carried out their orders. `guards(topic)` returns the
-    monitors with a safe message for a topic, or None if its relay does not answer.
+    `first` is the number of the first held call. `decide_again()` brings the present `approved` into force,
+    and `carried_out(topics)` waits until the relays of topics have carried out their orders. `guards(topic)`
+    returns the monitors with a safe message for a topic, or None if its relay does not answer.
 
-    An order or an end takes effect before it waits for anything, so a hanging relay delays no other one.
+    An order or an end takes effect before it waits for anything, so a hanging relay delays no other order.
     """
 
     def __init__(
@@ -145,7 +145,7 @@ class ApprovalOrders:
         )
 
     async def approve(self, request: requests.ApproveCall, who: str) -> requests.Approval:
-        """A lease may be given again to extend or shorten it."""
+        """Approve a held call; a lease may be given again to extend or shorten it."""
         entry = self._entry(request.number)
         seconds = request.seconds
         if seconds is None and entry.lease and entry.call.category is Category.CALL:
@@ -170,7 +170,7 @@ class ApprovalOrders:
         return _shown(entry)
 
     async def refuse(self, request: requests.RefuseCall, who: str) -> requests.Approval:
-        """A refused call is not held again when it is repeated."""
+        """Refuse a held call, which is then not held again when it is repeated, or end an approval."""
         entry = self._entry(request.number)
         take_effect()
         if entry.state is ApprovalState.APPROVED:
@@ -185,14 +185,15 @@ class ApprovalOrders:
     # --- the end of a time ---
 
     async def watch(self) -> None:
-        """End what is over; runs until cancelled."""
+        """End calls and approvals at their time; runs until cancelled."""
         async with asyncio.TaskGroup() as checks:
             while True:
                 checks.create_task(self.check())
                 await asyncio.sleep(CHECK_SECONDS)
 
     async def check(self) -> None:
-        """End the calls and approvals that are over now, and leases of hosts that stopped publishing a motion.
+        """End the calls and approvals whose time is over, and leases of hosts that stopped publishing a
+        motion.
 
         All of them end before this waits for the stops of the robot.
         """
@@ -214,7 +215,6 @@ class ApprovalOrders:
         await asyncio.gather(*map(self._stop_motion, ended), *map(self._end_if_guarded, still))
 
     def _ended(self, entry: ApprovalEntry) -> str:
-        """Return why an entry ends now; empty if it goes on."""
         now, call = clock.now(), entry.call
         if entry.until <= now:
             return (
@@ -249,7 +249,6 @@ class ApprovalOrders:
             await self._stop_motion(present)
 
     def _last_message(self, entry: ApprovalEntry) -> float:
-        """Return the time of the last message under a lease on a topic, or 0."""
         if not entry.lease or entry.call.category is not Category.PUBLISH:
             return 0.0
         moved = self._signs.moved(entry.call.host, frozenset({entry.call.resource}))
@@ -263,17 +262,17 @@ class ApprovalOrders:
         self._record("approval ended", entry, f"approval {entry.number} ended: {reason}", who=who)
 
     def _enforce(self) -> bool:
-        """Decide all rights again if the leases have changed; return whether they have."""
         differ = self._policy().approved != self.approved()
         if differ:
             self._decide_again()
         return differ
 
     async def _stop_motion(self, entry: ApprovalEntry) -> None:
-        """After the end of a lease on a topic, once its relay has cut the host off, the guards stop the robot.
+        """Let the guards stop the robot after the end of a lease on a topic, once its relay has cut the host
+        off.
 
-        They do so even if no message was reported: relays report once a second, and forget the traffic of a node that
-        has ended.
+        They do so even if no message was reported, because relays report once a second, and forget the
+        traffic of a node that has ended.
         """
         call = entry.call
         if not entry.lease or call.category is not Category.PUBLISH:

@@ -30,7 +30,7 @@ class ApprovalState(StrEnum):
 
 
 class HeldCall(NamedTuple):
-    """`digest` is the SHA-256 of its arguments; empty for a topic or a parameter."""
+    """A call that needs an approval; `digest` is the SHA-256 of its arguments, empty for a topic or a parameter."""
 
     host: Address
     category: Category
@@ -43,7 +43,7 @@ class HeldCall(NamedTuple):
 
 
 class ChargedHost(NamedTuple):
-    """The quota counts by the network by which the policy names a host, or by the host's address."""
+    """A host and its quota's key: the network by which the policy names the host, or the host's address."""
 
     network: str
     named: bool
@@ -60,8 +60,8 @@ class ChargedHost(NamedTuple):
 class ApprovalEntry:
     """A call, and the operators' decision. `arguments` are its first bytes, of `size`; `type` is its service type.
 
-    It ends at `until`. `once`: the approval is for one call; otherwise it is a lease for all calls of the key, which
-    began at `since`.
+    The entry ends at `until`. `once`: the approval is for one call; otherwise it is a lease for all calls of
+    the key, which began at `since`.
     """
 
     number: int
@@ -83,7 +83,7 @@ class ApprovalEntry:
 
 
 class ApprovalTable:
-    """The first entry has the number `first`."""
+    """The held calls and approvals; the first entry has the number `first`."""
 
     def __init__(self, first: int) -> None:
         self._next = first

@@ -67,7 +67,7 @@ def _say(appliance: Appliance, one: Approval) -> None:
 
 
 def _arguments(one: Approval) -> str:
-    """The type of the service may be unknown here."""
+    """Return the arguments of a call as text, even if the type of its service is not known here."""
     if not one.sha256:
         return " with any arguments" if one.category == "call" else ""
     data = bytes.fromhex(one.arguments)

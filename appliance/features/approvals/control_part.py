@@ -19,9 +19,10 @@ if TYPE_CHECKING:
 
 
 async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
-    """It begins without an approval, and stops what hosts commanded by an earlier one.
+    """Begin without an approval, and stop motions that hosts commanded by an earlier approval.
 
-    The first number is random, so an operator who answers late, after a restart, does not approve another call.
+    The first number is random, so an operator who answers late, after a restart, does not approve another
+    call.
     """
     relay, policy = parts.endpoints.relay, base.policies.policy
     stop = MotionStop(relay.stop, base.trail, policy)

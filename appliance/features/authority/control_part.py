@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 async def inherit(base: "Foundation", parts: "Parts") -> FeaturePart:
-    """It begins without a holder of any group, and stops what earlier ones commanded."""
+    """Begin without a holder of any group, and stop motions that earlier holders commanded."""
     relay, policy = parts.endpoints.relay, base.policies.policy
     stop = MotionStop(relay.stop, base.trail, policy)
     lost: Commands = set()

@@ -27,10 +27,11 @@ CHECK_SECONDS = 0.25
 
 
 class DriveOrders:
-    """The methods raise `SenselessError`, `UnavailableError` and `UnknownThingError`.
+    """The operators' orders about groups; they raise `SenselessError`, `UnavailableError` and
+    `UnknownThingError`.
 
-    `decide_again()` brings the present `holders` into force. `carried_out(topics)` waits until the relays of these
-    topics (None: all) have carried out their orders.
+    `decide_again()` brings the present `holders` into force. `carried_out(topics)` waits until the relays of
+    these topics (None: all) have carried out their orders.
 
     Each group has its own turn, so a hanging relay delays the next holder of a group, and no other group.
     """
@@ -86,7 +87,7 @@ class DriveOrders:
         return self._state(group)
 
     async def ask(self, request: requests.DriveAsk, who: str) -> requests.GroupState:
-        """A host that may take a free group gets it at once."""
+        """Let a host wait for a group; a host that may take a free group gets it at once."""
         group, host = self._group(request.group), self._host(request.host)
         async with self._turn(group):
             await self._asked(group, host, who)
@@ -137,7 +138,7 @@ class DriveOrders:
                 await asyncio.sleep(CHECK_SECONDS)
 
     async def check(self) -> None:
-        """End the authority that is over, and give each group to the host that waits for it.
+        """End the authority whose lease is over, and give each group to the host that waits for it.
 
         Every authority ends before this waits for a relay.
         """

@@ -13,7 +13,7 @@ GroupName = Annotated[str, parameter("name of the group", min_length=1, max_leng
 
 
 class GroupHost(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The host that is meant."""
+    """The host that takes or asks for a group."""
 
     host: Annotated[
         Annotated[str, msgspec.Meta(min_length=1, max_length=300)], doc("address or name of a host")
@@ -21,7 +21,7 @@ class GroupHost(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class GroupGift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The host that gets the group next; empty: the first one that waits."""
+    """The host that gets the group next; empty: the first waiting host."""
 
     to: Annotated[Annotated[str, msgspec.Meta(max_length=300)], doc("address or name of a host")] = ""
 
@@ -63,7 +63,7 @@ class DriveTake(WaitingRequest[GroupState], frozen=True, tag="drive take"):
     "operator", "POST", "/v1/drive/{group}/give", name="drive_give", body=GroupGift, problems=_NO_GROUP
 )  # fmt: skip
 class DriveGive(WaitingRequest[GroupState], frozen=True, tag="drive give"):
-    """End the authority of a group's holder: the group is given to a host, or to the first one that waits."""
+    """End the authority of a group's holder: the group is given to a host, or to the first waiting host."""
 
     group: GroupName
     to: str = ""
@@ -73,7 +73,7 @@ class DriveGive(WaitingRequest[GroupState], frozen=True, tag="drive give"):
     "operator", "POST", "/v1/drive/{group}/ask", name="drive_ask", body=GroupHost, problems=_NO_GROUP
 )  # fmt: skip
 class DriveAsk(WaitingRequest[GroupState], frozen=True, tag="drive ask"):
-    """Let a host wait for a group. One that may take it gets it as soon as it is free."""
+    """Let a host wait for a group. A host that may take the group gets it as soon as it is free."""
 
     group: GroupName
     host: str

@@ -79,7 +79,7 @@ def give(
 
 @speaks
 def ask(appliance: Appliance, group: _GroupName, *, host: _Host) -> None:
-    """Let a host wait for a group. One that may take it gets it as soon as it is free.
+    """Let a host wait for a group. A host that may take the group gets it as soon as it is free.
 
     Example: rosrv drive ask base --host host:agent-1
     """

@@ -22,7 +22,7 @@ ClaimOf = Callable[[AuthorityGroup, Address], Claim | None]
 
 @dataclass(frozen=True, slots=True)
 class Holding:
-    """`renewed` is when the host last took the group again; `had_node` is since then."""
+    """A holder; `renewed` is when it last took the group again, `had_node` whether it has had a node since then."""
 
     host: Address
     since: float
@@ -31,7 +31,7 @@ class Holding:
 
 
 class GroupHolders:
-    """`claim_of(group, host)` returns the present claim of a host."""
+    """The holders of all groups; `claim_of(group, host)` returns the present claim of a host."""
 
     def __init__(self, claim_of: ClaimOf) -> None:
         self._claim_of = claim_of
@@ -45,7 +45,6 @@ class GroupHolders:
         return self._held.get(group)
 
     def waiting(self, group: AuthorityGroup, now: float) -> list[Address]:
-        """Leave out hosts that lost their claim."""
         queue = self._waiting.get(group.name, {})
         left = {
             host: since
@@ -56,14 +55,14 @@ class GroupHolders:
         return list(left)
 
     def may_take(self, group: AuthorityGroup, host: Address) -> bool:
-        """A group can be taken if it is free or the host's own, or if the host may override its holder."""
+        """Whether the group is free or the host's own, or the host may override its holder."""
         claim, holding = self._claim_of(group, host), self._held.get(group.name)
         if holding is None or holding.host == host:
             return claim in (Claim.TAKE, Claim.OVERRIDE)
         return claim is Claim.OVERRIDE
 
     def wait(self, group: AuthorityGroup, host: Address, now: float) -> bool:
-        """Return False if too many hosts wait."""
+        """Let a host wait for a group; return False if too many hosts wait."""
         waiting = self.waiting(group, now)
         if host not in waiting and len(waiting) >= MOST_WAITING:
             return False

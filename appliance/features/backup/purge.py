@@ -15,7 +15,7 @@ from appliance.supervisor.state_directory import StateDirectory, foreign
 
 
 def purge(state: Path) -> tuple[int, int]:
-    """Return the numbers of removed files and of overwritten ones.
+    """Remove the directory; return the numbers of removed and overwritten files.
 
     Raises `BackupError` if `state` does not exist or is in use, or if a file cannot be removed.
     """

@@ -59,7 +59,7 @@ def _room_in(state: Path) -> int:
 
 @contextmanager
 def _marked(state: Path) -> Iterator[None]:
-    """The mark stays during the restore. On any error, everything that was created is removed."""
+    """Mark the folder during the restore; on an error, remove everything that was created."""
     is_new = not state.exists()
     state.mkdir(mode=0o711, parents=True, exist_ok=True)
     state.chmod(0o711)
@@ -92,7 +92,7 @@ def _extract(archive: tarfile.TarFile, entry: tarfile.TarInfo, state: Path) -> N
 
 
 def _hand_over(state: Path) -> None:
-    """Each part belongs to its role's user; the group of its files is the role that may read them."""
+    """Give each part to its role's user; the group of its files is the role that may read them."""
     for role in (role for role in ROLES if role.part in KEPT_PARTS):
         account = account_of(role.user)
         group = account.gid if role.readable_by is None else account_of(role.readable_by).gid

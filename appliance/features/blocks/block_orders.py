@@ -79,11 +79,11 @@ async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
 
 
 class BlockOrders:
-    """`live()` returns the rights that a change of the policy may end, `connected()` the two hosts of each connection
-    through the relay.
+    """The operators' requests; `live()` returns the rights that a change of the policy may end.
 
-    `enrolled()` returns the addresses of enrolled hosts and doors by name, `remotes()` the real addresses of hosts in
-    tunnels by name. `carried_out()` waits until the relays have carried out all orders.
+    `connected()` yields the two hosts of each connection through the relay, `enrolled()` returns the
+    addresses of enrolled hosts and doors by name, `remotes()` the real addresses of hosts in tunnels by name.
+    `carried_out()` waits until the relays have carried out all orders.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class BlockOrders:
         return requests.BlockedHosts([self._row(row) for row in self._blocks.rows().values()])
 
     async def block(self, request: HostBlock, who: str) -> requests.HostBlocked:
-        """Raises `SenselessError`, `HostRefusedError` and `StoreError`."""
+        """Block a host. Raises `SenselessError`, `HostRefusedError` and `StoreError`."""
         address = self._address(request.address)
         _require_sensible(request)
         if str(address) not in self._enrolled().values():
@@ -160,7 +160,7 @@ class BlockOrders:
         return requests.HostBlocked(**asdict(shown), ended=ended, replaced=replaced, other_addresses=others)
 
     async def unblock(self, request: HostUnblock, who: str) -> requests.HostUnblocked:
-        """Raises `SenselessError`, `UnknownThingError` and `StoreError`."""
+        """Lift the block of a host. Raises `SenselessError`, `UnknownThingError` and `StoreError`."""
         address = self._address(request.address)
         await self._read_clock()
         earlier = self._blocks.rows().get(address)
@@ -224,7 +224,6 @@ class BlockOrders:
     # --- what may be blocked ---
 
     def _address(self, text: str) -> Address:
-        """The text may be the name of one host."""
         with contextlib.suppress(ValueError):
             return plain_address(str(ipaddress.ip_address(text)))
         policy = self._policies.current
@@ -278,7 +277,6 @@ class BlockOrders:
 
 
 def _require_possible(address: Address) -> None:
-    """Raise `HostRefusedError` for addresses that cannot be another host's."""
     if address.is_unspecified or address.is_multicast or str(address) == "255.255.255.255":
         raise HostRefusedError(f"{address} cannot be the address of a host")
     if address.is_loopback or _is_own(address):
@@ -299,7 +297,6 @@ def _require_sensible(request: HostBlock) -> None:
 
 
 def _is_own(address: Address) -> bool:
-    """A socket can be bound only to an address of this machine."""
     family = socket.AF_INET if address.version == 4 else socket.AF_INET6
     with socket.socket(family, socket.SOCK_DGRAM) as sock:
         try:

@@ -49,8 +49,8 @@ def block(
 ) -> None:
     """Block a host at once: deny all its calls, and end its registrations and connections.
 
-    It stays blocked for the given time, or until `rosrv host unblock`, also over restarts. Blocking it again replaces
-    the block.
+    The block survives restarts. It ends after the given time, or with `rosrv host unblock`. Blocking it again
+    replaces the block.
 
     Example: rosrv host block 10.0.0.7 --for 1h --note "strange traffic"
     """

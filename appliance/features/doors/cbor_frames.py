@@ -1,8 +1,9 @@
-"""Turn CBOR frames of clients into JSON, within bounds.
+"""Convert CBOR frames of clients to JSON, within bounds.
 
-cbor2 knows many tags, among them big numbers, dates, regular expressions and references to earlier values. A door needs
-none of them. So a scan of the heads comes first, and accepts only the kinds that JSON also has, byte strings, and the
-typed arrays of RFC 8746. It bounds depth and number of values, which a frame of few bytes could make large.
+cbor2 knows many tags that a door does not need, such as big numbers, dates, regular expressions and
+references to earlier values. So a scan of the heads comes first, and accepts only the kinds that JSON also
+has, byte strings, and the typed arrays of RFC 8746. It bounds depth and number of values, which a frame of
+few bytes could make large.
 """
 
 import struct
@@ -14,13 +15,13 @@ import msgspec
 from appliance.features.doors.message_reader import MessageValueError
 
 MOST_DEPTH = 70
-"""Nested arrays and objects; messages nest at most 64 levels deep."""
+"""The deepest nesting of arrays and objects; messages nest at most 64 levels deep."""
 
 MOST_ITEMS = 50_000
-"""Values of one frame; a typed array is one value."""
+"""The most values of one frame; a typed array is one value."""
 
 MOST_NUMBERS = 500_000
-"""Numbers of the typed arrays of one frame, except those of `uint8`."""
+"""The most numbers in the typed arrays of one frame, except those of `uint8`."""
 
 _CODES = {
     64: "B", 65: ">H", 66: ">I", 67: ">Q", 68: "B", 69: "<H", 70: "<I", 71: "<Q", 72: "b", 73: ">h", 74: ">i",
@@ -97,7 +98,7 @@ def _head(frame: bytes, position: int) -> tuple[int, int, int]:
 
 
 def _scan_typed_array(frame: bytes, position: int, tag: int) -> tuple[int, int]:
-    """Return the position behind a typed array, and the number of values that it becomes."""
+    """Return the position after a typed array, and the number of values that it becomes."""
     if tag not in _CODES:
         raise MessageValueError(f"the CBOR tag {tag}; only typed arrays (RFC 8746) may have tags")
     major, size, position = _head(frame, position)

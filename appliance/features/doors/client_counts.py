@@ -1,4 +1,4 @@
-"""The counts of one connection: its frames and refusals in the last minute, for operators."""
+"""Count the frames and refusals of each connection in the last minute, for operators."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -20,7 +20,7 @@ class _Counts(NamedTuple):
 
 
 class CountedClient:
-    """A connection with its counts; `queues` are those of its protocol, once it has one."""
+    """A connection with its counts; `queues` are the queues of its protocol, once it has one."""
 
     def __init__(self, session: DoorSession, peer: str, ticket: str, queues: list[ViewerQueue[Any]]) -> None:
         self.session = session

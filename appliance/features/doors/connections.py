@@ -1,4 +1,4 @@
-"""The connections of one door, which come as descriptors from the front process, bounded in number and rate.
+"""Serve the connections of one door, which arrive as descriptors, and limit their number and rate.
 
 An agent that makes a connection for each call is normal; a client that connects in a loop is not.
 """

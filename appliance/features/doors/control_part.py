@@ -45,7 +45,6 @@ async def keep(sections: Sections, store: StateStore, lifeline: ControlLifeline)
 
 
 async def inherit(base: Foundation, parts: Any) -> FeaturePart:
-    """Return the part with the processes of doors."""
     kept = base.features.kept["doors"]
     assert isinstance(kept, KeptDoors)  # noqa: S101  `keep` made it
     table = kept.table
@@ -195,7 +194,6 @@ class DoorOrders:
     # --- connections ---
 
     async def _open(self, ports: list[int]) -> str:
-        """Have the firewall reserve the network of doors and open these ports; return why it does not."""
         problem = await self._base.lifeline.open_own_network(self._base.settings.of(Doors).network, ports)
         if not problem:
             self._table.closed = ""

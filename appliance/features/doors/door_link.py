@@ -12,7 +12,7 @@ from appliance.channel.messages.message import Message
 
 
 class DoorStarted(Message, frozen=True):
-    """The first message of a process on each link: its door (empty: not known yet), and when the door was added."""
+    """The first message of a process on each link: its door (empty if unknown), and when the door was added."""
 
     name: str
     added: float
@@ -22,7 +22,8 @@ class DoorStarted(Message, frozen=True):
 class DoorGiven(Message, frozen=True):
     """Control names the door that the process serves, or changes the pages that may connect.
 
-    `tickets` are the ids of those that are valid. Connections of others end: they may be over since control ended.
+    `tickets` are the ids of the valid tickets. Connections of other tickets end, because those may have
+    expired without control.
     """
 
     name: str
@@ -92,7 +93,7 @@ class SocketRefused(Message, frozen=True):
 
 
 class ConnectionsChanged(Message, frozen=True):
-    """Connections of one peer began or ended in the last second; `reason` is that of the last end."""
+    """Connections of one peer began or ended in the last second; `reason` is the reason of the last end."""
 
     peer: str
     ticket: str
@@ -102,7 +103,7 @@ class ConnectionsChanged(Message, frozen=True):
 
 
 class DoorCounted(Message, frozen=True):
-    """The counts of the process since its start, once a second when they have changed; `connections` is the present.
+    """The counts of the process since its start, at most once a second; `connections` is the present number.
 
     `refused` counts connections, and `refusals` requests of clients.
     """
@@ -118,7 +119,7 @@ class DoorCounted(Message, frozen=True):
 
 
 MOST_SHOWN = 50
-"""Connections of a door that operators see one by one."""
+"""The most connections of a door that operators see one by one."""
 
 
 class ClientShown(msgspec.Struct, frozen=True):

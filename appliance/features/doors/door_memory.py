@@ -1,8 +1,8 @@
 """Divide the memory of one door among its clients and its node.
 
-A client holds frames that have not come whole or are being carried out, with the values and messages that are made of
-them, fragments, and replies and messages that wait for it. Two more count as clients: the messages that wait for other
-nodes, and the arguments of calls that wait for answers. Invariants:
+A client holds unfinished frames, fragments, frames in execution with their values and messages, and replies
+and messages that wait for it. Two more count as clients: the messages that wait for other nodes, and the
+arguments of calls that wait for answers. Invariants:
 
 1. Each client may hold `least` bytes, whatever the others hold: half of the whole, divided by the most clients.
 2. Beyond `least`, clients share the other half. A client gets no more of it than it leaves for all others.
@@ -24,7 +24,6 @@ class DoorMemory:
         self.shared = 0
 
     def client(self) -> "ClientMemory":
-        """Return the memory of a new client."""
         return ClientMemory(self)
 
 
@@ -71,6 +70,5 @@ class ClientMemory:
             self.add(-size)
 
     def close(self) -> None:
-        """Give back all that this client holds."""
         self.add(-self.held)
         self.closed = True

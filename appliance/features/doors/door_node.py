@@ -2,8 +2,8 @@
 
 Agents make a new connection for each call. So a topic stays registered for some seconds after its last client left,
 and a client that comes back finds it. Each new client of a topic gets the last messages of latched publishers. The
-master sees one publication and one subscription for each topic, however many connections use it. Every registration
-and every call of a service is decided by the master and the relay, as for any host; the door decides nothing.
+master sees one publication and one subscription for each topic, however many connections use it. The door decides
+nothing: the master and the relay do, as for any host.
 """
 
 import asyncio
@@ -52,7 +52,7 @@ from roswire.node.network import OwnedTasks, PeerUnreachableError
 from roswire.node.tcpros_streams import ANY
 
 _SMALL_BYTES = 1 << 16
-"""The memory for writing a message, such as a stop, that no other memory in use refuses."""
+"""A message of up to this size, such as a stop, is written even if the memory is in use."""
 
 _LINGER_SECONDS = 10.0
 _REPLAY_SECONDS = 1.0  # not longer: an old command must not reach a robot
@@ -61,23 +61,19 @@ _ASK_SECONDS, _ASK_AGAIN_SECONDS = 1.0, 10.0
 _ANSWER_SECONDS = 60.0  # for a client that answers a call of its service
 
 BuiltIn = Callable[[CallOfService], "Awaitable[Raw] | None"]
-"""Answers a call of a service that the door itself has; None if the service is not one of these."""
+"""Answers a call of a service that the door itself has; returns None for other services."""
 
 
 class _Subscriber(Protocol):
-    def heard(self, message: DoorMessage) -> None:
-        """Take a message of a subscribed topic."""
+    def heard(self, message: DoorMessage) -> None: ...
 
-    def failed(self, request: DoorRequest, reason: str) -> None:
-        """Take the refusal of a call, or the end of a subscription."""
+    def failed(self, request: DoorRequest, reason: str) -> None: ...
 
 
 class _Learner:
-    def heard(self, message: DoorMessage) -> None:
-        """Ignore a message: only the header of its publisher is wanted."""
+    def heard(self, message: DoorMessage) -> None: ...
 
-    def failed(self, request: DoorRequest, reason: str) -> None:
-        """Do nothing: a learner accepts every type."""
+    def failed(self, request: DoorRequest, reason: str) -> None: ...
 
 
 class DoorClient(_Subscriber, ParameterClient, Protocol):
@@ -85,16 +81,14 @@ class DoorClient(_Subscriber, ParameterClient, Protocol):
 
     @property
     def memory(self) -> ClientMemory:
-        """The memory that what the connection sends is charged to."""
+        """Return the memory that is charged for the connection's requests."""
 
-    def answered(self, call: int, values: Raw | bytes) -> None:
-        """Take the answer to a call."""
+    def answered(self, call: int, values: Raw | bytes) -> None: ...
 
     def ask(self, service: str, values: Raw) -> str:
-        """Take a call of an offered service, and return its id. Raises `PeerError`."""
+        """Forward a call of an offered service, and return its id. Raises `PeerError`."""
 
-    def give_up(self, call: str) -> None:
-        """Forget a call that needs no answer any more."""
+    def give_up(self, call: str) -> None: ...
 
 
 @dataclass(slots=True)
@@ -102,9 +96,9 @@ class _Publication:
     publication: NodePublication
     codec: MessageCodec
     asked: float
-    """When the master was last asked whether it grants the publication."""
+    """The time when the master was last asked whether it grants the publication."""
     doubtful: bool = False
-    """Whether its subscribers have left since then, or the master refused it."""
+    """Whether subscribers of the publication have left since then, or the master refused it."""
     refusal: RosError | None = None
     clients: set[DoorClient] = field(default_factory=set)
     wills: dict[DoorClient, Raw] = field(default_factory=dict)
@@ -262,9 +256,9 @@ class DoorNode:
         known.publish(request.values, client.memory)
 
     async def _check_granted(self, known: _Publication) -> None:
-        """Raise the master's refusal if the publication is no longer granted, such as after the end of an approval.
+        """Raise the master's refusal if the publication is no longer granted, such as after an approval's end.
 
-        The master tells no publisher. So ask it again while no subscriber is connected: soon after they left.
+        The master does not notify publishers, so it is asked again soon after the last subscriber left.
         """
         if known.publication.subscribers:
             known.doubtful, known.refusal = True, None
@@ -449,7 +443,7 @@ class DoorNode:
 
 
 def _written(writer: MessageWriter, values: Raw | bytes, memory: ClientMemory) -> bytes:
-    """Return a message of JSON values, charged while it is written, unless it is small. Raises `PeerError`."""
+    """Return a message of JSON values, whose bytes are charged unless it is small. Raises `PeerError`."""
     cost = writer.cost(values)
     with memory.holding(cost) if cost > _SMALL_BYTES else contextlib.nullcontext():
         return writer.from_json(values, present_time())

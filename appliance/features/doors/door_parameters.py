@@ -41,7 +41,7 @@ class ParameterClient(Protocol):
         """Take the refusal of a read."""
 
     def parameter_changed(self, subscribed: str, name: str, value: Value) -> None:
-        """Take the new value of a parameter, which is the subscribed one or below it; `{}` if it was deleted."""
+        """Pass on the new value of a parameter, which is the subscribed one or below it; `{}` if it was deleted."""
 
 
 class DoorParameters:
@@ -79,7 +79,6 @@ class DoorParameters:
                 self._reads[client] -= 1
 
     async def read(self, names: Sequence[str]) -> dict[str, Any]:
-        """Return the values of parameters; those that do not exist are left out."""
         if not names:
             listed = await self._node.master("getParamNames")
             names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []

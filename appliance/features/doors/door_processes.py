@@ -92,14 +92,12 @@ class DoorProcesses:
         self._appliance = self._settings.gateway if host in _EVERYWHERE else host
 
     def links(self) -> dict[str, tuple[Link, Any]]:
-        """Return control's ends of the links, by the process's title."""
         return {
             f"{ROLE}-{number + 1}" if number else ROLE: (slot.link, door_link.DoorLink)
             for number, slot in enumerate(self._slots)
         }
 
     def state(self, row: DoorRow) -> tuple[door_link.DoorCounted, str]:
-        """Return the counts of a door, and why it does not serve."""
         slot = self._slots[row.slot or 0]
         trouble = self._table.problem or slot.trouble
         return slot.counts, trouble or ("" if slot.started else "its process is starting")
@@ -255,7 +253,7 @@ class DoorProcesses:
         self._base.trail.happened("door failed", reason, host=row.address, resource=row.name)
 
     def retry(self) -> None:
-        """Listen again on ports that were taken, and start processes that do not run."""
+        """Listen again on ports that were in use, and start processes that do not run."""
         for row in self._table.live():
             slot = self._slots[row.slot or 0]
             if slot.started and slot.trouble and row.port is not None:

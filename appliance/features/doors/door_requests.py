@@ -57,7 +57,7 @@ class DoorState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class OwnDoor(msgspec.Struct, frozen=True, kw_only=True):
-    """The door of the caller: that of a token has its name, that of a person the name of a group in `sso.doors`."""
+    """The door of the caller; a token's door has its name, a person's door the name of a group in `sso.doors`."""
 
     name: Annotated[str, doc("its name, also if it does not exist; empty: the caller can have none")]
     door: Annotated[DoorState | None, doc("null: there is none")]
@@ -79,7 +79,7 @@ class NewTicket(Ticket, frozen=True, kw_only=True):
 
 
 class NewDoor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A door; an agent's door has a port, and may have the agent's address or network."""
+    """A door; an agent's door has a port, and may be limited to the agent's address or network."""
 
     name: Annotated[str, msgspec.Meta(max_length=31)]
     port: Annotated[

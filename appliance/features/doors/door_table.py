@@ -23,7 +23,7 @@ _MOST_NAMES = 2000  # including removed ones
 
 
 class DoorTable:
-    """All doors that were ever added; `closed` is why the firewall does not reserve their network (empty: it does)."""
+    """All doors that were ever added; `closed` is why the firewall does not reserve their network, or empty."""
 
     def __init__(self, store: StateStore, settings: Doors) -> None:
         self._store = store
@@ -34,12 +34,12 @@ class DoorTable:
 
     @property
     def problem(self) -> str:
-        """Return why no door can be used now; empty: they can."""
+        """Return why no door can be used now, or an empty text."""
         return self.stray or self.closed
 
     @property
     def stray(self) -> str:
-        """Return which door has an address outside of the network, and what to do; empty: none has."""
+        """Return which door has an address outside of the network, and the remedy; empty if none has."""
         stray = next((row for row in self.live() if not self._has(row.address)), None)
         if stray is None:
             return ""

@@ -23,7 +23,7 @@ LONGEST_SECONDS = 30 * 86_400.0
 
 
 class DoorTickets:
-    """All tickets that are not over; `ends` has their ends since they are known."""
+    """All tickets that are not over; `ends` has their ends, limited by the time since they were made or loaded."""
 
     def __init__(self, store: StateStore, ends: Deadlines) -> None:
         self._store = store
@@ -55,7 +55,6 @@ class DoorTickets:
         return None if row is None or row.door != door or self._ends.passed(row.id, row.expires) else row
 
     def ended(self, ticket: str) -> bool:
-        """Return whether a ticket that was valid is over."""
         row = self._rows.get(ticket)
         return row is None or self._ends.passed(row.id, row.expires)
 

@@ -299,7 +299,7 @@ class Foxglove:
         self._tell("serviceCallFailure", serviceId=service, callId=call, message=text)
 
     def failed(self, request: DoorRequest, reason: str) -> None:
-        """Refuse a request in words, and forget what it began."""
+        """Refuse a request with its reason, and forget what it began."""
         match request:
             case CallOfService():
                 service, call = self._calls.pop(request.call, (0, 0))
@@ -331,16 +331,15 @@ class Foxglove:
         self.queue.put(subscribed, frame, sys.getsizeof(frame), now)
 
     def ask(self, service: str, _values: Raw) -> str:
-        """Refuse a call: a client of this protocol offers no services."""
         raise _FoxgloveError(f"the client does not offer {service}")
 
-    def give_up(self, _call: str) -> None:
-        """Do nothing: the client has no calls."""
+    def give_up(self, _call: str) -> None: ...
 
     # --- what the door sees ---
 
     def surroundings(self, seen: DoorSurroundings) -> list[DoorRequest]:
-        """Announce what is new, and withdraw what is gone; return the ends of subscriptions to it.
+        """Announce new channels and services, and withdraw old ones; return the ends of subscriptions to old
+        ones.
 
         Clients end these subscriptions without a frame. Raises `ViewerStalledError`.
         """

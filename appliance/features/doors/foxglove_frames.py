@@ -49,7 +49,7 @@ class FoxgloveAdvertise(_Operation, tag="advertise"):
 
 
 class FoxgloveUnadvertise(_Operation, tag="unadvertise"):
-    """Advertise channels no longer."""
+    """Withdraw channels of the client."""
 
     channelIds: list[_Number]  # noqa: N815  the protocol's name
 
@@ -80,7 +80,7 @@ class FoxgloveSubscribeParameters(_Operation, tag="subscribeParameterUpdates"):
 
 
 class FoxgloveUnsubscribeParameters(_Operation, tag="unsubscribeParameterUpdates"):
-    """Follow parameters no longer; without names, none of them."""
+    """Stop following parameters; without names, all of them."""
 
     parameterNames: list[_Name]  # noqa: N815  the protocol's name
 
@@ -90,7 +90,7 @@ class FoxgloveSubscribeGraph(_Operation, tag="subscribeConnectionGraph"):
 
 
 class FoxgloveUnsubscribeGraph(_Operation, tag="unsubscribeConnectionGraph"):
-    """Follow the graph no longer."""
+    """Stop following the graph."""
 
 
 class FoxgloveFetchAsset(_Operation, tag="fetchAsset"):

@@ -58,7 +58,7 @@ class GivenNetwork:
             future.set_exception(ConnectionRefusedError(reason))
 
     def lost(self) -> None:
-        """Refuse what waits for a control that is gone."""
+        """Refuse the requests that wait for a control process that has ended."""
         for number in [*self._waiting]:
             self.refused(number, "the appliance is being restarted")
 

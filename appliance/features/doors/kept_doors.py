@@ -13,23 +13,17 @@ from appliance.policy.model import Address
 class Orders(Protocol):
     """The operators' requests about doors."""
 
-    async def listed(self, request: requests.DoorsWanted) -> requests.DoorList:
-        """Return all doors."""
+    async def listed(self, request: requests.DoorsWanted) -> requests.DoorList: ...
 
-    async def add(self, request: requests.DoorAdd, who: str) -> requests.DoorState:
-        """Add a door."""
+    async def add(self, request: requests.DoorAdd, who: str) -> requests.DoorState: ...
 
-    async def remove(self, request: requests.DoorRemove, who: str) -> requests.DoorState:
-        """Remove a door."""
+    async def remove(self, request: requests.DoorRemove, who: str) -> requests.DoorState: ...
 
-    async def ticket(self, request: requests.DoorTicket, who: str) -> requests.NewTicket:
-        """Make a ticket."""
+    async def ticket(self, request: requests.DoorTicket, who: str) -> requests.NewTicket: ...
 
-    async def own(self, request: requests.OwnDoorWanted, who: str) -> requests.OwnDoor:
-        """Return the door of the caller."""
+    async def own(self, request: requests.OwnDoorWanted, who: str) -> requests.OwnDoor: ...
 
-    async def visit(self, request: requests.DoorVisit, who: str) -> requests.NewTicket:
-        """Make a ticket for one connection to the caller's door."""
+    async def visit(self, request: requests.DoorVisit, who: str) -> requests.NewTicket: ...
 
 
 class KeptDoors:

@@ -13,11 +13,11 @@ from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 
 _MOST_CHARACTERS = 500_000
-"""The size of all kept definitions together. A codec takes up to 140 bytes for each character of its definition."""
+"""The largest size of all kept definitions. A codec takes up to 140 bytes for each character of its definition."""
 
 
 class KnownTypes:
-    """The types of one door. If they are many, those that were not used for the longest time are forgotten."""
+    """The types of one door. Beyond the limit, the least recently used types are forgotten."""
 
     def __init__(self, standard: Definitions, limits: ValueLimits) -> None:
         self._standard = self._defined = standard

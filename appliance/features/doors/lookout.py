@@ -1,4 +1,4 @@
-"""Look at the surroundings of a door: topics and services that its identity may see, with definitions and types.
+"""Find the topics and services that a door's identity may see, with definitions and types.
 
 Viewers list topics before they subscribe, and need the definitions first. A definition that the door does not know
 comes with the header of a publisher, so the door subscribes to the topic for a moment. A topic that the policy denies
@@ -34,7 +34,7 @@ class _Asked(NamedTuple):
 
 
 class Lookout:
-    """Looks at the surroundings; `learn` subscribes to a topic until its definition is known."""
+    """Finds the surroundings; `learn` subscribes to a topic until its definition is known."""
 
     def __init__(self, sight: Sight, types: KnownTypes, learn: Callable[[str], Awaitable[None]]) -> None:
         self._sight = sight
@@ -46,7 +46,7 @@ class Lookout:
         self._last: tuple[float, DoorSurroundings] | None = None
 
     async def look(self) -> DoorSurroundings:
-        """Return the present surroundings; those of the last second are good enough."""
+        """Return the surroundings, at most a second old."""
         async with self._lock:
             now = asyncio.get_running_loop().time()
             if self._last is None or now - self._last[0] > _FRESH_SECONDS:

@@ -1,8 +1,7 @@
 """Read serialised messages as plain values, which JSON and CBOR can write.
 
-For each message type, a reader is composed once of the readers of its fields. Bytes (`uint8[]`, `char[]`) become
-`bytes`, times objects with `secs` and `nsecs`. For CBOR, numeric arrays become the typed arrays of RFC 8746, which are
-the bytes of the message itself.
+Bytes (`uint8[]`, `char[]`) become `bytes`, times objects with `secs` and `nsecs`. For CBOR, numeric arrays become the
+typed arrays of RFC 8746, which are the bytes of the message itself.
 
 A small message can have very many values, such as an array of empty strings. So each read has a budget of values.
 """

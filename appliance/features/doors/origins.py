@@ -1,8 +1,8 @@
 """Decide which pages may open a WebSocket, by the Origin that a browser sends.
 
-Programs send no Origin, or that of the address they connect to. A browser sends the origin of its page. A page may have
-the name of any address (DNS rebinding), so the origin that equals the Host is only accepted if the Host is an address
-or `localhost`: those have no page but the door's own.
+Programs send no Origin, or the address they connect to. A browser sends the origin of its page. A page may
+have the name of any address (DNS rebinding), so an origin that equals the Host is accepted only if the Host
+is an address or `localhost`, which have only the door's own page.
 """
 
 import ipaddress

@@ -1,7 +1,7 @@
-"""Find the door of a signed-in caller: that of a token has the token's name, that of a person the name of a group.
+"""Find the door of a signed-in caller: the door with the token's name, or with the name of a person's group.
 
-The rights of a door are those of `door:NAME` in the policy, so the names decide who gets them. An administrator gives
-all three names: that of a token, that of a door, and those of `sso.doors`. A name that the provider gives a person
+The rights of a door are those of `door:NAME` in the policy, so the names decide who gets them. An
+administrator chooses the names of tokens and doors, and `sso.doors`. A name that the provider gives a person
 opens no door, because people can choose it at some providers.
 """
 
@@ -14,9 +14,9 @@ from appliance.store.door_tables import DoorRow
 
 
 class CallerDoor(NamedTuple):
-    """The door of a caller; without a `row`, `reason` says why there is none and what to do.
+    """The door of a caller; without a `row`, `reason` has the cause and the remedy.
 
-    `name` is that of the door, also if it does not exist. It is empty if the caller can have none.
+    `name` is the door's name, even if the door does not exist. It is empty if the caller can have none.
     """
 
     name: str
@@ -32,7 +32,6 @@ class OwnDoors:
         self._sessions = sessions
 
     def of(self, who: str) -> CallerDoor:
-        """Return the door of the token or person with this name."""
         groups = self._groups(who)
         names = [name for name in ([who] if groups is None else groups) if is_door_name(name)]
         live = {row.name: row for row in self._table.live()}
@@ -48,7 +47,6 @@ class OwnDoors:
         return CallerDoor("", None, text)
 
     def _groups(self, who: str) -> list[str] | None:
-        """Return the groups of doors of a person; None for a token."""
         sessions = self._sessions()
         found = (
             [] if sessions is None else [sessions.of(row.id) for row in sessions.rows() if row.name == who]

@@ -1,7 +1,8 @@
 """Run the process of a door: its lifeline, its link to control, its node, and its clients' connections.
 
-The process has no network: control gives it every socket (`door_link.py`). It outlives control. While control is away,
-present connections go on, and no new one of the node can be made. The process ends when its door is removed.
+The process has no network: control gives it every socket (`door_link.py`). It outlives control. While control
+is away, present connections continue, and the node can make no new ones. The process ends when its door is
+removed.
 """
 
 import asyncio

@@ -1,7 +1,7 @@
-"""The requests of a client to the node of its door, in the order in which the client made them.
+"""Define the requests of a client to the node of its door, in the client's order.
 
-The protocols of doors make them, without I/O; the session carries them out. `reply_to` is the id that the client gave,
-which the answer or the refusal repeats. Names are canonical.
+The protocols of doors make the requests, without I/O, and the session carries them out. `reply_to` is the id
+that the client gave, which the answer or the refusal repeats. Names are canonical.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from typing import TypeAlias
 import msgspec
 
 ClientId: TypeAlias = str | int | float | None
-"""The id of a client's operation; None if it gave none."""
+"""The id of a client's operation, or None."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class AdvertiseTopic:
 
 @dataclass(frozen=True, slots=True)
 class UnadvertiseTopic:
-    """Advertise a topic no longer."""
+    """Withdraw an advertisement."""
 
     topic: str
     reply_to: ClientId = None
@@ -56,7 +56,7 @@ class SubscribeTopic:
 
 @dataclass(frozen=True, slots=True)
 class UnsubscribeTopic:
-    """Subscribe to a topic no longer."""
+    """End a subscription."""
 
     topic: str
     reply_to: ClientId = None
@@ -84,7 +84,7 @@ class OfferService:
 
 @dataclass(frozen=True, slots=True)
 class WithdrawService:
-    """Offer a service no longer."""
+    """Withdraw an offered service."""
 
     service: str
     reply_to: ClientId = None
@@ -128,7 +128,7 @@ class SubscribeParameter:
 
 @dataclass(frozen=True, slots=True)
 class UnsubscribeParameter:
-    """Subscribe to a parameter no longer."""
+    """End a subscription to a parameter."""
 
     name: str
     reply_to: ClientId = None

@@ -28,25 +28,20 @@ _EXAMPLES = {"bool": "False", "string": "", "float32": "0.0", "float64": "0.0"}
 
 
 class Sight(Protocol):
-    """The part of the system that an identity may see. All methods raise `RosError` with the reason of a denial."""
+    """The part of the system that an identity may see. The methods raise `RosError` with the reason of a denial."""
 
-    async def graph(self) -> VisibleGraph:
-        """Return topics, services and nodes."""
+    async def graph(self) -> VisibleGraph: ...
 
-    async def service_header(self, service: str) -> Mapping[str, str]:
-        """Return the connection header of a service."""
+    async def service_header(self, service: str) -> Mapping[str, str]: ...
 
-    async def service_uri(self, service: str) -> str:
-        """Return the URI of a service."""
+    async def service_uri(self, service: str) -> str: ...
 
     async def parameter(self, call: str, *arguments: Value) -> Value:
         """Make a call of the parameter API, except `setParam`."""
 
-    async def set_parameter(self, name: str, value: Value) -> None:
-        """Set a parameter."""
+    async def set_parameter(self, name: str, value: Value) -> None: ...
 
-    def time(self) -> Now:
-        """Return the present time."""
+    def time(self) -> Now: ...
 
 
 class MasterSight:

@@ -1,6 +1,6 @@
 """The rosbridge protocol, version 2, of one connection, without I/O.
 
-A frame of the client goes in; requests to the node of the door and frames for the client come out. Rules:
+Rules:
 
 1. The requests of one frame are carried out in order. After a refused advertisement, its message is dropped.
 2. Every refusal is words: a `status` of the level error with the id of the operation, or a `service_response` with
@@ -207,7 +207,7 @@ class Rosbridge:
         return [SubscribeTopic(topic, kind, operation.id)]
 
     def _configure(self, spelling: str, subscription: _Subscription) -> None:
-        """Use the least of the rates and lengths of all subscriptions to a topic, as rosbridge does."""
+        """Use the lowest rate and the shortest length of all subscriptions to a topic, as rosbridge does."""
         seconds = min(one[0] for one in subscription.clients.values())
         length = min(one[1] for one in subscription.clients.values())
         self.queue.configure(spelling, depth=length or None, interval=seconds)
@@ -291,7 +291,6 @@ class Rosbridge:
     # --- answers and refusals ---
 
     def failed(self, request: DoorRequest, reason: str) -> None:
-        """Refuse a request in words, and forget what it began."""
         match request:
             case CallOfService():
                 call = self._calls.pop(request.call, None)
@@ -325,20 +324,18 @@ class Rosbridge:
             fields = {"op": "service_response", "service": call.service, "values": values, "result": True}
             self.queue.reply(json_frame(fields, call.reply_to))
 
-    def parameters(self, _values: Mapping[str, Any], _reply_to: str | None) -> None:
-        """Do nothing: this protocol has parameters as services of rosapi."""
+    def parameters(self, _values: Mapping[str, Any], _reply_to: str | None) -> None: ...
 
-    def parameter_changed(self, _subscribed: str, _name: str, _value: Value, _now: float) -> None:
-        """Do nothing: clients of this protocol do not subscribe to parameters."""
+    def parameter_changed(self, _subscribed: str, _name: str, _value: Value, _now: float) -> None: ...
 
     def surroundings(self, _seen: DoorSurroundings) -> list[DoorRequest]:
-        """Do nothing: clients of this protocol call rosapi."""
         return []
 
     def ask(self, service: str, values: Raw) -> str:
         """Send the client a call of its service, and return the id of the call.
 
-        Raises `OperationError` if it does not offer the service or has many calls, and `ViewerStalledError`.
+        Raises `OperationError` if the client does not offer the service or has many calls, and
+        `ViewerStalledError`.
         """
         spelling = self._services.get(service)
         if spelling is None:
@@ -382,7 +379,7 @@ class Rosbridge:
 
 
 def _one_type(topic: str, use: str, known: str | None, given: str | None) -> str | None:
-    """Return the type of a topic of this client; raises `OperationError` if the client names a second one."""
+    """Return the type of a topic of this client. Raises `OperationError` if the client names a second type."""
     if None not in (known, given) and known != given:
         raise OperationError(f"{topic} is {use} as {known}, not {given}")
     return known or given

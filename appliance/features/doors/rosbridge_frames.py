@@ -46,7 +46,7 @@ class AdvertiseOp(_Operation, tag="advertise"):
 
 
 class UnadvertiseOp(_Operation, tag="unadvertise"):
-    """Advertise a topic no longer; without an id, end all advertisements of the topic."""
+    """Withdraw an advertisement; without an id, all advertisements of the topic."""
 
     topic: Name
 
@@ -71,7 +71,7 @@ class SubscribeOp(_Operation, tag="subscribe"):
 
 
 class UnsubscribeOp(_Operation, tag="unsubscribe"):
-    """Subscribe to a topic no longer; without an id, end all subscriptions to the topic."""
+    """End a subscription; without an id, all subscriptions to the topic."""
 
     topic: Name
 
@@ -92,7 +92,7 @@ class AdvertiseServiceOp(_Operation, tag="advertise_service"):
 
 
 class UnadvertiseServiceOp(_Operation, tag="unadvertise_service"):
-    """Offer a service no longer."""
+    """Withdraw an offered service."""
 
     service: Name
 
@@ -164,7 +164,7 @@ def publish_frame(topic: str, message: DoorMessage, compression: Compression) ->
 
 
 def _raw_head(topic: str, message: DoorMessage) -> bytes:
-    """Return the CBOR of a raw message up to its bytes, which follow: two maps of three fields."""
+    """Return the CBOR of a raw message without its bytes, which follow: two maps of three fields."""
     secs, nsecs = divmod(message.received, 1_000_000_000)
     return b"".join(
         (

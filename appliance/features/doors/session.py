@@ -1,6 +1,6 @@
 """The WebSocket of one client: handshake, frames in both directions, and the end.
 
-The front process identifies the client, and passes its connection here as a stream. Rules:
+Rules:
 
 1. A frame is at most `frame_bytes` long, also after inflation. A browser's Origin must be listed.
 2. The session carries out the requests of the client in order. While it does so, it does not read; calls of services
@@ -61,7 +61,7 @@ _WINDOW_BITS = 12  # with this and the level, a connection takes about 40 KB for
 
 @dataclass(frozen=True, slots=True)
 class SessionOptions:
-    """The limits of a connection, and the origins whose pages may open one; times are in seconds."""
+    """The limits of a connection, and the origins whose pages may open connections; times are in seconds."""
 
     origins: tuple[str, ...] = ()
     frame_bytes: int = 8 << 20
@@ -82,35 +82,28 @@ class ClientProtocol(Protocol):
     def receive(self, frame: bytes, *, is_text: bool) -> Sequence[DoorRequest]:
         """Return the requests of a frame, whose text is UTF-8."""
 
-    def failed(self, request: DoorRequest, reason: str) -> None:
-        """Refuse a request in words."""
+    def failed(self, request: DoorRequest, reason: str) -> None: ...
 
-    def answered(self, number: int, values: Raw | bytes) -> None:
-        """Answer a call."""
+    def answered(self, number: int, values: Raw | bytes) -> None: ...
 
-    def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
-        """Send the values of parameters."""
+    def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None: ...
 
-    def parameter_changed(self, subscribed: str, name: str, value: Value, now: float) -> None:
-        """Queue the new value of a parameter."""
+    def parameter_changed(self, subscribed: str, name: str, value: Value, now: float) -> None: ...
 
     def surroundings(self, seen: DoorSurroundings) -> Sequence[DoorRequest]:
-        """Announce what the door sees, and return the requests that follow; only if `wants_surroundings`."""
+        """Announce the surroundings, and return the requests that follow; only if `wants_surroundings`."""
 
-    def ask(self, service: str, values: Raw) -> str:
-        """Send a call of an offered service, and return its id."""
+    def ask(self, service: str, values: Raw) -> str: ...
 
-    def give_up(self, call: str) -> None:
-        """Forget a call of an offered service."""
+    def give_up(self, call: str) -> None: ...
 
-    def message(self, message: DoorMessage, now: float) -> None:
-        """Queue a message."""
+    def message(self, message: DoorMessage, now: float) -> None: ...
 
     def next_frame(self, now: float) -> Frame | Pieces | None:
-        """Return the next frame to send now, or None."""
+        """Return the next frame that may be sent now, or None."""
 
     def next_time(self) -> float | None:
-        """Return the time of the next frame that waits, or None."""
+        """Return the time at which the next waiting frame may be sent, or None."""
 
 
 Protocols = Callable[[str | None], ClientProtocol]
@@ -118,7 +111,7 @@ Protocols = Callable[[str | None], ClientProtocol]
 
 
 class DoorSession:
-    """One connection, from the handshake on; `end` has the reason of its end, in words."""
+    """One connection, from the handshake on; `end` has the reason of its end."""
 
     def __init__(
         self,
@@ -171,7 +164,6 @@ class DoorSession:
         return next((one for one in offered if one in self._subprotocols), None)
 
     async def run(self) -> None:
-        """Serve the connection until its end, and release everything that it used."""
         try:
             if await self._handshake():
                 await self._serve()
@@ -279,7 +271,7 @@ class DoorSession:
             self._disconnect(CloseCode.MESSAGE_TOO_BIG, reason)
 
     async def _drop_rest(self) -> None:
-        """Read for a short time; else the client would get a reset instead of the closing frame with the reason."""
+        """Read for a short time, because otherwise the client would get a reset instead of the closing frame."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_CLOSING_SECONDS):
                 while await self._reader.read(_READ_BYTES):
@@ -364,10 +356,11 @@ class DoorSession:
         await asyncio.sleep(_CLOSING_SECONDS)  # for the client's answer to the closing frame
 
     def _take_frames(self, now: float) -> int:
-        """Give frames that may be sent now to the WebSocket; return their number of bytes, about `_BATCH_BYTES`.
+        """Pass frames that may be sent now to the WebSocket; return their number of bytes, about
+        `_BATCH_BYTES`.
 
-        Without deflate, the session writes their heads itself, and their bodies are not copied. `_flush` sends them
-        before anything else can be added, so nothing follows a closing frame.
+        Without deflate, the session writes their heads itself, and their bodies are not copied. `_flush`
+        sends them before anything else can be added, so nothing follows a closing frame.
         """
         size = 0
         while size < _BATCH_BYTES and (frame := self._protocol.next_frame(now)) is not None:

@@ -39,7 +39,7 @@ class SeenService:
 
 @dataclass(frozen=True, slots=True)
 class DoorSurroundings:
-    """The result of a look; `denial` has the reason if the policy allows none."""
+    """The surroundings that the door sees; `denial` has the reason if the policy permits no look."""
 
     graph: VisibleGraph
     topics: Sequence[SeenTopic]

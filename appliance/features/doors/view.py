@@ -36,7 +36,7 @@ class DoorHealth(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class DoorsState(msgspec.Struct, frozen=True):
-    """The doors: of each its connections, counts and restarts."""
+    """The doors, each with its connections, counts and restarts."""
 
     doors: Annotated[list[DoorHealth], doc("the oldest first")]
 
@@ -56,7 +56,7 @@ _METRICS: Mapping[str, Metric] = {
     ),
     "restarts": counter("rosrv_door_restarts_total", "unexpected ends of the process of the door", "door"),
 }  # fmt: skip
-"""The metrics by the fields of `DoorHealth`. All but the restarts begin at zero when the door's process starts."""
+"""The metrics by the fields of `DoorHealth`. All except the restarts begin at zero when the door's process starts."""
 
 
 def _alarms(state: DoorsState) -> Iterator[Trouble]:

@@ -1,4 +1,4 @@
-"""The frames that wait for one client: replies in order, and of each topic the newest messages.
+"""Queue the frames that wait for one client: replies in order, and the newest messages of each topic.
 
 A client that reads slowly loses the oldest messages of its topics, never a reply. Invariants:
 
@@ -20,10 +20,10 @@ from appliance.features.doors.requests import Frame
 
 _BURST = 1000
 _BURST_BYTES = 256 << 10
-"""Messages and bytes of a topic that may come at once, in one packet, before the first is sent."""
+"""The most bytes of a topic that may come at once, in one packet, before the first message is sent."""
 
 _OVERHEAD = 300
-"""Bytes that a waiting frame takes besides its own."""
+"""The bytes that a waiting frame takes besides its own."""
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -44,9 +44,7 @@ class _Waiting:
 
 
 class ViewerQueue(Generic[Key]):
-    """The queue of one client; times are those of a monotonic clock, in seconds. `memory` is by default that of a door
-    with one client.
-    """
+    """The queue of one client; times are monotonic seconds. `memory` defaults to that of a door with one client."""
 
     def __init__(
         self,
@@ -83,8 +81,8 @@ class ViewerQueue(Generic[Key]):
     def configure(self, key: Key, *, depth: int | None, interval: float) -> None:
         """Set the number of messages that wait, and the seconds between two of them.
 
-        Without a depth, only as many wait as a client that reads needs, and a large one only until the next comes.
-        Then a message that comes too early is dropped; with a depth, it waits.
+        With a depth, a message that comes too early waits; without, it is dropped. Then only a few messages
+        wait, and a large message only until the next one comes.
         """
         most, most_bytes = (_BURST, _BURST_BYTES) if depth is None else (depth, self._most_message_bytes)
         topic = self._topics.setdefault(key, _Waiting(most, most_bytes, interval))
@@ -105,7 +103,7 @@ class ViewerQueue(Generic[Key]):
             self.memory.add(-topic.bytes - _OVERHEAD * len(topic.items))
 
     def put(self, key: Key, item: object, size: int, now: float) -> None:
-        """Add a message of a topic that is configured; otherwise it is dropped."""
+        """Add a message of a configured topic; drop it if the topic is not configured."""
         topic = self._topics.get(key)
         if topic is None or self.memory.closed:
             return

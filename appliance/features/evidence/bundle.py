@@ -92,12 +92,12 @@ class RecordingSelection(NamedTuple):
 
 
 def export(log: Path, wanted: TimeSpan | RecordingSelection, ask: Ask, names: Names) -> Iterator[bytes]:
-    """Record and seal an export, then return the bytes of its bundle; `ask` queries the appliance.
+    """Record and seal an export, then yield the bytes of its bundle; `ask` queries the appliance.
 
     The page of the bundle has the `names`; its records are as they are stored.
 
-    The bundle of a recording has the recording's messages and all records of its period. Raises `BundleError` and
-    `LogUnreadableError`, also during the iteration.
+    The bundle of a recording has the recording's messages and all records of its period. Raises `BundleError`
+    and `LogUnreadableError`, also during the iteration.
     """
     recording: RecordingSummary | None = None
     bag = Path()
@@ -142,7 +142,6 @@ class _Bundle:
         self.count = sum(last - first + 1 for first, last in self._runs)
 
     def _find(self, execute: Callable[..., sqlite3.Cursor]) -> None:
-        """Find the records, policies and specifications of the bundle. Raises `BundleError`."""
         (self._id,) = execute("SELECT id FROM log").fetchone()
         (sealed,) = execute("SELECT max(sequence) FROM checkpoint WHERE signature IS NOT NULL").fetchone()
         found = execute(
@@ -184,7 +183,6 @@ class _Bundle:
         self._alone = sorted(loads | there)
 
     def manifest(self) -> dict[str, Any]:
-        """Return the manifest: hashes and sizes of all members, and the names of missing members."""
         manifest: dict[str, Any] = {
             "format": FORMAT, "log": self._id, "since": self._span.since, "until": self._span.until,
             "recording": self._recording.id if self._recording else "", "runs": self._runs, "missing": [],
@@ -210,7 +208,6 @@ class _Bundle:
             raise BundleError(f"{', '.join(left)} disappeared during the export: export again", "failed")
 
     def members(self, manifest: dict[str, Any]) -> Iterator[Member]:
-        """Yield all members; add the names of missing ones to the manifest."""
         yield "verify.py", [verifier_program().encode()]
         yield "audit.pub", [pinned_key_path(self._log).read_bytes()]
         for revision in sorted(self._policies):

@@ -1,4 +1,4 @@
-"""Requests of an evidence export, and their answer."""
+"""Define the requests of an evidence export, and their answer."""
 
 from typing import Annotated
 
@@ -9,22 +9,22 @@ from appliance.channel.rest_operation import rest
 
 
 class Sealed(msgspec.Struct, frozen=True):
-    """A signed checkpoint seals all that was recorded; `record` is the id of what was recorded for it, if anything."""
+    """A signed checkpoint seals all records; `record` is the id of the record of the request, if it made one."""
 
     record: str = ""
 
 
 @rest("viewer")
 class LogSealed(WaitingRequest[Sealed], frozen=True, tag="audit seal"):
-    """Have all that was recorded sealed by a signed checkpoint, now."""
+    """Seal all records now by a signed checkpoint."""
 
 
 @rest("viewer")
 class EvidenceExported(WaitingRequest[Sealed], frozen=True, tag="evidence exported"):
     """Record that a bundle was made whose manifest has this hash, and seal the record.
 
-    The bundle has this number of `records`, from `since` until before `until` (nanoseconds since the epoch), and the
-    `recording` of this id.
+    The bundle has `records` records from `since` until before `until` (nanoseconds since the epoch), and the
+    recording with the id `recording`.
     """
 
     manifest: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]

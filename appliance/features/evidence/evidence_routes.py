@@ -33,15 +33,16 @@ def routes(services: Services) -> Routes:
     async def export_evidence(
         request: Request, bearer: Reader, since: _Moment, until: _Moment = "0s"
     ) -> Response:
-        """The audit records of a time, and the policies and specifications in force, as a bundle that proves itself.
+        """The audit records of a period, and the policies and specifications in force, as a bundle that
+        proves itself.
 
-        For investigators, operators and admins. It is on record who exported what.
+        For investigators, operators and admins. The audit log records each export.
         """
         return await _bundle(services, request, bearer, TimeSpan(given(since), given(until)))
 
     @router.get("/recordings/{recording_id:recording}/evidence", responses=_ZIP, response_class=Response)
     async def recording_evidence(recording_id: OneId, request: Request, bearer: Investigator) -> Response:
-        """Return the same of the time of a recording, with its messages. For investigators."""
+        """Return a bundle of the time of a recording, with its messages. For investigators."""
         kept = RecordingSelection(recording_id, services.settings.state / "recordings")
         return await _bundle(services, request, bearer, kept)
 

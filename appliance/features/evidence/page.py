@@ -78,7 +78,6 @@ class Page:
         self._rows.append(f'<tr class="{kind}"><td class="time">{rfc3339(record["time"])}{shown}\n')
 
     def html(self, manifest: dict[str, Any]) -> bytes:
-        """Return the page; `manifest` has all members except the page."""
         runs = ", ".join(f"{first} to {last}" for first, last in manifest["runs"])
         facts = {
             "robot": self._names.robot,

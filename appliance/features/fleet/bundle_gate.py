@@ -1,9 +1,8 @@
 """Bring bundles of the fleet into force through the same gate as local loads, all parts or none.
 
-The process `bundles` offers bundles that TUF has verified. The gate decides: hosts.yaml is parsed, the policy is
-compiled and passes the bundle's own test cases, the specifications compile and every relay takes them; with
-`site_keys`, all texts are signed. Then commit-confirm begins, a trial of `confirm_seconds`. The bundle stays only if
-the robot stays healthy.
+The gate decides on bundles that TUF has verified: hosts.yaml is parsed, the policy is compiled and passes the bundle's
+own test cases, the specifications compile and every relay takes them; with `site_keys`, all texts are signed. Then a
+trial of `confirm_seconds` begins: the bundle stays only if the robot stays healthy.
 
 Invariants:
 1. Before the first change, a journal (`BundleRecord.trial`) with the way back is on the disk. If control or the
@@ -67,9 +66,7 @@ _UNCONFIRMED_CHANGE = "a local change waits for its confirmation; the bundle wai
 
 
 class Trial(msgspec.Struct, frozen=True):
-    """The journal of a trial: the bundle, and what was in force before (`hosts_back` is empty for the file
-    hosts.yaml).
-    """
+    """The journal of a trial: the bundle, and what was in force before (`hosts_back` is empty for hosts.yaml)."""
 
     path: str
     sha256: str
@@ -106,7 +103,7 @@ class BundleRecord(msgspec.Struct, frozen=True):
 
 
 def disabled_among(monitors: Iterable[str], switches: Switches) -> str:
-    """Return the end of a record that names the monitors which do nothing, or an empty text."""
+    """Return the end of a record's reason that names the disabled monitors, or an empty text."""
     off = [name for name in monitors if not (switches.enabled(name) or switches.in_shadow(name))]
     return f"; disabled on this robot: {', '.join(off)} (rosrv monitor enable)" if off else ""
 
@@ -145,7 +142,7 @@ class BundleGate:
         self._fingerprinted: tuple[object, str] = (None, "")
 
     def status(self) -> BundlesState | None:
-        """None if no bundles are configured or in force."""
+        """Return the state, or None if no bundles are configured or in force."""
         record, fleet = self._record, self._fleet
         if fleet.bundles.root is None and not record.in_force:
             return None
@@ -167,7 +164,6 @@ class BundleGate:
         )
 
     async def run(self) -> None:
-        """Undo an interrupted trial, then take bundles as they are offered."""
         if self._record.trial is not None:
             await self._undo_interrupted(self._record, self._record.trial)
         if self._record.policy_back:
@@ -277,7 +273,7 @@ class BundleGate:
             self._save(msgspec.structs.replace(self._record, trial=None))
 
     async def _try(self, trial: Trial, contents: BundleContents) -> None:
-        """Keep the bundle if the robot stays healthy; otherwise go back."""
+        """Put a bundle into force; keep it if the robot stays healthy, otherwise go back."""
         before, self._earlier = self._health(), self._policies.current
         try:
             await self._put_in_force(trial, contents)
@@ -312,14 +308,13 @@ class BundleGate:
         )
 
     async def _put_in_force(self, trial: Trial, contents: BundleContents) -> None:
-        """Raises one of `_REFUSALS`; then some parts may be in force."""
+        """Bring all parts into force. Raises one of `_REFUSALS`, after which some parts may be in force."""
         await self._monitors.take_bundle(_sources(contents), trial.who, "of the bundle")
         load = admin.PolicyLoad(contents.policy, "of the bundle", signature=contents.policy_signature)
         await self._policies.load_with(load, trial.who, _cases(contents))
         await self._hosts.take_bundle(contents.hosts or "\n", trial.who)
 
     async def _watched(self, before: RobotHealth) -> str:
-        """Return why the robot is not healthy during the trial, or an empty text."""
         deadline = clock.now() + self._fleet.bundles.confirm_seconds
         there = (self._policies.revision, self._monitors.revision)
         while True:
@@ -332,8 +327,8 @@ class BundleGate:
             await asyncio.sleep(min(_TICK_SECONDS, max(0.0, deadline - clock.now())))
 
     def _health(self) -> RobotHealth:
-        """Leave out the effects that every activation of the bundle has: denials of hosts from which it took a right,
-        and monitors that lost their state and hold.
+        """Return the robot's health without the effects that every activation of the bundle has: denials of
+        hosts that lost a right, and monitors that hold because they lost their state.
         """
         old, new, lost = self._earlier, self._policies.current, self._lost
         if old is None:
@@ -358,7 +353,6 @@ class BundleGate:
     # --- going back ---
 
     async def _undo_interrupted(self, record: BundleRecord, trial: Trial) -> None:
-        """The bundle may be tried again."""
         await self._undo(trial)
         interruptions = 1 + (record.interruptions if record.interrupted == trial.sha256 else 0)
         self._save(
@@ -369,7 +363,7 @@ class BundleGate:
             self._refuse(trial.path, trial.sha256, reason)
 
     async def _undo(self, trial: Trial) -> None:
-        """Keep parts that an operator has changed."""
+        """Go back to the state before the trial, except for parts that an operator has changed."""
         while True:
             try:
                 if self._policies.in_force.who == trial.who and self._policies.revision > trial.policy_back:

@@ -1,9 +1,8 @@
 """Compare the robot's health before and after a change: denials, monitors, processes.
 
-A host can make any number of denials, and the host from which a change takes a right has a reason to. So all denials of
-the robot's own nodes count, but of every other host a few, and of all of them together little more than the number
-that needs attention: it takes several hosts, and they can hide no denial of the robot's. Denials of a host from which
-the bundle itself took a right do not count.
+A host that loses a right may cause many denials on purpose. So all denials of the robot's own nodes count, but only a
+few of every other host, and of all other hosts together little more than the number that needs attention. Denials of a
+host from which the bundle itself took a right do not count.
 """
 
 import ipaddress
@@ -26,7 +25,8 @@ _OF_ONE_HOST, _OF_OTHER_HOSTS = 3, 12
 def counted_denials(
     by_host: Mapping[str, int], policy: Policy, deprived: Callable[[Address], bool] = lambda _host: False
 ) -> int:
-    """`by_host` has denials of unknown hosts together, under an empty name.
+    """Return the number of denials that count; `by_host` has the denials of all unknown hosts under an empty
+    name.
 
     Addresses that the policy names as one network count as one host.
     """
@@ -41,8 +41,8 @@ def counted_denials(
 
 
 class RobotHealth(NamedTuple):
-    """Denials are those of the last minute that count; `failing` monitors fail or hold topics; `processes` keep
-    ending.
+    """The robot's health; `denials` are the last minute's that count, `failing` monitors fail or hold topics,
+    `processes` keep ending.
     """
 
     denials: int

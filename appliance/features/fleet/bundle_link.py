@@ -7,7 +7,9 @@ from appliance.formats.bundle_archive import BundleContents
 
 
 class BundleOffered(Message):
-    """A verified bundle for this robot. `path` is SITE/GROUP/VERSION.tar; `sha256` identifies its archive."""
+    """The process offers a verified bundle for this robot. `path` is SITE/GROUP/VERSION.tar; `sha256`
+    identifies its archive.
+    """
 
     path: str
     sha256: str
@@ -17,8 +19,8 @@ class BundleOffered(Message):
 class BundlePollReported(Message):
     """The state of polling, after each change and each check.
 
-    `checked` is when the collector's metadata were last verified (seconds since the epoch; 0: not yet). `trouble` is
-    the reason if the last check failed; `rejected`: what the collector serves was not accepted.
+    `checked` is when the collector's metadata were last verified (seconds since the epoch; 0: not yet).
+    `trouble` is the reason if the last check failed; `rejected`: the collector's files were not accepted.
     """
 
     checked: float = 0.0
@@ -35,14 +37,14 @@ class RefusedBundle(msgspec.Struct, frozen=True):
 
 
 class BundleHealth(msgspec.Struct, frozen=True):
-    """Denials of the last minute, and monitors that fail or hold topics."""
+    """The last minute's denials, and monitors that fail or hold topics."""
 
     denials: int = 0
     failing: int = 0
 
 
 class BundleStated(Message):
-    """The bundle in force, the one under commit-confirm, and the last refused one.
+    """Control reports the bundle in force, the one under commit-confirm, and the last refused one.
 
     `changed`: an operator has since changed the policy, the specifications or the hosts on the robot.
     """

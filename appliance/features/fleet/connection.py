@@ -2,8 +2,7 @@
 
 Invariants:
 1. Only the configured collector is asked. httpcore follows no redirect, uses no proxy and expands nothing.
-2. An exchange has one deadline: connecting, the handshake, the request, the head and the body of the answer together. A
-   collector that sends or accepts a byte now and then does not extend it.
+2. An exchange has one deadline: connecting, the handshake, the request, the head and the body of the answer together.
 3. An answer beyond its size limit is discarded. Compressed answers are not requested, and rejected.
 4. After a failure the connection is closed. Each connection reads the certificate files, so replaced ones apply.
 """
@@ -54,18 +53,17 @@ class _Refusal(msgspec.Struct, frozen=True):
 
 
 class ConditionalAnswer(NamedTuple):
-    """Its entity tag is sent when it is asked for again."""
+    """An answer with its entity tag, which the next request for it repeats."""
 
     tag: bytes
     body: bytes
 
 
 class CollectorConnection:
-    """Made when it is needed. Not thread-safe."""
+    """A connection to the collector, opened when it is needed. Not thread-safe."""
 
     def __init__(self, url: str, context: Callable[[], ssl.SSLContext], name: str | None = None) -> None:
-        """`url` is `https://ADDRESS:PORT`; `context` makes the TLS context of each connection, and may raise
-        `OSError`.
+        """`url` is `https://ADDRESS:PORT`; `context` makes the TLS context of each connection, or raises `OSError`.
 
         `name` is the name in the collector's certificate (None: the address).
         """
@@ -78,11 +76,11 @@ class CollectorConnection:
         self._connection: httpcore.HTTPConnection | None = None
 
     def get(self, path: str, longest: int = _LARGEST_ANSWER) -> bytes:
-        """Raises `CollectorError`."""
+        """Return the body of an answer. Raises `CollectorError`."""
         return b"".join(self.chunks(path, longest))
 
     def get_changed(self, path: str, longest: int) -> bytes:
-        """Ask with the entity tag if it is known. Raises `CollectorError`."""
+        """Return the body, or the known one if its entity tag is still current. Raises `CollectorError`."""
         known = self._known.get(path)
         headers = [] if known is None else [("If-None-Match", known.tag)]
         with self._exchange("GET", path, headers) as answer:
@@ -95,26 +93,26 @@ class CollectorConnection:
             return body
 
     def chunks(self, path: str, longest: int) -> Iterator[bytes]:
-        """Raises `CollectorError`."""
+        """Yield the body in chunks. Raises `CollectorError`."""
         with self._exchange("GET", path) as answer:
             yield from _bounded(path, answer, longest)
 
     def put(
         self, path: str, content: Iterator[bytes], size: int, headers: Iterable[tuple[str, str]] = ()
     ) -> bytes:
-        """Send `size` bytes. Raises `CollectorError`, and what `content` raises."""
+        """Send `size` bytes and return the answer. Raises `CollectorError`, and the errors of `content`."""
         sent = [("Content-Length", str(size)), *headers]
         with self._exchange("PUT", path, sent, content, size) as answer:
             return b"".join(_bounded(path, answer, _LARGEST_ANSWER))
 
     def post(self, path: str, body: bytes) -> bytes:
-        """Raises `CollectorError`."""
+        """Send the body and return the answer. Raises `CollectorError`."""
         sent = [("Content-Length", str(len(body)))]
         with self._exchange("POST", path, sent, iter((body,)), len(body)) as answer:
             return b"".join(_bounded(path, answer, _LARGEST_ANSWER))
 
     def events(self, path: str) -> Iterator[bytes]:
-        """Yield parts until the stream ends. Raises `CollectorError`, even if the stream is silent."""
+        """Yield the parts of an event stream until it ends. Raises `CollectorError`, even if the stream is silent."""
         with self._exchange("GET", path, [("Accept", "text/event-stream")]) as answer:
             self._deadline.begin(_SILENT_SECONDS)
             for part in _checked(path, answer).iter_stream():
@@ -123,7 +121,7 @@ class CollectorConnection:
 
     @property
     def is_open(self) -> bool:
-        """The next exchange continues on the connection of the last one."""
+        """Whether the next exchange continues on the present connection."""
         connection = self._connection
         return connection is not None and connection.is_available() and not connection.has_expired()
 
@@ -141,7 +139,7 @@ class CollectorConnection:
         content: Iterator[bytes] | None = None,
         size: int = 0,
     ) -> Iterator[httpcore.Response]:
-        """Only the head of the answer is read. Raises `CollectorError`."""
+        """Send a request and yield the head of the answer. Raises `CollectorError`."""
         self._deadline.begin(_EXCHANGE_SECONDS + size / _SLOWEST_UPLOAD)
         sent: Any = [*self._headers, *headers]  # httpcore takes text and bytes, but its types say one of them
         url = f"{self.url}/{path}"
@@ -164,7 +162,7 @@ class CollectorConnection:
             raise CollectorError(f"{self.url}/{path.partition('?')[0]}: {reason}") from error
 
     def _connected(self) -> httpcore.HTTPConnection:
-        """Raises `OSError` for unusable certificate files."""
+        """Return an open connection. Raises `OSError` for unusable certificate files."""
         if self._connection is None or not self.is_open:
             self.close()
             self._connection = httpcore.HTTPConnection(
@@ -174,7 +172,7 @@ class CollectorConnection:
 
 
 class _Deadline:
-    """All waits on the connection share the deadline of an exchange."""
+    """The deadline of an exchange, which all waits on the connection share."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -242,7 +240,7 @@ class _Stream(httpcore.NetworkStream):
 
 
 def _bounded(path: str, answer: httpcore.Response, longest: int) -> Iterator[bytes]:
-    """Raises `CollectorError`."""
+    """Yield the body of at most `longest` bytes. Raises `CollectorError`."""
     size = 0
     for part in _checked(path, answer).iter_stream():
         size += len(part)
@@ -252,7 +250,7 @@ def _bounded(path: str, answer: httpcore.Response, longest: int) -> Iterator[byt
 
 
 def _checked(path: str, answer: httpcore.Response) -> httpcore.Response:
-    """Raises `CollectorError` with the collector's reason for an unexpected answer."""
+    """Return an expected answer; raise `CollectorError` with the collector's reason for any other."""
     if _header(answer, b"content-encoding") not in (b"", b"identity"):
         raise CollectorError(f"{path}: the collector compresses its answer")
     if answer.status in _EXPECTED:
@@ -284,7 +282,7 @@ def _header(answer: httpcore.Response, name: bytes) -> bytes:
 
 
 def trusting_context(ca: Path) -> ssl.SSLContext:
-    """Raises `OSError`."""
+    """Return a context that trusts only `ca`. Raises `OSError`."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     try:
@@ -296,7 +294,7 @@ def trusting_context(ca: Path) -> ssl.SSLContext:
 
 
 def robot_context(ca: Path, certificate: Path, key: Path) -> ssl.SSLContext:
-    """The context trusts only `ca`, and presents `certificate`.
+    """Return a context that trusts only `ca`, and presents `certificate`.
 
     Raises `OSError`, and `CollectorError` for a certificate that is not valid now.
     """

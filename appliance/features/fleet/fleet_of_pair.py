@@ -15,7 +15,7 @@ _SETTING = "fleet of the active appliance"
 
 
 class FleetOfAppliance(msgspec.Struct, frozen=True):
-    """The robot's name is that in the fleet; empty for none."""
+    """The fleet of an appliance; the robot's name in the fleet is empty without one."""
 
     name: str
     robot: str = ""

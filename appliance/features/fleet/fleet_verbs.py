@@ -92,7 +92,7 @@ def join(
 
 
 def leave(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
-    """Forget the collector of `rosrv fleet join`. The collector keeps what it has.
+    """Forget the collector of `rosrv fleet join`. The collector keeps all that it received.
 
     Example: sudo rosrv fleet leave
     """

@@ -12,7 +12,7 @@ _ANY = "any_name"  # stands for the stars of a key
 
 
 class LostRights:
-    """Blocks of hosts are ignored."""
+    """Finds lost rights; blocks of hosts are ignored."""
 
     def __init__(self, old: Policy, new: Policy) -> None:
         self.old, self.new = old, new
@@ -45,7 +45,6 @@ def _names(old: Policy, new: Policy, category: Category) -> Iterator[str]:
 
 
 def _matching(key: Key) -> Iterator[str]:
-    """Include names at each depth at which another key may be more specific."""
     if key.exact:
         yield key.text
         return

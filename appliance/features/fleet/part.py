@@ -13,7 +13,7 @@ _LONGEST_BUNDLE = 16 << 20
 
 
 def make_part(context: OperatorContext) -> FeaturePart:
-    """Raises `StoreError`."""
+    """Return control's part. Raises `StoreError`."""
     fleet = context.core.sections.of(Fleet)
     if context.appliance:
         compare_fleets(fleet, context.store, context.core.trail, name=context.appliance)

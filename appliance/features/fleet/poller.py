@@ -61,7 +61,6 @@ class Poller:
         return pause
 
     def report(self) -> None:
-        """Report a state that has changed, or was not reported for some time."""
         stated = self.stated()
         if stated is not None:
             self._report(stated)
@@ -138,5 +137,5 @@ def _offered(bundle: VerifiedBundle) -> BundleOffered:
 
 
 def _jittered(seconds: float) -> float:
-    """Robots must not ask at the same time."""
+    """Return the time with jitter, because robots must not ask at the same time."""
     return seconds * random.uniform(1 - _JITTER, 1 + _JITTER)  # noqa: S311  spreads load, protects nothing

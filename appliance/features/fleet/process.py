@@ -43,10 +43,10 @@ def main(lifeline_fd: int, config: Path) -> None:
 
 
 class PollLoop:
-    """One thread polls, the other listens to `events` at `path`.
+    """Two threads, of which one polls and the other listens to `events` at `path`.
 
-    The first poll, and those after events, are spread over some seconds, because all robots start or are woken at the
-    same time.
+    The first poll, and those after events, are spread over some seconds, because all robots start or are
+    woken at the same time.
     """
 
     def __init__(self, poller: Poller, events: CollectorConnection, path: str) -> None:
@@ -58,11 +58,11 @@ class PollLoop:
 
     @property
     def alive(self) -> bool:
-        """Both threads run; an exception that ends one is a logged defect."""
+        """Whether both threads run; an exception that ends one is a logged defect."""
         return all(thread.is_alive() for thread in self._threads)
 
     def start(self) -> None:
-        """The threads are daemons: the end of the process does not wait for a hanging collector."""
+        """Start the threads, as daemons: the end of the process does not wait for a hanging collector."""
         for work in (self._poll, self._listen):
             context = contextvars.copy_context()  # keeps the process name in the thread's log lines
             thread = threading.Thread(target=context.run, args=(work,), name=work.__name__, daemon=True)
@@ -175,7 +175,7 @@ def make_poller(
     stated: Callable[[], BundleStated | None],
     offer: Callable[[BundleOffered], object],
 ) -> Poller:
-    """The settings must configure bundles. Raises `OSError`."""
+    """Return the poller of settings that configure bundles. Raises `OSError`."""
     wanted = fleet.bundles
     assert wanted.root is not None  # noqa: S101  the role runs only with it
     connection = robot_connection(*fleet.connection)

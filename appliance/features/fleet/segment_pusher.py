@@ -10,7 +10,7 @@ Invariants:
 5. Records that retention removed before they had a receipt are counted and reported (`missed`).
 6. If the log was restored from a copy, pushing continues from the last checkpoint that both have.
 7. While nothing waits, the robot states so every minute (`idle`): a robot without records is not a silent one. It does
-   not while a checkpoint waits for its signature or for a receipt. An appliance that has no log yet is also idle.
+   not while a checkpoint waits for its signature or for a receipt.
 """
 
 import gzip
@@ -56,7 +56,9 @@ class PushPosition(msgspec.Struct, frozen=True):
 
 
 class StoredHead(msgspec.Struct, frozen=True):
-    """The collector's newest checkpoint of a log (number 0: none), with the hashes of all that have this number."""
+    """The collector's newest checkpoint of a log (number 0: none), with the hashes of all checkpoints of this
+    number.
+    """
 
     robot: str
     log: str
@@ -66,7 +68,7 @@ class StoredHead(msgspec.Struct, frozen=True):
 
 @dataclass(slots=True)
 class SegmentPusher:
-    """Its files are in `folder`. It trusts receipts of `receipt_key` (raw)."""
+    """Pushes segments; its files are in `folder`. It trusts receipts of `receipt_key` (raw)."""
 
     log: Path
     folder: Path
@@ -117,7 +119,7 @@ class SegmentPusher:
         return position
 
     def _kept_sequence(self, log: str, number: int) -> int:
-        """Return 0 unless segment `number` had the last receipt."""
+        """Return the last sequence of segment `number`; 0 unless it had the last receipt."""
         try:
             kept = msgspec.json.decode((self.folder / "position.json").read_bytes(), type=PushPosition)
         except (FileNotFoundError, ValueError):
@@ -125,13 +127,14 @@ class SegmentPusher:
         return kept.sequence if (kept.log, kept.number) == (log, number) else 0
 
     def _has_log(self) -> bool:
-        """Only an appliance that was never active has no log."""
+        """Whether there is a log; only an appliance that was never active has none."""
         return self.log.exists() or (self.folder / "position.json").exists()
 
     def _state_presence(self, position: PushPosition) -> bool:
-        """State that nothing waits, unless that was stated lately.
+        """Report that nothing waits, unless that was reported lately.
 
-        If the collector lacks the last segment, pushing begins again. Raises `CollectorError` and `ValueError`.
+        If the collector lacks the last segment, pushing begins again. Raises `CollectorError` and
+        `ValueError`.
         """
         now = clock.now()
         if now < self._presence_due:
@@ -182,7 +185,7 @@ class SegmentPusher:
         return True
 
     def _write(self, file: Path, number: int) -> SegmentSummary | None:
-        """Return None, without a file, if the segment is not signed yet."""
+        """Write a segment and return its summary; None, without a file, if it is not signed yet."""
         left = _LARGEST_SEGMENT
         try:
             with (
@@ -215,7 +218,7 @@ class SegmentPusher:
             )
 
     def _keep(self, receipt: SegmentReceipt) -> None:
-        """Keep the last 16 to 32 MiB of receipts."""
+        """Store a receipt, and keep only the last 16 to 32 MiB of receipts."""
         file = self.folder / "receipts.ndjson"
         with file.open("a+b") as kept:
             if kept.tell():  # a kill or a full disk may have left a part of a line
@@ -251,7 +254,7 @@ class SegmentPusher:
         )
 
     def _failed(self, error: Exception) -> float:
-        """The pause grows, with jitter, so that robots do not return together."""
+        """Return the pause after an error; it grows, with jitter, so that robots do not return together."""
         self.collector.close()
         self._position = None
         reason = str(error) or type(error).__name__

@@ -10,7 +10,7 @@ from appliance.configuration.sections import FeatureSection, key, section, split
 from appliance.formats.fleet_membership import FOLDER, SETTINGS, joined_settings
 
 PUSHER, POLLER = "fleet", "bundles"
-"""The two roles also name their links."""
+"""The names of the two roles and of their links."""
 
 _WORD = re.compile(r"[a-z0-9][a-z0-9-]{0,62}")
 
@@ -136,7 +136,7 @@ class Fleet(FeatureSection):
 
     @property
     def connection(self) -> tuple[str, Path, Path, Path, str | None]:
-        """The collector's URL, its authority, this robot's certificate and key, and the collector's name."""
+        """Return the collector's URL and authority, this robot's certificate and key, and the collector's name."""
         assert self.collector and self.ca and self.certificate and self.key  # noqa: S101  checked above
         return self.collector, self.ca, self.certificate, self.key, self.name
 
@@ -153,7 +153,7 @@ class Fleet(FeatureSection):
 
     @classmethod
     def with_stored(cls, state: Path, given: dict[str, Any]) -> dict[str, Any]:
-        """A key in `given` overrides the key of `rosrv fleet join`, unless `given` names a collector."""
+        """Return the keys in `given`, with those of `rosrv fleet join` unless `given` names a collector."""
         joined = {} if given.get("collector") else joined_settings(state)
         if not joined:
             return given

@@ -1,8 +1,8 @@
 """Verify bundles with TUF.
 
-The collector is not trusted. It can withhold a bundle, delay it, and choose one of those that the group's key has
-signed and not withdrawn. It cannot change a bundle, bring back a withdrawn one, or give a robot the bundle of another
-site, group or later ring.
+The collector is not trusted. It can withhold a bundle, and choose one of those that the group's key has signed and not
+withdrawn. It cannot change a bundle, bring back a withdrawn one, or give a robot the bundle of another site, group or
+later ring.
 
 Invariants:
 1. Every check refreshes the metadata first. Expired, older or badly signed metadata end the check.
@@ -41,11 +41,11 @@ _UNFINISHED = "tmp*"  # the names that the TUF library gives to files that it ha
 
 
 class BundleRejectedError(Exception):
-    """The text has the reason."""
+    """A bundle is not accepted; the text has the reason."""
 
 
 class BundleTooEarlyError(Exception):
-    """`at` is when the robot's ring may take the bundle (seconds since the epoch)."""
+    """The robot's ring may take the bundle from `at` on (seconds since the epoch)."""
 
     def __init__(self, path: BundlePath, at: float) -> None:
         super().__init__(f"{path} is for this robot's ring in {max(0.0, at - clock.wall()):.0f} s")
@@ -53,12 +53,12 @@ class BundleTooEarlyError(Exception):
 
 
 class BundleFolderError(Exception):
-    """Nothing is lost, and the next check tries again."""
+    """A file cannot be written; nothing is lost, and the next check tries again."""
 
 
 @dataclass(frozen=True, slots=True)
 class VerifiedBundle:
-    """A bundle that the robot may take. `sha256` identifies its archive."""
+    """A bundle that the robot may take; `sha256` identifies its archive."""
 
     path: BundlePath
     sha256: str
@@ -78,7 +78,7 @@ class SelectedBundle:
 
 
 class _Fetcher(FetcherInterface):
-    """Ask for the timestamp with its entity tag."""
+    """Fetches metadata, and the timestamp with its entity tag."""
 
     def __init__(self, connection: CollectorConnection) -> None:
         self._connection = connection
@@ -98,7 +98,7 @@ class _Fetcher(FetcherInterface):
 
 
 class VerifiedBundles:
-    """The robot's view of the bundles of its group, with trusted metadata in `folder`. Not thread-safe."""
+    """The bundles of the robot's group, with trusted metadata in `folder`. Not thread-safe."""
 
     def __init__(
         self,
@@ -177,7 +177,7 @@ class VerifiedBundles:
         return SelectedBundle(path, target)
 
     def get(self, selected: SelectedBundle) -> VerifiedBundle:
-        """Raises as `refresh`."""
+        """Return the bundle of the target. Raises as `refresh`."""
         if self._updater is None:
             raise RuntimeError("refresh the metadata first")
         with _translated():
@@ -200,7 +200,7 @@ class VerifiedBundles:
             raise BundleTooEarlyError(path, earliest)
 
     def _sync(self) -> None:
-        """The library replaces its files, but does not sync them."""
+        """Sync the library's files, which it replaces without syncing."""
         for path in (*self._metadata.rglob("*.json"), self._metadata / "root_history", self._metadata):
             descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
             try:

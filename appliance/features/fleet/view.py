@@ -14,7 +14,7 @@ from appliance.forwarding.forwarding_state import ForwardingState, samples_of
 
 
 class BundlesState(msgspec.Struct, frozen=True):
-    """The bundle of the fleet in force (SITE/GROUP/VERSION.tar; empty: none), and what became of later ones."""
+    """The bundle of the fleet in force (SITE/GROUP/VERSION.tar, or empty), and the results of later ones."""
 
     collector: Annotated[str, doc("URL of the collector")]
     in_force: Annotated[str, doc("the bundle in force; empty: none")]

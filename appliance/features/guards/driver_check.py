@@ -44,7 +44,7 @@ _LOOK_SECONDS = 0.1
 _ANSWER_SECONDS = 1.0
 _ASKED_SECONDS = 3.0
 _FURTHER_SECONDS = 10.0
-"""The monitor's line may come as much later; then the relay is not running it."""
+"""The time after which the monitor's line no longer comes, because the relay is not running it."""
 _LIMIT_SECONDS = 60.0
 _log = structlog.get_logger()
 

@@ -18,5 +18,4 @@ def sentence_of(outcome: str, seconds: float | None, why: str = "") -> str:
 
 
 def status_of(outcome: str) -> int:
-    """Return the exit status: 2 if nothing was measured."""
     return _STATUSES.get(outcome, 2)

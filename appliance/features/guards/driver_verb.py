@@ -37,11 +37,13 @@ def check_driver(
     ] = "30s",
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask; needed without a terminal")] = False,
 ) -> None:
-    """Measure whether the robot's driver stops the base when commands end, as if the appliance's machine had died.
+    """Measure whether the robot's driver stops the base when commands end, as if the appliance's machine had
+    died.
 
-    Somebody drives the base slowly, with its wheels raised or in free space. After a second the appliance withholds the
-    motions of this topic once, and watches the odometry. Every stop command passes, guards stay in force, and commands
-    pass again afterwards. Exit status: 0 the driver stopped the base, 1 it still moved, 2 not measured.
+    Drive the base slowly, with its wheels raised or in free space. After a second the appliance withholds the
+    motions of this topic once, and watches the odometry. Every stop command passes, guards stay in force, and
+    commands pass again afterwards. Exit status: 0 the driver stopped the base, 1 it still moved, 2 not
+    measured.
 
     Example: rosrv guard check-driver /cmd_vel --by /odom
     """
@@ -58,7 +60,6 @@ def check_driver(
 
 
 def _require_consent(seconds: float, *, yes: bool) -> None:
-    """Exit with status 2 unless the operator agrees."""
     typer.echo(
         f"While the base is driven slowly, its commands are withheld for up to {seconds:g} s. A driver without a"
         " timeout drives on for that time: raise the wheels, or have free space and a hand on the emergency stop.",

@@ -91,7 +91,6 @@ class GuardOrders:
             await asyncio.sleep(_LOOK_SECONDS)
 
     def look(self) -> None:
-        """Compare the counts of acts with those before."""
         guards = self._guards()
         self._acted_at = {name: at for name, at in self._acted_at.items() if name in guards}
         for name in guards:
@@ -119,7 +118,7 @@ class GuardOrders:
         return Suggestions(_suggestions_of(self._graph()))
 
     async def new(self, request: guard_requests.GuardNew, who: str) -> Replacement:
-        """Make a guard, load it and enable it. Raises `SenselessError`, and the errors of a load."""
+        """Make, load and enable a guard. Raises `SenselessError`, and the errors of a load."""
         file, text = self._made(request)
         order = admin.MonitorLoad(
             {file: text}, note=described(text), expected=request.expected, confirm_within=request.confirm_within,
@@ -143,7 +142,7 @@ class GuardOrders:
         return await self.guards(guard_requests.GuardsWanted())
 
     async def plan(self, request: guard_requests.GuardTry, who: str) -> GuardPlan:
-        """Return what a change would do; nothing changes. Raises `UnknownThingError` and `SenselessError`."""
+        """Return the effects of a change, which is not made. Raises `UnknownThingError` and `SenselessError`."""
         monitors, name = self._monitors, request.name or request.preset
         changed: dict[str, list[str]] = {}
         if request.preset:
@@ -172,7 +171,6 @@ class GuardOrders:
     async def _judged(
         self, request: guard_requests.GuardTry, file: str, text: str, who: str, *, shadow: bool
     ) -> tuple[list[str], list[str]]:
-        """Return the warnings of a change, and why it would be refused."""
         warnings: list[str] = []
         try:
             if file:
@@ -225,7 +223,7 @@ class GuardOrders:
         return guards[name], self._monitors.sources.files[self._monitors.checked.monitors[name]]
 
     def _acts_of(self, name: str) -> int:
-        """Return how many messages a guard changed, dropped or published; or would have, in shadow mode."""
+        """Return how many messages a guard changed, dropped or published, or would have in shadow mode."""
         before = "shadow " if self._monitors.switches.in_shadow(name) else ""
         return sum(self._monitors.records.counts[f"{before}{kind}", name] for kind in _ACTS)
 

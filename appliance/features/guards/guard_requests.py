@@ -37,7 +37,7 @@ class GuardValues(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class GuardDraft(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A change of a guard to try: with `preset` a new guard, else new values of the guard `name`."""
+    """A change of a guard to try: with `preset` a new guard, otherwise new values of the guard `name`."""
 
     preset: Annotated[_Name, doc("the preset of a new guard; empty: a guard that is loaded")] = ""
     topics: Annotated[_Values, doc("of a new guard, as in a new guard")] = {}
@@ -64,14 +64,14 @@ class GuardsWanted(WaitingRequest[GuardList], frozen=True, tag="guards"):
 
 @rest("viewer", "GET", "/v1/guards/suggestions", name="guard_suggestions")
 class GuardSuggestionsWanted(WaitingRequest[Suggestions], frozen=True, tag="guard suggestions"):
-    """GuardList that fit the topics of the running robot; nothing changes."""
+    """Guards that fit the topics of the running robot; nothing changes."""
 
 
 @rest(
     "admin", "POST", "/v1/guards", ("confirm_within", "hold"), name="new_guard", body=NewGuard, of=MONITORS,
 )  # fmt: skip
 class GuardNew(AdminRequest[Replacement], frozen=True, tag="guard new"):
-    """Make a guard from a preset and load it; refused if a monitor has its name, or a topic another type."""
+    """Make a guard from a preset and load it; refused if a monitor has its name, or the topic has another type."""
 
     preset: str
     topics: dict[str, str]
@@ -89,7 +89,8 @@ class GuardNew(AdminRequest[Replacement], frozen=True, tag="guard new"):
     problems=_NO_GUARD,
 )  # fmt: skip
 class GuardSet(AdminRequest[GuardList], frozen=True, tag="guard set"):
-    """Set parameters of a guard. Its state stays, except for a polygon, limits of joints, a deadline or hosts.
+    """Set parameters of a guard. It keeps its state, unless a polygon, limits of joints, a deadline or hosts
+    are set.
 
     Operators set constants with `PATCH /v1/monitors/{name}/given`.
     """
@@ -122,8 +123,8 @@ class GuardTry(WaitingRequest[GuardPlan], frozen=True, tag="guard try"):
 class DriverCheckBegin(AdminRequest[DriverCheck], frozen=True, tag="driver check"):
     """Withhold the motions of a slowly driven base once, to measure how long its driver takes to stop it.
 
-    It loads a monitor, which acts once, and is removed afterwards. The client asks for the outcome at least every three
-    seconds; otherwise the check ends.
+    The appliance loads a monitor that acts once, and removes it afterwards. The client asks for the outcome
+    at least every three seconds; otherwise the check ends.
     """
 
     command: str
@@ -134,7 +135,7 @@ class DriverCheckBegin(AdminRequest[DriverCheck], frozen=True, tag="driver check
 
 @rest("viewer", "GET", "/v1/guards/driver-check", name="driver_check")
 class DriverCheckWanted(WaitingRequest[DriverCheck], frozen=True, tag="driver check wanted"):
-    """The check of a driver. If it is under way, the answer comes with its end, or after a second."""
+    """The present check of a driver. While it runs, the answer comes with its end, or after a second."""
 
 
 REQUESTS = (

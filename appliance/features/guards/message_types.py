@@ -19,11 +19,11 @@ class TypeRow:
 
     paths: Mapping[str, str] = field(default_factory=dict)
     stops: bool = True
-    """Whether a message can stop the robot. If not, a command is dropped and all goals of its action are cancelled."""
+    """Whether a message can stop the robot. Otherwise a command is dropped and all its action's goals are cancelled."""
     parameters: str = ""
     local: str = ""
     element: str = ""
-    """The type of the elements of `values`, in variables that keep them; empty: as in the text."""
+    """The type of the elements of `values`, in variables that keep them; empty: the type in the text."""
 
 
 def _twist(before: str = "") -> TypeRow:
@@ -31,7 +31,6 @@ def _twist(before: str = "") -> TypeRow:
 
 
 def _listed(*paths: str) -> TypeRow:
-    """Return a row whose `values` are these numbers."""
     names = [f"v{place}" for place in range(len(paths))]
     return TypeRow(
         dict(zip(names, paths, strict=True)),
@@ -121,7 +120,7 @@ PRIVATE = {
         "std_msgs/String",
     )
 }  # fmt: skip
-"""Messages that a preset does not read."""
+"""Rows of messages that a preset does not read."""
 
 _EVENT = re.compile(
     r"event (?P<name>\w+)\((?P<parameters>[^)]*)\) (?P<topic>\w+)\s+(?P<type>\w+/\w+)\s+'\{(?P<pattern>[^}]*)\}' \{"

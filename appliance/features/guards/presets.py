@@ -46,7 +46,7 @@ class GuardError(UserError):
 
 @dataclass(frozen=True)
 class Parameter:
-    """A value of a preset that operators set. `loads`: it is in the text, so another value is another text."""
+    """A value of a preset that operators set. `loads`: the value is in the text, so a new value needs a load."""
 
     name: str
     kind: str
@@ -58,7 +58,7 @@ class Parameter:
     loads: bool = False
 
     def checked(self, value: str) -> str:
-        """Return a value as the text has it. Raises `GuardError`."""
+        """Return a value in the form of the text. Raises `GuardError`."""
         if self.kind == "bool":
             if value not in {"true", "false"}:
                 raise GuardError(f"{self.name}={value}: write {self.name}=true or {self.name}=false")
@@ -128,7 +128,6 @@ class Preset:
 
     @property
     def what(self) -> str:
-        """The effect: the second line of the text."""
         return self.text.split("\n", 2)[1].removeprefix("// ")
 
     @property
@@ -138,7 +137,6 @@ class Preset:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Values that operators set; not the topics."""
         given = (
             Parameter(one["name"], one["kind"], one["default"], one["unit"] or "", one["least"] or "",
                       one["most"] or "", one["remark"] or "")
@@ -151,7 +149,6 @@ class Preset:
         return {one["name"]: one["default"] for one in self._given if one["kind"] == "topic"}
 
     def parameter(self, name: str) -> Parameter:
-        """Return a parameter. Raises `GuardError`."""
         for one in self.parameters:
             if one.name == name:
                 return one
@@ -182,7 +179,7 @@ PRESETS = {
 }
 
 DRIVER_CHECK = Preset("driver_check", {**_MOVES, "by": types.MOTIONS})
-"""Not a guard: a monitor that `rosrv guard check-driver` loads for a short time."""
+"""The preset of the monitor that `rosrv guard check-driver` loads for a short time; not a guard."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +194,6 @@ class Guard:
 
 
 def preset_named(name: str) -> Preset:
-    """Return a preset. Raises `GuardError`."""
     if name not in PRESETS:
         raise GuardError(f"there is no preset {name!r}; use one of: {', '.join(PRESETS)}")
     return PRESETS[name]

@@ -27,7 +27,7 @@ class TopicFacts(NamedTuple):
 
 @dataclass(frozen=True)
 class Proposal:
-    """A guard that fits the graph. `measured`: values from the present rates; the others are defaults."""
+    """A guard that fits the graph; `measured` are values from the present rates, and all others are defaults."""
 
     preset: str
     name: str
@@ -60,7 +60,6 @@ def proposals(graph: Iterable[TopicFacts]) -> list[Proposal]:
 
 
 def _commands_a_base(topic: TopicFacts, topics: Iterable[TopicFacts]) -> bool:
-    """Return whether a subscriber is the base, not a node that passes commands on, such as a multiplexer."""
     passing = {
         node
         for one in topics
@@ -117,7 +116,7 @@ def _sources(
     prefer: "re.Pattern[str] | None" = None,
     avoid: "re.Pattern[str] | None" = None,
 ) -> list[TopicFacts]:
-    """Return topics of these types that a node publishes, the likeliest first: in the namespace of the command."""
+    """Return topics of these types that a node publishes; those in the namespace of the command come first."""
     found = [one for one in topics if one.type in rows and one.publishers and not _COMMAND.search(one.name)]
 
     def order(one: TopicFacts) -> tuple[bool, bool, int, str]:
@@ -141,5 +140,5 @@ def _silence(topic: TopicFacts, least: float, most: float) -> dict[str, str]:
 
 
 def _name(preset: str, topic: TopicFacts, alone: bool) -> str:
-    """Return the name of a guard: of its preset, and of its topic if the robot has several that need guards."""
+    """Return the name of a guard: its preset's, with the topic if the robot needs several such guards."""
     return preset if alone else f"{preset}_{re.sub(r'[^a-z0-9]+', '_', topic.name.lower()).strip('_')[-50:]}"

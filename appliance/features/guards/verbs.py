@@ -175,7 +175,8 @@ def set_values(
     since: Annotated[str, typer.Option("--since", help="With --dry-run: from this time on")] = "1h",
     hold: _Hold = False,
 ) -> None:
-    """Set parameters of a guard while it runs. Its state stays, except for a polygon, limits, a deadline or hosts.
+    """Set parameters of a guard while it runs. It keeps its state, unless a polygon, limits, a deadline or
+    hosts are set.
 
     Example: rosrv guard set fence margin=0.5
     """
@@ -246,7 +247,6 @@ def remove(appliance: Appliance, name: _Name, confirm_within: ConfirmWithin = No
 
 
 def _runs(appliance: Appliance) -> bool:
-    """Return whether an appliance answers; presets are listed without one also."""
     from appliance.cli.connection.admin_client import NotRunningError  # noqa: PLC0415  only for this verb
 
     try:
@@ -293,7 +293,7 @@ def _say_changed(appliance: Appliance, body: Replacement) -> None:
 
 
 def _folder(appliance: Appliance, loaded: Monitors) -> Path | None:
-    """Return the appliance's folder of specifications; over REST, a folder of this machine may be another's."""
+    """Return the appliance's folder of specifications; None over REST, whose folder may be on another machine."""
     if loaded.folder is None or appliance.place is not None:
         return None
     return Path(loaded.folder) if Path(loaded.folder).is_dir() else None

@@ -18,7 +18,7 @@ class LimitList(msgspec.Struct, frozen=True):
 
 @rest("viewer", "GET", "/v1/limits", name="limits", tag="status")
 class LimitsWanted(AdminRequest[LimitList], frozen=True, tag="limits"):
-    """The finite resources that hosts can exhaust: used of allowed, and the host that uses most of each."""
+    """The finite resources that hosts can exhaust: used, allowed, and the host that uses most of each."""
 
 
 REQUESTS = (LimitsWanted,)

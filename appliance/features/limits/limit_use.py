@@ -25,7 +25,7 @@ async def inherit(base: Foundation, parts: Parts) -> FeaturePart:
 
 @dataclass(frozen=True)
 class LimitQueries:
-    """`features()` returns the resources of features."""
+    """Answers `LimitsWanted`; `features()` returns the resources of features."""
 
     parts: Parts
     settings: Settings
@@ -80,7 +80,7 @@ _MEMORY: dict[str, tuple[str, QuotaRow]] = {
     "queues": ("bytes waiting for subscribers", RELAY_QUEUES),
     "latched": ("bytes of latched messages", RELAY_LATCHED),
 }
-"""A row has the relay that holds most of the resource."""
+"""The kinds of relay memory; each row has the relay that holds most."""
 
 _WHOLE_MEMORY = sum(row.bounds.whole for _resource, row in _MEMORY.values())  # as `RelayMemory.of` divides it
 

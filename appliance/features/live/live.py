@@ -61,14 +61,14 @@ def routes(services: Services) -> Routes:
 
     @router.get("/whoami")
     async def whoami(bearer: Viewer) -> Holder:
-        """Return the name and role of the token that asks, and when it ends."""
+        """Return the name and role of the token that asks, and its end."""
         return Holder(bearer.name, bearer.role, bearer.expires)
 
     @router.get("/history", operation_id="history", dependencies=[VIEWER])
     async def last_hour(
         points: Annotated[int, Query(ge=2, le=1800, description="maximum number of samples")] = 360,
     ) -> Hour:
-        """Decisions, relayed messages and what monitors did over the last hour, as counters."""
+        """Decisions, relayed messages and actions of monitors over the last hour, as counters."""
         return Hour(services.history.samples(points))
 
     @router.get("/live", operation_id="live_state", responses=_TEXT, response_class=Response)
@@ -79,8 +79,8 @@ def routes(services: Services) -> Routes:
     ) -> Response:
         """Status, open alarms and a sample every two seconds (server-sent events).
 
-        `now`: `{status, alarms, sample}`; `graph`: as `/v1/graph`; `away`: `{reason}` while RVMaster does not answer.
-        Ends when the token does, and when this appliance becomes the standby.
+        `now`: `{status, alarms, sample}`; `graph`: as `/v1/graph`; `away`: `{reason}` while RVMaster does not
+        answer. The stream ends when the token ends, or when this appliance becomes the standby.
         """
         seen = services.history.seen
         if seen.active:  # the state is at most `history.IDLE_SECONDS` old

@@ -172,7 +172,6 @@ _PORTS = {"open": 1, "closed": 0, "unknown": -1}
 
 
 def _tunnels(hosts: list[Host]) -> dict[str, _Samples]:
-    """Revoked hosts are only counted."""
     enrolled = [host for host in hosts if host.serial is not None and host.revoked is None]
     now = clock.wall()
     return {
@@ -192,7 +191,7 @@ def _tunnels(hosts: list[Host]) -> dict[str, _Samples]:
 
 
 def _named(processes: Sequence[ProcessInfo]) -> Iterator[tuple[str, ProcessInfo]]:
-    """Two processes of one role are two series."""
+    """Yield processes with the names of their series, because one role may have two."""
     return zip(process_names(processes), processes, strict=True)
 
 

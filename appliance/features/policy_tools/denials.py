@@ -18,7 +18,7 @@ from appliance.policy.model import Category
 from appliance.policy.policy_settings import AT_ONCE
 
 _ASKS = {"topic": "requestTopic", "service": "lookupService"}
-"""The call that grants a connection of this category."""
+"""The calls that grant a connection, by category."""
 
 
 def is_denial(record: AuditRecord) -> bool:
@@ -34,7 +34,7 @@ def asks_policy(record: AuditRecord) -> bool:
 
 
 def asked_of(record: AuditRecord) -> DecidedRequest:
-    """Raises `UngrantableError` if no change of the policy would allow it."""
+    """Return the request. Raises `UngrantableError` if no change of the policy would allow it."""
     what = DENIALS.get(record.event)
     if what is None:
         raise UngrantableError("it is not a record of a decision about a host's call")
@@ -121,4 +121,4 @@ DENIALS: dict[str, str | Callable[[AuditRecord], DecidedRequest]] = {
     "tunnel refused": "a tunnel needs a valid certificate of this appliance (rosrv host list)",
     "packets refused": "replayed packets, and packets with the address of another host, are never accepted",
 }
-"""A function that derives the request from the record, or why no policy would allow it."""
+"""The functions that derive the request from a record, or why no policy would allow it, by event."""

@@ -113,7 +113,6 @@ def _sources(appliance: Appliance, old: str | None, new: str | None) -> tuple[_S
 
 
 def _source(appliance: Appliance, word: str) -> _Source:
-    """A number is a revision (`./7` is a file)."""
     return _revision(appliance, int(word)) if word.isdecimal() else _Source(word, read_text(Path(word)))
 
 
@@ -139,7 +138,7 @@ def _known(
     robot: list[str] | None,
     enrolled: list[str] | None,
 ) -> PolicyContext:
-    """For a revision of the appliance, include the hosts that the appliance knows."""
+    """Return the hosts for a comparison; for a revision, those that the appliance knows."""
     return (
         known_of(robot, enrolled) if _are_files(old, new) else policy_in_force(appliance, robot, enrolled)[2]
     )
@@ -177,7 +176,7 @@ def _requests(file: Path | None, appliance: Appliance) -> Iterator[Request]:
 
 
 def _say_requests(differences: list[Difference]) -> None:
-    """Requests of several nodes with the same decisions are printed once."""
+    """Print the differences, once for several nodes with the same decisions."""
     equal: dict[tuple[str, ...], list[Difference]] = {}
     for one in differences:
         request = one.request

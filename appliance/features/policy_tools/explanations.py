@@ -32,7 +32,7 @@ _GRANTED = (
 
 
 def granted(record: AuditRecord, current: PolicyKnown, *, whole_tool: bool = False) -> Granted:
-    """Raises `UngrantableError` if no change allows the request.
+    """Return the change that grants the request. Raises `UngrantableError` if no change does.
 
     `whole_tool`: the change also has all other rights that the stock tool of the record needs.
     """
@@ -62,7 +62,7 @@ def explained(
     in_full: LogEntry | None = None,
     host_in_words: HostInWords = str,
 ) -> Why:
-    """A denial that a policy might allow needs `current`.
+    """Return the explanation of a record; a denial that a policy might allow needs `current`.
 
     `in_full`: the record that a record of repetitions continues.
     """
@@ -80,7 +80,7 @@ def explained(
 
 
 def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> PolicyJudgement:
-    """With `cases`, also run the test cases in the file next to the policy file.
+    """Return the errors and warnings of a text; with `cases`, also run the test cases beside the policy file.
 
     Raises `ProblemError` with every finding if the text or the cases are invalid.
     """
@@ -96,7 +96,7 @@ def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> Policy
 def explanation(
     text: str | None, current: PolicyKnown, *, host: str, node: str, category: Category, resource: str
 ) -> DecisionExplanation:
-    """Raises `ProblemError` if the request is invalid."""
+    """Return why a request is decided as it is. Raises `ProblemError` if the request is invalid."""
     fields = msgspec.structs.asdict(current)
     known = PolicyContext.of(fields)
     policy = judge_text(text, current, cases=False).policy

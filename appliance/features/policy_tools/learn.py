@@ -1,7 +1,7 @@
 """Learn a least-privilege policy from the recorded decisions of a robot.
 
-Run the robot with `audit-only = all`, then learn from the recorded decisions. Each used right is granted to the hosts
-that used it; nothing else is granted. Three keys are wider than observed, because the next run needs them:
+Each used right is granted to the hosts that used it; nothing else is granted. Three keys are wider than observed,
+because the next run needs them:
 
 1. An anonymous node name (`/rostopic_4711_1700000000000`) becomes a pattern (`/rostopic_*`).
 2. `searchParam` needs the right to find every parameter that it tries, whether it is found or not: the next run may
@@ -11,8 +11,8 @@ that used it; nothing else is granted. Three keys are wider than observed, becau
 
 A host that used a right with approvals only is written behind `ask`.
 
-The result is written for engineers: every line names the nodes that used the right, and how often. Hosts that occur
-together on several lines become a group. A parameter's key is left out if the key above it has the same hosts.
+Every line names the nodes that used the right, and how often. Hosts that occur together on several lines become a
+group. A parameter's key is left out if the key above it has the same hosts.
 """
 
 from collections import Counter
@@ -54,7 +54,7 @@ class _Right:
 
 @dataclass(frozen=True, slots=True)
 class LearnedPolicy:
-    """`left_out` is the number of requests that no rule can grant."""
+    """The policy; `left_out` is the number of requests that no rule can grant."""
 
     text: str
     requests: int
@@ -62,7 +62,7 @@ class LearnedPolicy:
 
 
 def learn(observations: Iterable[Observation], robot: Collection[Address | Network] = ()) -> LearnedPolicy:
-    """`robot` lists the addresses of the group `robot`."""
+    """Return the policy that grants the observations; `robot` lists the addresses of the group `robot`."""
     rights: dict[tuple[Category, str], _Right] = {}
     requests = left_out = 0
     for observation in observations:
@@ -84,7 +84,6 @@ def learn(observations: Iterable[Observation], robot: Collection[Address | Netwo
 
 
 def covered(given: Network, places: Iterable[Network]) -> bool:
-    """Return whether all addresses of a network are among these."""
     return any(
         given.version == place.version and given.subnet_of(place)  # type: ignore[arg-type]  # both are of one version
         for place in places

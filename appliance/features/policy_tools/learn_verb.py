@@ -88,7 +88,6 @@ def _observations(appliance: Appliance, since: str | None) -> Iterator[Observati
 
 
 def _members(appliance: Appliance, robot: list[Network]) -> list[Network]:
-    """Report addresses that are not the group `robot` of the running appliance; they stay addresses."""
     try:
         own = running_robot(appliance) if robot else []
     except NotRunningError:

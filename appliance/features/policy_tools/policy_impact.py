@@ -23,7 +23,7 @@ from rosmop.tool.terminal import printable
 
 @dataclass(frozen=True)
 class PolicyImpact:
-    """`ends` are the live connections that the policy would end."""
+    """The effects of a policy; `ends` are the live connections that it would end."""
 
     findings: list[PolicyFinding]
     ends: list[Ending]
@@ -32,7 +32,7 @@ class PolicyImpact:
 def impact_of(
     appliance: Appliance, file: Path, robot: list[str] | None, enrolled: list[str] | None
 ) -> PolicyImpact:
-    """`robot` and `enrolled` override what the appliance knows. Raises `NotRunningError`."""
+    """Return the impact of a file; `robot` and `enrolled` override the appliance's. Raises `NotRunningError`."""
     if appliance.place is not None:
         return _by_dry_run(appliance, file)
     known = known_of(robot, enrolled, PolicyContext.of(asdict(appliance.ask(PolicyWanted()).given())))

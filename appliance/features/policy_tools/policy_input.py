@@ -43,7 +43,7 @@ Enrolled = Annotated[
 
 
 def read_text(file: Path) -> str:
-    """Invalid UTF-8 becomes U+FFFD, which policies allow only in comments."""
+    """Return the text; invalid UTF-8 becomes U+FFFD, which policies allow only in comments."""
     try:
         return read_given_text(file, errors="replace")
     except OSError as error:
@@ -53,14 +53,14 @@ def read_text(file: Path) -> str:
 def known_of(
     robot: list[str] | None, enrolled: list[str] | None, running: PolicyContext | None = None
 ) -> PolicyContext:
-    """Options override the hosts of the running appliance."""
+    """Return the known hosts; options override those of the running appliance."""
     known = running or PolicyContext()
     hosts = dict(_enrolled(text) for text in enrolled or ())
     return replace(known, hosts={**known.hosts, **hosts}, robot=networks_of(robot) or known.robot)
 
 
 def networks_of(robot: list[str] | None) -> list[Network]:
-    """Exits with status 2 for an invalid network."""
+    """Return the networks of `--robot`. Exits with status 2 for an invalid network."""
     return [_network(text) for text in robot or ()]
 
 
@@ -100,7 +100,7 @@ def policy_in_force(
 
 
 def running_robot(appliance: Appliance) -> list[Network]:
-    """Raises `NotRunningError`."""
+    """Return the addresses of the group `robot`. Raises `NotRunningError`."""
     body = appliance.ask(PolicyWanted()).given() if appliance.place is None else _over_rest(appliance)
     return [canonical_network(ipaddress.ip_network(place)) for place in body.robot]
 
@@ -118,7 +118,7 @@ def _over_rest(appliance: Appliance) -> PolicyInForce:
 
 
 def asking_host(text: str, policy: Policy) -> Address:
-    """`text` may be the name of one host. Raises `BadWordError`."""
+    """Return the address in `text`, or of the one host with this name. Raises `BadWordError`."""
     try:
         return find_host(text, policy)
     except BadWordError as error:
@@ -133,7 +133,7 @@ def asking_host(text: str, policy: Policy) -> Address:
 
 
 def requests_of_file(file: Path) -> Iterator[Request]:
-    """The file is NDJSON with `host`, `caller_id`, `category`, `resource`."""
+    """Yield the requests of an NDJSON file with `host`, `caller_id`, `category`, `resource`."""
     for number, line in enumerate(read_text(file).split("\n"), start=1):
         if not line.strip():
             continue
@@ -146,19 +146,19 @@ def requests_of_file(file: Path) -> Iterator[Request]:
 
 
 def request_of(host: str, caller_id: str, category: str, resource: str) -> Request:
-    """Raises `ValueError`."""
+    """Return the request of these words. Raises `ValueError`."""
     address = canonical_address(ipaddress.ip_address(host))
     return Request(address, str(caller_id or ""), Category(category), str(resource))
 
 
 def live_now(appliance: Appliance) -> list[LiveRight]:
-    """Raises `NotRunningError`."""
+    """Return the live rights. Raises `NotRunningError`."""
     answer = appliance.ask(RegistrationsWanted())
     return [LiveRight.of(asdict(row)) for row in answer.given().registrations] if answer.ok else []
 
 
 def requests_of_audit_log(appliance: Appliance) -> Iterator[Request]:
-    """Folded records are left out: they do not name their requests."""
+    """Yield the requests in the log, without folded records, which do not name their requests."""
     decided = Filter(decision=("allow", "deny", "would deny"))
     try:
         for entry in appliance.audit().export(decided):

@@ -11,7 +11,7 @@ from appliance.policy.model import Category
 
 
 class RuleText(msgspec.Struct, frozen=True):
-    """The place of a rule in a file."""
+    """A rule and its place in a file."""
 
     section: str
     key: str
@@ -20,7 +20,7 @@ class RuleText(msgspec.Struct, frozen=True):
 
 
 class LostRule(msgspec.Struct, frozen=True):
-    """A rule that speaks of the resource and does not decide."""
+    """A rule about the resource that does not decide."""
 
     rule: RuleText
     would: Literal["allow", "deny"]
@@ -28,7 +28,7 @@ class LostRule(msgspec.Struct, frozen=True):
 
 
 class Explained(msgspec.Struct, frozen=True, kw_only=True):
-    """Why a request is decided as it is; `node` is the right to the node's name, where that is needed too."""
+    """The decision of a request with its reason; `node` is the right to the node's name, if it is also needed."""
 
     host: str
     caller_id: str
@@ -50,7 +50,7 @@ class Explained(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Question(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A request to explain; `text`: under this policy instead of the one in force."""
+    """A request to explain; `text` is another policy than the one in force."""
 
     host: Annotated[str, doc("an address, or `robot`", min_length=1, max_length=100)]
     node: Annotated[str, msgspec.Meta(max_length=256)] = ""
@@ -60,13 +60,13 @@ class Question(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class Draft(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The text to run them on; null: the policy in force."""
+    """The text on which the tests run; null: the policy in force."""
 
     text: Text | None = None
 
 
 class Case(msgspec.Struct, frozen=True, kw_only=True):
-    """One case: what it expects, and what is decided; `line` and `column` are its place in `file`."""
+    """A test case: the expected and the present decision; `line` and `column` are its place in `file`."""
 
     file: str
     line: int
@@ -82,7 +82,7 @@ class Case(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Tested(msgspec.Struct, frozen=True, kw_only=True):
-    """The cases of the policy's tests, at most a thousand of them; none when the file does not exist."""
+    """The test cases of the policy, at most a thousand; none if the file does not exist."""
 
     file: str
     exists: bool

@@ -75,7 +75,7 @@ def _of_policy(services: Services) -> Routes:
 
     @router.post("/explain")
     async def explain_under(question: Annotated[Question, body(Question)], bearer: Viewer) -> Explained:
-        """Return the same under another text, which is not loaded."""
+        """Explain the decision of a request under another text, which is not loaded."""
         return await explained(question, bearer)
 
     @router.post("/test")
@@ -103,9 +103,11 @@ def _of_records(services: Services) -> Routes:
 
     @router.get("/{record_id}/why", responses=UNKNOWN)
     async def why_of_record(record_id: OneRecord, bearer: Viewer) -> Why:
-        """Explain a record: its cause, the deciding events and values (not for viewers), and the places in the text.
-        For a monitor's verdict, these events alone lead to it. For a denial, the answer has the smallest change of the
-        policy in force that would allow it.
+        """Explain a record: its cause, the deciding events and values (not for viewers), and the places in
+        the text.
+
+        For a monitor's verdict, these events alone lead to it. For a denial, the answer has the smallest
+        change of the policy in force that would allow it.
         """
         shown = await desk.record(bearer, record_id, 0)
         record = readable_by(shown.entry, bearer).record
@@ -121,9 +123,10 @@ def _of_records(services: Services) -> Routes:
 
     @router.get("/{record_id}/grant", responses=UNKNOWN | _NO_GRANT)
     async def grant_of_record(record_id: OneRecord, bearer: Viewer, *, tool: bool = False) -> Granted:
-        """Return the smallest change of the policy in force that grants what this record says was refused.
+        """Return the smallest change of the policy in force that grants the denied request of this record.
 
-        `tool`: the change also has all other rights that the stock tool of the record needs, such as rostopic.
+        `tool`: the change also has all other rights that the stock tool of the record needs, such as
+        rostopic.
         """
         shown = await desk.record(bearer, record_id, 0)
         known = await ask(services.control, PolicyWanted(), bearer)

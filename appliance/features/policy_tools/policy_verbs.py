@@ -127,7 +127,7 @@ def _allowing(policy: Policy, request: Request) -> Iterator[str]:
 def compiled(
     appliance: Appliance, file: Path | None, robot: list[str] | None, enrolled: list[str] | None
 ) -> Policy:
-    """Without a file, return the policy in force with its blocks. Exits with status 1 if it has errors."""
+    """Return the policy of a file, or the one in force with its blocks. Exits with status 1 if it has errors."""
     if file is not None:
         return _judge_or_exit(file, robot, enrolled).policy
     text, name, known = policy_in_force(appliance, robot, enrolled)

@@ -14,10 +14,10 @@ from appliance.policy.rights import decide, decide_right, rights_of
 
 @dataclass(frozen=True, slots=True)
 class HostAnswer:
-    """`network` is None for all hosts that no network of the policy contains.
+    """An answer for some hosts; `network` is None for all hosts that no network of the policy contains.
 
-    `names` are the names of the network: `robot`, `host:NAME`. `through` are the words of the deciding rule that
-    include the hosts. `near`: only a further right is missing, such as the one on the command.
+    `names` are the names of the network: `robot`, `host:NAME`. `through` are the words of the deciding rule
+    that include the hosts. `near`: only another right is missing, such as the right to the command.
     """
 
     network: Network | None
@@ -28,7 +28,6 @@ class HostAnswer:
 
     @property
     def hosts(self) -> str:
-        """The address, the network, or `every other host`."""
         if self.network is None:
             return "every other host"
         return str(
@@ -41,8 +40,8 @@ class HostAnswer:
 def who_may(policy: Policy, category: Category, resource: str, node: str = "") -> Iterator[HostAnswer]:
     """Yield networks in order of addresses, then all other hosts.
 
-    Without the name of a `node`, the right to a node's name is not decided. Blocks of hosts, approvals, and the
-    holders of groups are ignored.
+    Without the name of a `node`, the right to a node's name is not decided. Blocks of hosts, approvals, and
+    the holders of groups are ignored.
     """
     policy = replace(policy, blocks={}, holders=None, approved=None)
     networks = sorted(policy.hosts.networks(), key=lambda one: (one.version, one))

@@ -30,7 +30,7 @@ _U32, _U64, _STAMP = struct.Struct("<I"), struct.Struct("<Q"), struct.Struct("<I
 
 
 class MessagePosition(NamedTuple):
-    """`chunk` and `offset` are offsets in the file and in the chunk."""
+    """A position; `chunk` and `offset` are offsets in the file and in the chunk."""
 
     time: int
     chunk: int
@@ -45,7 +45,7 @@ class MessagePosition(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """Times of the first and last message, and the offset in the file."""
+    """A chunk: times of the first and last message, and its offset in the file."""
 
     first: int
     last: int
@@ -80,7 +80,7 @@ class BagReader:
     @classmethod
     @contextmanager
     def of(cls, path: Path) -> Iterator[Self]:
-        """Raises `OSError` and `ValueError`, even while the bag is read in the block."""
+        """Yield the bag at a path. Raises `OSError` and `ValueError`, even while the bag is read in the block."""
         with path.open("rb") as file:
             try:
                 yield cls(file)
@@ -88,7 +88,7 @@ class BagReader:
                 raise ValueError(f"not a bag that the recorder wrote: {error!r}") from None
 
     def index(self, chunk: Chunk) -> Iterator[tuple[int, bytes]]:
-        """An entry is an `INDEX_ENTRY`: seconds, nanoseconds, offset."""
+        """Yield the index entries of a chunk (`INDEX_ENTRY`): seconds, nanoseconds, offset."""
         self._file.seek(chunk.place)
         if read_fields(self._file)["op"] != CHUNK:
             raise ValueError("a chunk is not at the offset in the index")
@@ -103,14 +103,12 @@ class BagReader:
             self._file.seek(after)
 
     def places(self, chunk: Chunk, connections: Collection[int]) -> Iterator[tuple[MessagePosition, int]]:
-        """Yield positions, each with its connection."""
         for number, entries in self.index(chunk):
             if number in connections:
                 for seconds, nanoseconds, offset in INDEX_ENTRY.iter_unpack(entries):
                     yield MessagePosition(seconds * _SECOND + nanoseconds, chunk.place, offset), number
 
     def messages(self, connections: Collection[int], since: int = 0) -> Iterator[tuple[MessagePosition, int]]:
-        """Yield positions in order, each with its connection."""
         waiting: list[tuple[MessagePosition, int]] = []
         for chunk in (chunk for chunk in self.chunks if chunk.last >= since):
             while waiting and waiting[0][0].time < chunk.first:
@@ -124,7 +122,7 @@ class BagReader:
     def before(
         self, place: MessagePosition, connections: Collection[int], most: int
     ) -> list[tuple[MessagePosition, int]]:
-        """Return the last ones before a position, in order."""
+        """Return at most `most` positions before a position, in order."""
         found: list[tuple[MessagePosition, int]] = []
         for chunk in sorted(self.chunks, key=lambda chunk: -chunk.last):
             if len(found) == most and chunk.last < found[-1][0].time:
@@ -135,7 +133,7 @@ class BagReader:
         return found[::-1]
 
     def body(self, place: MessagePosition, most: int) -> tuple[int, bytes]:
-        """Return the whole size, and at most `most` of the first bytes."""
+        """Return the size of a message, and at most `most` of its first bytes."""
         self._file.seek(place.chunk)
         read_fields(self._file)
         self._file.seek(4 + place.offset, 1)

@@ -23,7 +23,7 @@ _BILLION = 1_000_000_000
 
 
 class BagMessage(NamedTuple):
-    """`time` is nanoseconds since the epoch."""
+    """A message; `time` is nanoseconds since the epoch."""
 
     connection: int
     time: int
@@ -31,10 +31,10 @@ class BagMessage(NamedTuple):
 
 
 class BagWriter:
-    """Writes behind the first `size` bytes of the file."""
+    """Writes a bag after the first `size` bytes of the file."""
 
     def __init__(self, path: Path, connections: Mapping[int, Mapping[str, str]], size: int = 0) -> None:
-        """The bag is cut after `size` bytes. `connections` are the headers so far."""
+        """Cut the bag after `size` bytes and continue it; `connections` are the headers so far."""
         self._connections = dict(connections)
         self._file: BinaryIO = path.open("r+b" if size and path.exists() else "w+b")
         whole = self._whole(size)
@@ -46,7 +46,7 @@ class BagWriter:
             self._file.write(MAGIC + _bag_header(0, 0, 0))
 
     def connect(self, header: Mapping[str, str]) -> int:
-        """The header has topic, type, md5sum, …"""
+        """Add a connection with a header (topic, type, md5sum and others); return its number."""
         number = len(self._connections)
         self._connections[number] = dict(header)
         return number
@@ -122,7 +122,7 @@ class BagWriter:
             at = following
 
     def _chunk_infos(self, end: int) -> list[bytes]:
-        """A record has the position of its chunk, times, and number of messages by connection."""
+        """Return the records of chunks: position, times, and number of messages by connection."""
         chunks: list[tuple[int, list[tuple[int, int]], list[tuple[int, int]]]] = []
         for at, fields, size in self._records(end):
             if fields["op"] == CHUNK:
@@ -151,7 +151,7 @@ class BagWriter:
 
 
 def read_fields(file: BinaryIO) -> dict[str, bytes]:
-    """Afterwards the position is at the length of the record's data."""
+    """Return the fields of a record; the file is then at the length of the record's data."""
     data = file.read(_U32.unpack(file.read(4))[0])
     return fields_of(data)
 

@@ -13,7 +13,7 @@ from appliance.features.recorder.settings import RecorderRules
 
 
 def make(core: FeatureContext) -> FeaturePart:
-    """The recorder checks its own disk space, so its orders need no room in the store."""
+    """Return control's part. The recorder checks its own disk space, so its orders need no room in the store."""
     rules = core.sections.of(RecorderRules)
     plan = RecordingPlan(rules, core.charged_to, IdSource().next)
     orders = RecordingOrders(rules, core.trail, core.in_force, plan)

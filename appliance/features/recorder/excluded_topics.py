@@ -21,7 +21,6 @@ _SHIPPED = {
 
 
 def known_sums(never: Collection[str]) -> dict[str, str]:
-    """Only types with known definitions have a sum."""
     if all(glob in _SHIPPED or glob.startswith("/") for glob in never):
         return {name: md5sum for name, md5sum in _SHIPPED.items() if name in never}
     from roswire.standard import standard_definitions  # noqa: PLC0415  only where it is configured
@@ -34,7 +33,7 @@ def known_sums(never: Collection[str]) -> dict[str, str]:
 def left_out_because(
     never: Collection[str], sums: Mapping[str, str], topic: str, header: Mapping[str, str]
 ) -> str:
-    """Return why a publisher's messages are not recorded; empty if they are."""
+    """Return why a publisher's messages are not recorded, or an empty text."""
     if fits(never, topic):
         return NAMED
     name = header.get("type", "")

@@ -18,7 +18,7 @@ _OF_SENDER = ("md5sum", "callerid", "host", "latching")
 
 
 def as_mcap(bag: Path) -> Iterator[bytes]:
-    """The bag may be removed during the iteration.
+    """Yield the MCAP of a bag, which may be removed during the iteration.
 
     Raises `OSError`, and `ValueError` for an invalid bag; either may also come during the iteration.
     """
@@ -27,7 +27,7 @@ def as_mcap(bag: Path) -> Iterator[bytes]:
 
 
 class _Pieces(BytesIO):
-    """The bytes since the last `take`; `tell` counts all bytes of the file."""
+    """A buffer for the bytes since the last `take`; `tell` counts all bytes of the file."""
 
     _taken = 0
 

@@ -252,7 +252,7 @@ def remove(appliance: Appliance, recording: _Id) -> None:
 
 
 def bag_of(appliance: Appliance, recording: str, part: Path) -> Path:
-    """Audit the request. Over REST, fill `part`. Raises `OSError`."""
+    """Return the path of a bag, and record the request. Over REST, write the bag to `part`. Raises `OSError`."""
     way = appliance.way
     if isinstance(way, AdminSocket):
         return _bag(way, appliance.ask_or_exit(recording_requests.RecordingFetch(recording)))
@@ -272,7 +272,7 @@ def _bag(way: AdminSocket, recording: Recording) -> Path:
 
 
 def _asked(way: "RestWay", path: str, query: dict[str, Any], kind: type[_T]) -> _T:
-    """Exits with status 1 for a rejected request, and 2 for bad input or without an answer."""
+    """Return an answer of REST. Exits with status 1 for a rejected request, and 2 for bad input or no answer."""
     from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
 
     given = {name: value for name, value in query.items() if value is not None}
@@ -287,7 +287,7 @@ def _asked(way: "RestWay", path: str, query: dict[str, Any], kind: type[_T]) -> 
 
 
 def _read(what: Callable[[], _T]) -> _T:
-    """Exits with status 2 if the bag cannot be read."""
+    """Read a bag. Exits with status 2 if it cannot be read."""
     try:
         return what()
     except OSError as error:
@@ -309,7 +309,6 @@ def _sender(sender: Sender, host_in_words: HostInWords) -> str:
 
 
 def _drawn(found: Timeline, host_in_words: HostInWords) -> Iterator[str]:
-    """Yield bars for each topic and kind of event, then the events."""
     yield f"{found.id}  {_moment(found.since)} to {_moment(found.until)}"
     lanes = [(flow.topic, flow.counts, "message", flow.senders) for flow in found.topics]
     lanes += [(mark.kind, mark.counts, "event", []) for mark in found.marks]
@@ -333,12 +332,12 @@ def _drawn(found: Timeline, host_in_words: HostInWords) -> Iterator[str]:
 
 
 def _private(path: Path) -> int:
-    """Messages are private. Raises `OSError`."""
+    """Open a new file that only its owner may read, because messages are private. Raises `OSError`."""
     return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
 
 
 def _convert(bag: Path, target: Path) -> None:
-    """Raises `OSError`; exits with status 1 if a message type is invalid."""
+    """Convert a bag to MCAP. Raises `OSError`; exits with status 1 if a message type is invalid."""
     made = name_to_make(target)
     with os.fdopen(_private(made), "wb") as file:
         try:

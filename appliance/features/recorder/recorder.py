@@ -1,6 +1,6 @@
 """Make a recording of the relays' memory when an audit record is a trigger.
 
-`step` does all work that is due and returns the messages for control. This module never waits and uses no socket.
+`step` does all work that is due, without waiting, and returns the messages for control.
 
 Invariants:
 
@@ -35,7 +35,7 @@ from appliance.features.recorder.settings import RecorderRules
 from appliance.features.recorder.triggers import trigger_of
 
 SETTLE_SECONDS = 0.5
-"""Messages and audit records may arrive late."""
+"""The time that late messages and audit records have to arrive."""
 
 _IDLE_SECONDS, _BUSY_SECONDS = 0.5, 0.25
 _PAGES = 20  # pages of the log in one step
@@ -81,7 +81,6 @@ class Recorder:
         self._take_up()
 
     def step(self, said: Iterable[Any] = ()) -> list[messages.Message]:
-        """Return the messages for control."""
         for message in said:
             try:
                 self._obey(message)
@@ -107,7 +106,6 @@ class Recorder:
 
     @property
     def pause(self) -> float:
-        """Seconds until the next step is due."""
         return _BUSY_SECONDS if self._making else _IDLE_SECONDS
 
     # --- messages of control ------------------------------------------------------------------------------
@@ -194,7 +192,7 @@ class Recorder:
     # --- triggers -----------------------------------------------------------------------------------------
 
     def _new_triggers(self) -> list[tuple[Trigger, str]]:
-        """A trigger comes with the id of the recording that control has planned, if any."""
+        """Return the new triggers, each with the id of the recording that control has planned, if any."""
         follower = self._follower or self._begin_to_follow()
         found: list[tuple[Trigger, str]] = []
         for _page in range(_PAGES):
@@ -212,7 +210,7 @@ class Recorder:
         return found
 
     def _begin_to_follow(self) -> Follower:
-        """An earlier recorder may not have read the log since the start of the memory."""
+        """Follow the log from the start of the memory, because an earlier recorder may not have read it so far."""
         since = max(self._memory, self._clock() - int(self._rules.before * _SECOND))
         first = search(self._log, Filter(since=since), "0", 1, newest_first=False).entries
         self._follower = Follower(self._log, Filter(), first[0].sequence - 1 if first else None)
@@ -352,7 +350,7 @@ class Recorder:
         self._asked_for.discard(making.progress.id)
 
     def _take_up(self) -> None:
-        """Discard recordings of an earlier recorder without readable progress."""
+        """Continue the recordings of an earlier recorder, and discard those without readable progress."""
         for folder in self._store.parts():
             try:
                 progress = load_progress(folder)

@@ -25,7 +25,7 @@ _SECOND = 1_000_000_000
 
 
 class Span(NamedTuple):
-    """In nanoseconds since the epoch, both ends included."""
+    """A period in nanoseconds since the epoch, both ends included."""
 
     since: int
     until: int
@@ -42,11 +42,11 @@ class Piece(NamedTuple):
     bag: Path
     span: Span
     why_not: str
-    """Why the bag is incomplete."""
+    """The reason why the bag is incomplete, or empty."""
 
 
 def span_of(since: str | None, until: str | None) -> Span:
-    """Exits with status 2 for an invalid period."""
+    """Return the period of --since and --until. Exits with status 2 for an invalid one."""
     now = clock.wall_ns()
     try:
         span = Span(
@@ -128,7 +128,7 @@ def recorded_messages(
 def _cover(
     pieces: Sequence[Piece], span: Span, in_progress: Sequence[OpenRecording], *, as_json: bool
 ) -> None:
-    """Messages of a recording that is still being made are not readable yet."""
+    """Print the gaps in the pieces; messages of a recording that is still being made are not readable yet."""
     # Without --since, the time before the first piece is not a gap.
     began = span.since or pieces[0].span.since
     for gap in gaps([piece.span for piece in pieces], Span(began, span.until)):
@@ -150,7 +150,7 @@ def _cover(
 
 
 def gaps(parts: Sequence[Span], span: Span) -> Iterator[Span]:
-    """The parts must be in order."""
+    """Yield the parts of the span that no part covers; the parts must be in order."""
     at = span.since
     for part in parts:
         if part.since > at:

@@ -72,7 +72,7 @@ class RecordingRequested(Message, frozen=True):
 
 
 class RecordingStarted(Message, frozen=True):
-    """Request `number` began the recording `id`, from `began` to `ends` (ns) or later."""
+    """The recording `id` of request `number` began, and lasts from `began` to `ends` (ns) or later."""
 
     number: int
     id: str
@@ -89,7 +89,7 @@ class RecordingRemovalWanted(Message, frozen=True):
 
 
 class RecordingRemoved(Message, frozen=True):
-    """Removed by order `number` of `who`, or because of `reason`.
+    """A recording was removed, by order `number` of `who` or because of `reason`.
 
     The recorder repeats this report until control has noted it.
     """
@@ -110,14 +110,14 @@ class MemoryWanted(Message, frozen=True):
 
 
 class MemoryLent(Message, frozen=True):
-    """`recording` can be read. It expires, or is removed for later ones."""
+    """A temporary `recording` can be read. It expires, or is removed for later ones."""
 
     number: int
     recording: Recording
 
 
 class RecordingRefused(Message, frozen=True):
-    """`unknown`: there is no such recording."""
+    """The recorder refuses a request; `unknown`: there is no such recording."""
 
     number: int
     reason: str
@@ -125,7 +125,7 @@ class RecordingRefused(Message, frozen=True):
 
 
 class RecordingMissed(Message, frozen=True):
-    """The recorder sends only some of these reports.
+    """A trigger made no recording. The recorder sends only some of these reports.
 
     `planned` is the recording that the trigger's audit record promised, if any.
     """

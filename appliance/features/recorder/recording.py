@@ -58,11 +58,12 @@ class TopicCount(msgspec.Struct):
 
 
 class Progress(msgspec.Struct):
-    """Times are nanoseconds since the epoch.
+    """The progress of a recording; times are nanoseconds since the epoch.
 
-    `memory` is when the rings were created. `size` is the length of the bag, `connections` are the headers in it. For
-    each ring, `places` has the position in each stream, and `following` the number of each stream's next message.
-    `not_there` has the counts of messages and streams that the ring had lost when the recording began.
+    `memory` is when the rings were created. `size` is the length of the bag, `connections` are the headers in
+    it. For each ring, `places` has the position in each stream, and `following` the number of each stream's
+    next message. `not_there` has the counts of messages and streams that the ring had lost when the recording
+    began.
     """
 
     id: str
@@ -78,21 +79,21 @@ class Progress(msgspec.Struct):
     topics: list[TopicCount] = []
     torn: list[str] = []
     unconnected: int = 0
-    """Messages left out because headers exceed `_MOST_HEADERS`."""
+    """The number of messages left out because headers exceed `_MOST_HEADERS`."""
     why_not: str = ""
     """Why the recording ended early, or is incomplete."""
     charged_to: str = OPERATORS
     hold: int = 0
-    """In nanoseconds, after a trigger."""
+    """The time that an act extends the recording, in nanoseconds."""
     latest: int = 0
     """The recording ends at this time at the latest."""
     left_out: list[LeftOutTopic] = []
     claims: int = 0
-    """Topics left out because of their publishers' claims."""
+    """The number of topics left out because of their publishers' claims."""
 
 
 def load_progress(folder: Path) -> Progress:
-    """Raises `OSError` and `ValueError`."""
+    """Return the progress of an unfinished recording. Raises `OSError` and `ValueError`."""
     return msgspec.msgpack.decode((folder / PROGRESS).read_bytes(), type=Progress)
 
 
@@ -102,7 +103,6 @@ class RecordingInProgress:
     def __init__(
         self, folder: Path, progress: Progress, rings: Sequence[memoryview], *, largest: int
     ) -> None:
-        """Raises `OSError`."""
         folder.mkdir(mode=0o750, exist_ok=True)
         folder.chmod(0o750)
         self.progress = progress
@@ -225,7 +225,6 @@ class RecordingInProgress:
         return recording
 
     def _missing(self) -> str:
-        """Return which messages are missing, and why; empty if the bag is complete."""
         progress = self.progress
         reasons = [progress.why_not] if progress.why_not else []
         missed = sum(row.missed for row in progress.topics)
@@ -251,7 +250,7 @@ class RecordingInProgress:
         return "; ".join(reasons)
 
     def _write_records(self, records: Iterable[LogEntry]) -> None:
-        """Each is written as JSON, and as a log message for rqt_console."""
+        """Write each record as JSON, and as a log message for rqt_console."""
         definitions = standard_definitions()
         numbers = {
             topic: self._connection({

@@ -8,7 +8,7 @@ from appliance.base.actors import APPLIANCE
 from appliance.channel.answers.field_docs import NanoMoment, doc
 
 OPERATORS = "operators"
-"""Recordings that operators order are charged to this; others as `charged_to` of control says."""
+"""The payer of recordings that operators order; others are charged as `charged_to` of control returns."""
 
 TriggerKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "service", "order"]
 EventKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "notice"]
@@ -148,7 +148,7 @@ class RecordedEvent(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Timeline(msgspec.Struct, frozen=True):
-    """A recording, or a part of it, in columns of equal time: what flowed, and what happened."""
+    """A recording, or a part of it, in columns of equal time: traffic and events."""
 
     id: str
     since: Annotated[NanoMoment, doc("where the first column begins: nanoseconds since the epoch")]
@@ -177,7 +177,7 @@ class RecordedMessage(msgspec.Struct, frozen=True):
 
 
 class RecordedMessages(msgspec.Struct, frozen=True):
-    """Messages of a recording around a moment, in their order."""
+    """Messages of a recording around a time, in order."""
 
     id: str
     messages: list[RecordedMessage]

@@ -38,10 +38,10 @@ _M = TypeVar("_M", recorder_link.RecordingStarted, recorder_link.RecordingRemove
 
 
 class RecordingOrders:
-    """The methods raise `UnavailableError`, `UnknownThingError` and `SenselessError`.
+    """Operators' orders; the methods raise `UnavailableError`, `UnknownThingError` and `SenselessError`.
 
-    `in_force()` returns the revisions of policy and specifications in force. `plan` finds the recording that covers
-    an event.
+    `in_force()` returns the revisions of policy and specifications in force. `plan` finds the recording that
+    covers an event.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class RecordingOrders:
         self._notes: set[asyncio.Future[None]] = set()
 
     def state(self) -> RecorderState | None:
-        """None if the recorder is off."""
+        """Return the recorder's state, or None if it is off."""
         if not self._rules.enabled:
             return None
         sizes = [recording.size for recording in self._kept.values()]
@@ -121,7 +121,7 @@ class RecordingOrders:
     async def _begin(
         self, what: TriggerKind, reason: str, text: str, who: str, span: tuple[float, float], **caller: Any
     ) -> recorder_link.RecordingStarted:
-        """The order is recorded first. `span` is seconds before and after now."""
+        """Record the order, then begin a recording; `span` is seconds before and after now."""
         before, after = span
         record = self._trail.happened(
             "recording ordered", reason, who=who, before=before, after=after, **caller
@@ -212,7 +212,7 @@ class RecordingOrders:
         return known[recording_id]
 
     async def _ask(self, order: Callable[[int], messages.Message], kind: type[_M]) -> _M:
-        """Send an order with a new number; the answer must be of this kind."""
+        """Send an order with a new number, and return the answer, which must be of this kind."""
         try:
             answer: _M | recorder_link.RecordingRefused = await self.link.ask(order, _PATIENCE_SECONDS)
         except ChannelClosedError:
@@ -267,8 +267,6 @@ class RecordingOrders:
                 self.link.answered(number, message)
 
     def _note(self, recording_id: str) -> None:
-        """Notify the recorder once the audit record of its report is on disk."""
-
         async def note() -> None:
             if await self._trail.durable() is None:
                 with suppress(ChannelFullError):

@@ -1,5 +1,5 @@
-"""Plan which recording an *act* (an audited event that triggers recordings) begins or extends, and who is charged. No
-I/O.
+"""Plan which recording an *act* (an audited event that triggers recordings) begins or extends, and which host is
+charged. No I/O.
 
 Times are nanoseconds since the epoch.
 
@@ -14,8 +14,7 @@ Invariants:
    act during a recording extends it, up to `longest`.
 2. Each host may begin `per_hour` recordings an hour for each kind of trigger.
 3. Recordings of one host do not overlap, unless an order requests one. A recording that would overlap begins at the
-   end of the previous one, and lasts for the length of the memory after an act. Therefore recurring acts after the
-   first one share a recording.
+   end of the previous one, and lasts for the length of the memory after an act.
 4. All other hosts together have at most `_MOST_AT_ONCE` open recordings.
 """
 
@@ -30,7 +29,7 @@ from appliance.features.recorder.settings import RecorderRules
 from appliance.features.recorder.triggers import kinds_of
 
 KEPT = frozenset({ROBOT, OPERATORS})
-"""These are never removed for another host's recording."""
+"""The owners whose recordings are never removed for another host's recording."""
 
 _OURS = KEPT | {APPLIANCE}
 _MOST_AT_ONCE = 2
@@ -40,13 +39,13 @@ _MOST_HOSTS = 4096  # hosts whose last recording's end is remembered
 
 
 def recording_owner(charged_to: str) -> str:
-    """The robot, operators and the appliance are one owner."""
+    """Return the owner of recordings; the robot, operators and the appliance are one owner."""
     return ROBOT if charged_to in _OURS else charged_to
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingSpan:
-    """An act extends it to `hold` nanoseconds after the act, but never beyond `latest`."""
+    """The period of a recording, which an act extends to `hold` nanoseconds after it, but never beyond `latest`."""
 
     began: int
     ends: int
@@ -76,7 +75,7 @@ class HourlyLimit:
     """At most `most` recordings an hour for each host and kind of trigger."""
 
     def __init__(self, most: int, kept: Iterable[Recording]) -> None:
-        """`kept` counts, so that a restart does not reset the limit."""
+        """Count the recordings in `kept`, so that a restart does not reset the limit."""
         self._most = most
         self._begun: dict[tuple[str, str], deque[int]] = {}
         for recording in kept:
@@ -84,7 +83,6 @@ class HourlyLimit:
                 self._begun.setdefault((recording.charged_to, trigger.what), deque()).append(trigger.time)
 
     def take(self, charged_to: str, what: TriggerKind, now: int) -> bool:
-        """Returns False beyond the limit."""
         for key, begun in list(self._begun.items()) if len(self._begun) > _MOST_HOSTS else []:
             if begun[-1] + _HOUR <= now:
                 del self._begun[key]
@@ -122,7 +120,7 @@ class RecordingPlan:
     def detail(
         self, event: str, decision: str | None, severity: Severity, host: str | None, now: int
     ) -> dict[str, str]:
-        """Return an empty mapping if the event is not a trigger."""
+        """Return the detail of an event's audit record, empty if the event is not a trigger."""
         wanted = [kind for kind in kinds_of(event, decision, severity) if kind in self._rules.triggers]
         if not wanted:
             return {}
@@ -158,7 +156,7 @@ class RecordingPlan:
     # --- messages of the recorder ---
 
     def stated(self, recordings: Iterable[Recording], in_progress: Iterable[OpenRecording]) -> None:
-        """Include the recorder's recordings, even after a restart of control."""
+        """Plan with the recorder's recordings, even after a restart of control."""
         kept = list(recordings)
         self._limit = HourlyLimit(self._rules.per_hour, kept)
         for recording in kept:
@@ -171,7 +169,7 @@ class RecordingPlan:
         return next((open_span.ends for name, open_span in self._open.values() if name == recording_id), None)
 
     def opened(self, charged_to: str, recording_id: str, began: int, ends: int) -> None:
-        """For an order or a call."""
+        """Note a recording that began by an order or a call."""
         latest = began + int(self._rules.longest * _SECOND)
         self._open[recording_owner(charged_to)] = (
             recording_id,
@@ -186,7 +184,7 @@ class RecordingPlan:
             del self._ended[next(iter(self._ended))]
 
     def missed(self, charged_to: str, recording_id: str, why: str, now: int) -> None:
-        """For the next minute, acts get the same reason."""
+        """Note why a recording is missing; acts in the next minute get the same reason."""
         self._close(recording_owner(charged_to), recording_id)
         self._obstacle = why, now + 60 * _SECOND
 

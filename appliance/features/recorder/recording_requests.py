@@ -31,7 +31,7 @@ class NewRecording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MemorySpan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A span of time: from `since` (null: from the first data) to `until` (null: now)."""
+    """A period from `since` (null: from the first data) to `until` (null: now)."""
 
     since: GivenNanoMoment = None
     until: GivenNanoMoment = None
@@ -39,12 +39,12 @@ class MemorySpan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @rest("viewer", "GET", "/v1/recordings", name="recordings", problems=_NO_RECORDING)
 class RecordingsWanted(WaitingRequest[Recordings], frozen=True, tag="recordings"):
-    """All recordings that are kept, the oldest first."""
+    """All stored recordings, the oldest first."""
 
 
 @rest("viewer", "GET", "/v1/recordings/{recording_id}", name="recording", problems=_NO_RECORDING)
 class RecordingWanted(WaitingRequest[Recording], frozen=True, tag="recording"):
-    """Why a recording was made, and what it has."""
+    """Why a recording was made, and its contents."""
 
     id: RecordingId
 
@@ -54,7 +54,7 @@ class RecordingWanted(WaitingRequest[Recording], frozen=True, tag="recording"):
     good="The recording is being made.", problems=_NO_RECORDING,
 )  # fmt: skip
 class RecordNow(WaitingRequest[RecordingBegun], frozen=True, tag="record now"):
-    """Record the last seconds, and the next ones, of what the robot says."""
+    """Record the robot's messages of the last and the next seconds."""
 
     before: float | None = None  # seconds before now; None: as configured
     after: float | None = None
@@ -63,14 +63,14 @@ class RecordNow(WaitingRequest[RecordingBegun], frozen=True, tag="record now"):
 
 @rest("investigator", "GET", "/v1/recordings/{recording_id}/bag")
 class RecordingFetch(WaitingRequest[Recording], frozen=True, tag="recording fetch"):
-    """Record who fetches the messages of a recording."""
+    """Record in the audit log who fetches the messages of a recording."""
 
     id: RecordingId
 
 
 @rest("investigator", "GET", "/v1/recordings/{recording_id}/messages", ("topics",))
 class RecordingRead(WaitingRequest[Recording], frozen=True, tag="recording read"):
-    """Record who reads messages of a recording, of these topics (none: of all)."""
+    """Record in the audit log who reads messages of a recording, of these topics (none: of all)."""
 
     id: RecordingId
     topics: Annotated[list[str], parameter(name="topic")] = msgspec.field(default_factory=list)
@@ -89,7 +89,7 @@ class RecordingOfMemory(WaitingRequest[Recording], frozen=True, tag="recording m
 
 @rest("admin", "DELETE", "/v1/recordings/{recording_id}", name="remove_recording", problems=_NO_RECORDING)
 class RecordingRemove(WaitingRequest[Recording], frozen=True, tag="recording remove"):
-    """Remove a recording; it is recorded who removed it. For admins."""
+    """Remove a recording. The audit log records who removed it. For admins."""
 
     id: RecordingId
 

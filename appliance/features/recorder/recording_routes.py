@@ -72,7 +72,7 @@ def _add_bag(router: Routes, services: Services) -> None:
         bearer: Investigator,
         format: Annotated[Literal["bag", "mcap"], Query(description="mcap: converted from the bag")] = "bag",  # noqa: A002  its name in the contract
     ) -> Response:
-        """Return the messages of a recording, for investigators; it is recorded who fetched them."""
+        """Return the messages of a recording. For investigators; the audit log records who fetched them."""
         give_back = services.exports.take(bearer, peer_of(request), "exports")
         try:
             return StreamResponse(
@@ -91,7 +91,7 @@ def _add_reading(router: Routes, services: Services) -> None:
         bearer: Bearer,
         what: _Reading[_T],
     ) -> _T:
-        """Only one bag is read at a time."""
+        """Read a bag, one at a time."""
         recording = answered(await services.control.ask(asked, bearer))
         async with reading.turn(bearer):
             try:
@@ -144,7 +144,7 @@ def _add_reading(router: Routes, services: Services) -> None:
             int, Query(ge=1, le=MOST_NEIGHBOURS, description="number of messages before, and after")
         ] = NEIGHBOURS,
     ) -> RecordedMessages:
-        """Messages of a recording around a moment, read as fields, for investigators; it is recorded who read."""
+        """Messages of a recording around a time, as fields. For investigators; the audit log records who read them."""
         moment = at if is_record(at) else MessagePosition.parsed(at) or _moment(at)
         assert moment is not None  # noqa: S101  `_moment` returns None only for None
         return await read(
@@ -155,7 +155,7 @@ def _add_reading(router: Routes, services: Services) -> None:
 
 
 async def bag_response(services: Services, recording_id: str, bearer: Bearer, *, mcap: bool) -> Response:
-    """The audit log first records which bearer fetches the file."""
+    """Return the file of a recording, after the audit log has recorded the bearer."""
     found = answered(await services.control.ask(recording_requests.RecordingFetch(recording_id), bearer))
     try:  # open it before the answer begins: a recording that is then removed is still sent completely
         pieces = await asyncio.to_thread(as_mcap if mcap else _pieces_of, _bag_of(services, found.id))

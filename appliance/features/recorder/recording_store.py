@@ -5,8 +5,7 @@ garbage.
 
 Invariants:
 
-1. A folder is renamed to its recording's id only when its whole content is on disk, so a folder with that name is
-   complete.
+1. A folder is renamed to its recording's id only when its whole content is on disk, so it is complete.
 2. All recordings together never exceed `disk` bytes: before a recording begins, room for the largest possible one is
    made. Each host other than the robot has at most a quarter of `disk`, and all of them together three quarters. Their
    recordings never replace recordings of the robot or of operators, for whom half of `disk` is always available. The
@@ -50,7 +49,7 @@ _log = structlog.get_logger()
 
 
 class RecordingStore:
-    """Each recording is removed after `seconds` of `clock`."""
+    """The recordings in a folder, each of which is removed after `seconds` of `clock`."""
 
     def __init__(self, folder: Path, *, disk: int, seconds: float | None, clock: Callable[[], int]) -> None:
         self._folder = folder
@@ -77,7 +76,7 @@ class RecordingStore:
                     _log.error("a recording cannot be read", recording=path.name, error=str(error))
 
     def _kept_since(self, recording: Recording) -> int:
-        """Return when it was stored, by the age clock, or else its end."""
+        """Return when the recording was stored, by the age clock, or else its end."""
         with suppress(OSError, ValueError):
             return int((self._folder / recording.id / _SINCE).read_bytes())
         return recording.ended
@@ -103,7 +102,7 @@ class RecordingStore:
         return sorted(path for path in self._folder.iterdir() if kind.fullmatch(path.name))
 
     def _discard(self, folder: Path) -> None:
-        """The audit log gets no record. Raises `OSError`."""
+        """Remove a folder without an audit record. Raises `OSError`."""
         rest = self._folder / f".{folder.name.strip('.')[:20]}.rest"
         folder.rename(rest)
         shutil.rmtree(rest)
@@ -113,7 +112,7 @@ class RecordingStore:
             self._discard(self.part(recording_id))
 
     def keep(self, recording: Recording) -> None:
-        """The recording is completely on disk."""
+        """Add a recording that is completely on disk."""
         kept = self._folder / recording.id
         with suppress(OSError):  # the disk is full: the recording's age then counts from its end
             (self.part(recording.id) / _SINCE).write_bytes(b"%d" % self._clock())
@@ -124,22 +123,21 @@ class RecordingStore:
         self._described[recording.id] = self._length(recording)
 
     def mark_temporary(self, recording_id: str) -> None:
-        """Call this before the recording is made. Raises `OSError`."""
+        """Mark a recording as temporary before it is made. Raises `OSError`."""
         self.part(recording_id).mkdir(mode=0o750, exist_ok=True)
         (self.part(recording_id) / _TEMPORARY).touch()
 
     def has_temporary_room(self, now: int) -> bool:
-        """Make room; return False if all are too new to remove. Raises `OSError`."""
+        """Make room; return False if all temporary recordings are too new to remove. Raises `OSError`."""
         self._expire(now, MOST_TEMPORARY - 1, _OPENING_SECONDS)
         return len(self._temporary) < MOST_TEMPORARY
 
     def publish_temporary(self, recording: Recording) -> None:
-        """It is kept for `TEMPORARY_SECONDS`, or until another replaces it. Raises `OSError`."""
+        """Add a temporary recording for `TEMPORARY_SECONDS`, or until another replaces it. Raises `OSError`."""
         self.part(recording.id).rename(self._folder / recording.id)
         self._temporary.append(recording)
 
     def _expire(self, now: int, most: int, seconds: float) -> None:
-        """Recordings younger than `seconds` stay."""
         while (
             len(self._temporary) > most and abs(now - self._temporary[0].triggers[0].time) > seconds * _SECOND
         ):
@@ -153,7 +151,7 @@ class RecordingStore:
         return self.find(recording_id) is not None or self._gone(recording_id).exists()
 
     def remove(self, recording: Recording, who: str, reason: str) -> None:
-        """The audit log gets `who` and `reason`. Raises `OSError`."""
+        """Remove a recording; the audit log gets `who` and `reason`. Raises `OSError`."""
         kept, gone = self._folder / recording.id, self._gone(recording.id)
         with suppress(OSError):  # the disk may be full, since recordings are then removed
             (kept / _REMOVED).write_bytes(msgspec.json.encode((who, reason)))
@@ -166,7 +164,6 @@ class RecordingStore:
         return self._folder / f".{recording_id}.gone"
 
     def removed(self) -> Iterator[tuple[Recording, str, str]]:
-        """Yield removals that may not be in the audit log yet."""
         for folder in self._named(_GONE):
             try:
                 recording = msgspec.json.decode((folder / ABOUT).read_bytes(), type=Recording)
@@ -178,7 +175,7 @@ class RecordingStore:
             yield recording, who, reason
 
     def note(self, recording_id: str) -> None:
-        """The audit log has the recording or its removal. Raises `OSError`."""
+        """Note that the audit log has the recording or its removal. Raises `OSError`."""
         if self.find(recording_id) is not None:
             (self._folder / recording_id / _NOTED).touch()
         elif self._gone(recording_id).exists():

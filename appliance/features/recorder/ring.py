@@ -15,8 +15,8 @@ Invariants:
    `birth` has changed, the reader discards the copy.
 3. While blocks are free, every stream may take them. When none is free, the first of these is reused: the oldest
    block, if it is too old; the oldest of the writing topic or host, if that topic or host has used its quota; the
-   oldest of a topic or host above its quota; the oldest of all. So a flood replaces its own data. A block that an
-   active stream is filling counts as new.
+   oldest of a topic or host above its quota; the oldest of all. A block that an active stream is filling counts as
+   new.
 4. The reader trusts no content: it derives all sizes from the memory's own size, and bounds every number by that
    size.
 5. Header blocks stay while their stream is open or has data. They take at most a quarter of the memory, and the
@@ -38,10 +38,10 @@ from appliance.base import clock
 from roswire.tcpros import encode_header
 
 SMALLEST = 1 << 20
-"""In bytes."""
+"""The smallest ring in bytes."""
 
 LEFT_OUT = "left_out"
-"""A header's reason why its messages are not recorded; a publisher cannot set this field."""
+"""The field of a header with the reason why its messages are not recorded; a publisher cannot set it."""
 
 HEADER, DATA = 1, 2
 RECORD = struct.Struct("<IIQQQ")  # mark, frames, bytes of the frames, time, number of the first frame
@@ -61,7 +61,7 @@ _MOST_HEADERS = 4  # headers may take a quarter
 
 
 class Geometry(NamedTuple):
-    """`data` is the offset of the first block."""
+    """The layout of a ring; `data` is the offset of the first block."""
 
     block: int
     blocks: int
@@ -69,7 +69,7 @@ class Geometry(NamedTuple):
 
 
 def geometry(size: int) -> Geometry:
-    """Raises `ValueError` if the size is too small."""
+    """Return the layout. Raises `ValueError` if the size is too small."""
     if size < SMALLEST:
         raise ValueError(f"a ring of {size} bytes is too small: use at least {SMALLEST}")
     block = _SMALLEST_BLOCK
@@ -91,7 +91,7 @@ class BlockRow(NamedTuple):
 
     @property
     def sound(self) -> bool:
-        """In use and plausible; numbers of a compromised writer must not overflow a word."""
+        """Whether the row is in use and plausible; numbers of a compromised writer must not overflow a word."""
         return (
             0 < self.birth < _MOST_NUMBER
             and 0 < self.stream < _MOST_NUMBER
@@ -102,7 +102,7 @@ class BlockRow(NamedTuple):
 
 @dataclass(eq=False, slots=True)
 class _Share:
-    """`blocks` are the data blocks of a topic or host, oldest first."""
+    """The use of a quota: `blocks` are the data blocks of a topic or host, oldest first."""
 
     most: int
     blocks: OrderedDict[int, None] = field(default_factory=OrderedDict)
@@ -112,7 +112,7 @@ class _Share:
 
 @dataclass(eq=False, slots=True)
 class _Chain:
-    """The blocks of one stream, and whose quotas they use."""
+    """The blocks of one stream, and the quotas that they use."""
 
     shares: tuple[_Share, ...] = ()
     names: tuple[str, str] = ("", "")
@@ -122,12 +122,11 @@ class _Chain:
 
 
 def words_of(memory: memoryview) -> memoryview:
-    """Words of 64 bits are loaded and stored atomically."""
+    """Return the memory as 64-bit words, which are loaded and stored atomically."""
     return memory[: len(memory) // 8 * 8].cast("Q")
 
 
 def rows(memory: memoryview) -> list[tuple[int, BlockRow]]:
-    """Return a copy of the table."""
     table = bytes(memory[_COUNTERS : _COUNTERS + geometry(len(memory)).blocks * _ROW.size])
     return [(block, BlockRow._make(row)) for block, row in enumerate(_ROW.iter_unpack(table))]
 
@@ -144,7 +143,7 @@ class RingStream:
     """The open stream of one connection to a publisher."""
 
     keeps = True
-    """The stream stores messages."""
+    """Whether the stream stores messages."""
 
     __slots__ = ("_chain", "_end", "_number", "_place", "_ring", "_stream", "_used", "block", "written")
 
@@ -159,7 +158,7 @@ class RingStream:
         self._used = 0  # the index of the block's word
 
     def write(self, frames: memoryview, messages: int, first: int, judged: int = 0) -> None:
-        """`first` is the first frame's number, `judged` the time when monitors got the frames, or 0."""
+        """Write frames; `first` is the first frame's number, `judged` the time when monitors got the frames, or 0."""
         ring = self._ring
         size = len(frames)
         now = self.written = ring.clock(judged)
@@ -176,11 +175,10 @@ class RingStream:
             self._append(memoryview(RECORD.pack(MARK, messages, size, now, first)), frames)
 
     def close(self) -> None:
-        """The blocks stay until others need them."""
         self._ring.close_chain(self._stream, self._chain)
 
     def lose_block(self) -> None:
-        """Another stream reuses the current block."""
+        """Note that another stream reuses the current block."""
         self.block, self._place, self._end = -1, 0, 0
 
     def _append(self, head: memoryview, frames: memoryview) -> None:
@@ -252,7 +250,7 @@ class RingWriter:
         self._inherit()
 
     def open(self, topic: str, host: str, header: Mapping[str, str]) -> RingStream | None:
-        """Return None if the header has no room."""
+        """Open a stream; None if its header has no room."""
         text = memoryview(encode_header({**header, "topic": topic, "host": host}))
         needed = -(-len(text) // self.block)
         shares = tuple(
@@ -284,7 +282,7 @@ class RingWriter:
         self.words[counter] = (self.words[counter] + by) % (1 << 64)
 
     def take(self, stream: int, number: int, kind: int, begins: int, chain: _Chain, *, now: int) -> int:
-        """If no block is free, reuse one (invariant 3)."""
+        """Return a free block for a chain; if none is free, reuse one (invariant 3)."""
         if not self._free:
             self._give_up(chain, now - self._keep)
         block = self._free.pop()
@@ -310,7 +308,7 @@ class RingWriter:
             self._forget(stream, chain)
 
     def _give_up(self, chain: _Chain, old: int) -> None:
-        """Blocks written before the time `old` are too old (invariant 3)."""
+        """Free a block for a chain; blocks written before the time `old` are too old (invariant 3)."""
         oldest = self._oldest(old)
         if self._order[oldest][1] >= old or self._in_use(oldest, old):
             full = (share for share in chain.shares if len(share.blocks) >= share.most)
@@ -319,12 +317,12 @@ class RingWriter:
         self._push_out(oldest)
 
     def _in_use(self, block: int, old: int) -> bool:
-        """A stream is filling the block and has written lately; a slow stream may have all its data in it."""
+        """Whether a stream is filling the block and has written lately; a slow stream may have all its data in it."""
         writer = self._chains[self._order[block][0]].writer
         return writer is not None and writer.block == block and writer.written >= old
 
     def _oldest(self, old: int) -> int:
-        """Blocks that are being filled count as new."""
+        """Return the oldest block; blocks that are being filled count as new."""
         for _ in range(len(self._order)):
             block = next(iter(self._order))
             if not self._in_use(block, old):
@@ -347,7 +345,7 @@ class RingWriter:
             loser.writer.lose_block()
 
     def _room_for_header(self, needed: int, host: _Share) -> bool:
-        """Remove closed streams if needed."""
+        """Make room for a header, and remove closed streams if needed; return whether there is room."""
 
         def crowded(*, of_host: bool) -> bool:
             has, whole = (
@@ -385,7 +383,7 @@ class RingWriter:
         self._free.append(block)
 
     def _inherit(self) -> None:
-        """An earlier writer's blocks count as the oldest ones, and its streams as closed."""
+        """Take over an earlier writer's blocks as the oldest ones, and its streams as closed."""
         left = sorted((row, block) for block, row in rows(self.memory) if row.sound)
         with_data = {row.stream for row, _block in left if row.kind == DATA}
         for row, block in left:

@@ -28,20 +28,20 @@ _LONGEST_HEADER = 256 << 10
 _NEEDED = frozenset({"topic", "type", "md5sum", "message_definition", "callerid", "host"})
 _LONGEST_TYPE = 256
 MOST_MESSAGES = 1 << 53
-"""The limit of one stream."""
+"""The most messages of one stream."""
 
 _Blocks = dict[int, tuple[int, BlockRow]]
 
 
 class ReadPosition(NamedTuple):
-    """A block of the chain, and a byte in it."""
+    """A position: a block of the chain, and a byte in it."""
 
     number: int
     offset: int
 
 
 class RecordedFrames(NamedTuple):
-    """One batch. `time` is nanoseconds since the epoch, and `first` counts from 1."""
+    """One batch of messages. `time` is nanoseconds since the epoch, and `first` counts from 1."""
 
     time: int
     first: int
@@ -49,7 +49,7 @@ class RecordedFrames(NamedTuple):
 
 
 class StreamFrames(NamedTuple):
-    """`torn`: frames before or between them were overwritten or are damaged."""
+    """The batches of a stream; `torn`: frames before or between them were overwritten or are damaged."""
 
     stream: int
     header: dict[str, str]
@@ -68,7 +68,7 @@ class _Run:
 
 
 class RingReader:
-    """`places` are the positions up to which streams were read."""
+    """Reads a ring; `places` are the positions up to which streams were read."""
 
     def __init__(self, memory: memoryview, places: dict[int, ReadPosition] | None = None) -> None:
         self._memory = memory
@@ -78,12 +78,11 @@ class RingReader:
 
     @property
     def not_there(self) -> tuple[int, int]:
-        """Messages that were too long, and streams without room, since the ring was created."""
+        """Return the numbers of too long messages, and of streams without room, since the ring was created."""
         return self._words[MISSED], self._words[REFUSED]
 
     def read(self, since: int, until: int) -> Iterator[StreamFrames]:
-        """Yield messages since the last call that were received from `since` to `until` (nanoseconds since the
-        epoch).
+        """Yield messages since the last call that were received from `since` to `until` (ns since the epoch).
 
         Later messages are left for a later call. Such a message is skipped if the stream continues with an earlier
         one, because then the clock was set back.
@@ -116,16 +115,16 @@ class RingReader:
         return _readable(header) if header.keys() >= _NEEDED else None
 
     def _copy(self, block: int, row: BlockRow) -> bytes | None:
-        """Return None if the block was reused.
+        """Return the data of a block, or None if the block was reused.
 
-        Use the current `used`: while the table was copied, the block may have been filled and the next one begun.
+        The current `used` applies: while the table was copied, the block may have been filled and the next
+        one begun.
         """
         start = self._geometry.data + block * self._geometry.block
         part = bytes(self._memory[start : start + min(self._words[used_at(block)], self._geometry.block)])
         return part if self._words[birth_at(block)] == row.birth else None
 
     def _runs(self, blocks: _Blocks, place: ReadPosition | None) -> Iterator[_Run]:
-        """A missing block begins a new run."""
         run: _Run | None = None
         broken = False
         for number in sorted(blocks):
@@ -188,7 +187,6 @@ class RingReader:
 
 
 def _readable(header: dict[str, str]) -> dict[str, str]:
-    """Undecodable bytes are replaced and long fields cut, so that tools can read the header."""
     definition = header["message_definition"].encode("utf-8", "surrogateescape").decode("utf-8", "replace")
     plain = {name: header[name][:_LONGEST_TYPE] for name in ("type", "md5sum")}
     if "latching" in header:
@@ -197,7 +195,6 @@ def _readable(header: dict[str, str]) -> dict[str, str]:
 
 
 def _frames(view: memoryview, messages: int) -> list[memoryview] | None:
-    """Return None if lengths do not match the record."""
     found: list[memoryview] = []
     at = 0
     while at + _LENGTH.size <= len(view) and len(found) < messages:

@@ -26,7 +26,7 @@ USED_BY = "appliance.features.recorder.recorder_ring:open_ring"
 
 
 class RecorderRings:
-    """`rules` has the total size of the rings. Raises `StartError` (not enough memory), `OSError`."""
+    """The rings of all relays; `rules` has their total size. Raises `StartError` (not enough memory), `OSError`."""
 
     def __init__(self, rules: RecorderRules, relays: int) -> None:
         if rules.memory > (left := _left()):

@@ -31,7 +31,6 @@ _AHEAD_SECONDS = 60.0
 
 
 def files(settings: Settings) -> Iterator[SelftestFinding]:
-    """Yield findings about the files that the configuration names, and the state directory."""
     yield from run_check("policy", lambda: _policy(settings.policy, settings.site_keys))
     yield from run_check("monitors", lambda: _monitors(settings.monitors, settings.site_keys))
     yield from run_check("hosts", lambda: _hosts(settings.hosts))

@@ -91,7 +91,6 @@ def _here(appliance: Appliance, config: Path | None) -> Iterator[SelftestFinding
 
 
 def _settings(appliance: Appliance, config: Path | None) -> Settings:
-    """Without a running appliance, return the settings that `rosrv up` would use here."""
     state = _state(appliance)
     resolved = None if state is None else state / "run" / "config.json"
     if config is None and resolved is not None and _runs(appliance):

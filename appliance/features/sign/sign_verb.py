@@ -63,7 +63,7 @@ def _private(file: Path) -> Ed25519PrivateKey:
 
 
 def _text(file: Path) -> str:
-    """Exits with status 2 unless the text is UTF-8 with LF, the only format the appliance reads."""
+    """Return the text of a file. Exits with status 2 unless it is UTF-8 with LF, as the appliance requires."""
     try:
         text = read_given(file).decode("utf-8")
     except OSError as error:

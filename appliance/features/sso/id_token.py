@@ -2,9 +2,9 @@
 
 Invariants:
 
-1. Only a key of the provider that fits the token's algorithm verifies it: the kind, the curve, the use. The token
-   never names or brings a key (`jwk`, `jku` and `x5u` are ignored), and a symmetric key is never used.
-2. Only allowed algorithms are accepted. All of them are signatures by a private key.
+1. Only a key of the provider that fits the token's algorithm verifies it: the kind, the curve, the use. `jwk`, `jku`
+   and `x5u` in the token are ignored, and a symmetric key is never used.
+2. Only allowed algorithms are accepted, all of them signatures by a private key.
 3. Issuer, audience, nonce, subject, expiry and time of issue are required.
 """
 
@@ -39,7 +39,7 @@ _PUBLIC = ("kty", "crv", "n", "e", "x", "y")
 
 @dataclass(frozen=True)
 class Expected:
-    """`skew` is in seconds."""
+    """The values that an ID token must have; `skew` is in seconds."""
 
     issuer: str
     client_id: str
@@ -49,7 +49,7 @@ class Expected:
 
 
 def verify(token: str, keys: Sequence[dict[str, Any]], expected: Expected, now: float) -> dict[str, Any]:
-    """Raises `SignOnRefusedError`."""
+    """Return the claims of a valid token. Raises `SignOnRefusedError`."""
     header = _header_of(token, expected.algorithms)
     key = _key_for(header, keys)
     registry = JWSRegistry(algorithms=list(expected.algorithms), strict_check_header=False)
@@ -112,7 +112,7 @@ def _header_of(token: str, algorithms: Sequence[str]) -> dict[str, Any]:
 
 
 def _key_for(header: dict[str, Any], keys: Sequence[dict[str, Any]]) -> RSAKey | ECKey:
-    """Only one key of the provider can have signed the token."""
+    """Return the only key of the provider that can have signed the token."""
     algorithm = header["alg"]
     curve = _CURVES.get(algorithm)
     fitting = [
@@ -137,7 +137,7 @@ def _key_for(header: dict[str, Any], keys: Sequence[dict[str, Any]]) -> RSAKey |
 
 
 def _decoded(text: str) -> bytes:
-    """The text is base64url without padding. Raises `ValueError`."""
+    """Decode base64url without padding. Raises `ValueError`."""
     return base64.urlsafe_b64decode(text + "=" * (-len(text) % 4))
 
 

@@ -17,7 +17,7 @@ _MOST_VALUES = 1000
 
 
 def identity_of(claims: Mapping[str, Any], wanted: Sso, now: float) -> SignedInPerson:
-    """Raises `SignOnRefusedError`."""
+    """Return the person whom the claims describe. Raises `SignOnRefusedError`."""
     mail = _verified_mail(claims)
     if wanted.domains and mail.rpartition("@")[2] not in wanted.domains:
         raise SignOnRefusedError(

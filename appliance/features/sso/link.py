@@ -7,7 +7,7 @@ from appliance.channel.messages.message import Message
 
 
 class SessionKeys(msgspec.Struct, frozen=True):
-    """The id of a session that a browser chose, and the verifiers of its keys, as of a token (`TokenKeys`)."""
+    """A session's id, which a browser chose, and the verifiers of its keys, as of a token (`TokenKeys`)."""
 
     id: str
     reading: bytes
@@ -15,10 +15,10 @@ class SessionKeys(msgspec.Struct, frozen=True):
 
 
 class SignedInPerson(msgspec.Struct, frozen=True):
-    """`ends` is seconds since the epoch.
+    """A person; `ends` is seconds since the epoch.
 
-    `subject` is the provider's `sub`. `name` is unique among the people of the provider. `mail` is empty unless it is
-    verified. `doors` are groups of doors.
+    `subject` is the provider's `sub`. `name` is unique among the people of the provider. `mail` is empty
+    unless it is verified. `doors` are groups of doors.
     """
 
     subject: str
@@ -30,7 +30,7 @@ class SignedInPerson(msgspec.Struct, frozen=True):
 
 
 class SignOnWanted(Message, frozen=True):
-    """Control passes on that a browser at this address begins; `again`: the person must prove who they are again."""
+    """A browser at this address begins to sign in; `again`: the person must prove who they are again."""
 
     number: int
     keys: SessionKeys
@@ -39,7 +39,7 @@ class SignOnWanted(Message, frozen=True):
 
 
 class SignOnBegun(Message, frozen=True):
-    """The browser goes to this URL, and returns with `state`."""
+    """The sign-on began: the browser goes to this URL, and returns with `state`."""
 
     number: int
     url: str
@@ -47,7 +47,7 @@ class SignOnBegun(Message, frozen=True):
 
 
 class SignOnReturned(Message, frozen=True):
-    """Control passes on that a browser returned from the provider with a code."""
+    """A browser returned from the provider with a code."""
 
     number: int
     state: str
@@ -65,7 +65,7 @@ class SignOnConfirmed(Message, frozen=True):
 
 
 class SignOnFailed(Message, frozen=True):
-    """`refused`: the person or the browser is not accepted; otherwise, the provider fails."""
+    """The sign-on failed; `refused`: the person or the browser is not accepted, otherwise the provider fails."""
 
     number: int
     reason: str

@@ -94,7 +94,7 @@ class _Process:
 
 
 def _secret(file: Path | None) -> str | None:
-    """The file is read for each use, so that a replaced one applies. Raises `OSError`."""
+    """Return the client's secret, read for each use so that a replaced file applies. Raises `OSError`."""
     if file is None:
         return None
     lines = read_given(file, _LONGEST_SECRET).decode().splitlines()

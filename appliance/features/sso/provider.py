@@ -1,4 +1,4 @@
-"""Know the provider: its endpoints and its keys, both with bounds on their age.
+"""Fetch the provider's endpoints and keys, and bound their age.
 
 Invariants:
 
@@ -49,7 +49,7 @@ class Provider:
         self._keys: tuple[float, list[dict[str, Any]]] | None = None
 
     async def endpoints(self) -> ProviderEndpoints:
-        """The endpoints are at most an hour old. Raises `ProviderError`."""
+        """Return the endpoints, at most an hour old. Raises `ProviderError`."""
         if self._endpoints is None or clock.now() - self._endpoints[0] >= _FRESH_SECONDS:
             url = self.issuer.removesuffix("/") + _DISCOVERY
             try:
@@ -82,7 +82,7 @@ class Provider:
         return self._keys[1]
 
     async def post(self, url: str, headers: Sequence[tuple[str, str]], body: bytes) -> tuple[int, bytes]:
-        """Raises `ProviderError`."""
+        """Send a request to the provider; return status and body. Raises `ProviderError`."""
         return await self._exchange("POST", url, headers, body)
 
     async def _fetch_keys(self) -> list[dict[str, Any]]:

@@ -2,8 +2,8 @@
 
 Invariants:
 
-1. Every connection goes to `Sso.destination`, whatever host a URL has: the provider's address, or the proxy. No name is
-   looked up, and the firewall lets the process reach nothing else.
+1. Every connection goes to `Sso.destination`, whatever host a URL has: the provider's address, or the proxy. The
+   firewall lets the process reach nothing else.
 2. TLS verifies the host of the URL. Without a proxy, all URLs have the issuer's origin.
 3. An exchange has one deadline, from connecting to the last byte. It follows no redirect, and reads at most
    `LARGEST_ANSWER` bytes. Compressed answers are not requested, and rejected.
@@ -55,7 +55,7 @@ class ProviderConnection:
     async def exchange(
         self, method: str, url: str, headers: Headers = (), body: bytes = b""
     ) -> ProviderAnswer:
-        """The answer may have any status. Raises `ProviderError`."""
+        """Return the answer to a request, whatever its status. Raises `ProviderError`."""
         try:
             origin = origin_of(url)
         except ValueError as error:
@@ -112,7 +112,7 @@ class _OneDestination(httpcore.AsyncNetworkBackend):
 
 
 def _tls(wanted: Sso) -> ssl.SSLContext:
-    """Made for each exchange, so that a replaced file applies to the next. Raises `OSError`."""
+    """Return a TLS context, made for each exchange so that replaced files apply. Raises `OSError`."""
     if wanted.ca is None:
         context = ssl.create_default_context()
     else:
@@ -129,7 +129,7 @@ def _tls(wanted: Sso) -> ssl.SSLContext:
 
 
 async def _bounded(url: str, answer: httpcore.Response) -> bytes:
-    """Raises `ProviderError` if the body is compressed or too large."""
+    """Return the body. Raises `ProviderError` if it is compressed or too large."""
     for name, value in answer.headers:
         if name.lower() == b"content-encoding" and value.lower() != b"identity":
             raise ProviderError(f"{url}: the provider compresses its answer, which was not requested")

@@ -37,7 +37,7 @@ _FAILS: Responses = {
 
 
 class BrowserKeys(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The session that the browser made: a token's id, and the verifiers of its keys."""
+    """A session that the browser made: a token's id, and the verifiers of its keys."""
 
     id: Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{12}$" + WHOLE)]
     reading: Annotated[str, msgspec.Meta(pattern=_KEY + WHOLE), doc("SHA-256 of the reading key, base64url")]
@@ -54,7 +54,7 @@ class Returned(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _Limits:
-    """Apply to calls that need no token."""
+    """The limits of calls that need no token."""
 
     def __init__(self, per_minute: int) -> None:
         self._buckets = Buckets(per_minute / 60, per_minute)
@@ -62,7 +62,7 @@ class _Limits:
 
     @contextmanager
     def place(self, peer: str) -> Iterator[None]:
-        """Raises `ProblemError` (429, 503)."""
+        """Count a call during the block. Raises `ProblemError` (429, 503)."""
         seconds = self._buckets.take(peer, clock.now())
         if seconds:
             raise too_many("too-many-failures", "too many sign-ins from this host", seconds)
@@ -81,7 +81,7 @@ def routes(services: Services) -> Routes:
 
     @router.post("/begin", operation_id="begin_sign_on", responses=_FAILS)
     async def begin(brought: Annotated[BrowserKeys, body(BrowserKeys)], request: Request) -> SignOnPlace:
-        """Begin to sign in at the provider; no bearer token. The browser makes the keys of its session before."""
+        """Begin to sign in at the provider; no bearer token. The browser has already made the keys of its session."""
         peer = peer_of(request)
         keys = SessionKeys(brought.id, _bytes(brought.reading), _bytes(brought.verifying))
         with limits.place(peer):
@@ -89,7 +89,7 @@ def routes(services: Services) -> Routes:
 
     @router.post("/complete", operation_id="complete_sign_on", responses=_FAILS)
     async def complete(returned: Annotated[Returned, body(Returned)], request: Request) -> SignedOn:
-        """Complete a sign-in with the provider's code; no bearer token. From then on the session's keys are valid."""
+        """Complete a sign-in with the provider's code; no bearer token. The session's keys are then valid."""
         peer = peer_of(request)
         with limits.place(peer):
             order = SignOnComplete(returned.state, returned.code, returned.iss, peer)

@@ -46,7 +46,7 @@ class SessionTable:
         return next((one for one in self.sessions() if one.id == session_id), None)
 
     def open(self, identity: SignedInPerson, keys: SessionKeys) -> tuple[Session, list[Session]]:
-        """Return also the person's sessions that this ends. Raises `TokenRefusedError`."""
+        """Open a session; return it with the person's sessions that it ends. Raises `TokenRefusedError`."""
         name, now = f"{_PREFIX}{identity.name}", clock.wall()
         present = self.sessions()
         if any(one.id == keys.id for one in present):
@@ -83,7 +83,7 @@ class SessionTable:
         return session, ended
 
     def end(self, session_id: str, who: str) -> Session:
-        """Raises `UnknownThingError`."""
+        """End a session. Raises `UnknownThingError`."""
         found = self.of(session_id)
         if found is None or found.name != who:
             raise UnknownThingError("this is not a session of yours")
@@ -91,7 +91,7 @@ class SessionTable:
         return found
 
     def end_all(self, name: str) -> list[Session]:
-        """Raises `UnknownThingError`."""
+        """End all sessions of a name. Raises `UnknownThingError`."""
         ended = [one for one in self.sessions() if one.name in (name, f"{_PREFIX}{name}")]
         if not ended:
             names = ", ".join(sorted({one.name for one in self.sessions()})[:20]) or "none"

@@ -11,7 +11,7 @@ from appliance.channel.answers.token_answers import TokenRole
 from appliance.configuration.sections import FeatureSection, is_loopback, key, section, split_receiver
 
 Algorithm = Literal["RS256", "RS384", "RS512", "PS256", "PS384", "PS512", "ES256", "ES384", "ES512"]
-"""Signatures with a public key only: neither `none`, nor an HMAC, whose key could be a public one."""
+"""The accepted algorithms: signatures with a public key, neither `none` nor an HMAC."""
 
 Origin = tuple[str, str, int]
 _RANKING: tuple[TokenRole, ...] = ("admin", "operator", "investigator", "viewer")
@@ -21,7 +21,7 @@ _PORTS = {"https": 443, "http": 80}
 
 
 def origin_of(url: str) -> Origin:
-    """`http` is allowed only on the loopback. Raises `ValueError`."""
+    """Return the origin of a URL; `http` is allowed only on the loopback. Raises `ValueError`."""
     try:
         parts = urlsplit(url)
         port = parts.port or _PORTS.get(parts.scheme, 0)
@@ -188,7 +188,7 @@ class Sso(FeatureSection):
 
     @property
     def destination(self) -> tuple[str, int]:
-        """The only address and port to which the process connects; only with an `issuer`."""
+        """Return the only address and port to which the process connects; only with an `issuer`."""
         _protocol, host, port = split_receiver(
             f"tcp://{self.address or (self.proxy or '').partition('://')[2]}"
         )

@@ -44,7 +44,7 @@ class _Pending(NamedTuple):
 
 
 class SignOns:
-    """`secret()` returns the client's secret, if any; it may raise `OSError`."""
+    """The unfinished sign-ons; `secret()` returns the client's secret, if any, and may raise `OSError`."""
 
     def __init__(self, wanted: Sso, provider: Provider, secret: Callable[[], str | None]) -> None:
         self._wanted = wanted
@@ -73,7 +73,7 @@ class SignOns:
         return f"{url}{'&' if '?' in url else '?'}{urlencode(asked, quote_via=quote)}", state
 
     async def finish(self, state: str, code: str, issuer: str) -> tuple[SignedInPerson, SessionKeys, str]:
-        """Return identity, keys and address.
+        """Complete a sign-on; return the person, the session's keys and the address.
 
         `issuer` is the parameter `iss` of the response (RFC 9207), or empty. Raises `SignOnRefusedError` and
         `ProviderError`.

@@ -1,8 +1,10 @@
-"""The two appliances at which hosts open their tunnels: addresses, and the certificates for their own tunnel keys.
+"""The two appliances at which hosts open their tunnels: addresses, and the certificates for their own tunnel
+keys.
 
-The standby introduces itself over the replication (`replication_frames.Introduction`). The active appliance has its key
-certified and stores the certificate in the replicated state: the standby finds it there when it takes over. Each key
-stays on its appliance. There are at most two rows; the certificate of an appliance that was replaced is revoked.
+The standby introduces itself over the replication (`replication_frames.Introduction`). The active appliance
+has the standby's key certified and stores the certificate in the replicated state, for a takeover. Each key
+stays on its appliance. There are at most two rows; the certificate of an appliance that was replaced is
+revoked.
 """
 
 import asyncio
@@ -49,7 +51,7 @@ class ApplianceTable(Appliances):
         return next((row for row in self._rows.values() if not self._is_own(row)), None)
 
     async def until_introduced(self) -> None:
-        """Wait a moment for the other appliance of two: with the first host, it begins to prepare its tunnels."""
+        """Wait a moment for the other appliance, which begins to prepare its tunnels with the first host."""
         if self.other is None:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(_INTRODUCTION_SECONDS):
@@ -61,7 +63,7 @@ class ApplianceTable(Appliances):
         return row.certificate.encode() if row is not None and row.expires > clock.wall() else b""
 
     def is_served(self, pin: str) -> None:
-        """Note the pin of this appliance's REST server, for the kits that the other one makes."""
+        """Note the pin of this appliance's REST server, for the kits that the other appliance makes."""
         self._pin = pin
         row = self._rows.get(self._own)
         if row is not None and pin not in ("", row.pin):
@@ -120,7 +122,6 @@ class ApplianceTable(Appliances):
         self._kept.save_appliance(row)
 
     def _forget(self, row: ApplianceRow) -> None:
-        """Remove an appliance that is not one of the two any more; its key may be in wrong hands."""
         self._revoked.add("", row.serial, row.expires)
         del self._rows[row.key]
         self._kept.forget_appliance(row.key)

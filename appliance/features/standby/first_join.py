@@ -79,7 +79,6 @@ def join_first(options: JoinOptions, *, as_json: bool) -> None:
 
 
 def _with_authority(other: Membership, state: Path) -> Membership:
-    """Add the tunnels' authority to the other appliance's file, if its key is encrypted."""
     signer = state / "signer"
     try:
         with as_owner(signer):
@@ -108,7 +107,7 @@ def as_owner(folder: Path) -> Iterator[None]:
 
 
 def existing_membership(path: Path) -> Membership | None:
-    """Return the membership in a file, None if there is none; a damaged one is replaced like a missing one.
+    """Return the membership in a file; None if the file is missing or damaged.
 
     Exits with status 1 if it cannot be read.
     """
@@ -175,7 +174,6 @@ def _plan(options: JoinOptions, settings: Settings) -> PairPlan:
 
 
 def _ports(options: JoinOptions, settings: Settings) -> tuple[str, ...]:
-    """Return the TCP ports that the robot's computers translate to the active appliance."""
     if options.ports is not None:
         return tuple(part.strip() for part in options.ports.split(","))
     nodes = read_node_ports(settings)
@@ -198,7 +196,6 @@ def _followers(texts: tuple[str, ...]) -> dict[str, str]:
 
 
 def _write_kits(kits: Kits, out: Path) -> None:
-    """Write all files below a new folder; remove it again after an error."""
     try:
         out.mkdir(mode=0o700, parents=True)
     except FileExistsError:

@@ -1,15 +1,16 @@
 """Pass the state of monitors from one appliance to the other.
 
-The replicated setting `active appliance` has the name and epoch of the appliance whose relays passed the last messages.
-It is stored only after all relays have taken the inherited state: a control that dies before inherits again. In a
-planned switchover, the relays first drop all messages and leave their state, which is stored before the lease is given
-up.
+The replicated setting `active appliance` has the name and epoch of the appliance whose relays passed the last
+messages. It is stored only after all relays have taken the inherited state, so a control that dies before
+repeats the inheritance. In a planned switchover, the relays first drop all messages and leave their state,
+which is stored before the lease is given up.
 
-For any other takeover, the state is copied while it changes: at most every `_COPY_SECONDS`, and less often if it is
-large. The replicated setting `_COPIES` has the time of the last copy; a standby notes when it gets a later one
-(`CopyAge`). A copy is used only if it was made in the last epoch, and if the standby got a time of it in the last
-`_FRESH_SECONDS`. Otherwise the state is lost: monitors that act by their state hold their topics. Monitors without a
-copy then hold theirs too, and so do those with the modifier `hold`, because a copy lacks the last moment.
+For any other takeover, the state is copied while it changes: at most every `_COPY_SECONDS`, and less often if
+it is large. The replicated setting `_COPIES` has the time of the last copy; a standby notes when it gets a
+later one (`CopyAge`). A copy is used only if it was made in the last epoch, and if the standby got its time
+in the last `_FRESH_SECONDS`. Otherwise the state is lost, and monitors that act by their state hold their
+topics. So do monitors without a copy, and those with the modifier `hold`, because a copy lacks the last
+moment.
 """
 
 import asyncio
@@ -40,7 +41,7 @@ class _Active(msgspec.Struct, frozen=True):
 
 
 class _Copies(msgspec.Struct, frozen=True):
-    """The stored states are those of this epoch; `at` is the time of its monitors (ns).
+    """The epoch of the stored states; `at` is the time of its monitors (ns).
 
     0: the relays left these states, and passed no message since.
     """
@@ -92,13 +93,13 @@ async def leave_state(pair: Pair, store: StateStore, rollout: Rollout) -> None:
 
 
 def keep_state(store: StateStore, rollout: Rollout) -> None:
-    """Go on after `leave_state`: what the relays left is void."""
+    """Continue after `leave_state`; the states that the relays left become void."""
     store.save_setting(_COPIES, "")
     rollout.pass_again()
 
 
 class StateCopies:
-    """The copies of the active appliance's monitors, for an unplanned takeover.
+    """Copies the states of the active appliance's monitors for an unplanned takeover.
 
     `followed()`: the standby gets changes now.
     """
@@ -167,5 +168,5 @@ class CopyAge:
             self._note, self._changed = note, clock.now()
 
     def at(self, moment: float) -> float | None:
-        """Return the age at a time (monotonic); None if there was no new note."""
+        """Return the age at a time (monotonic), or None if there was no new note."""
         return None if self._changed is None else max(0.0, moment - self._changed)

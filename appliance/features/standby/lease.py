@@ -1,13 +1,13 @@
 """The lease as an appliance sees it: active or passive, by times and messages alone.
 
-This module reads no clock and no socket. Its owner passes the time with each message, sends what comes back, and calls
-`tick` when `next_event` is due. A time is that of the appliance's own clock, which must run while the machine sleeps
-(CLOCK_BOOTTIME); clocks are never compared.
+This module reads no clock and no socket. Its owner passes the time with each message, sends the results, and
+calls `tick` when `next_event` is due. All times are from the appliance's own clock, which must run while the
+machine sleeps (CLOCK_BOOTTIME); clocks are never compared.
 
 1. The active appliance stays active for 0.8 of an expiry after it *sent* a renewal that was granted, or a request for a
    promise that was given. The witness and the other appliance count a whole expiry from a later time.
 2. A passive appliance becomes active only by a grant of the witness. A grant that arrives while it has promised not to
-   claim waits until the promise ends: the other appliance may rely on it.
+   claim waits until the promise ends.
 3. A passive appliance gives no promise while the witness says that the lease has expired: the active appliance is cut
    off from the robot, which then needs this one. It asks the witness also while it has promised not to claim.
 4. An appliance that starts may have given a promise before, so it claims one expiry later.
@@ -39,7 +39,7 @@ Operation = Literal["renew", "claim", "remove", "add", "release", "look"]
 
 
 class LeaseError(Exception):
-    """An order that is not possible now; the message has the remedy."""
+    """An order is not possible now; the message has the remedy."""
 
 
 @dataclass(frozen=True)
@@ -147,16 +147,16 @@ class ApplianceLease:
 
     @property
     def heard(self) -> float | None:
-        """Return the time of the last request of this appliance that the other one answered; None: no answer yet."""
+        """Return the time of this appliance's last request that the other one answered, or None."""
         return self._heard if self._heard > self._started else None
 
     @property
     def other_witnessed(self) -> float | None:
-        """Return the time of the last answer of the witness to the other appliance, by its promises; None: unknown."""
+        """Return the time of the witness's last answer to the other appliance, by its promises; None if unknown."""
         return self._other_witnessed
 
     def handover_obstacle(self, now: float) -> str:
-        """Return why the other appliance could not claim at once if this one gave the lease up; empty: it could."""
+        """Return why the other appliance could not claim at once if this one gave the lease up, or an empty text."""
         other = self._other
         if self.answers_alone or now - self._heard > SILENCE:
             return f"{other} is not ready to take over; wait until it answers and has all data"
@@ -170,7 +170,7 @@ class ApplianceLease:
         return self.held is not None and self._promised_until <= now < self._valid_until
 
     def may_be_renewed(self, now: float) -> bool:
-        """Return whether a lapsed lease may soon be renewed in its epoch; then no other appliance was active since."""
+        """Whether a lapsed lease may soon be renewed in its epoch, so no other appliance was active since."""
         if self.held is None or self._switching_until is not None:
             return False
         return self.answers_alone or now < self._valid_until + _RENEWABLE
@@ -318,7 +318,7 @@ class ApplianceLease:
         self._switching_until, self._released = now + 2 * EXPIRY, released
 
     def _is_cut_off(self, now: float) -> bool:
-        """Return whether only the other appliance reaches the robot. A witness that has ended answers neither."""
+        """Whether only the other appliance reaches the robot. A witness that has ended answers neither."""
         other = self._other_witnessed
         return (
             self.is_active(now)

@@ -75,7 +75,7 @@ class LeaseClient:
         return answered is not None and clock.since_boot() - answered <= EXPIRY
 
     async def standby_hears_witness(self) -> bool:
-        """Whether the witness answers a request that the standby sends after this call; wait an expiry at most."""
+        """Whether the witness answers a request that the standby sends after this call; wait at most an expiry."""
         asked = clock.since_boot()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(EXPIRY):

@@ -1,8 +1,9 @@
 """The link control <-> lease, of an appliance that is one of two (docs/standby.md).
 
-Control may answer without the standby only after a `LeaseState` with `alone` and a new `permission`. To end that, it
-first waits for the standby again, and then reports `caught_up` with that permission. Only then the lease asks the
-witness to add the standby. So a standby in the in-sync set has every answered change.
+Control may answer without the standby only after a `LeaseState` with `alone` and a new `permission`. To end
+this, control first waits for the standby again, and then reports `caught_up` with that permission, after
+which the lease asks the witness to add the standby. So a standby in the in-sync set has every answered
+change.
 """
 
 from typing import Annotated
@@ -17,12 +18,13 @@ _Epoch = Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
 class LeaseState(Message):
     """The lease reports its state after each change, and at least once a second.
 
-    `until` is the time (seconds of CLOCK_BOOTTIME) to which this appliance may answer; 0: it is passive. `epoch` is the
-    highest that it knows. `alone`: the witness has removed the other appliance from the in-sync set. `permission`
-    counts these messages with `alone`. `answered` and `heard` are the times of the last answer of the witness and the
-    last message of the other appliance, None if there was none. `other_witnessed` is the time of the last answer of
-    the witness to the other appliance, None if that is unknown. `handover_obstacle` is why the other appliance could
-    not claim if this one gave the lease up now; `trouble` is why the witness could not save a takeover.
+    `until` is the time (seconds of CLOCK_BOOTTIME) to which this appliance may answer; 0: it is passive.
+    `epoch` is the highest known one. `alone`: the witness has removed the other appliance from the in-sync
+    set. `permission` counts these messages with `alone`. `answered` and `heard` are the times of the last
+    answer of the witness and the last message of the other appliance, None if there was none.
+    `other_witnessed` is the time of the last answer of the witness to the other appliance, None if that is
+    unknown. `handover_obstacle` is why the other appliance could not claim if this one gave the lease up now;
+    `trouble` is why the witness could not save a takeover.
     """
 
     until: float
@@ -73,7 +75,7 @@ class ControlUnready(Message):
 
 
 class ControlServes(Message):
-    """Control of an active appliance serves the robot; with an obstacle: it runs, but cannot serve. Sent repeatedly.
+    """Control of an active appliance reports repeatedly that it serves the robot, or the obstacle to it.
 
     `keeps_state`: a monitor holds its topics if its state is lost, as it is at an unplanned takeover.
     """

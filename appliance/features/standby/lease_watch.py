@@ -1,7 +1,7 @@
 """Decide by the reports of the lease whether this appliance may serve.
 
-A report has the time to which the lease is valid. If no later time follows, the appliance does not serve from that time
-on: also if the process of the lease hangs, dies, or is not scheduled.
+A report has the time to which the lease is valid. From that time on, the appliance does not serve, unless a later time
+follows.
 
 A lease that has lapsed may be renewed in the same epoch. Then no other appliance was active in between, and the state
 in memory is still the newest. So a lapse only suspends the processes that serve the robot. They go on after a renewal
@@ -50,14 +50,14 @@ class LeaseWatch(ServiceGate):
                 self.lapsed() if renewable else self.ended()
 
     def died(self, role: str, *, serves_robot: bool) -> None:
-        """End a lapse if what could end it in order is gone."""
+        """End a lapse if the process that could end it in order is gone."""
         if role == "lease":
             self.not_renewable()
         elif self.suspended and serves_robot:
             self.ended()
 
     def held(self, until: float, epoch: int) -> None:
-        """Take a report: the lease is valid until `until` (seconds of CLOCK_BOOTTIME), in this epoch."""
+        """Note that the lease is valid until `until` (seconds of CLOCK_BOOTTIME), in this epoch."""
         if self.epoch not in (None, epoch):
             self.ended()
         self._until, self._renewable = until, True
@@ -72,7 +72,6 @@ class LeaseWatch(ServiceGate):
             self._check()
 
     def lapsed(self) -> None:
-        """Take a report: the lease is not valid, but it may be renewed."""
         if self.epoch is None or self.suspended:
             return
         self._stop_timer()
@@ -83,7 +82,6 @@ class LeaseWatch(ServiceGate):
         self._timer = asyncio.get_running_loop().call_later(LONGEST_LAPSE, self.ended)
 
     def ended(self) -> None:
-        """Take a report: the lease is not valid any more, and is not renewed."""
         self._stop_timer()
         if self.epoch is not None:
             self.epoch, self.suspended = None, False

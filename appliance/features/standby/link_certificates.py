@@ -69,7 +69,7 @@ def link_context(own: LinkCertificate, peer: str, folder: Path, *, server: bool)
 
 
 def replication_context(membership: Membership, folder: Path, *, server: bool) -> ssl.SSLContext:
-    """Return the TLS context of the replication. Raises `OSError` with what to do."""
+    """Return the TLS context of the replication. Raises `OSError` with the remedy."""
     own = LinkCertificate(membership.certificate, membership.key)
     try:
         return link_context(own, membership.other_certificate, folder, server=server)

@@ -97,7 +97,7 @@ def promote(appliance: Appliance) -> None:
 def _look(appliance: Appliance) -> StatusView:
     """Return the present state. Raises `NotRunningError` also for an appliance that cannot give it now.
 
-    Exits with status 1 on an appliance that is not one of two.
+    Exits with status 1 on an appliance without a pair.
     """
     answer = appliance.ask(StandbyWanted())
     if not answer.ok and answer.trouble != "unknown":

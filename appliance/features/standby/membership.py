@@ -11,7 +11,7 @@ from appliance.base.atomic_files import write_whole
 FOLDER = "standby"
 FILE = "membership.json"
 LEASE_FILE, LINK_FILE = "lease.json", "link.json"
-"""The parts of it that the supervisor writes for the process `lease` and for control."""
+"""The parts of the membership that the supervisor writes for the process `lease` and for control."""
 
 LEASE_NICE = -10  # as the unit of the witness has
 LEFT_FILE = "left.json"
@@ -32,11 +32,12 @@ class MembershipError(ValueError):
 class Membership(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """This appliance, the other one, and the witness on the robot.
 
-    `address` and `other_address` are the IPv4 addresses of the appliances as the robot and each other see them. `fixed`
-    is the address at which the robot's nodes reach the active appliance. The keys (hexadecimal) authenticate datagrams
-    to the witness and to the other appliance; the certificates (PEM) and the key (PEM) are those of the replication. A
-    process gets only the secrets that it needs; the others are empty. The sealed certificate and key are those of the
-    tunnels' authority, encrypted by a passphrase; only the file for the other appliance has them.
+    `address` and `other_address` are the IPv4 addresses of the appliances as the robot and each other see
+    them. `fixed` is the address at which the robot's nodes reach the active appliance. The keys (hexadecimal)
+    authenticate datagrams to the witness and to the other appliance; the certificates (PEM) and the key (PEM)
+    are those of the replication. A process gets only the secrets that it needs; the others are empty. The
+    sealed certificate and key are the tunnels' authority, encrypted by a passphrase; only the file for the
+    other appliance has them.
     """
 
     name: _Name

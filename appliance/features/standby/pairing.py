@@ -1,4 +1,4 @@
-"""Read the membership of an appliance that is one of two, and say what its start needs."""
+"""Read the membership of one of two appliances, and find what its start needs."""
 
 from pathlib import Path
 

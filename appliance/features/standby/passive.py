@@ -91,7 +91,7 @@ class PassiveControl:
         self.api: Channel | None = None  # the link to the api, after `run`
 
     async def run(self, until: asyncio.Event) -> None:
-        """Stand by until the event is set. Then the state file is closed and consistent."""
+        """Stand by until the event is set; the state file is then closed and consistent."""
         loop = asyncio.get_running_loop()
 
         def begin(what: str, work: Callable[[], Awaitable[None]]) -> asyncio.Task[None]:
@@ -127,8 +127,6 @@ class PassiveControl:
             await asyncio.to_thread(self._replica.close)
 
     async def _sync(self) -> None:
-        """Keep the replica on the disk, and note when it is complete."""
-
         def complete() -> None:
             self._complete = True
             self._state_presence()

@@ -48,7 +48,6 @@ class ReplicatedTokens:
         return self._rows is not None
 
     def read(self) -> bool:
-        """Read the tokens again; return whether they have changed."""
         with suppress(sqlite3.Error):  # no state yet
             with closing(sqlite3.connect(f"file:{self._path}?mode=ro", uri=True)) as connection:
                 connection.execute("BEGIN")  # one snapshot: keys and tokens of the same time

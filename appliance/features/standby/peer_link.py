@@ -1,9 +1,8 @@
 """The datagrams between two appliances: requests for a promise, promises, and the order to take over.
 
 Each datagram is authenticated with a key that both appliances share. A promise repeats the nonce and the number of its
-request, so no earlier promise is valid. An active appliance uses one nonce in an epoch, because a restarted appliance
-needs a new epoch. So a request is new only if its epoch is greater, or if its nonce is the same and its number is
-greater.
+request. An active appliance uses one nonce in an epoch. So a request is new only if its epoch is greater, or if its
+nonce is the same and its number is greater.
 """
 
 import msgspec
@@ -19,7 +18,7 @@ PURPOSES: dict[type[PeerMessage], bytes] = {
 
 
 class PeerChannel:
-    """Write messages to the other appliance, and read its messages."""
+    """Writes messages to the other appliance, and reads its messages."""
 
     def __init__(self, name: str, other: str, key: bytes) -> None:
         self._name = name

@@ -1,8 +1,8 @@
 """Run the lease as a process of the appliance: the witness, the other appliance, the supervisor and control.
 
 The process does nothing else, so neither a busy nor a restarted control loses the lease. It reports each extension to
-the supervisor. If no further extension arrives, the supervisor stops the processes that serve the robot. So the
-appliance also becomes passive if this process hangs or dies. The epoch is on the disk before it is used.
+the supervisor. If no further extension arrives, the supervisor stops the processes that serve the robot. The epoch is
+on the disk before it is used.
 
 This appliance claims only while its control is present. The control of a standby also withdraws its presence while it
 could not serve (`features/standby/takeover_check.py`). If the control of an active appliance does not serve
@@ -129,7 +129,6 @@ class LeaseProcess:
         self._after(lease.tick(now, waiting_since=waiting, caught_up=caught_up))
 
     def _give_away(self, now: float) -> None:
-        """Let the other appliance take over if this one holds the lease, but does not serve."""
         fault = self._service.fault(now, active=self._lease.is_active(now), present=self._present)
         if not fault:
             return
@@ -142,7 +141,6 @@ class LeaseProcess:
             self._after(due)
 
     def _after(self, due: Outgoing) -> None:
-        """Store the epoch, send what is due, and report the state."""
         epoch = self._lease.epoch
         if epoch != self._stored:
             store_epoch(self._epoch_file, epoch)
@@ -219,7 +217,7 @@ class LeaseProcess:
             self.child.tell(state)
 
     def control_linked(self) -> None:
-        """A new control waits for the standby until it gets a new permission."""
+        """Make a new control wait for the standby until it gets a new permission."""
         self._present = False
         self._service.linked()
         self._report = lease_link.ReplicationReported(self._permission, False, None)
@@ -255,7 +253,7 @@ class LeaseProcess:
 
 
 def stored_epoch(path: Path) -> int:
-    """Return the stored epoch; 0 if there is no file. Raises `ValueError` if it is damaged: then nothing is safe."""
+    """Return the stored epoch; 0 without a file. Raises `ValueError` if it is damaged, because then nothing is safe."""
     try:
         text = path.read_text("ascii").strip()
     except FileNotFoundError:

@@ -67,10 +67,10 @@ class Replica:
         self.position = Stored(*kept) if kept else Stored(0, "", 0)
 
     def take(self, message: FromActive) -> None:
-        """Take a message; then `position` survives the death of this process.
+        """Store a message, so that `position` survives the death of this process.
 
-        Raises `ReplicationError` if it is not allowed, and `StoreError` if it cannot be written. The state is then as
-        it was before the message, or before the snapshot.
+        Raises `ReplicationError` if it is not allowed, and `StoreError` if it cannot be written. The state is
+        then as it was before the message, or before the snapshot.
         """
         with self._lock:
             try:

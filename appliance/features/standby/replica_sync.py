@@ -1,8 +1,8 @@
 """Keep the replica of a standby on the disk, and notice that a power cut may have taken its last changes.
 
-A change is acknowledged before it is on the disk. While the machine runs, it cannot be lost. After a reboot the last
-changes may be missing, so this appliance takes over only once it has followed the active one again. If no active
-appliance appears within `WAIT_SECONDS`, both lost their power together, and each has all but the last changes.
+A change is acknowledged before it is on the disk. After a reboot the last changes may be missing, so this appliance
+takes over only once it has followed the active one again. If no active appliance appears within `WAIT_SECONDS`, both
+lost their power together, and each has all but the last changes.
 """
 
 import asyncio
@@ -46,7 +46,7 @@ class ReplicaSync:
             await asyncio.sleep(_SYNC_SECONDS)
 
     def _is_complete(self) -> bool:
-        """Return whether the machine was not started again since the replica was complete; a new one is."""
+        """Whether the machine has not restarted since the replica was complete; a new replica is complete."""
         try:
             return self._mark.read_text("ascii") == self._boot
         except FileNotFoundError:

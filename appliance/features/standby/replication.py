@@ -252,7 +252,6 @@ class Replication:
         return self.sender.lag().connected
 
     def _connected(self) -> bool:
-        """Return whether the standby is connected and answers: a dead one is noticed by its missing promises first."""
         lease = self._lease.state
         heard = lease.heard if lease is not None else None
         return (

@@ -94,7 +94,7 @@ class EncodedChanges(msgspec.Struct, frozen=True, array_like=True, tag="changes"
 
 
 class SnapshotBegin(msgspec.Struct, frozen=True, array_like=True, tag="snapshot"):
-    """All rows follow, as they were after the change `number`."""
+    """The beginning of a snapshot: all rows as they were after the change `number`."""
 
     epoch: _Number
     history: _History

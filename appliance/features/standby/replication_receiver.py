@@ -51,7 +51,7 @@ class ReplicationReceiver:
         self._accepts = accepts
         self._link: ReplicationLink[FromActive] | None = None
         self.followed = False
-        """Whether the active appliance has sent what was missing since this object was made."""
+        """Whether the active appliance has sent the missing changes since this object was made."""
         self._introduction = introduction
         self._introduced = 0.0  # when, by the clock of the event loop
         self._obstacle = obstacle

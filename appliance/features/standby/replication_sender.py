@@ -1,8 +1,8 @@
 """Send the changes of the active appliance's state to its standby, and wait until the standby has them.
 
-The standby connects, and reports its last change. It gets the later changes, if this process made them and still has
-them in memory. Otherwise it gets a snapshot: all rows of a copy of the database, then the changes after the copy. Rows
-are sent rather than the database file, because the standby must not have to trust a file.
+The standby connects, and reports its last change. It gets the later changes if this process still has them in
+memory. Otherwise it gets a snapshot: all rows of a copy of the database, then the changes after the copy.
+Rows are sent rather than the database file, which the standby would have to trust.
 
 1. A change counts as acknowledged only if it was sent on this link, and the standby has reported it stored.
 2. While the standby is away, at most `room` bytes of changes are kept; while it is connected, four times as many, so
@@ -296,7 +296,6 @@ class ReplicationSender:
                             await self._changed.wait()
 
     async def _send_snapshot(self, link: ReplicationLink[FromStandby]) -> int:
-        """Send a copy of the database; return the number of its last change."""
         await self._database.settled()
         copy = await _in_thread(self._database.copy)
         with contextlib.closing(copy):
@@ -328,7 +327,7 @@ class ReplicationSender:
 
 
 async def _in_thread(function: Callable[..., T], *arguments: Any) -> T:
-    """Call a function in a thread, and wait for its end even if cancelled: it uses a connection that is closed then."""
+    """Call a function in a thread, and wait for its end even if cancelled, because its connection is closed then."""
     task = asyncio.ensure_future(asyncio.to_thread(function, *arguments))
     try:
         return await asyncio.shield(task)
@@ -338,7 +337,6 @@ async def _in_thread(function: Callable[..., T], *arguments: Any) -> T:
 
 
 def _rows_of(copy: sqlite3.Connection, tables: Iterable[str]) -> Iterator[Put]:
-    """Yield all rows: at most `ROWS` at a time, and fewer if they have more than `_BATCH` bytes."""
     for table in tables:
         rows: list[tuple[str | int | float | bytes | None, ...]] = []
         size = 0

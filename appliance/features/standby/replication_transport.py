@@ -18,7 +18,7 @@ _log = structlog.get_logger()
 
 
 class ReplicationListener:
-    """Accept the standby's connections on a listening socket, and send to the last one."""
+    """Accepts the standby's connections on a listening socket, and sends to the last one."""
 
     def __init__(self, sender: ReplicationSender, context: ssl.SSLContext) -> None:
         self._sender = sender

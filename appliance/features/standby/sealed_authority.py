@@ -1,7 +1,7 @@
-"""Bring the encrypted key of an authority to the other one of two appliances.
+"""Bring the encrypted key of an authority to the other appliance.
 
-Only a key that the passphrase encrypts is brought. The other appliance keeps it beside its own authority, and its
-signer uses it (`ipsec/brought_authority.py`).
+Only a key that the passphrase encrypts is brought. The other appliance keeps it beside its own authority, and
+its signer uses it (`ipsec/brought_authority.py`).
 """
 
 import contextlib

@@ -26,7 +26,7 @@ _VERB = "rosrv standby"
 
 
 def join_second(file: Path, state: Path, *, again: bool, as_json: bool) -> None:
-    """Back the state up, then write the membership. The appliance must be stopped: later changes would be lost."""
+    """Back up the state, then write the membership. The appliance must be stopped, or later changes would be lost."""
     membership = _given(file)
     directory = StateDirectory(state)
     try:
@@ -68,7 +68,6 @@ def _given(file: Path) -> Membership:
 
 
 def _join(membership: Membership, state: Path, *, again: bool) -> Path | None:
-    """Write the membership; return the backup, None if there was nothing to lose."""
     path = path_of(state)
     earlier = existing_membership(path)
     if earlier == membership.unsealed():

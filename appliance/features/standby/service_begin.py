@@ -26,7 +26,7 @@ _REPAIR_SECONDS = 8.0
 
 
 class ServiceReport:
-    """The reports of one control process."""
+    """The service reports of one control process."""
 
     def __init__(self, base: Foundation, parts: Parts) -> None:
         self._base = base
@@ -45,7 +45,6 @@ class ServiceReport:
         return lease_link.ControlServes(obstacle or self._lasting(), keeps_state)
 
     def _lasting(self) -> str:
-        """Return what should have been repaired by now; empty: nothing."""
         probe = self._base.lifeline.surroundings.probe
         broken = no_relay(self._parts.endpoints.relay.presence)
         if probe not in ("", "passed"):
@@ -109,7 +108,7 @@ def _part(orders: StandbyOrders) -> FeaturePart:
 
 
 async def _begin_epoch(base: Foundation, parts: Parts, pair: Pair) -> TakeoverRecorder:
-    """Record that this appliance is active, and give its relays the state of the other one's monitors."""
+    """Record that this appliance is active, and give its relays the state of the other appliance's monitors."""
     name, other = pair.membership.name, pair.membership.other
     recorder = TakeoverRecorder(
         base.trail, base.audit, base.store, base.signing.signed, name=name, other=other

@@ -1,15 +1,16 @@
 """Judge whether the control of an active appliance serves the robot, by its reports and by times alone.
 
-An appliance that holds the lease and does not serve is worse than none: the other one sees a healthy holder. So the
-lease is given away when control reports an obstacle (a full disk), is silent, or does not get ready after a start.
+An appliance that holds the lease without serving is worse than none, because the other one sees a healthy
+holder. So the lease is given away when control reports an obstacle (a full disk), is silent, or does not get
+ready after a start.
 
-A control that stood by is ready soon after the activation, in less than `START_SECONDS`. A control that died and starts
-again has `RESTART_SECONDS`, because topics and the state of monitors need no control. But a lease that comes back after
-a lapse meets a control that has just begun to start, without relays. The other appliance takes over sooner, so it gets
-the lease, unless a monitor would then hold its topics, because its state would be lost.
+A control that stood by is ready soon after the activation, in less than `START_SECONDS`. A control that died and
+starts again has `RESTART_SECONDS`, because topics and the state of monitors need no control. After a lapse, control
+has just begun to start, without relays. The other appliance takes over sooner, unless a monitor would lose its state
+and hold its topics.
 
-If the lease is given away after less than `STEADY_SECONDS` of service, all limits are doubled the next time: two
-appliances that both cannot serve must not pass it back and forth.
+If the lease is given away after less than `STEADY_SECONDS` of service, all limits are doubled the next time:
+two appliances that both cannot serve must not pass it back and forth.
 """
 
 from appliance.features.standby.witness import EXPIRY
@@ -40,7 +41,7 @@ class ServiceWatch:
         self._serves, self._obstacle = False, ""
 
     def reported(self, now: float, obstacle: str, *, keeps_state: bool) -> None:
-        """Take a report of control; an empty obstacle: it serves."""
+        """Note a report of control; it serves if the obstacle is empty."""
         self._keeps_state = keeps_state
         if not obstacle:
             self._served, self._serves, self._cold = now, True, False
@@ -50,7 +51,7 @@ class ServiceWatch:
         self._obstacle = obstacle
 
     def fault(self, now: float, *, active: bool, present: bool = True) -> str:
-        """Return why the lease should be given away; empty: it should not. `present`: control stands by or serves."""
+        """Return why the lease should be given away, or an empty text. `present`: control stands by or serves."""
         if active and not self._active:
             self._served, self._cold = now, not present
             self._ready = None

@@ -24,7 +24,7 @@ class StandbySource(Protocol):
     """The state of the two appliances, and the switchover."""
 
     def state(self) -> StandbyState | None:
-        """Return the state of both appliances; None: this appliance is not one of two."""
+        """Return the state of both appliances, or None on a single appliance."""
 
     async def hand_over(self) -> None:
         """Make the standby the active appliance. The active appliance may end before this returns.
@@ -34,19 +34,19 @@ class StandbySource(Protocol):
 
 
 class SingleAppliance:
-    """The `StandbySource` of an appliance that is not one of two."""
+    """The `StandbySource` of a single appliance."""
 
-    def state(self) -> None:
-        """Return None."""
+    def state(self) -> None: ...
 
     async def hand_over(self) -> None:
         raise HandOverError(_SINGLE)
 
 
 class ActiveAppliance:
-    """The `StandbySource` of the active one of two.
+    """The `StandbySource` of the active appliance.
 
-    `leaving()` stops the relays and makes the last changes before the switchover. If it fails, `staying()` is called.
+    `leaving()` stops the relays and makes the last changes before the switchover. If it fails, `staying()` is
+    called.
     """
 
     def __init__(

@@ -10,7 +10,7 @@ from appliance.features.standby.standby_answers import StandbyState
     problems={404: "This appliance is not one of two."},
 )  # fmt: skip
 class StandbyWanted(AdminRequest[StandbyState], frozen=True, tag="standby"):
-    """This appliance, the other one, and the witness on the robot. The standby also answers it."""
+    """This appliance, the other one, and the witness on the robot. The standby also answers this request."""
 
 
 @rest(

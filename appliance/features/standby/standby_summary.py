@@ -6,18 +6,18 @@ from appliance.features.standby.standby_answers import OtherAppliance, StandbySt
 from appliance.features.view import Trouble
 
 PATIENCE_SECONDS = 60.0
-"""How long the standby may be away or behind before this is an alarm: an update of its machine takes longer."""
+"""The time that the standby may be away or behind before an alarm: an update of its machine takes that long."""
 
 SILENT_SECONDS = 5.0
-"""From this age of its last answer on, the witness is silent. It is asked every 0.3 s."""
+"""The age of its last answer from which the witness is silent. It is asked every 0.3 s."""
 
 
 UNCHECKED = "it has just started, and still checks whether it could serve"
-"""The obstacle of a standby before the end of its first check, which takes as long as its specifications need."""
+"""The obstacle of a standby before its first check ends, which takes as long as its specifications need."""
 
 
 def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Trouble]:
-    """Yield what is wrong, the most urgent first; `patience`: seconds for which the other may be away or start."""
+    """Yield the troubles, the most urgent first; `patience`: seconds that the other appliance may be away or start."""
     other = state.other
     if both_active(state):
         holder = state.witness.holder
@@ -40,7 +40,7 @@ def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Tro
 
 
 def both_active(state: StandbyState) -> bool:
-    """Return whether this appliance is active, and the witness names another holder of the lease."""
+    """Whether this appliance is active, and the witness names another holder of the lease."""
     witness = state.witness
     return state.role == "active" and not is_silent(witness) and witness.holder not in ("", state.name)
 

@@ -32,7 +32,7 @@ class StandbyTunnels:
             _log.warning("this appliance cannot take over the tunnels of hosts", reason=message.reason)
 
     def introduction(self, endpoint: str, pin: str) -> Introduction | None:
-        """Return the request for this appliance's certificate; None while the process has not made it."""
+        """Return the request for this appliance's certificate, or None while the process has not made it."""
         needed = self._needed
         return None if needed is None else Introduction(needed.request, needed.key, endpoint, pin)
 

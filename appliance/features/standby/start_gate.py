@@ -20,7 +20,7 @@ from appliance.specifications.compiler_link import SpecificationCompiler
 
 
 class StandbyGate(StartGate):
-    """Stand by until the lease is held. A single appliance serves at once."""
+    """Stands by until the lease is held. A single appliance serves at once."""
 
     def __init__(self) -> None:
         self._lease = LeaseClient()

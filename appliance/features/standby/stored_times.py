@@ -1,13 +1,13 @@
 """Move the times in the state to this appliance's clocks when it takes over from the other one.
 
-The state has ends of durations: of blocks, commit-confirm, timed disables, tokens and their grace time, tickets of
-doors, and one-time tokens of hosts. They are in the clocks of the appliance that wrote them. The active appliance
-replicates a reading of its clocks every `READ_SECONDS`. At a takeover, all ends move by the difference between both
-appliances' clocks, in one write, so that each duration has the time left that it had.
+The state has the ends of blocks, commit-confirm, timed disables, tokens and their grace time, tickets of
+doors, and one-time tokens of hosts, by the clocks of the appliance that wrote them. The active appliance
+replicates a reading of its clocks every `READ_SECONDS`. At a takeover, all ends move by the difference
+between both appliances' clocks, in one write, so that each duration has the same time left.
 
-If this appliance did not follow the other one before the takeover, the difference is not known: it may be time off.
-Durations then go on from the last reading: a block never ends early. The ends of tokens stay as they are, because they
-are dates.
+If this appliance did not follow the other one before the takeover, the difference is not known, because it
+may include time off. Durations then continue from the last reading, so no block ends early. The ends of
+tokens stay as they are, because they are dates.
 """
 
 import asyncio

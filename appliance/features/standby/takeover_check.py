@@ -1,13 +1,13 @@
 """Check on a standby that control could start if this appliance took over now.
 
-The check calls the functions by which the start of control reads the stored policy, specifications, hosts and nodes,
-makes the certificate of the link and opens the port of the ROS master. It also writes to the disk of the state, and
-compiles the specifications for the relays, so that a takeover need not (`SpecificationCompiler`). It runs
-at the start, when the active appliance brings another policy or other specifications into force, and every
+The check calls the functions by which the start of control reads the stored policy, specifications, hosts and
+nodes, makes the certificate of the link and opens the port of the ROS master. It also writes to the disk of
+the state, and compiles the specifications for the relays, so that a takeover need not
+(`SpecificationCompiler`). It runs at the start, after a change of the policy or the specifications, and every
 `_AGAIN_SECONDS`, because the appliance's own files, disk and ports may change.
 
-While the check fails, this appliance does not claim the lease. It still follows the active appliance and promises not
-to claim, and stays in the in-sync set: once the cause is gone, it takes over with all data.
+While the check fails, this appliance does not claim the lease, but still follows the active appliance and stays in the
+in-sync set.
 """
 
 import asyncio
@@ -72,7 +72,7 @@ _log = structlog.get_logger()
 class TakeoverCheck:
     """The check; set `news` when the policy or the specifications of the active appliance have changed.
 
-    `obstacle` is why this appliance could not serve after a takeover, in a line; empty: it could.
+    `obstacle` is why this appliance could not serve after a takeover, or empty.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class TakeoverCheck:
 
 
 def lacking_room(folder: Path) -> str:
-    """Return why the disk of the state cannot take the records and changes of an active appliance; empty: it can."""
+    """Return why the state's disk has no room for the records and changes of an active appliance, or an empty text."""
     disk = os.statvfs(folder)
     free = disk.f_bavail * disk.f_frsize
     if free >= _ROOM:

@@ -2,8 +2,7 @@
 
 Each appliance has its own hash chain and key. The replicated state has a row for each appliance of the pair with its
 newest signed checkpoint, and a row with the last takeover. The record of a takeover names both, as the other appliance
-left them. The other appliance is not believed: a checkpoint that is not valid, or of this appliance's chain, is not
-named, and the record has the reason.
+left them. A checkpoint that is not valid, or of this appliance's chain, is not named; the record has the reason.
 """
 
 import asyncio
@@ -29,10 +28,10 @@ _log = structlog.get_logger()
 
 
 class TakeoverRecorder:
-    """The recorder of the appliance `name`, which is one of two with `other`.
+    """The recorder of the appliance `name`, whose partner is `other`.
 
-    `signed` is set with each signature of a checkpoint. Only the active appliance uses this class, because only it
-    changes the state: call `took_over`, then run `follow` as a task.
+    `signed` is set with each signature of a checkpoint. Only the active appliance uses this class, because
+    only it changes the state: call `took_over`, then run `follow` as a task.
     """
 
     def __init__(

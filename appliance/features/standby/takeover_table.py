@@ -11,7 +11,7 @@ from appliance.features.standby.takeover_verification import PairVerification, T
 
 
 def absent(log: Path, state: Path) -> str:
-    """Return the name of the other appliance of a pair if it has no log; else an empty text."""
+    """Return the name of the other appliance of a pair if it has no log, or an empty text."""
     if log.exists():
         return ""
     try:

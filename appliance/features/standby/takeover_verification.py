@@ -7,8 +7,7 @@
 5. While one appliance decided, the other was silent for at least as long. Each duration is measured with one clock, so
    the two clocks need not agree. `_TOLERANCE` allows for a clock that was set while its machine was off.
 
-The logs cannot prove more: records of the other log after the named checkpoint are its tail. The log itself and its
-later checkpoints cover them, if there are any.
+Records of the other log after the named checkpoint are its tail, which its later checkpoints cover, if there are any.
 """
 
 import enum
@@ -62,13 +61,13 @@ class TakeoverFinding(msgspec.Struct, frozen=True):
 
 
 class TakeoverProof(msgspec.Struct, frozen=True, kw_only=True):
-    """A takeover, and what the logs prove about it; `sequence` is its record in the log of `appliance`.
+    """A takeover with its proof; `sequence` is its record in the log of `appliance`.
 
-    `link`: "proven" (the named checkpoint is in the other log), "removed" (retention removed its records since), "none"
-    (no checkpoint was replicated), or "wrong" (see the findings). The checkpoint sealed the other log `through` that
-    record; the `tail` are the other log's records after it until its next takeover, of which `tail_signed` are sealed
-    by its later checkpoints. `overlap`: "excluded", "found", or "unknown" (the other appliance did not take over again,
-    decided nothing, or a clock was set).
+    `link`: "proven" (the named checkpoint is in the other log), "removed" (retention removed its records
+    since), "none" (no checkpoint was replicated), or "wrong" (see the findings). The checkpoint sealed the
+    other log `through` that record; the `tail` are the other log's records after it until its next takeover,
+    of which `tail_signed` are sealed by its later checkpoints. `overlap`: "excluded", "found", or "unknown"
+    (the other appliance did not take over again, decided nothing, or a clock was set).
     """
 
     epoch: int
@@ -229,7 +228,6 @@ class _Pair:
             self._check_silence(log, handover)
 
     def _check_silence(self, log: TakeoverLog, handover: Handover) -> None:
-        """Find decisions after a hand-over, except those that were under way or came after it failed."""
         end = log.end_of(handover.sequence)
         late = log.last_decision(handover.sequence, log.stayed(handover.sequence, end) or end)
         if late is None or log.clock_was_set(handover.sequence, late.sequence):
@@ -283,7 +281,6 @@ class _Pair:
     # --- overlapping epochs -----------------------------------------------------------------------------------
 
     def _overlaps(self) -> Iterator[tuple[int, Overlap]]:
-        """Yield the places of takeovers for which an overlap with the epoch before is excluded or found."""
         switches = [
             place for place, two in enumerate(pairwise(self._placed), 1) if two[0].own is not two[1].own
         ]
@@ -332,7 +329,7 @@ _WRONG = {
 
 
 def _wrong_checkpoint(named: SignedCheckpoint, log: TakeoverLog) -> tuple[TakeoverFindingKind, str] | None:
-    """Return why a named checkpoint is not one of a log; None if it is, or if its records were removed."""
+    """Return why a named checkpoint is not in a log; None if it is, or if its records were removed."""
     first, last, key = log.result.removed + 1, log.result.last, log.result.key or "no key"
     known = KnownLog(log.result.log, key, first, last, log.hash_at, log.checkpoint_text)
     fault = named.fault_in(known)

@@ -83,7 +83,7 @@ class TakeoverLog:
         self.takeovers: list[Takeover] = []
         self.handovers: list[Handover] = []
         self.unreadable: list[int] = []
-        """The sequences of records whose detail is not that of a takeover or hand-over."""
+        """The sequences of records whose detail is not a valid takeover or hand-over."""
         self._read()
         self.names = {takeover.detail.appliance for takeover in self.takeovers}
         self.epochs = {takeover.detail.epoch for takeover in self.takeovers}
@@ -153,7 +153,6 @@ class TakeoverLog:
         return row[0] if row is not None and isinstance(row[0], bytes) else None
 
     def checkpoint_text(self, number: int) -> bytes:
-        """Return the text of a checkpoint; empty for a missing one."""
         row = self._connection.execute("SELECT text FROM checkpoint WHERE number = ?", (number,)).fetchone()
         return b"" if row is None else row[0]
 

@@ -238,7 +238,6 @@ class LeaseFile:
         return record
 
     def has_room(self) -> bool:
-        """Return whether a change needs no free space."""
         try:
             return os.stat(self.path).st_size == 2 * _COPY
         except OSError:
@@ -524,16 +523,17 @@ class WitnessGate:
 
 
 class WitnessFollower:
-    """The rules of a computer that does as the witness does.
+    """The rules of a follower.
 
-    It admits an appliance only while the appliance's lease runs at the witness: for 0.9 of the time that the answer
-    has left, counted from the time the request was *sent*. The rest allows for clocks of different speeds. The
-    witness grants the lease only after it expired or was released. So whenever the robot admits one appliance, no
-    follower admits the other one, unless that one has given the lease up. Without answers, both are shut out after at
-    most one expiry. Old and repeated answers are ignored.
+    It admits an appliance only while the appliance's lease runs at the witness: for 0.9 of the time that the
+    answer has left, counted from the time the request was *sent*. The rest allows for clocks of different
+    speeds. The witness grants the lease only after it expired or was released. So whenever the robot admits
+    one appliance, no follower admits the other one, unless that one has given the lease up. Without answers,
+    both are shut out after at most one expiry. Old and repeated answers are ignored.
 
-    `epoch` is the greatest that was saved; a smaller one, of a witness that was restored from an old disk, is not
-    accepted. `clock` also runs while the computer sleeps; `answered` is its time at the last authentic answer.
+    `epoch` is the greatest that was saved; a smaller one, of a witness that was restored from an old disk, is
+    not accepted. `clock` also runs while the computer sleeps; `answered` is its time at the last authentic
+    answer.
     """
 
     def __init__(
@@ -829,10 +829,10 @@ class LeaseFirewall:
         self._written = self._present()
 
     def intact(self) -> bool:
-        """Return whether the rules are still those that were written; a removed table cannot be listed.
+        """Return whether the written rules are unchanged; a removed table cannot be listed.
 
-        Another program may have changed them before they were read for the first time. So the jumps, which must be
-        first, and the number of rules are compared with what was written.
+        Another program may have changed them before they were read for the first time. So the jumps, which
+        must be first, and the number of rules are compared with what was written.
         """
         try:
             present = self._present()
@@ -901,7 +901,7 @@ def segment(connection: Ends, flags: int, number: int) -> bytes:
 
 
 class IdleConnections:
-    """Reset local connections with an appliance that is no longer admitted, also those in which nothing is sent."""
+    """Reset local connections with an appliance that is no longer admitted, even idle ones."""
 
     def __init__(self, settings: WitnessSettings) -> None:
         self._settings = settings
@@ -1033,7 +1033,7 @@ def _ports(text: str) -> str:
 
 
 class BoundedLog:
-    """Lines on standard error; of more than a few in some seconds, only the number is printed."""
+    """Lines on standard error; if there are more than a few in some seconds, only their number is printed."""
 
     def __init__(self, write: Callable[[str], Any], clock: Callable[[], float]) -> None:
         self._write = write
@@ -1074,7 +1074,7 @@ class LeaseEnforcement:
         self._log.add("the robot admits %s" % (name or "no appliance"))
 
     def go_on(self, enforce_again: Callable[[], None]) -> bool:
-        """Go on with the resets, and check the rules once a second; return whether they were checked."""
+        """Continue the resets, and check the rules once a second; return whether they were checked."""
         now = time.monotonic()
         if now - self._reset >= _RESET_SECONDS:
             self._reset = now
@@ -1136,7 +1136,7 @@ def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
 
 
 def _note_trouble(witness: Witness, lease: LeaseFile, disk: DiskCheck, log: BoundedLog) -> None:
-    """Store for the answers why the next change of the lease would not be saved. If the file has no room, make it."""
+    """Store why the next change of the lease would not be saved, for the answers. If the file has no room, make it."""
     if witness.record is not None and not lease.has_room():
         with contextlib.suppress(WitnessError):  # reported as the trouble
             lease.write(witness.record)
@@ -1173,7 +1173,7 @@ class RequestSockets:
         return [(one, _BATCH if one is self._common else _EACH) for one in found]
 
     def prefer(self, name: str, source: Tuple[str, int]) -> None:
-        """Connect a socket to the source of a new request. Raises `OSError`; then the common socket serves it."""
+        """Connect a socket to the source of a new request. If that raises `OSError`, the common socket serves it."""
         before = self._connected.get(name)
         if before is not None and before[1] == source:
             return
@@ -1216,7 +1216,7 @@ def _answer_one(one: socket.socket, gate: WitnessGate, requests: RequestSockets)
 
 
 def follow(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
-    """Do as the witness does until the process ends. First, both appliances are shut out."""
+    """Follow the witness until the process ends. First, both appliances are shut out."""
     log = BoundedLog(_write_error, time.monotonic)
     enforcement = LeaseEnforcement(settings, backend, log)
     names = tuple(sorted(settings.appliances))

@@ -30,7 +30,7 @@ class _AnswerBody(msgspec.Struct, frozen=True):
 
 
 class WitnessChannel:
-    """Write requests and read answers. `session` is a nonce of this process: no earlier answer has it."""
+    """Writes requests and reads answers. `session` is a nonce of this process, so no earlier answer has it."""
 
     def __init__(self, name: str, key: bytes, session: str) -> None:
         self._name = name
@@ -96,7 +96,7 @@ class WitnessLink(asyncio.DatagramProtocol):
             self._answered(*answer)
 
     def error_received(self, exc: Exception) -> None:
-        """Ignore an unreachable witness: the lease counts on answers only."""
+        """Ignore an unreachable witness, because the lease counts only on answers."""
 
     def send(self, request: WitnessRequest) -> None:
         """Send a request. Without a socket or a route it is lost; the lease asks again."""

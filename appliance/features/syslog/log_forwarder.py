@@ -52,7 +52,7 @@ class ForwardingPosition(msgspec.Struct, frozen=True):
 
 
 def load_position(path: Path) -> ForwardingPosition | None:
-    """Raises `ValueError` and `OSError` if the file cannot be read."""
+    """Return the stored position. Raises `ValueError` and `OSError` if the file cannot be read."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=ForwardingPosition)
     except FileNotFoundError:
@@ -62,13 +62,12 @@ def load_position(path: Path) -> ForwardingPosition | None:
 
 
 def save_position(path: Path, position: ForwardingPosition) -> None:
-    """Raises `OSError`."""
     write_whole(path, msgspec.json.encode(position), 0o600)
 
 
 @dataclass(slots=True)
 class LogForwarder:
-    """The position is in the file `kept`. Not thread-safe."""
+    """Forwards the log; its position is in the file `kept`. Not thread-safe."""
 
     log: Path
     kept: Path

@@ -3,7 +3,7 @@
 Invariants:
 
 1. `send` returns when the receiver's kernel has acknowledged every byte (TCP, TLS), or the datagrams have left (UDP).
-   Otherwise it raises `OSError`. All waits have a limit.
+   Otherwise it raises `OSError`.
 2. Data from the receiver is discarded; a closed connection is detected before more is sent.
 3. TLS requires that the configured authority certifies the receiver's configured name or address.
 
@@ -35,13 +35,13 @@ class Receiver(Protocol):
     """A receiver of messages."""
 
     def send(self, messages: Sequence[bytes]) -> None:
-        """Send in order, as the module's invariants say. Raises `OSError`."""
+        """Send messages in order, with the module's invariants. Raises `OSError`."""
 
     def close(self) -> None: ...
 
 
 class DatagramReceiver:
-    """A closed port is not always reported, so messages may be lost."""
+    """A UDP receiver. A closed port is not always reported, so messages may be lost."""
 
     def __init__(self, host: str, port: int) -> None:
         self._place = (host, port)
@@ -63,7 +63,7 @@ class DatagramReceiver:
 
 
 class StreamReceiver:
-    """The connection lasts; `context` returns a new connection's TLS context (None: clear text)."""
+    """A receiver by one lasting connection; `context` returns a new connection's TLS context (None: clear text)."""
 
     def __init__(
         self,
@@ -78,7 +78,7 @@ class StreamReceiver:
         self._socket: socket.socket | None = None
 
     def send(self, messages: Sequence[bytes]) -> None:
-        """Each message follows its length. Wait until all bytes are acknowledged."""
+        """Send each message after its length, and wait until all bytes are acknowledged."""
         connection = self._socket
         if connection is None:
             connection = self._socket = self._connect()
@@ -107,7 +107,7 @@ class StreamReceiver:
 
 
 def tls_context(ca: Path | None, certificate: Path | None, key: Path | None) -> ssl.SSLContext:
-    """Without `ca`, the system's authorities verify the receiver.
+    """Return the TLS context; without `ca`, the system's authorities verify the receiver.
 
     Raises `OSError`, which names the unreadable file.
     """
@@ -129,7 +129,7 @@ def tls_context(ca: Path | None, certificate: Path | None, key: Path | None) -> 
 
 
 def _await_objection(connection: socket.socket) -> None:
-    """With TLS 1.3 the server rejects our certificate after our handshake. Raises `OSError`."""
+    """Wait for the server's rejection of our certificate, which TLS 1.3 sends after our handshake. Raises `OSError`."""
     select.select([connection], [], [], _OBJECTION_SECONDS)
     _require_open(connection)
 
@@ -158,6 +158,5 @@ def _await_acknowledgement(connection: socket.socket) -> None:
 
 
 def _unacknowledged(connection: socket.socket) -> int:
-    """The number of bytes by `SIOCOUTQ`, tcp(7)."""
     answer = fcntl.ioctl(connection.fileno(), termios.TIOCOUTQ, b"\0\0\0\0")
     return int(struct.unpack("i", answer)[0])

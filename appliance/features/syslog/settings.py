@@ -10,7 +10,7 @@ from appliance.configuration.sections import FeatureSection, checked_receiver, k
 
 @section
 class Syslog(FeatureSection):
-    """Where the audit log is forwarded to (RFC 5424), in a process of its own; off unless `to` is given."""
+    """The receiver of the audit log (RFC 5424), served by a process of its own; off unless `to` is given."""
 
     place: ClassVar[str] = "audit.syslog"
     to: Annotated[str, AfterValidator(checked_receiver)] | None = key(
@@ -46,7 +46,7 @@ class Syslog(FeatureSection):
 
     @property
     def destination(self) -> tuple[str, str, int]:
-        """`to` as protocol, address and port; only where it is given."""
+        """Return `to` as protocol, address and port; only if it is given."""
         return split_receiver(self.to or "")
 
     @property

@@ -4,8 +4,8 @@ Invariants:
 
 1. A message is printable ASCII, and `"`, `\` and `]` are escaped (RFC 5424, 6.3.3). A name chosen by a host can neither
    control a receiver or a terminal, nor end its parameter, element or message.
-2. A message has at most `longest` bytes. To fit, first the details are left out, then the text is cut; each leaves a
-   mark. The sequence and id of the record are always included.
+2. A message has at most `longest` bytes. First the details are left out, then the text is cut; each leaves a mark. The
+   sequence and id of the record are always included.
 3. The same record gives the same message; a receiver detects duplicates by `sequence`.
 """
 
@@ -37,7 +37,7 @@ _CUT = "..."
 
 
 class Formatter:
-    """The facility is 0 to 23; a message has at most `longest` bytes."""
+    """Formats messages of at most `longest` bytes; the facility is 0 to 23."""
 
     def __init__(self, *, facility: int, longest: int, host_name: str | None = None) -> None:
         self._facility = facility
@@ -61,7 +61,7 @@ class Formatter:
         return _message(head, ELEMENT, named, _shortened(text, room))
 
     def checkpoint(self, signed: SignedCheckpoint) -> bytes:
-        """`rosrv audit verify --checkpoints` must find it in the receiver's file."""
+        """Return the message of a checkpoint, which `rosrv audit verify --checkpoints` finds in the receiver's file."""
         head = self._head(Severity.NOTICE, signed.time, "checkpoint signed")
         fields = {
             name: str(value) for name, value in msgspec.structs.asdict(signed).items() if value is not None
@@ -81,7 +81,6 @@ def _message(head: str, element: str, fields: dict[str, str], text: str) -> byte
 
 
 def _value(value: str, room: int) -> str:
-    """Escape and cut to `room` bytes."""
     pieces = [f"\\{character}" if character in '\\"]' else character for character in _ascii(value)]
     if sum(map(len, pieces)) <= room:
         return "".join(pieces)
@@ -105,12 +104,12 @@ def _shortened(text: str, room: int) -> str:
 
 
 def _name(text: str, longest: int) -> str:
-    """Printable ASCII without space, or `-` (RFC 5424, 6)."""
+    """Return the text as printable ASCII without spaces, or `-` (RFC 5424, 6)."""
     return "".join(character for character in text if "!" <= character <= "~")[:longest] or "-"
 
 
 def _time(time: int) -> str:
-    """RFC 3339 with microseconds, as RFC 5424 allows; `-` if it is out of range."""
+    """Return the time as RFC 3339 with microseconds, as RFC 5424 allows, or `-` if it is out of range."""
     seconds, fraction = divmod(time, 1_000_000_000)
     try:
         moment = datetime.fromtimestamp(seconds, UTC)

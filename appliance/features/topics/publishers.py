@@ -14,8 +14,10 @@ _COUNTED = "repetitions folded"
 
 @dataclass(frozen=True, slots=True)
 class PastPublisher:
-    """`since` is nanoseconds since the epoch, and `sequence` the record of the registration or of the node's return.
-    Both are None if the log only has the end of the registration.
+    """A publisher; `since` is nanoseconds since the epoch, and `sequence` the record of the registration or
+    of the node's return.
+
+    Both are None if the log has only the end of the registration.
     """
 
     node: str
@@ -26,7 +28,7 @@ class PastPublisher:
 
 @dataclass(frozen=True, slots=True)
 class PastPublishers:
-    """Ordered by name, with sentences on what the log does not show."""
+    """The publishers by name, with sentences on gaps of the log."""
 
     publishers: tuple[PastPublisher, ...]
     unknown: tuple[str, ...]
@@ -35,7 +37,7 @@ class PastPublishers:
 def publishers_at(
     export: Callable[[Filter], Iterable[LogEntry]], first: LogEntry | None, topic: str, at: int
 ) -> PastPublishers:
-    """`at` is nanoseconds since the epoch.
+    """Return the publishers of a topic `at` a time in nanoseconds since the epoch.
 
     `export` yields the records that match a filter; `first` is the first record of the log.
     """
@@ -86,7 +88,7 @@ def _registered(past: Iterable[LogEntry]) -> list[PastPublisher]:
 def _ended_later(
     later: Iterable[LogEntry], seen: set[tuple[str | None, str | None]]
 ) -> Iterator[PastPublisher]:
-    """Yield nodes whose registration ended later, and of which the log lacks the beginning.
+    """Yield nodes whose registration ended later, and whose beginning the log lacks.
 
     After a loss of records, the beginning may be among the lost ones.
     """
@@ -101,7 +103,7 @@ def _ended_later(
 
 
 def _counts(entry: LogEntry, topic: str, at: int) -> bool:
-    """A summary may count repeated registrations of the topic, or changes of nodes."""
+    """Whether a summary may count repeated registrations of the topic, or changes of nodes."""
     detail, resource = entry.record.detail, entry.record.resource
     return (
         entry.record.event == _COUNTED

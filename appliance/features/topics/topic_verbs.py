@@ -139,7 +139,6 @@ def publishers(
 
 
 def _to_seconds(text: str) -> str:
-    """Times in a text lose the fractions of a second."""
     return re.sub(r"(T\d\d:\d\d:\d\d)\.\d++Z", r"\1Z", text)
 
 
@@ -174,7 +173,7 @@ def _show(message: TopicMessage, field: str | None, *, as_json: bool) -> None:
 
 
 def part_of(fields: Any, path: str) -> Any:
-    """Exits with status 2 if the field is neither there nor left out."""
+    """Return the part at a path. Exits with status 2 if the field is neither there nor left out."""
     value = fields
     for name in path.split("."):
         if isinstance(value, Mapping) and name in value:

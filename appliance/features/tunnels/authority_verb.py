@@ -1,4 +1,4 @@
-"""`rosrv host authority rotate`: another key for the authority of hosts."""
+"""`rosrv host authority rotate`: replace the key of the authority of hosts."""
 
 from appliance.backup.contents import BackupError
 from appliance.cli.connection.target import DEFAULT_STATE, State
@@ -13,9 +13,10 @@ def rotate(
     confirm: Confirm = None,
     as_json: Json = False,
 ) -> None:
-    """Erase the key of the hosts' authority: the next start makes another. Stop the appliance first.
+    """Erase the key of the hosts' authority; the next start makes a new one. Stop the appliance first.
 
-    No certificate of the earlier authority is accepted then: all tunnels stay closed until each host has a new kit.
+    Certificates of the earlier authority are then rejected: all tunnels stay closed until each host has a new
+    kit.
 
     Example: rosrv host authority rotate --state /var/lib/rosrv
     """

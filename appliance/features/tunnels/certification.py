@@ -33,7 +33,7 @@ _SERVED_SECONDS = 10.0
 
 
 class Certification:
-    """The steps shared by enrolment by an operator and by the host itself.
+    """The common steps of enrolment by operators and by hosts.
 
     `changed()` is called after a change of the hosts; it returns the number of rights that this revoked.
     """
@@ -94,7 +94,7 @@ class Certification:
     async def issue(
         self, name: str, request: str, days: float, *, proof: bytes = b"", former: bytes = b""
     ) -> CertificateMade:
-        """Raises `HostRefusedError`."""
+        """Return a new certificate. Raises `HostRefusedError`."""
         self.table.require_room(name)
         try:
             return await self._authority.issue(request.encode(), name, days, proof=proof, former=former)
@@ -102,7 +102,6 @@ class Certification:
             raise HostRefusedError(str(error), ours=not error.refused) from error
 
     def enrolled(self, name: str, address: str, made: CertificateMade, who: str, **more: Any) -> None:
-        """The certificate is the host's first one, or the first after a revocation."""
         self.awaited.forget(name)
         self.keep(name, address, made)
         self.trail.happened(
@@ -150,7 +149,7 @@ class Certification:
         return await self.kit(name, warning, kept)
 
     async def kit(self, name: str, warning: str | None, kept: dict[str, str] | None = None) -> KitParts:
-        """Raises `HostRefusedError`."""
+        """Return the parts of a host's kit. Raises `HostRefusedError`."""
         if self.rest.inner_port is not None and not await self.until_served():
             warning = warning or "REST is not running: the kit cannot renew its certificate automatically"
         authority = await self.authority_certificate()
@@ -183,7 +182,7 @@ class Certification:
         )
 
     async def revocations(self, _request: host_requests.RevocationsWanted) -> RevocationList:
-        """The list is in PEM. Raises `HostRefusedError`."""
+        """Return the revocation list in PEM. Raises `HostRefusedError`."""
         try:
             listed = await self.tunnels.revocations.signed()
         except AuthorityError as error:
@@ -191,18 +190,17 @@ class Certification:
         return RevocationList(listed.decode())
 
     async def authority(self, _request: host_requests.AuthorityWanted) -> AuthorityCertificate:
-        """The certificate is in PEM. Raises `HostRefusedError`."""
+        """Return the authority's certificate in PEM. Raises `HostRefusedError`."""
         return AuthorityCertificate((await self.authority_certificate()).decode())
 
     async def authority_certificate(self) -> bytes:
-        """The certificate is in PEM. Raises `HostRefusedError`."""
         try:
             return await self._authority.certificate()
         except AuthorityError as error:
             raise HostRefusedError(str(error), ours=True) from error
 
     async def until_served(self) -> bool:
-        """The api starts after control; return False if it does not connect in time."""
+        """Wait for the api, which starts after control; return False if it does not connect in time."""
         try:
             async with asyncio.timeout(_SERVED_SECONDS):
                 await self._served.wait()

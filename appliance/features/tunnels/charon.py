@@ -28,11 +28,11 @@ _FAULTS = (
 
 
 class CharonError(Exception):
-    """The message gives the reason and the remedy."""
+    """Charon cannot be provisioned; the message gives the reason and the remedy."""
 
 
 class ViciClient:
-    """Raises `CharonError`."""
+    """A client of charon; the methods raise `CharonError`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -46,12 +46,11 @@ class ViciClient:
         self._session.transport.close()
 
     def load_key(self, key: bytes) -> None:
-        """The key is in PEM."""
         with self._said("the appliance's key"):
             self._session.load_key({"type": "any", "data": key})
 
     def provision(self, stated: TunnelsStated) -> None:
-        """Revoked tunnels are closed before new ones are loaded."""
+        """Bring the wanted state into charon; revoked tunnels are closed before new ones are loaded."""
         before = self._stated
         if before is None or before.authority != stated.authority:
             with self._said("the authority's certificate"):
@@ -169,7 +168,7 @@ class ViciClient:
 
 
 def _der_of(pem: bytes) -> bytes:
-    """DER is a quarter shorter than PEM, and vici's limit is 65,535 bytes."""
+    """Return the certificate in DER, which is a quarter shorter than PEM: vici's limit is 65,535 bytes."""
     return base64.b64decode(b"".join(pem.split(b"-----")[2:3]))
 
 
@@ -196,7 +195,7 @@ def _seen(name: str, row: Any) -> TunnelSeen | None:
 
 
 def _parts(row: Any) -> set[bytes]:
-    """A rekeying changes only one of the two kinds of ids."""
+    """Return the ids of a tunnel, of two kinds; a rekeying changes only one of them."""
     carried = row.get("child-sas", {}).values()
     return {b"ike " + row["uniqueid"], *(b"child " + child["uniqueid"] for child in carried)}
 

@@ -18,7 +18,7 @@ _MOST_PORTS = 100
 
 
 class PortChecks:
-    """`machines()` returns the number of nodes by address."""
+    """The results by machine; `machines()` returns the number of nodes by address."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class PortChecks:
         self._in_words = in_words
 
     async def tell(self, request: host_requests.HostPorts, who: str) -> PortsReport:
-        """Raises `HostRefusedError`, `HostsChangedError`."""
+        """Store a result. Raises `HostRefusedError`, `HostsChangedError`."""
         self._table.require(request.expected)
         key, state = self._known_machine(request.name), request.state
         now = clock.wall()
@@ -59,7 +59,7 @@ class PortChecks:
         return PortsReport(self._view.ports(key), self._table.revision, key)
 
     def in_clear_text(self) -> dict[str, int]:
-        """The number of nodes, by address."""
+        """Return the number of nodes by address."""
         pool = self._table.pool
         return {
             address: nodes

@@ -48,7 +48,7 @@ class Enrolment(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
-    """A host is enrolled; `files` are those of its kit, by path, all but the private key."""
+    """A host is enrolled; `files` are the files of its kit by path, without the private key."""
 
     name: str
     address: str
@@ -127,7 +127,7 @@ def _add_renewal(router: Routes, services: Services) -> None:
     async def renew(
         name: OneName, renewal: Annotated[Renewal, body(Renewal)], request: Request
     ) -> NewCertificate:
-        """For a host in its tunnel: a certificate for a new key, asked for by its present key."""
+        """Return a certificate for a new key to a host in its tunnel; its present key has signed the request."""
         try:
             proof = base64.b64decode(renewal.proof, validate=True)
         except binascii.Error as error:
@@ -144,7 +144,7 @@ def _add_renewal(router: Routes, services: Services) -> None:
         status_code=204,
     )
     async def renewed(name: OneName, request: Request) -> None:
-        """For a host in its tunnel: the new certificate is installed. The one before ends, and the tunnel is built
+        """Note that a host in its tunnel has its new certificate. The one before ends, and the tunnel is built
         again.
         """
         await _ask(services, host_requests.HostRenewed(name, peer_of(request)))

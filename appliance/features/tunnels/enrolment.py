@@ -37,11 +37,12 @@ from appliance.store.host_tables import EnrolmentTokenRow
 
 
 class HostEnrolment(TunnelHosts):
-    """`itself` serves the requests of hosts.
+    """The operators' requests; `itself` serves the requests of hosts.
 
-    `expel(address, reason)` removes a host's registrations and grants and returns their number. `find_endpoint()`
-    returns the address at which hosts reach the appliance; `machines()` returns the number of nodes by address.
-    `carried_out()` waits for the relays: the operator's answer comes after the connections of an expelled host close.
+    `expel(address, reason)` removes a host's registrations and grants and returns their number.
+    `find_endpoint()` returns the address at which hosts reach the appliance; `machines()` returns the number
+    of nodes by address. `carried_out()` waits for the relays: the operator's answer comes after the
+    connections of an expelled host close.
     """
 
     def __init__(
@@ -100,14 +101,14 @@ class HostEnrolment(TunnelHosts):
         return await self._find_endpoint()
 
     async def kit(self, request: host_requests.HostKit) -> answers.KitParts:
-        """Raises `HostRefusedError`."""
+        """Return the parts of a host's kit. Raises `HostRefusedError`."""
         self._table.enrolled_row(request.name)
         return await self._certification.kit(request.name, None)
 
     # --- changes by operators ---
 
     async def add(self, request: host_requests.HostAdd, who: str) -> answers.KitParts:
-        """Raises `HostRefusedError`, `HostsChangedError`, `StoreError`."""
+        """Enrol a host. Raises `HostRefusedError`, `HostsChangedError`, `StoreError`."""
         name = request.name
         async with self._certification.changing:
             self._table.require(request.expected)
@@ -122,7 +123,7 @@ class HostEnrolment(TunnelHosts):
             return await self._certification.finish(name)
 
     async def renew(self, request: host_requests.HostRenew, who: str) -> answers.KitParts:
-        """Raises as `add`."""
+        """Replace the certificate of a host. Raises as `add`."""
         name = request.name
         async with self._certification.changing:
             self._table.require(request.expected)
@@ -136,7 +137,7 @@ class HostEnrolment(TunnelHosts):
             return await self._certification.finish(name)
 
     async def token(self, request: host_requests.HostToken, who: str) -> answers.EnrolmentToken:
-        """Raises as `add`."""
+        """Make a one-time token. Raises as `add`."""
         name = request.name
         found = answers.Endpoint(request.endpoint, "") if request.endpoint else await self._find_endpoint()
         async with self._certification.changing:
@@ -225,7 +226,7 @@ class HostEnrolment(TunnelHosts):
         return answers.Revoked(self._table.revision, name, row.address, row.serial, taken)
 
     async def reload(self, request: host_requests.HostsReload, who: str) -> answers.Reloaded:
-        """Raises as `add`; an invalid file changes nothing."""
+        """Read hosts.yaml again. Raises as `add`; an invalid file changes nothing."""
         self._table.require(request.expected)
         return await self._declare(self._table.declared.reload, who)
 
@@ -233,7 +234,7 @@ class HostEnrolment(TunnelHosts):
         await self.reload(host_requests.HostsReload(), who)
 
     async def take_bundle(self, text: str, who: str) -> answers.Reloaded:
-        """An empty text stands for hosts.yaml. Raises as `reload`."""
+        """Replace the declared hosts by a bundle's text; an empty one stands for hosts.yaml. Raises as `reload`."""
         declared = self._table.declared
         return await self._declare(partial(declared.take, text) if text else declared.reload, who)
 
@@ -315,7 +316,7 @@ _ENDPOINT_SECONDS = 20.0
 
 
 async def find_endpoint(settings: Settings, look: Callable[[], Awaitable[EndpointFound]]) -> Endpoint:
-    """Without a configured address, the supervisor finds one.
+    """Return the configured address, or the one that the supervisor finds.
 
     Raises `HostRefusedError`; if no address is found, its text lists the options that set the address.
     """

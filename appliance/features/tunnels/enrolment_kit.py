@@ -21,7 +21,8 @@ _SCRIPTS = ("join.sh", "leave.sh", "keep.sh", "renew.sh", "README")
 
 @dataclass(frozen=True)
 class Kit:
-    """`endpoint` is the address or name by which the host reaches the appliance; `protect` is an nftables file.
+    """The data of a kit. `endpoint` is the address or name by which the host reaches the appliance; `protect`
+    is an nftables file.
 
     `key` is None if the host made its own key. `host.second` is the address of the other appliance of two.
     """
@@ -38,7 +39,6 @@ class Kit:
 
 
 def members(kit: Kit) -> list[tuple[str, str, int]]:
-    """Each member has a path, a text and a mode."""
     host = kit.host
     found = [
         ("swanctl/swanctl.conf", swanctl_conf(kit), 0o644),
@@ -63,14 +63,13 @@ def members(kit: Kit) -> list[tuple[str, str, int]]:
 
 
 def filled(script: str, values: Mapping[str, str]) -> str:
-    """`@stop@` stands for the file `stop.inc`."""
+    """Return a script with its values; `@stop@` stands for the file `stop.inc`."""
     folder = files("appliance.features.tunnels").joinpath("kit_files")
     text, stop = (folder.joinpath(name).read_text(encoding="utf-8") for name in (script, "stop.inc"))
     return _Template(text.replace("@stop@\n", stop)).substitute(values)
 
 
 def archive(kit: Kit) -> bytes:
-    """A `.tar.gz` of one folder, `rosrv-NAME`."""
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w:gz") as tar:
         for path, content, mode in members(kit):
@@ -82,7 +81,7 @@ def archive(kit: Kit) -> bytes:
 
 
 def swanctl_conf(kit: Kit) -> str:
-    """Include a tunnel to each of two appliances."""
+    """Return the configuration of swanctl, with a tunnel to each of two appliances."""
     # charon opens no tunnel: keep.sh notices a lost one in seconds (charon with its own settings in minutes), and opens
     # only one if there are two appliances.
     connections = "".join(_connection(kit, name, remote) for name, remote in kit.remotes.items())
@@ -130,7 +129,7 @@ def _connection(kit: Kit, name: str, remote: str) -> str:
 
 
 class _Template(Template):
-    """Values are `@name@`, so that the scripts keep their `$`."""
+    """A template with values such as `@name@`, so that the scripts keep their `$`."""
 
     delimiter = "@"
     pattern = r"""

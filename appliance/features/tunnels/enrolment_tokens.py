@@ -2,8 +2,8 @@
 
 Invariants:
 
-1. Only one answer contains a token's text, and only the hash of its secret is stored. The secret has 256 random bits,
-   so a fast hash is enough.
+1. Only one answer contains a token's text, and only the hash of its secret is stored. The secret has
+   256 random bits, so a fast hash is enough.
 2. A token is valid once, for one name, until it expires or a newer token for the name replaces it. It is used up before
    the certificate is requested, so if two hosts send the same token, only one gets a certificate.
 """
@@ -23,11 +23,11 @@ MOST = 1000
 
 
 class BadEnrolmentTokenError(Exception):
-    """The text does not reveal why the token is invalid."""
+    """The token is invalid; the text does not reveal why."""
 
 
 class EnrolmentTokens:
-    """Expired tokens are removed. `ends` keeps their ends although the clock may step back."""
+    """All tokens that have not expired. `ends` keeps their ends although the clock may step back."""
 
     def __init__(self, tables: HostTables, ends: Deadlines) -> None:
         self._tables = tables
@@ -47,7 +47,7 @@ class EnrolmentTokens:
     def add(
         self, name: str, *, seconds: float, address: str, days: float, kit: dict[str, str], who: str
     ) -> tuple[EnrolmentTokenRow, str]:
-        """The text of the token cannot be read again."""
+        """Make a token; return its row and its text, which cannot be read again."""
         token_id, now = secrets.token_hex(6), clock.wall()
         secret = secrets.token_urlsafe(32)
         row = EnrolmentTokenRow(name, token_id, _hash(secret), now, now + seconds, address, days, kit, who)
@@ -69,7 +69,7 @@ class EnrolmentTokens:
         return row
 
     def give_back(self, row: EnrolmentTokenRow) -> None:
-        """No certificate was issued, so the token is valid again, unless its name has a newer one."""
+        """Make a token valid again, unless its name has a newer one, because no certificate was issued."""
         if row.name not in self._rows:
             self._rows[row.name] = row
             self._tables.save_awaited(row)

@@ -36,10 +36,10 @@ class Hosts(msgspec.Struct, frozen=True):
 class KitParts(msgspec.Struct, frozen=True, kw_only=True):
     """The contents of an enrolled host's kit, without its private key.
 
-    `rest_url` is the URL of REST in the tunnel, and `pin` the pin of its server's key. If either is empty, the host
-    cannot renew its certificate through REST. `rest_trouble` says why other machines cannot reach REST, else it is
-    empty. `kept` contains the data that were stored with the one-time token. `second` is the address of the other
-    appliance of two, else empty; `pin` then names the keys of both.
+    `rest_url` is the URL of REST in the tunnel, and `pin` the pin of its server's key. If either is empty,
+    the host cannot renew its certificate through REST. `rest_trouble` is why other machines cannot reach
+    REST, or empty. `kept` has the data that were stored with the one-time token. `second` is the address of
+    the other appliance of two, or empty; `pin` then names the keys of both.
     """
 
     revision: int
@@ -60,7 +60,7 @@ class KitParts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EnrolmentToken(msgspec.Struct, frozen=True, kw_only=True):
-    """A one-time token: shown only once."""
+    """A one-time token, which is shown only once."""
 
     revision: Annotated[int, doc("revision of the table of hosts, the number in the ETag")]
     name: str
@@ -76,7 +76,7 @@ class EnrolmentToken(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Renewed(msgspec.Struct, frozen=True):
-    """A host has put its new certificate in place."""
+    """A host has installed its new certificate."""
 
     name: str
 

@@ -50,9 +50,9 @@ class HostToken(WaitingRequest[host_answers.EnrolmentToken], frozen=True, tag="h
     machine_only=_KIT,
 )  # fmt: skip
 class HostAdd(WaitingRequest[host_answers.KitParts], frozen=True, tag="host add"):
-    """Enrol a host by a signing request (PKCS #10, PEM) for the key that it has, for `days`.
+    """Enrol a host by a signing request (PKCS #10, PEM) for its own key, for `days`.
 
-    `address`: the virtual address it shall have; None: the next free one.
+    `address` is its virtual address; None: the next free one.
     """
 
     name: str
@@ -64,7 +64,7 @@ class HostAdd(WaitingRequest[host_answers.KitParts], frozen=True, tag="host add"
 
 @rest(None, seconds=_CHARON_SECONDS, changes=True)
 class HostEnrol(WaitingRequest[host_answers.KitParts], frozen=True, tag="host enrol"):
-    """The host itself, at the real address `peer`, brings its token and a signing request (PEM)."""
+    """A host at the real address `peer` enrols itself with its token and a signing request (PEM)."""
 
     token: str
     request: str
@@ -76,7 +76,7 @@ class HostEnrol(WaitingRequest[host_answers.KitParts], frozen=True, tag="host en
     seconds=_CHARON_SECONDS, filled=("request",), good="The kit: an archive (.tar.gz)", machine_only=_KIT,
 )  # fmt: skip
 class HostRenew(WaitingRequest[host_answers.KitParts], frozen=True, tag="host renew"):
-    """A new certificate for an enrolled host, in a kit; the one before is revoked, its tunnel closed."""
+    """A new certificate for an enrolled host, in a kit; the earlier one is revoked and its tunnel closed."""
 
     name: OneHost
     request: str
@@ -88,8 +88,8 @@ class HostRenew(WaitingRequest[host_answers.KitParts], frozen=True, tag="host re
 class HostRenewItself(WaitingRequest[host_answers.NewCertificate], frozen=True, tag="host renew itself"):
     """A host asks through its tunnel, at its virtual address `peer`, for a certificate for a new key.
 
-    `proof` is the signature of its present key over the bytes of `request`. The certificate before is good until
-    `HostRenewed`.
+    `proof` is the signature of its present key over the bytes of `request`. The earlier certificate is valid
+    until `HostRenewed`.
     """
 
     name: str
@@ -100,7 +100,7 @@ class HostRenewItself(WaitingRequest[host_answers.NewCertificate], frozen=True, 
 
 @rest(None, seconds=_CHARON_SECONDS, changes=True)
 class HostRenewed(AdminRequest[host_answers.Renewed], frozen=True, tag="host renewed"):
-    """A host at its virtual address `peer` has put its new certificate in place: the one before ends now."""
+    """A host at its virtual address `peer` has installed its new certificate, so the earlier one ends now."""
 
     name: str
     peer: str
@@ -108,12 +108,12 @@ class HostRenewed(AdminRequest[host_answers.Renewed], frozen=True, tag="host ren
 
 @rest("viewer", "GET", "/v1/hosts", name="hosts", of=HOSTS)
 class HostList(AdminRequest[host_answers.Hosts], frozen=True, tag="host list"):
-    """Every host that is enrolled, declared or awaited, with its tunnel; and machines that nodes run on."""
+    """Every host that is enrolled, declared or awaited, with its tunnel, and the machines with nodes."""
 
 
 @rest("viewer", machine_only=_KIT)
 class HostEndpoint(AdminRequest[host_answers.Endpoint], frozen=True, tag="host endpoint"):
-    """The address at which hosts reach the appliance if none is given: `endpoint`, and the `reason`."""
+    """The address at which hosts reach the appliance unless one is given: `endpoint`, with the `reason`."""
 
 
 @rest("operator")
@@ -136,7 +136,7 @@ class HostRevoke(AdminRequest[host_answers.Revoked], frozen=True, tag="host revo
     problems=_NO_HOST, answer_field="ports",
 )  # fmt: skip
 class HostPorts(AdminRequest[host_answers.PortsReport], frozen=True, tag="host ports"):
-    """Tell whether the ROS ports of a host are closed, as `rosrv protect --check` saw it from outside."""
+    """Report whether the ROS ports of a host are closed, as `rosrv protect --check` found from outside."""
 
     name: Annotated[
         str,
@@ -152,7 +152,7 @@ class HostPorts(AdminRequest[host_answers.PortsReport], frozen=True, tag="host p
 
 @rest("operator", "POST", "/v1/hosts/reload", name="reload_hosts", of=HOSTS)
 class HostsReload(AdminRequest[host_answers.Reloaded], frozen=True, tag="hosts reload"):
-    """Read hosts.yaml again: open and close tunnels as it says. Enrolments and revocations do not change."""
+    """Read hosts.yaml again, and open and close tunnels accordingly. Enrolments and revocations do not change."""
 
     expected: int | None = None
 

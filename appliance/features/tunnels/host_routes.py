@@ -59,7 +59,7 @@ def add_host_routes(router: Routes, services: Services) -> None:
             Query(pattern=ENDPOINT, description="address or name at which the host reaches the appliance"),
         ] = None,
     ) -> Response:
-        """Return the kit of an enrolled host as it is now, without its private key, which the host has."""
+        """Return the present kit of an enrolled host, without its private key, which the host has."""
         parts = await ask(control, host_requests.HostKit(name), bearer)
         wishes = KitOptions(endpoint or (await ask(control, host_requests.HostEndpoint(), bearer)).endpoint)
         return _archive(parts, wishes, None)
@@ -82,7 +82,7 @@ async def _enrol(call: OperationCall[Any]) -> Response:
 
 
 async def _kit(call: OperationCall[Any]) -> Response:
-    """Make the key here unless the host has its own."""
+    """Return a kit; its key is made here unless the host has its own."""
     wishes, key, order = _wishes(call.body), None, call.order
     if not order.request:
         made = await asyncio.to_thread(make_key)

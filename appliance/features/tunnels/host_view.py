@@ -19,14 +19,14 @@ _NEVER = PortsSeen("unknown", None, [], "")
 
 
 def soon(table: HostTable, row: HostRow, now: float) -> bool:
-    """A certificate ends within 14 days, or within a third of its life if that is shorter."""
+    """Whether a certificate ends within 14 days, or within a third of its life if that is shorter."""
     certificate = table.certificates.get(row.name)
     life = row.expires - certificate.made if certificate is not None else SOON_SECONDS * 3
     return row.expires - now < min(SOON_SECONDS, life / 3)
 
 
 class HostView:
-    """`machines` counts, by address, nodes that use no tunnel."""
+    """Shows the hosts; `machines` counts, by address, nodes that use no tunnel."""
 
     def __init__(
         self, table: HostTable, awaited: EnrolmentTokens, tunnels: Tunnels, in_words: HostInWords
@@ -72,7 +72,7 @@ class HostView:
         )
 
     def divergence(self, name: str) -> str | None:
-        """None if there is no difference, or if hosts.yaml declares no hosts."""
+        """Return the difference from hosts.yaml, or None if there is none or hosts.yaml declares no hosts."""
         if not self._table.declared.there:
             return None
         declared, row = self._table.declared.hosts.get(name), self._table.rows.get(name)
@@ -93,7 +93,6 @@ class HostView:
         return PortsSeen(cast(PortsState, row.state), row.checked, row.open, row.who)
 
     def status(self, machines: Mapping[str, int]) -> IpsecState:
-        """Include what needs a person's attention."""
         charon = self._tunnels.charon
         return IpsecState(
             esp=self._tunnels.esp,

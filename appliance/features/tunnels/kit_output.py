@@ -21,7 +21,9 @@ _LONGEST_REQUEST = 16 << 10
 
 
 def wishes_of(appliance: str | None, ports: str, opened: list[str] | None) -> KitOptions:
-    """The endpoint is empty if the appliance must choose it. Exits with status 2 for invalid options."""
+    """Return the options of a kit; the endpoint is empty if the appliance must choose it. Exits with status 2
+    for invalid ones.
+    """
     if appliance is not None and not _ENDPOINT.fullmatch(appliance):
         raise usage_error(f"--appliance {appliance!r} is neither an address nor a name")
     try:
@@ -31,7 +33,7 @@ def wishes_of(appliance: str | None, ports: str, opened: list[str] | None) -> Ki
 
 
 def placed(running: Appliance, wishes: KitOptions) -> tuple[KitOptions, str]:
-    """Return also the reason for an endpoint that the appliance chose. Exits with status 1 if it cannot."""
+    """Return the options with an endpoint, and why the appliance chose it. Exits with status 1 if it cannot."""
     if wishes.endpoint:
         return wishes, ""
     found = running.ask_or_exit(HostEndpoint())
@@ -39,7 +41,7 @@ def placed(running: Appliance, wishes: KitOptions) -> tuple[KitOptions, str]:
 
 
 def key_and_request(csr: Path | None) -> tuple[str | None, str]:
-    """In PEM. With `csr`, return None and the request in that file."""
+    """Return a new key and its request in PEM. With `csr`, return None and the request in that file."""
     if csr is not None:
         return None, _read_request(csr)
     key = make_key()

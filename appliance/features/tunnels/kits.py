@@ -10,14 +10,13 @@ from appliance.network.close_ports import parse_ports, parse_services, protectio
 
 @dataclass(frozen=True)
 class KitOptions:
-    """`opened` are services that stay open."""
+    """The options of a kit; `opened` are services that stay open."""
 
     endpoint: str
     ports: str = "32768-60999"
     opened: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        """Raise `ValueError`, with the option's name."""
         parse_ports(self.ports)
         parse_services(self.opened)
 
@@ -27,6 +26,5 @@ class KitOptions:
 
 
 def kit_of(body: KitParts, wishes: KitOptions, key: str | None) -> Kit:
-    """If `key` is None, the host has its own."""
     ports, opened = parse_ports(wishes.ports), parse_services(wishes.opened)
     return Kit(body, wishes.endpoint, protection([body.appliance], ports, opened, tunnelled=True), key)

@@ -23,7 +23,7 @@ _RESERVED = 64 << 10  # bytes; a kit needs about ten thousand
 
 
 class Output:
-    """`name` is the file's name on the host."""
+    """The output of a kit or script; `name` is the file's name on the host."""
 
     def __init__(self, path: Path, name: str, file: BinaryIO) -> None:
         self.path = path
@@ -36,7 +36,7 @@ class Output:
         return self.path == STANDARD_OUTPUT
 
     def write(self, data: bytes, lost: str) -> None:
-        """If writing fails, print `lost`, which has the remedy, and exit with status 1."""
+        """Write the data; if that fails, print `lost`, which has the remedy, and exit with status 1."""
         try:
             self._file.write(data)
             if not self.is_standard:
@@ -47,7 +47,6 @@ class Output:
         self.written = True
 
     def say(self, line: str) -> None:
-        """Use standard error if the data goes to standard output."""
         if self.is_standard:
             typer.echo(printable(line), err=True)
         else:
@@ -56,7 +55,8 @@ class Output:
 
 @contextlib.contextmanager
 def new_output(out: Path | None, default: str, *, as_json: bool) -> Iterator[Output]:
-    """Existing files are never replaced. A file that the block did not write is removed.
+    """Yield the output. Existing files are never replaced, and a file that the block did not write is
+    removed.
 
     Exits with status 2 if the file cannot be created.
     """

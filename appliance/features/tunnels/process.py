@@ -2,8 +2,7 @@
 
 This process makes the appliance's key for the tunnels once, and requests a certificate from the control process. The
 control process sends the complete wanted state (`TunnelsStated`) after each change; charon is started when the first
-state arrives. If charon dies, this process also ends, and the supervisor starts both again without any state of the
-earlier run.
+state arrives. If charon dies, this process also ends, and the supervisor starts both again.
 
 1. The private key stays in this process's own directory (mode 0600) and in charon.
 2. charon has the privileges of this process: its own user, and the capabilities to change the network and to bind the
@@ -208,7 +207,7 @@ class TunnelProcess:
                 await self._say_how_it_stands(self._vici)
 
     async def _say_how_it_stands(self, vici: ViciClient) -> None:
-        """If a tunnel changed since charon listed them, list again: the list may be older."""
+        """Report the tunnels; list them again if a tunnel changed in the meantime, because the list may be older."""
         for _ in range(_LISTINGS):
             changes = self._changes
             seen = await self._in_turn(vici.seen)
@@ -254,7 +253,7 @@ def main(lifeline_fd: int, directory: Path) -> None:
 
 
 def tun_obstacle() -> str:
-    """Return why the TUN device cannot be opened, and what to do."""
+    """Return why the TUN device cannot be opened, and the remedy, or an empty text."""
     try:
         os.close(os.open(TUN, os.O_RDWR | os.O_CLOEXEC))
     except OSError as error:

@@ -143,7 +143,7 @@ def _remove(as_json: bool) -> None:
 
 @dataclass(frozen=True)
 class _CheckTarget:
-    """`name` is what the result is reported under, or the address."""
+    """The machine to check; `name` is used in the report, or else the address."""
 
     host: str
     name: str | None
@@ -189,7 +189,7 @@ def _check(checked: _CheckTarget, running: Appliance) -> None:
 
 
 def _own(running: Appliance) -> str:
-    """Raises `ValueError`."""
+    """Return this machine's address. Raises `ValueError`."""
     hint = "give its address as this machine sees it: --appliance 192.168.1.20"
     if running.place is not None:
         raise ValueError(f"REST does not know the appliance's address on this machine's network; {hint}")

@@ -43,7 +43,7 @@ _LONGEST = 400
 
 @dataclass(frozen=True)
 class Refusal:
-    """An address and charon's reasons. `packet`: a tunnel's packet was dropped, not a request."""
+    """A refusal: an address and charon's reasons. `packet`: a tunnel's packet was dropped, not a request."""
 
     remote: str
     reason: str

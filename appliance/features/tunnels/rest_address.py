@@ -13,8 +13,11 @@ NO_TUNNELS = (
 
 @dataclass(frozen=True)
 class RestAddress:
-    """`port` is for other machines; if it is None, `trouble` gives the reason and the remedy. `inner_port` is for
-    hosts in tunnels, at the appliance's tunnel address; None if these hosts cannot reach REST.
+    """The ports of REST. `port` is for other machines; if it is None, `trouble` gives the reason and the
+    remedy.
+
+    `inner_port` is for hosts in tunnels, at the appliance's tunnel address; None if these hosts cannot reach
+    REST.
     """
 
     port: int | None
@@ -37,7 +40,6 @@ def rest_address(settings: Settings) -> RestAddress:
 
 
 def _trouble_outside(settings: Settings, host: str, port: int, *, everywhere: bool) -> str:
-    """Return why other machines cannot reach REST, and what to do."""
     if not everywhere and is_loopback(host):
         return f"REST listens on {host} only: for hosts to enrol themselves set `api: 0.0.0.0:{port}`"
     if not settings.api_published:

@@ -72,7 +72,7 @@ class NewHost(TokenWishes, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class NewKit(KitWishes, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A new certificate for an enrolled host, in a kit; the one before is revoked."""
+    """A new certificate for an enrolled host, in a kit; the earlier one is revoked."""
 
     days: Days = 90
     request: SigningRequest | None = None

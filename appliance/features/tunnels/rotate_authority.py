@@ -1,6 +1,6 @@
 """Remove the key of the hosts' authority of a stopped appliance; its next start makes another one.
 
-For a stolen or possibly stolen key: with it, anyone can make certificates of trusted hosts. The key file is
+This is for a stolen key, with which anyone can make certificates of trusted hosts. The key file is
 overwritten first, as by `purge`.
 """
 
@@ -18,7 +18,7 @@ from appliance.supervisor.state_directory import StateDirectory, foreign
 
 
 def rotate_authority(state: Path) -> None:
-    """Raises `BackupError` if an appliance runs, is one of two, or has no authority."""
+    """Remove the key. Raises `BackupError` if an appliance runs, is one of two, or has no authority."""
     state = state.absolute()
     folder = state / "signer"
     try:

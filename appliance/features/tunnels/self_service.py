@@ -7,7 +7,7 @@
 3. The present certificate stays valid until the host reports that it has installed the next one. If the host loses its
    connection in between, it can use either certificate.
 4. A host can renew once in a twentieth of its certificate's life, because each renewal makes the list of revoked
-   certificates longer. A restart does not reset this limit.
+   certificates longer.
 """
 
 import asyncio
@@ -44,7 +44,7 @@ class HostSelfService:
         }
 
     async def enrol(self, request: host_requests.HostEnrol) -> KitParts:
-        """Raises `HostRefusedError`."""
+        """Enrol a host by its token. Raises `HostRefusedError`."""
         async with self._certification.changing:
             try:
                 awaited = self._certification.awaited.take(request.token)
@@ -68,7 +68,7 @@ class HostSelfService:
             return await self._certification.finish(name, awaited.kit)
 
     async def renew(self, request: host_requests.HostRenewItself) -> NewCertificate:
-        """Raises `HostRefusedError`."""
+        """Return a certificate for a host's new key. Raises `HostRefusedError`."""
         name = request.name
         async with self._certification.changing:
             row = self._in_its_tunnel(name, request.peer)
@@ -95,7 +95,7 @@ class HostSelfService:
             )
 
     async def renewed(self, request: host_requests.HostRenewed) -> Renewed:
-        """Raises `HostRefusedError`."""
+        """End a host's earlier certificate. Raises `HostRefusedError`."""
         name = request.name
         before = self._in_its_tunnel(name, request.peer).serial
         # Without the authority's key the previous certificate could not be put on the list of revoked certificates.

@@ -139,11 +139,11 @@ class ServedRequest(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Execution:
-    """Carry out calls. A write of at least `large` bytes waits for other large writes.
+    """Carries out calls. A write of at least `large` bytes waits for other large writes.
 
-    `flush` carries out the changes of the registry. `hold_call(request)` holds a call that needs an approval, and
-    returns the answer to its host.
-    `redecide_for(host, caller_id)` revokes the rights of a caller that the policy in force does not allow.
+    `flush` carries out the changes of the registry. `hold_call(request)` holds a call that needs an approval,
+    and returns the answer to its host. `redecide_for(host, caller_id)` revokes the rights of a caller that
+    the policy in force does not allow.
     """
 
     gate: CallGate

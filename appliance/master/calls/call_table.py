@@ -117,7 +117,6 @@ def master_table(
     parameters: ParameterCalls,
     monitors: MonitorCalls,
 ) -> Table:
-    """Return the table of the Master API; these parts carry out its calls."""
     return {
         **served(_REGISTRATION, registration),
         **served(_LOOKUPS, lookups),

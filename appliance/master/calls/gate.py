@@ -41,7 +41,7 @@ class HostLimits:
 
 
 class CallGate:
-    """Decide calls by the policy that `policy()` returns at the time of a call."""
+    """Decides calls by the policy that `policy()` returns at the time of a call."""
 
     def __init__(self, policy: Callable[[], Policy], registry: Registry, limits: HostLimits) -> None:
         self._policy = policy
@@ -49,7 +49,6 @@ class CallGate:
         self._limits = limits
 
     def decide(self, attempt: Attempt, tree: Tree) -> Decision | NameConflict:
-        """Return the decision on a call; `tree` is the present parameter tree."""
         caller, call = attempt.caller, attempt.call
         if caller.own:
             return _of_own_node(attempt)

@@ -1,8 +1,8 @@
 """Answer `system.multicall`. The parts are carried out in order, and a failed part does not affect other parts.
 
 roslaunch clears and sets parameters in one multicall, and relies on the order. Adjacent reads and writes of parameters
-form a *run*. Each call of a run is decided and recorded separately, but the whole run waits only once for the disk and
-for the ROS master. A read of a parameter that the run writes begins a new run.
+form a *run*. Each call of a run is decided and recorded separately, but the run waits once for the disk and for the
+ROS master. A read of a parameter that the run writes begins a new run.
 
 Other hosts have their turn after each run, and after each part outside a run.
 """
@@ -31,7 +31,7 @@ _Parts = deque["Value | Attempt"]
 
 @dataclass(frozen=True, slots=True)
 class Multicall:
-    """Answer multicalls. All answers to one multicall together have at most `mirror.bytes_limit` bytes."""
+    """Answers multicalls. All answers to one multicall together have at most `mirror.bytes_limit` bytes."""
 
     execution: Execution
     parameters: ParameterCalls
@@ -66,7 +66,6 @@ class Multicall:
         return await self.trail.still_owing(visit.caller.peer.text)
 
     async def _run(self, visit: ServedRequest, left: "_Parts", room: int) -> "_Run":
-        """Parse the next parts of a run, and remove them from `left`."""
         run, most = _Run(), min(room, self.offload)
         while left and len(run.answers) < run.longest and run.weight < most and _in_run(visit, left[0]):
             attempt = await self._understand(visit, left[0])

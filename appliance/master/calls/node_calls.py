@@ -5,7 +5,7 @@ forwarded to the node. The registry and the relay answer all other calls.
 
 If the node does not answer `getPid`, the connection is reset: `rosnode` then skips the node, but would stop at an
 error. The publisher for monitors is control itself, so `getPid` returns control's process id. `publisherUpdate` and
-`paramUpdate` are not in the table, because only a master sends them. They are denied like unknown calls.
+`paramUpdate`, which only a master sends, are denied like unknown calls.
 """
 
 import os
@@ -74,7 +74,7 @@ class NodeCalls:
         return [1, f"ready on {target.host}:{port}", ["TCPROS", str(target.host), port]]
 
     async def get_pid(self, caller: Caller) -> Answer:
-        """`getPid(caller_id)`: asked of the node."""
+        """`getPid(caller_id)` → the node's own, from the node."""
         target = _target(caller)
         if target.of_monitors:
             return [1, "", os.getpid()]
@@ -88,7 +88,7 @@ class NodeCalls:
         return [0, f"{target.name} answered with something that is not [code, message, pid]", -1]
 
     async def shutdown(self, caller: Caller, message: str) -> Answer:
-        """`shutdown(caller_id, msg)`: carried to the node, which often dies before it answers."""
+        """`shutdown(caller_id, msg)`: sent to the node, which often ends before it answers."""
         target = _target(caller)
         if target.of_monitors:
             return [

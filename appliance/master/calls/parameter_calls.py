@@ -4,11 +4,9 @@ The ROS master answers reads of a large tree and `searchParam`. Writes are sent 
 requests. While the ROS master is away or incomplete, all calls wait.
 
 `searchParam` finds parameters that the caller may read. The ROS master searches a relative key in the caller's
-namespace and then upwards. The `caller_id` is not verified, so any host can search anywhere.
-
-The answer must not reveal whether a parameter exists that the host may not read. So a global key is decided before the
-search. A search upwards skips keys that the host may not read. If nothing is found, the answer depends only on the
-policy.
+namespace and then upwards. The answer must not reveal whether a parameter exists that the host may not read. So a
+global key is decided before the search. A search upwards skips keys that the host may not read. If nothing is found,
+the answer depends only on the policy.
 """
 
 import asyncio
@@ -87,7 +85,7 @@ class ParameterCalls:
         return await self._write_one(ParameterWrite(caller, key, None))
 
     async def get_param_names(self, caller: Caller) -> Answer:
-        """`getParamNames(caller_id)`: those that the host may read."""
+        """`getParamNames(caller_id)` → the names of the parameters that the host may read."""
         if self.rosmaster.reachable and self.mirror.weight < self.large:
             answer: Answer = [1, "Parameter names", list(names_in(self.mirror.tree))]
         else:
@@ -102,7 +100,7 @@ class ParameterCalls:
         return answer
 
     async def search_param(self, caller: Caller, key: str) -> Answer:
-        """`searchParam(caller_id, key)`: the name that is found is one the host may read."""
+        """`searchParam(caller_id, key)` → the name that is found, which the host may read."""
         if caller.own or not caller.caller_id:
             return await self.rosmaster.call(_SEARCH, caller.caller_id, key)
         places = {name: self.rights.to_find(caller, name) for name in searched(key, caller.caller_id)}

@@ -17,7 +17,7 @@ from roswire.xmlrpc import Value
 
 @dataclass(frozen=True, slots=True)
 class ParameterRights:
-    """Check parameters by the policy in force (`policy()`), and record denials."""
+    """Checks parameters by the policy in force (`policy()`), and records denials."""
 
     policy: Callable[[], Policy]
     trail: AuditTrail

@@ -30,7 +30,7 @@ _INTERNAL_FAULT = -32603
 
 @dataclass(frozen=True, slots=True)
 class Pipeline:
-    """Serve requests by a table of calls.
+    """Serves requests by a table of calls.
 
     Bodies and answers over `offload` bytes are parsed and written in threads. Hosts take turns for this (`bulk`).
     Answers to other hosts wait for `before_answer`, if there is one.

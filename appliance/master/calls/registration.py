@@ -20,7 +20,7 @@ from appliance.master.reconcile.subscribers import Subscribers
 
 @dataclass(frozen=True, slots=True)
 class RegistrationCalls:
-    """Change the graph by the calls of nodes, and answer them."""
+    """Changes the graph by the calls of nodes, and answers them."""
 
     registry: Registry
     graph: RosGraph
@@ -79,7 +79,7 @@ class RegistrationCalls:
         return await self._unregister_topic(caller, Kind.SUBSCRIPTION, topic, caller_api)
 
     async def unregister_service(self, caller: Caller, service: str, service_api: ApiUri) -> Answer:
-        """`unregisterService(caller_id, service, service_api)`: the caller's node is found by what it offers."""
+        """`unregisterService(caller_id, service, service_api)`: the node is found by its service."""
         port = service_api.uri.port
         provider = next(
             (
@@ -98,7 +98,7 @@ class RegistrationCalls:
         return self._unregistered(caller, provider, Kind.SERVICE, service, other)
 
     async def unsubscribe_param(self, caller: Caller, caller_api: ApiUri, key: str) -> Answer:
-        """`unsubscribeParam(caller_id, caller_api, key)`: the ROS master's answer is always the same."""
+        """`unsubscribeParam(caller_id, caller_api, key)`, with the ROS master's constant answer."""
         self._unregistered(caller, self.arrivals.known(caller, caller_api), Kind.PARAMETER, key, "")
         return [1, f"Unsubscribe to parameter [{key}]", 1]
 

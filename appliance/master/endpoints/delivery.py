@@ -1,12 +1,12 @@
 """Deliver the calls that nodes expect from a master. Each node has its own queue, in order.
 
-A slow or dead node does not delay other nodes. Every list of publishers is delivered, even if a newer list waits,
-because roscpp must see a removal before the following addition. The two are some time apart: of lists that arrive
-together, rospy uses only the last, and takes a connection that is ending for a connection. Calls about other topics
-overtake a list that waits for this reason.
+A slow or dead node does not delay other nodes. Every list of publishers is delivered, even if a newer list
+waits, because roscpp must see a removal before the following addition. The two are some time apart, because
+rospy uses only the last of lists that arrive together, and takes an ending connection for a present one.
+Calls about other topics overtake a list that waits for this reason.
 
-A failed call is repeated a few times, then dropped and reported to `troubled`. The node is then checked, and gets the
-missed updates when it answers again (`Watchlist.could_not_tell`).
+A failed call is repeated a few times, then dropped and reported to `troubled`. The node is then checked, and
+gets the missed updates when it answers again (`Watchlist.could_not_tell`).
 """
 
 import asyncio
@@ -58,7 +58,7 @@ class NodeCall:
 
 @dataclass(slots=True)
 class _DeliveredList:
-    """The last delivered list of a topic: the publishers that were `removed` are not added before `free`."""
+    """The last delivered list of a topic; the `removed` publishers are not added before `free`."""
 
     publishers: frozenset[object] | None = (
         None  # None: unknown; the answer to the registration had the first list
@@ -78,7 +78,6 @@ class _DeliveredList:
         self.publishers = publishers
 
     def wait(self, publishers: frozenset[object]) -> float:
-        """Return the seconds until this list may be delivered."""
         adds = publishers if self.removed is None else self.removed & publishers
         return max(0.0, self.free - clock.now()) if adds else 0.0
 
@@ -175,7 +174,6 @@ class Delivery:
         self._troubled(queue.incarnation, self._take(queue), f"{why}; the oldest was dropped")
 
     def _next(self, queue: _Queue) -> tuple[int, float]:
-        """Return the position of the next call, and the seconds until it may be delivered."""
         lists = self._lists.get(queue.incarnation.key, {})
         waits: dict[str, tuple[int, float]] = {}
         for position, (call, _weight) in enumerate(queue.calls):

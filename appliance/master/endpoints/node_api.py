@@ -7,8 +7,8 @@ one API.
 A node that starts gets a dozen calls in a second, so its connection is kept for the next call, for two seconds at most.
 A call that finds out whether a node is there, or ends it, always opens a new connection.
 
-Each answer of a node is a code, a text, and a number or protocol. The size limit for answers is far smaller than for
-requests, because thousands of nodes may answer at once, and each node may be compromised.
+Each answer of a node is a code, a text, and a number or protocol. The size limit for answers is small, because
+thousands of nodes may answer at once, and each may be compromised.
 """
 
 import asyncio
@@ -26,7 +26,7 @@ _MOST_KEPT = 256  # addresses, each with one connection
 
 
 class NodeApiClient:
-    """Call nodes; `timeout` is in seconds per call."""
+    """Calls nodes; `timeout` is in seconds per call."""
 
     def __init__(self, registry: Registry, *, timeout: float) -> None:
         self._registry = registry

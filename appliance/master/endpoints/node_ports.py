@@ -1,13 +1,15 @@
-"""Manage the ports and listening sockets of each incarnation (proxy endpoint, relays), and the advertised address.
+"""Manage the ports and listening sockets of each incarnation (proxy endpoint, relays), and the advertised
+address.
 
-Control opens every listening socket and gives the supervisor a duplicate. So the death of control or of a relay does
-not close a port. A restarted control gets the sockets back by name.
+Control opens every listening socket and gives the supervisor a duplicate. So the death of control or of a
+relay does not close a port. A restarted control gets the sockets back by name.
 
-An incarnation needs one port for its proxy endpoint and one for each relay process, from the policy's `[Ports]` range.
-The longest unused port is taken first, because a subscriber may still call the port of a dead node.
+An incarnation needs one port for its proxy endpoint and one for each relay process, from the policy's
+`[Ports]` range. The port that was unused for the longest time is taken first, because a subscriber may still
+call the port of a dead node.
 
-A host may have `_TIMES_THE_REST` times as many ports as are left: the first host can get three quarters of the range,
-the next host three quarters of the rest. Hosts that the policy names as one network count as one host.
+A host may have `_TIMES_THE_REST` times as many ports as are left. Hosts that the policy names as one network count as
+one host.
 """
 
 import asyncio
@@ -201,14 +203,16 @@ _ANSWER_SECONDS = 3.0
 
 
 class AdvertisedAddresses:
-    """Choose the appliance's address that each host gets in URIs.
+    """Chooses the appliance's address that each host gets in URIs.
 
-    The setting `advertise:` has priority, if it has an address for the host's network. Otherwise, the host gets the
-    address at which it reached the appliance; behind address translation, this is the machine's address.
+    The setting `advertise:` has priority, if it has an address for the host's network. Otherwise, the host
+    gets the address at which it reached the appliance; behind address translation, this is the machine's
+    address.
 
-    `advertised` are (network, address) pairs. `route_to(host)` finds the machine's address that `host` used (None: no
-    translation). `listen` is the address that RVMaster, the proxy endpoints and the relay listen on. `fixed` is the
-    address of the active one of two appliances, for all hosts outside the network `tunnels`.
+    `advertised` are (network, address) pairs. `route_to(host)` finds the machine's address that `host` used
+    (None: no translation). `listen` is the address that RVMaster, the proxy endpoints and the relay listen
+    on. `fixed` is the address of the active one of two appliances, for all hosts outside the network
+    `tunnels`.
     """
 
     def __init__(

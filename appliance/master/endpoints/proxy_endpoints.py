@@ -68,7 +68,7 @@ class ProxyEndpoints:
 
 
 class MasterSideApi:
-    """Serve the ROS master's calls to nodes. The path is the incarnation's key, which no other host knows."""
+    """Serves the ROS master's calls to nodes. The path is the incarnation's key, which no other host knows."""
 
     def __init__(self, registry: Registry) -> None:
         self._registry = registry

@@ -57,7 +57,6 @@ class RelayOutbox(Link):
         self._orders: deque[asyncio.Future[None]] = deque()
 
     def close(self) -> None:
-        """Close the link; nothing waits any longer for the relay's orders."""
         super().close()
         self.stated.clear()
         self.unstated.clear()
@@ -134,7 +133,6 @@ class RelayControl:
     # --- the links ---
 
     def attach(self, index: int, channel: Channel) -> None:
-        """Serve the link of a new relay, and send it its whole state."""
         post = self._posts[index]
         self.carried.lost(index)
         post.attach(channel)
@@ -152,7 +150,6 @@ class RelayControl:
         self.monitors().relay_lost(index)
 
     def send(self, message: messages.Message, relay: int) -> bool:
-        """Send a message to a relay; return False if it is not connected."""
         return self._posts[relay].send(message)
 
     def publish(self, message: messages.OwnPublished) -> None:
@@ -201,13 +198,13 @@ class RelayControl:
     # --- what is wanted ---
 
     def flush(self, changed: Iterable[Change]) -> None:
-        """State what these changes have changed, at once if it is a grant."""
+        """Send the differences that these changes make, at once for a grant."""
         changes = list(changed)
         for post in self._posts:
             self._state_all(post, changes)
 
     def compare(self) -> None:
-        """State all that a new policy has changed: limits, named hosts, hosts that command, and approvals."""
+        """Send the differences that a new policy makes: limits, named hosts, hosts that command, and approvals."""
         self.flush(self.registry.live())
 
     def withdraw_moving(self, moves: Sequence[Move]) -> None:
@@ -229,7 +226,6 @@ class RelayControl:
                         yield row
 
     def _state_all(self, post: RelayOutbox, changes: Iterable[Change] = ()) -> None:
-        """State these changes after those that could not be sent; try again soon what cannot be sent now."""
         post.unstated |= dict.fromkeys(changes)
         why = ""
         for change in list(post.unstated):
@@ -261,7 +257,6 @@ class RelayControl:
                     self._state_fact(post, provider, change, self._granted(post, provider, change))
 
     def _state_node(self, post: RelayOutbox, node: Incarnation) -> None:
-        """State all facts about a live node; withdraw a node that has ended, with all its facts."""
         if node.life is Life.LIVE:
             for kind, resource in node.registrations:
                 self._state(post, RegistrationKey(node, kind, resource))
@@ -274,7 +269,7 @@ class RelayControl:
     def _state_fact(
         self, post: RelayOutbox, node: Incarnation, fact: Change, wanted: messages.RelayFact | None
     ) -> None:
-        """Send a fact that the relay does not have, or not like this. `wanted`: None if it must not have the fact."""
+        """Send a fact that the relay lacks or has differently. `wanted` is None if it must not have the fact."""
         before = post.stated.get(node.key, {}).get(fact)
         if wanted == before or post.channel is None:
             return

@@ -106,14 +106,12 @@ class RelayTraffic:
 
     @property
     def total(self) -> Traffic:
-        """Return the total traffic, including forgotten incarnations."""
         total = Traffic()
         for traffic in (*self.past.values(), *self.traffic.values()):
             total.include(traffic)
         return total
 
     def flow(self, key: str, resource: str) -> Flow:
-        """Return the traffic of a topic or service of an incarnation."""
         traffic = self.traffic.get((key, resource), Traffic())
         flows = clock.now() - traffic.seconds < _STILL_SECONDS
         return Flow(
@@ -142,7 +140,6 @@ class RelayTraffic:
             self.past.setdefault(name, Traffic()).include(self.traffic.pop(carried))
 
     def reported(self, rows: list[TopicTraffic], over: float = 1.0) -> None:
-        """Add a relay's counters, except those of a forgotten node."""
         now = clock.now()
         for row in rows:
             if self._registry.by_key(row.key) is not None:

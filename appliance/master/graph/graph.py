@@ -92,7 +92,6 @@ class RosGraph:
                 self.grants.take(row)
 
     def replaced(self, incarnation: Incarnation, by: Incarnation) -> None:
-        """End an incarnation whose name another incarnation took."""
         other = by.host != incarnation.host
         subscribed = incarnation.resources(Kind.SUBSCRIPTION)
         self.registry.replace(incarnation, clock.now())

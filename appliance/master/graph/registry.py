@@ -178,7 +178,6 @@ class Registry:
         self._changed: dict[Change, None] = {}
 
     def mark(self, change: Change) -> None:
-        """Note a change for `take_changes`."""
         if not self._changed:
             self._woken()
         self._changed[change] = None
@@ -261,8 +260,8 @@ class Registry:
         return idle or min(gone, key=lambda incarnation: incarnation.changed, default=None)
 
     def evictable_for(self, host: Address) -> Incarnation | None:
-        """Return the incarnation to evict for a new one of this host: one of the same host, or an evictable one of
-        another host.
+        """Return the incarnation to evict for a new one of this host: one of this host, or an evictable one of
+        another.
         """
         return self._evictable_of(host) or next(
             (incarnation for incarnation in self._by_key.values() if incarnation.evictable), None
@@ -367,7 +366,6 @@ class Registry:
         self.mark(RegistrationKey(incarnation, kind, resource))
 
     def replace(self, incarnation: Incarnation, when: float) -> None:
-        """Remove the registrations of an incarnation whose name another incarnation took."""
         for kind, resource in list(incarnation.registrations):
             self.unregister(incarnation, kind, resource)
         self._retire(incarnation, Life.REPLACED, when)

@@ -29,7 +29,7 @@ CALLS = {
 
 @dataclass(frozen=True, slots=True)
 class Revocation:
-    """Decide registrations and grants again, by the present policy and the present parameters (`tree`)."""
+    """Decides registrations and grants again, by the present policy and the present parameters (`tree`)."""
 
     registry: Registry
     grants: Grants
@@ -58,7 +58,7 @@ class Revocation:
         return count
 
     def redecide_for(self, host: Address, caller_id: str) -> int:
-        """Revoke denied rights of a caller, if its call was decided before a policy change and carried out after it."""
+        """Revoke denied rights of a caller whose call was decided before a policy change and carried out after it."""
         return self._redecide(
             [pair for pair in self._registrations() if (pair[0].host, pair[0].name) == (host, caller_id)],
             [row for row in self.grants.of_client(caller_id) if row.host == str(host)],

@@ -1,7 +1,7 @@
 """Find or make the incarnation of a registering call, by its name, host and API URI.
 
-An incarnation with a registering call under way is not evicted. Otherwise, two nodes that arrive at the same time, with
-room for only one, would evict each other forever.
+An incarnation with a registering call under way is not evicted. Otherwise, two nodes that arrive at the same time
+could evict each other forever.
 
 Nodes are called at their caller's address, whatever their API's URI says: a node on a machine with several addresses
 may name another one. multimaster_fkie registers the nodes of other machines, which cannot be called there. So a new
@@ -29,7 +29,7 @@ class NodeElsewhereError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Arrivals:
-    """Find or make the incarnations of callers. `flush` carries out the changes of the registry."""
+    """Finds or makes the incarnations of callers. `flush` carries out the changes of the registry."""
 
     registry: Registry
     graph: RosGraph
@@ -43,11 +43,12 @@ class Arrivals:
         return self.registry.find(caller.caller_id, caller.peer.host, api.text)
 
     async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
-        """Return the calling incarnation. If it is unknown, make and save a new incarnation with its ports.
+        """Return the calling incarnation. An unknown caller gets a new incarnation with ports.
 
-        At its host's limit, the new incarnation replaces an unused or lost one of the host. Raises `HostFullError`
-        if there is none, `NoPortError` if the range of ports is exhausted or control has no descriptors left, and
-        `NodeElsewhereError` if the node runs on another host; no incarnation is made then.
+        At its host's limit, the new incarnation replaces an unused or lost one of the host. Raises
+        `HostFullError` if there is none, `NoPortError` if the range of ports is exhausted or control has no
+        descriptors left, and `NodeElsewhereError` if the node runs on another host; no incarnation is made
+        then.
         """
         identity = (caller.caller_id, caller.peer.host, api.text)
         incarnation = self.registry.find(*identity)

@@ -1,7 +1,7 @@
-"""State the registrations to the hidden ROS master, behind the answers to nodes.
+"""State the registrations to the hidden ROS master, after the answers to nodes.
 
-A registering call is answered from the registry, once the change is stored. The ROS master gets the change afterwards,
-with the node's inner URI; services get a stand-in URI. Clients never get these URIs. Invariants:
+A registering call is answered from the registry, once the change is stored. The ROS master gets the change
+afterwards, with the node's inner URI; services get a stand-in URI. Clients never get these URIs. Invariants:
 
 1. No answer to a node depends on a forwarded change. All reads of the graph are answered from the registry.
 2. `_stated` has the registrations that the ROS master has, or will have after the request under way. There is one
@@ -72,7 +72,7 @@ class MasterRegistrations:
             self._sending = asyncio.get_running_loop().create_task(self._send())
 
     def adopt(self, seen: Mapping[EntryKey, MasterEntry]) -> int:
-        """Take over what the ROS master has. Return the number of registrations that it lacks or has differently."""
+        """Take over the ROS master's state. Return the number of registrations that it lacks or has differently."""
         self._stated = dict(seen)
         self._differing.clear()
         for node, registration in self._registry.in_order():

@@ -85,7 +85,7 @@ class Watchlist:
         self._filled.set()
 
     def could_not_tell(self, node: Incarnation, call: NodeCall, why: str) -> None:
-        """Note that a call did not reach a node; the node is checked, and gets the present state once it answers."""
+        """Note that a call did not reach a node, which is then checked and gets the present state once it answers."""
         _log.info("a call to a node failed", node=node.name, call=call.method, why=why)
         missed = self._missed.setdefault(node.key, MissedUpdates())
         if call.method == "publisherUpdate":
@@ -131,7 +131,8 @@ class Watchlist:
 
 @dataclass(eq=False)
 class Liveness:
-    """Check nodes. Hosts take turns, so that hanging nodes of one host do not delay checks of other hosts' nodes.
+    """Checks nodes. Hosts take turns, so that hanging nodes of one host do not delay checks of other hosts'
+    nodes.
 
     A node that refuses `refusals` connections in a row is lost, unless `shut_out()`.
     """
@@ -231,7 +232,6 @@ class Liveness:
         asyncio.get_running_loop().call_later(RECENTLY_LOST_SECONDS, self.look_at, incarnation)
 
     async def look(self, incarnation: Incarnation) -> None:
-        """Check a node, and carry out the consequences."""
         await self._turns.enter(incarnation.host)
         try:
             there, why = await self._ask(incarnation)

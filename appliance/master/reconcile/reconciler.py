@@ -34,7 +34,7 @@ _ROUND_SECONDS = 30.0
 
 @dataclass(frozen=True, slots=True)
 class Reconciler:
-    """Run a round whenever the ROS master is in doubt, and every `_ROUND_SECONDS`. The first success sets `ready`."""
+    """Runs a round whenever the ROS master is in doubt, and every `_ROUND_SECONDS`. The first success sets `ready`."""
 
     rosmaster: RosMaster
     entries: MasterRegistrations
@@ -140,7 +140,7 @@ class Reconciler:
         }
 
     def _entry(self, key: EntryKey, api: str, service: str) -> MasterEntry:
-        """Return a registration of the ROS master. It does not tell the type, which counts as the wanted type."""
+        """Return a registration of the ROS master, which does not tell the type; the wanted type is assumed."""
         wanted = self.entries.wanted(key)
         return MasterEntry(
             api, service if key[0] is Kind.SERVICE else wanted.detail if wanted is not None else ""

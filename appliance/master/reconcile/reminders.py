@@ -1,15 +1,15 @@
 """Send subscribers their lists of publishers again, after a relay started or a topic moved to another relay.
 
 rospy reconnects only for a list that arrives *after* rospy noticed the broken connection. An earlier list has no
-effect, for example if the machine is busy, or if the relay hung before it died. roscpp reconnects to a port that stayed
-open. If the port was closed for a while (the appliance was restarted), roscpp gives up and ignores an unchanged list.
+effect. roscpp reconnects to a port that stayed open. After a restart of the appliance, whose ports were closed, roscpp
+gives up and ignores an unchanged list.
 
-So a subscriber that is still absent after the first reminders gets a list without the publisher, and then a list with
-the publisher again. A subscriber without a grant is handled in the same way: the policy withdrew and restored the
-topic, and the subscriber or control missed this.
+So a subscriber that is still absent after the first reminders gets a list without the publisher, and then a
+list with the publisher again. A subscriber without a grant is handled in the same way: the policy withdrew
+and restored the topic, and the subscriber or control missed this.
 
 Whatever the reason, a subscriber is reminded in this way as long as it is absent: after `_LASTING_SECONDS`, then at
-growing intervals. So no interruption ends a subscription for good.
+growing intervals.
 """
 
 import asyncio
@@ -38,7 +38,7 @@ class _Absence:
 
 
 class Reminders:
-    """Check whether all subscribers are connected: always, and at shorter intervals after a relay was attached."""
+    """Checks whether all subscribers are connected, at shorter intervals after a relay was attached."""
 
     def __init__(self, registry: Registry, subscribers: Subscribers) -> None:
         self._registry = registry

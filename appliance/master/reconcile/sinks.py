@@ -56,7 +56,7 @@ class Sinks:
         asyncio.get_running_loop().call_soon(self.flush)
 
     def flush(self) -> None:
-        """State all that has changed. The endpoints of ended nodes close last, when no sink uses their ports."""
+        """Send all changes. The endpoints of ended nodes close last, when no sink uses their ports."""
         changed = self.registry.take_changes()
         if not changed:
             return
@@ -75,7 +75,7 @@ class Sinks:
 
 @dataclass(frozen=True, slots=True)
 class Enforcement:
-    """Revoke rights that are no longer allowed."""
+    """Revokes rights that are no longer allowed."""
 
     revocation: Revocation
     sinks: Sinks
@@ -146,7 +146,6 @@ def _save(change: Change, grants: Grants, store: StateStore) -> None:
 
 
 def restore(registry: Registry, store: StateStore) -> int:
-    """Fill `registry` from the store; return the number of incarnations."""
     incarnations, registrations = store.load_registry()
     by_key = {
         row.key: Incarnation(

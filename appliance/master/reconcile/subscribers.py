@@ -46,7 +46,7 @@ class Subscribers:
     """The lists that each node has; for a parameter, the node has its value."""
 
     def flush(self, changed: Iterable[Change]) -> None:
-        """Send the lists that these changes have changed. A replaced node is shut down, with the ROS master's text."""
+        """Send the changed lists. A replaced node is shut down, with the ROS master's text."""
         topics: dict[str, None] = {}
         for change in changed:
             match change:
@@ -74,7 +74,6 @@ class Subscribers:
             self.delivery.drop(node)
 
     def _state(self, node: Incarnation, kind: Kind, resource: str) -> None:
-        """Send a node what it does not have yet about a topic or a parameter."""
         if kind not in (Kind.SUBSCRIPTION, Kind.PARAMETER) or node.life is not Life.LIVE:
             return
         wanted = self._wanted(node, kind, resource)
@@ -89,10 +88,6 @@ class Subscribers:
                 self._tell_parameter(node, resource)
 
     def _wanted(self, node: Incarnation, kind: Kind, resource: str) -> tuple[str, ...] | None:
-        """Return the wanted list. It is empty if the policy withdrew the subscription.
-
-        Client libraries drop a publisher only if a list does not contain it.
-        """
         if (kind, resource) in node.registrations:
             return self._publishers_for(node, resource) if kind is Kind.SUBSCRIPTION else ()
         return () if kind is Kind.SUBSCRIPTION and (kind, resource) in node.shelf else None

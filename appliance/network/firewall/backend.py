@@ -30,15 +30,14 @@ class Backend(Protocol):
     """A back end for one namespace."""
 
     @property
-    def name(self) -> str:
-        """`nft` or `iptables`."""
+    def name(self) -> str: ...
 
     @property
     def families(self) -> tuple[Family, ...]:
         """The families that the kernel supports."""
 
     def install(self, rules: tuple[PacketRule, ...]) -> None:
-        """Rules of other programs stay.
+        """Install the rules; rules of other programs stay.
 
         Raises `BackendMissingError`, `FirewallError`; the old rules are then still in force.
         """
@@ -46,4 +45,4 @@ class Backend(Protocol):
     def remove(self) -> None: ...
 
     def counters(self) -> tuple[RuleCounter, ...]:
-        """Only rules that are in force and hooked in."""
+        """Return the counters of rules that are in force and hooked in."""

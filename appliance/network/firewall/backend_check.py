@@ -18,7 +18,7 @@ _LOOPBACK = ((socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1"))
 
 
 def prove(backend: Backend, namespace: Namespace) -> None:
-    """Raises `FirewallError`."""
+    """Test a back end. Raises `FirewallError` if it does not work."""
     own, other = os.geteuid(), os.geteuid() + 1
     try:
         for family, address in _LOOPBACK:
@@ -47,7 +47,7 @@ def _listen(family: socket.AddressFamily, address: str) -> socket.socket | None:
 
 
 def _expect(namespace: Namespace, server: socket.socket, when: str, *, reached: bool) -> None:
-    """Raises `FirewallError` unless the outcome is as `reached` demands."""
+    """Connect to the port. Raises `FirewallError` unless the outcome is as `reached` demands."""
     address = server.getsockname()[:2]
 
     def connect() -> str | None:

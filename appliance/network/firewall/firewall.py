@@ -32,7 +32,7 @@ class FirewallReport:
 
 
 class Firewall:
-    """Without a given back end, the first one that works (nft, then iptables)."""
+    """The firewall with the given back end, or with the first one that works (nft, then iptables)."""
 
     def __init__(self, namespace: Namespace, backend: BackendChoice = "auto") -> None:
         self._namespace = namespace
@@ -55,7 +55,7 @@ class Firewall:
         return self._backend.name
 
     def update(self, settings: FirewallSettings) -> None:
-        """Raises `FirewallError`; the old rules then stay in force."""
+        """Replace the rules. Raises `FirewallError`; the old rules then stay in force."""
         if self._backend is None:
             raise FirewallError("the firewall is not installed yet: call install first")
         rules = appliance_rules(settings)
@@ -63,7 +63,6 @@ class Firewall:
         self._rules = rules
 
     def remove(self) -> None:
-        """Both back ends are cleared."""
         for backend in self._all():
             if self._backend is not None and backend.name == self._backend.name:
                 backend.remove()
@@ -82,7 +81,6 @@ class Firewall:
         return (NftBackend(self._namespace), IptablesBackend(self._namespace))
 
     def _choose(self, rules: tuple[PacketRule, ...]) -> Backend:
-        """Return the first back end that works and accepts all rules."""
         backends = self._all()
         for backend in backends:
             self._clear(backend)  # an old rule of any back end would disturb the test
@@ -103,7 +101,7 @@ class Firewall:
         )
 
     def _clear(self, backend: Backend) -> None:
-        """A back end that this machine lacks has no rules."""
+        """Remove the rules of a back end; one that this machine lacks has none."""
         try:
             backend.remove()
         except FirewallError as error:
@@ -115,9 +113,10 @@ class Firewall:
 def statuses(
     rules: tuple[PacketRule, ...], counters: tuple[RuleCounter, ...], families: tuple[Family, ...] = (4, 6)
 ) -> tuple[FirewallRule, ...]:
-    """Counters are summed over both address families.
+    """Return the state of each rule, with counters summed over both address families.
 
-    A rule is in force if the kernel has it once for each of its families, or once for both. Only `families` count.
+    A rule is in force if the kernel has it once for each of its families, or once for both. Only `families`
+    count.
     """
     of_rule: dict[tuple[str, str], list[RuleCounter]] = {}
     for counter in counters:

@@ -19,7 +19,7 @@ MAX_PORT = 65535
 
 
 class Chain(StrEnum):
-    """`HOOKS` has their hooks in the kernel."""
+    """A chain of netfilter; `HOOKS` has the hooks in the kernel."""
 
     IN = "ROSRV-IN"
     OUT = "ROSRV-OUT"
@@ -32,7 +32,7 @@ class Chain(StrEnum):
 
 
 class Hook(NamedTuple):
-    """Chains of one hook run by priority, smallest first."""
+    """A hook; its chains run by priority, smallest first."""
 
     place: str
     kind: Literal["filter", "nat"] = "filter"
@@ -71,7 +71,7 @@ class PacketVerdict(StrEnum):
 
 @dataclass(frozen=True)
 class PortRange:
-    """Both ends are included."""
+    """A range of ports that includes both ends."""
 
     first: int
     last: int
@@ -95,7 +95,7 @@ class PortRange:
 
 @dataclass(frozen=True)
 class Interface:
-    """`other` means every interface except this one."""
+    """An interface; `other` means every interface except this one."""
 
     name: str
     other: bool = False
@@ -106,7 +106,7 @@ class Interface:
 
 @dataclass(frozen=True)
 class RateLimit:
-    """Per host: matches new connections above `per_second`, after `burst`."""
+    """A limit per host that matches new connections above `per_second`, after `burst`."""
 
     per_second: int
     burst: int
@@ -118,7 +118,7 @@ class RateLimit:
 
 @dataclass(frozen=True)
 class PacketRule:
-    """All given conditions must match."""
+    """A rule that matches if all given conditions do."""
 
     purpose: str  # shown by `rosrv status` and kept as the rule's comment; at most 100 characters
     verdict: PacketVerdict
@@ -169,14 +169,13 @@ class PacketRule:
         return self.tcp_ports is not None or self.from_ports is not None or self.opening or self.accepting
 
     def families(self) -> tuple[Family, ...]:
-        """The own family, else that of the addresses, else both."""
+        """Return the own family, otherwise that of the addresses, otherwise both."""
         given = self.source or self.destination or self.to
         if given is not None:
             return (family_of(given),)
         return (4, 6) if self.family is None else (self.family,)
 
     def describe(self) -> str:
-        """The text is in netfilter's terms."""
         matches = {
             "in": self.arrives_on,
             "out": self.leaves_on,
@@ -209,7 +208,7 @@ class PacketRule:
 
 @dataclass(frozen=True)
 class ForwarderAccess:
-    """The user may reach only this receiver, such as that of the audit log."""
+    """The access of a user to one receiver only, such as that of the audit log."""
 
     uid: int
     address: str
@@ -226,7 +225,7 @@ class ForwarderAccess:
 
 @dataclass(frozen=True)
 class PeerAccess:
-    """`port` is that of both appliances (TCP and UDP)."""
+    """The access of two appliances to each other; `port` is that of both (TCP and UDP)."""
 
     other: str
     port: int
@@ -261,13 +260,13 @@ class OwnNodeAccess:
 class FirewallSettings:
     """The values for the rules of the appliance's namespace.
 
-    `rosmaster_port` and `inner_port` may be unknown (None) until their processes run. Hosts in `tunnel_only` are
-    accepted through IPsec only: by the kernel's policy, or on `tunnel_interface` if ESP runs in user space.
-    `api_networks` and loopback may reach the REST port. `neighbours` are addresses of the machine at the other end of
-    the link (isolation netns): `own_network` has addresses of the appliance's own doors, and `own_ports` the ports of
-    doors. Only packets from that machine itself, which arrive with a full TTL, may have them.
-    `client_ports` is the kernel's local port range; there the own node (rosout) listens on every address, even with
-    ROS_IP.
+    `rosmaster_port` and `inner_port` may be unknown (None) until their processes run. Hosts in `tunnel_only`
+    are accepted through IPsec only: by the kernel's policy, or on `tunnel_interface` if ESP runs in user
+    space. `api_networks` and loopback may reach the REST port. `neighbours` are addresses of the machine at
+    the other end of the link (isolation netns): `own_network` has addresses of the appliance's own doors, and
+    `own_ports` the ports of doors. Only packets from that machine itself, which arrive with a full TTL, may
+    have these addresses. `client_ports` is the kernel's local port range; there the own node (rosout) listens
+    on every address, even with ROS_IP.
     """
 
     control_uid: int
@@ -315,7 +314,6 @@ _sending = partial(PacketRule, chain=Chain.OUT)
 
 
 def appliance_rules(settings: FirewallSettings) -> tuple[PacketRule, ...]:
-    """The rules apply in their order."""
     return (
         *(
             _arriving(
@@ -345,7 +343,7 @@ def appliance_rules(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def family_of(address: str) -> Family:
-    """Raises `ValueError`."""
+    """Return the family of an address. Raises `ValueError`."""
     try:
         return 6 if ipaddress.ip_network(address).version == 6 else 4
     except ValueError as error:
@@ -354,7 +352,7 @@ def family_of(address: str) -> Family:
 
 
 def inner_port(name: str, port: int | None, user: str, uid: int) -> tuple[PacketRule, ...]:
-    """Only one local user may connect, over loopback; no rules without a port."""
+    """Return rules by which only one local user may connect, over loopback; none without a port."""
     return () if port is None else _inner_ports(name, PortRange.one(port), user, uid)
 
 
@@ -367,7 +365,7 @@ def _inner_ports(name: str, ports: PortRange, user: str, uid: int) -> tuple[Pack
 
 
 def _rosmaster(settings: FirewallSettings) -> tuple[PacketRule, ...]:
-    """Only to the master-side endpoint, once it exists."""
+    """Return rules by which rosmaster connects only to the master-side endpoint, once it exists."""
     if settings.inner_port is None:
         return ()
     uid = settings.rosmaster_uid
@@ -378,7 +376,9 @@ def _rosmaster(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def _own_node(settings: FirewallSettings) -> tuple[PacketRule, ...]:
-    """Only control may call the node, which reaches only its master, proxy endpoints and relays."""
+    """Return rules by which only control calls the own node, which reaches its master, proxy endpoints and relays
+    only.
+    """
     node = settings.own_node
     if node is None:
         return ()
@@ -421,7 +421,7 @@ def _sends_nothing_out(name: str, uid: int) -> PacketRule:
 
 
 def _tunnel_only(network: str, interface: str | None) -> tuple[PacketRule, ...]:
-    """Only the tunnel carries packets of the network."""
+    """Return rules by which only the tunnel carries packets of the network."""
     outside = Interface(interface, other=True) if interface else None
     refused = partial(PacketRule, verdict=PacketVerdict.DROP, clear_text=interface is None)
     return (
@@ -431,7 +431,7 @@ def _tunnel_only(network: str, interface: str | None) -> tuple[PacketRule, ...]:
 
 
 def _own_network(network: str | None) -> tuple[PacketRule, ...]:
-    """Packets from other machines must not have such an address."""
+    """Return rules that drop packets from other machines with an address of the own network."""
     if network is None:
         return ()
     outside = partial(PacketRule, verdict=PacketVerdict.DROP, chain=Chain.IN, arrives_on=OUTSIDE)
@@ -495,7 +495,9 @@ def _rate_limits(settings: FirewallSettings) -> tuple[PacketRule, ...]:
 
 
 def _chosen_by_the_kernel(settings: FirewallSettings) -> Iterator[PacketRule]:
-    """Close the local port range to other machines, except for configured ports, because the own node listens there."""
+    """Yield rules that close the local port range to other machines, except for configured ports, because the
+    own node listens there.
+    """
     if settings.client_ports is None:
         return
     chosen = {
@@ -513,11 +515,11 @@ def _chosen_by_the_kernel(settings: FirewallSettings) -> Iterator[PacketRule]:
 
 
 def _rate_limit(limit: RateLimit | None, name: str, ports: PortRange) -> tuple[PacketRule, ...]:
-    """Packets above the limit are dropped, and the host's kernel sends them again.
+    """Return rules that drop packets above the limit, which the host's kernel sends again.
 
-    The first packet after the handshake counts: its sender received our SYN-ACK, so its address is not forged.
-    Against forged first packets, the kernel limits half-open connections; above that limit it answers with SYN
-    cookies, which need no memory.
+    The first packet after the handshake counts: its sender received our SYN-ACK, so its address is not
+    forged. Against forged first packets, the kernel limits half-open connections; above that limit it answers
+    with SYN cookies, which need no memory.
     """
     if limit is None:
         return ()

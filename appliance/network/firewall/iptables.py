@@ -76,7 +76,6 @@ class IptablesBackend:
         return self._namespace.run(_families)
 
     def install(self, rules: tuple[PacketRule, ...]) -> None:
-        """The rules of IPv4 come first, then those of IPv6."""
         elsewhere = [rule.purpose for rule in rules if rule.chain not in _CHAINS]
         if elsewhere:
             raise BackendMissingError(f"address translation needs nft, not iptables: {'; '.join(elsewhere)}")
@@ -84,7 +83,7 @@ class IptablesBackend:
         self._in_tables(lambda table: table.replace(rendered))
 
     def remove(self) -> None:
-        """This creates no unused tables."""
+        """Remove the rules without creating unused tables."""
         _in_used_tables(self._namespace, "filter", lambda table: table.replace([]))
 
     def counters(self) -> tuple[RuleCounter, ...]:
@@ -103,9 +102,10 @@ class IptablesBackend:
 
 
 def load_modules() -> None:
-    """The kernel does not load the modules of legacy xtables automatically.
+    """Load the modules of legacy xtables, which the kernel does not load automatically.
 
-    Call this while the process may still load modules. A failure appears only later, as an error of `install`.
+    Call this while the process may still load modules. A failure appears only later, as an error of
+    `install`.
     """
     command = ["modprobe", "--quiet", "--all", "ip_tables", "ip6_tables"]
     with contextlib.suppress(OSError, subprocess.TimeoutExpired):  # a container has no modprobe
@@ -113,24 +113,24 @@ def load_modules() -> None:
 
 
 def foreign_translations(namespace: Namespace) -> tuple[str, ...]:
-    """Only chains of legacy xtables are returned."""
+    """Return the chains of legacy xtables that translate addresses."""
     return _foreign(namespace, "nat", lambda table: table.translating())
 
 
 def foreign_forward_drops(namespace: Namespace) -> tuple[str, ...]:
-    """Only chains of legacy xtables are returned."""
+    """Return the chains of legacy xtables that drop forwarded packets."""
     return _foreign(namespace, "filter", lambda table: table.dropping("FORWARD"))
 
 
 def _foreign(namespace: Namespace, name: str, look: "Callable[[_Table], list[str]]") -> tuple[str, ...]:
-    """Only for families that use the table."""
+    """Return the result of `look` for the families that use the table."""
     found: list[str] = []
     _in_used_tables(namespace, name, lambda table: found.extend(look(table)))
     return tuple(found)
 
 
 def _in_used_tables(namespace: Namespace, name: str, work: "Callable[[_Table], None]") -> None:
-    """The library is loaded only if a family uses the table."""
+    """Call `work` with the table; the library is loaded only if a family uses the table."""
 
     def inside() -> None:
         used = [family for family in _families() if name in _tables_in_use(family)]
@@ -144,7 +144,6 @@ def _in_used_tables(namespace: Namespace, name: str, work: "Callable[[_Table], N
 
 
 def _tables_in_use(family: Family) -> list[str]:
-    """Opening an unused table would create it."""
     names = "ip6_tables_names" if family == 6 else "ip_tables_names"
     try:
         return Path("/proc/thread-self/net", names).read_text(encoding="ascii").split()
@@ -218,7 +217,7 @@ def _tracked(rule: PacketRule) -> list[Extension]:
 
 
 def _hashlimit(per_second: int, burst: int) -> tuple[tuple[str, str], ...]:
-    """One bucket per source address, shared by rules with the same limit."""
+    """Return a match with one bucket per source address, shared by rules with the same limit."""
     return (
         ("hashlimit-above", f"{per_second}/sec"),
         ("hashlimit-burst", str(burst)),
@@ -246,7 +245,7 @@ _CHAINS = (Chain.IN, Chain.OUT, Chain.FORWARD)
 
 
 class _Table:
-    """Open in the namespace of the thread."""
+    """A table, opened in the namespace of the thread."""
 
     def __init__(self, library: Any, table: Any, family: Family) -> None:
         self._library = library
@@ -311,7 +310,7 @@ class _Table:
                 self._table.delete_entry(hook.place, jump.rule, jump.mask)
 
     def _hooks(self, chain: Chain, hook: str) -> int:
-        """Only the targets of foreign rules are read."""
+        """Return the position of the chain's rule in a hook; only the targets of foreign rules are read."""
         count, entry = 0, self._table.first_rule(hook)
         while entry:
             count += self._table.get_target(entry) == chain.value.encode()
@@ -348,7 +347,7 @@ class _Table:
 
 
 def _comment(rule: Any) -> str:
-    """The library's own function would redirect our standard output."""
+    """Return the comment of a rule; the library's own function would redirect our standard output."""
     for match in rule.matches:
         if match.name == "comment":
             content = bytes(match.match_buf)[_MATCH_HEADER:]
@@ -396,7 +395,6 @@ def _library() -> Any:
 
 
 def _families() -> tuple[Family, ...]:
-    """Without IPv6 if it is disabled."""
     return (4, 6) if Path("/proc/sys/net/ipv6").exists() else (4,)
 
 

@@ -67,7 +67,7 @@ class NftBackend:
         return _counters([rule for rule in rules if rule["chain"] in hooked])
 
     def foreign_forward_drops(self) -> tuple[str, ...]:
-        """Chains of other tables that drop forwarded packets by default."""
+        """Return chains of other tables that drop forwarded packets by default."""
         return tuple(
             f"nftables chain {chain['family']} {chain['table']} {chain['name']}"
             for chain in self._list("chain", "list", "chains")
@@ -75,7 +75,7 @@ class NftBackend:
         )
 
     def foreign_translations(self) -> tuple[str, ...]:
-        """Chains of other tables that translate the source of forwarded connections."""
+        """Return chains of other tables that translate the source of forwarded connections."""
         rules = self._list("rule", "list", "ruleset")
         found = (
             f"nftables chain {rule['family']} {rule['table']} {rule['chain']}"
@@ -113,7 +113,6 @@ class NftBackend:
 
 
 def render(rules: tuple[PacketRule, ...]) -> list[Json]:
-    """The JSON commands make the table."""
     chains = [chain for chain in Chain if any(rule.chain is chain for rule in rules)]
     limits = sorted({_meter(rule, family) for rule in rules if rule.above for family in rule.families()})
     return [
@@ -125,7 +124,7 @@ def render(rules: tuple[PacketRule, ...]) -> list[Json]:
 
 
 def render_rule(rule: PacketRule) -> list[Json]:
-    """One rule, or one for each family, in libnftables' format."""
+    """Return one rule, or one for each family, in libnftables' format."""
     same = rule.above is None and not rule.distant and rule.verdict not in _OF_A_FAMILY
     if same and len(rule.families()) == 2:
         return [_body(rule, [], None)]
@@ -226,7 +225,7 @@ def _over_limit(rule: PacketRule, protocol: str) -> Json:
 
 
 def _shared(rule: PacketRule, own: Json, family: Family) -> Json:
-    """This rule follows `own` and limits hosts without a bucket."""
+    """Return the rule after `own` that limits hosts without a bucket."""
     assert rule.above is not None  # noqa: S101 - the caller asked
     address = _payload("ip6" if family == 6 else "ip", "saddr")
     expressions: list[Json] = []
@@ -267,7 +266,7 @@ def _hook(chain: Chain, hook: Hook) -> list[Json]:
 
 
 def _delete_table() -> list[Json]:
-    """Adding an existing table first is not an error."""
+    """Return commands that delete the table; adding an existing table first is not an error."""
     return [_table("add"), _table("delete")]
 
 
@@ -309,7 +308,7 @@ def _ports(ports: PortRange) -> object:
 
 
 def _translates_source(rule: Json) -> bool:
-    """`masquerade` or `snat`, in the form of nft or of iptables-nft."""
+    """Whether a rule has `masquerade` or `snat`, in the form of nft or of iptables-nft."""
     return any(
         "masquerade" in part or "snat" in part or part.get("xt", {}).get("name") in SOURCE_TRANSLATIONS
         for part in rule["expr"]
@@ -318,7 +317,7 @@ def _translates_source(rule: Json) -> bool:
 
 
 def _counters(rules: list[Json]) -> tuple[RuleCounter, ...]:
-    """The two rules of a limit count as one, and only if both exist."""
+    """Return the counters; the two rules of a limit count as one, and only if both exist."""
     shared = {_key(counter): counter for counter in map(_counter, rules) if counter.purpose.endswith(_SHARED)}
     found = []
     for rule in rules:

@@ -18,7 +18,7 @@ MOST_OF_HOST = 2
 _SHOWN = 4096
 
 Answered = Callable[[str], None]
-"""Takes why the request is refused; empty: it is approved."""
+"""Gets the reason for refusing a request, or an empty text if it is approved."""
 
 
 class CallApprovals:
@@ -50,7 +50,6 @@ class CallApprovals:
         return number
 
     def forget(self, number: int) -> None:
-        """Forget a request whose client has ended: control is not asked about it."""
         if number not in self._open:
             return
         host, _answered = self._open[number]
@@ -61,7 +60,6 @@ class CallApprovals:
             self._unsent.get(host, {}).pop(number, None)
 
     def answered(self, answer: ApprovalAnswered) -> None:
-        """Give control's answer to the client that waits for it."""
         host, waiting = self._open.pop(answer.number, ("", None))
         if waiting is None:
             return

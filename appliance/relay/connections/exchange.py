@@ -1,8 +1,8 @@
 """The requests and replies of one service connection after the headers, without sockets.
 
-The client sends a request, and the service answers with a reply. A persistent connection repeats this. A request that
-comes before the previous reply waits, and the relay stops reading the client (`may_read`). The relay parses every
-request and reply, has monitors judge it, and encodes it again (`_request`, `_reply`).
+The client sends a request, and the service answers with a reply. A request that comes before the previous reply waits,
+and the relay stops reading the client (`may_read`). The relay parses every request and reply, has monitors judge it,
+and encodes it again (`_request`, `_reply`).
 
 Invariants:
 - The service has at most one request at a time. A reply without a request is an error.

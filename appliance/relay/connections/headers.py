@@ -50,7 +50,6 @@ def switched_on(fields: Mapping[str, str], name: str) -> bool:
 
 
 def to_service(fields: Mapping[str, str], caller_id: str) -> dict[str, str]:
-    """Return the header that a service gets from its client."""
     switches = {name: "1" for name in _SWITCHES if switched_on(fields, name)}
     return {"callerid": caller_id, "service": fields["service"], **_known(fields, _OF_CLIENT), **switches}
 

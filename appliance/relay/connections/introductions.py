@@ -1,9 +1,9 @@
-"""The header with which the relay introduces itself to a publisher: any type first, then those that may be meant.
+"""The header with which the relay introduces itself to a publisher: any type first, then the likely ones.
 
-The relay passes on any type, so it asks for `type=*`, `md5sum=*`. rospy and roscpp accept that; rosgo, roslibrust up to
-0.9 and many nodes written by hand accept only their own type and md5sum, and some demand a `message_definition`. They
-refuse with an error header, or just close the connection. The relay then introduces itself again, at once, with each
-claim that it knows. The first accepted header is used for all later connections to the publisher.
+The relay passes on any type, so it asks for `type=*`, `md5sum=*`. rospy and roscpp accept that; rosgo, roslibrust up
+to 0.9 and many nodes written by hand accept only their own type and md5sum, and some demand a `message_definition`.
+They refuse with an error header, or just close the connection. The relay then introduces itself again with each claim
+that it knows. The first accepted header is used for all later connections.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -46,7 +46,6 @@ class Introductions:
         return False
 
     def accepted(self) -> None:
-        """Keep these fields for later connections."""
         self._refused.clear()
 
 

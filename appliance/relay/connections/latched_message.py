@@ -9,8 +9,8 @@ from appliance.relay.transport.memory import HostMemory
 class LatchedMessage:
     """The message that late subscribers of one topic get, or none; `share` counts its memory.
 
-    `make_room(size)` tries to free that many bytes of other hosts. `refused(size)` is called when a message is not kept
-    while the one before was, or there was none.
+    `make_room(size)` tries to free that many bytes of other hosts. `refused(size)` is called for the first
+    message that is not kept.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class LatchedMessage:
 
     @property
     def is_asked_again(self) -> bool:
-        """Whether a message was not kept for which there is memory now: the publisher can send it again."""
+        """Whether there is now memory for a message that was not kept, so the publisher can send it again."""
         return self._refused_size is not None and not self._share.refusal(self._refused_size)
 
     @property

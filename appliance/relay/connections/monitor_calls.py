@@ -50,7 +50,7 @@ class _Call:
 
 
 class ServiceCalls:
-    """The calls under way, and what control also answers: calls of the service that the appliance offers (`own`), and
+    """The calls under way, with control's other answers: calls of the appliance's own service (`own`), and
     requests that need an approval (`approvals`).
     """
 
@@ -63,7 +63,6 @@ class ServiceCalls:
         self._connected = False
 
     def call(self, wanted: Published) -> None:
-        """Begin a call; nothing of it happens before the next turn of the loop."""
         own = sum(call.wanted.monitor == wanted.monitor for call in self._calls.values())
         for number, most, whose in (
             (own, MOST_OF_MONITOR, wanted.monitor),
@@ -118,7 +117,7 @@ class ServiceCalls:
         )
 
     def attach(self, connected: bool) -> None:
-        """End the calls that wait for a control that has gone."""
+        """End the calls that wait for a control process that has ended."""
         self._connected = connected
         self.own.control_gone()
         self.approvals.attach(connected)

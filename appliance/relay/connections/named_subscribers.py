@@ -79,7 +79,6 @@ class NamedSubscribers:
         self._open_missing()
 
     def close(self) -> None:
-        """Close all connections with the main connection."""
         self._wanted, self._address = frozenset(), None
         for stream in self._streams.values():
             stream.close()

@@ -80,7 +80,6 @@ class OwnService:
                 self._settle(call, False, _AWAY)
 
     def tidy(self) -> None:
-        """Forget answers that are older than a second."""
         now = self._loop.clock()
         self._calls = {
             key: call
@@ -107,10 +106,10 @@ class OwnService:
 
 
 class OwnServer:
-    """One client's connection, used like a `BufferedSocket`; `received` gets the bytes that a service would send.
+    """One client's connection, with the methods of a `BufferedSocket`; `received` gets the bytes of a service.
 
-    `opened()` is called in the next turn of the loop. After that, `send` expects the client's header, and then its
-    requests.
+    `opened()` is called in the next turn of the loop. After that, `send` expects the client's header, and
+    then its requests.
     """
 
     backlog = 0

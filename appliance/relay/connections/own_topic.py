@@ -17,7 +17,6 @@ class OwnTopicPublisher(Upstream):
         self._wanted = False
 
     def connect(self) -> None:
-        """Open the topic at once if its header is known."""
         self._wanted = True
         if self._current is None:
             self.recheck()

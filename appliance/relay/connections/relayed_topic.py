@@ -43,7 +43,7 @@ _SEEN_OF_A_HOST = 16  # subscribers of a host that a publisher may see by name, 
 
 
 class Upstream:
-    """The connection to the publisher. By default, its methods do nothing."""
+    """The connection to the publisher; here, its methods do nothing."""
 
     def connect(self) -> None:
         """Connect, because the topic is wanted."""
@@ -54,8 +54,7 @@ class Upstream:
     def pause(self, seconds: float) -> None:
         """Stop reading until `resume`, for at most these seconds."""
 
-    def resume(self) -> None:
-        """Go on reading."""
+    def resume(self) -> None: ...
 
     def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
         """Report new subscribers of a topic of this type; `names` is called after the current turn of the loop."""
@@ -90,11 +89,11 @@ def _no_call() -> ModuleCall | None:
 
 
 Through = Callable[[Batch], Batch | None]
-"""Passes frames through monitors; returns the frames that are passed on, or None."""
+"""A function that passes frames through monitors, and returns the passed ones or None."""
 
 
 class TopicState(Enum):
-    """The publisher of a topic. LOST: its connection is closed, and served subscribers have read its header."""
+    """The state of a publisher. LOST: its connection is closed, and served subscribers have read its header."""
 
     UNKNOWN = auto()
     OPEN = auto()
@@ -112,13 +111,14 @@ class _Monitoring:
 
 
 class RelayedTopic:
-    """A topic of an incarnation at `host`, with its subscribers; `share` counts the memory of its kept messages.
+    """A topic of an incarnation at `host`, with its subscribers; `share` counts the memory of its kept
+    messages.
 
-    `fresh`: the publisher has just appeared. `flow` holds the rate limits, and `limited(part, messages, size)` reports
-    the messages that they dropped. `make_room(size)` tries to free that many bytes of other hosts, and
-    `refused(message)` is called if a latched message is not kept. Once the publisher's quantum is used up (`over()`),
-    the remaining subscribers get the batch in the publisher's next turn, before more data is read. `servers(topic)`
-    returns the subscribers for which an action's client waits.
+    `fresh`: the publisher has just appeared. `flow` holds the rate limits, and `limited(part, messages,
+    size)` reports the messages that they dropped. `make_room(size)` tries to free that many bytes of other
+    hosts, and `refused(message)` is called if a latched message is not kept. Once the publisher's quantum is
+    used up (`over()`), the remaining subscribers get the batch in the publisher's next turn, before more data
+    is read. `servers(topic)` returns the subscribers for which clients of an action wait.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class RelayedTopic:
         return (*self._waiting, *self._served)
 
     def join(self, member: TopicSubscriber) -> None:
-        """Add a subscriber with a grant; it is served when the publisher's header is known."""
+        """Add a subscriber with a grant, which is served once the publisher's header is known."""
         if self._header is None:
             self._waiting[member] = None
         else:
@@ -327,9 +327,9 @@ class RelayedTopic:
         return self._take(batch, passing, since)
 
     def sent(self, batch: Batch, since: float, number: int, sent: int) -> None:
-        """Go on behind the pump, which has passed a batch to the first `number` subscribers.
+        """Continue after the pump, which has passed a batch to the first `number` subscribers.
 
-        The next one has accepted `sent` bytes (negative: the number of an error).
+        The next subscriber has accepted `sent` bytes (negative: the number of an error).
         """
         self.counters.add(batch.messages, len(batch.view))
         self._reported = False
@@ -366,7 +366,6 @@ class RelayedTopic:
         return rest
 
     def _admit(self, batch: Batch, since: float, *, divided: bool = True) -> Batch | None:
-        """Give a batch to monitors and subscribers; return the part that monitors had no time for."""
         if self._served.masked and batch.messages > 1:  # a message may withhold the next one
             first = batch.head(1)
             self._admit(first, since, divided=False)
@@ -384,7 +383,7 @@ class RelayedTopic:
         return rest
 
     def published(self, batch: Batch) -> None:
-        """Send a message of a monitor to the subscribers, past all monitors."""
+        """Send a message of a monitor to the subscribers, bypassing all monitors."""
         first = self.counters.following
         self.counters.add(batch.messages, len(batch.view))
         self._reported = False
@@ -446,7 +445,6 @@ class RelayedTopic:
         self._latch.give_up()
 
     def repeat(self) -> None:
-        """Report to a new control which latched message is not kept."""
         self._latch.repeat()
 
     def traffic(self) -> TopicTraffic | None:
@@ -503,7 +501,6 @@ class RelayedTopic:
         return frozenset().union(*of_host.values())
 
     def _pause_or_trim(self) -> None:
-        """Pause the publisher if all subscribers have just fallen behind; else trim the full queues."""
         since = [member.behind_since for member in self._served.row if member.behind_since is not None]
         if since and len(since) == len(self._served):
             left = max(since) + self._grace - self._clock()

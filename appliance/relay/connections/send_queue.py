@@ -54,7 +54,6 @@ class SendQueue:
 
     @property
     def short(self) -> bool:
-        """Whether the queue holds memory while the host's memory is exhausted."""
         return bool(self) and self._share.exhausted
 
     @property
@@ -85,7 +84,6 @@ class SendQueue:
         self._share.add(len(rest))
 
     def vectors(self) -> list[memoryview]:
-        """Return the views to send next, in order."""
         views = [] if self._started is None else [self._started]
         for index, (view, _messages) in enumerate(self._waiting):
             if index == _VECTORS:

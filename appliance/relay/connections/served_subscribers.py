@@ -20,10 +20,10 @@ class TopicSubscriber(Protocol):
     caller_id: str
 
     missed: bool
-    """Whether it did not get the last message, because of its rate limit or because the topic is withheld from it."""
+    """Whether the subscriber did not get the last message: its rate limit was used up, or the topic is withheld."""
 
     behind_since: float | None
-    """When its queue first became so long that it is behind; None once it has caught up completely."""
+    """When the queue first became so long that the subscriber is behind; None once it has caught up."""
 
     def greet(self, header: Mapping[str, str]) -> bool:
         """Answer with the publisher's header, or refuse a different type; return whether the subscriber is served."""
@@ -36,15 +36,14 @@ class TopicSubscriber(Protocol):
 
     @property
     def descriptor(self) -> int:
-        """The socket to which the next batch is just sent; -1 if it needs other work (a limit, a queue)."""
+        """Return the socket for the next batch, or -1 if the subscriber needs other work (a limit, a queue)."""
 
     @property
     def exhausted(self) -> bool:
-        """Whether no more data should be kept for its host."""
+        """Whether no more data should be kept for the subscriber's host."""
 
     @property
-    def full(self) -> bool:
-        """Whether its queue has reached its bounds."""
+    def full(self) -> bool: ...
 
     def trim(self) -> int:
         """Drop messages beyond the bounds, oldest first; return how many."""
@@ -52,8 +51,7 @@ class TopicSubscriber(Protocol):
     def check_stall(self) -> None:
         """Cut the connection if it makes no progress; called once a second."""
 
-    def cut(self, reason: str) -> None:
-        """Close its connection."""
+    def cut(self, reason: str) -> None: ...
 
 
 class ServedSubscribers:
@@ -84,7 +82,6 @@ class ServedSubscribers:
 
     @property
     def row(self) -> tuple[TopicSubscriber, ...]:
-        """Return the subscribers; the tuple stays the same while some of them end."""
         if self._row is None:
             self._row = tuple(self._members)
         return self._row
@@ -107,7 +104,7 @@ class ServedSubscribers:
             self._dropped += member.deliver(batch)
 
     def send(self, batch: Batch, *, divided: bool) -> bool:
-        """Send all of them a batch, after the previous one; return whether a subscriber is behind."""
+        """Send all subscribers a batch, after the previous one; return whether a subscriber is behind."""
         behind = self.hand_out(divided=False)
         self._waits = batch, self.row
         return self.hand_out(divided=divided) or behind
@@ -115,7 +112,8 @@ class ServedSubscribers:
     def go_on_behind(self, batch: Batch, number: int, sent: int) -> bool:
         """Send the rest of a batch that the pump has passed to the first `number` subscribers.
 
-        The next one has accepted `sent` bytes (negative: the number of an error). Return whether one is behind.
+        The next subscriber has accepted `sent` bytes (negative: the number of an error). Return whether a
+        subscriber is behind.
         """
         row = self.row
         self._waits = batch, row[number + 1 :]
@@ -123,7 +121,9 @@ class ServedSubscribers:
         return self.hand_out(divided=True) or row[number].behind_since is not None
 
     def hand_out(self, *, divided: bool) -> bool:
-        """Send the waiting batch; if `divided`, stop when the quantum is used up. Return whether one is behind."""
+        """Send the waiting batch; if `divided`, stop when the quantum is used up. Return whether a subscriber
+        is behind.
+        """
         if self._waits is None:
             return False
         (batch, members), self._waits = self._waits, None
@@ -139,7 +139,7 @@ class ServedSubscribers:
         return behind
 
     def trim(self, *, stalled: bool = False) -> bool:
-        """Trim the full queues, and cut subscribers that make no progress (`stalled`); return whether one was full."""
+        """Trim the full queues, and cut subscribers without progress (`stalled`); return whether a queue was full."""
         full = False
         for member in self.row:
             if member.full:

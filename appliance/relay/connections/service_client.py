@@ -184,7 +184,6 @@ class ServiceClient:
             self._ended(self)
 
     def _patience(self, seconds: float) -> None:
-        """Turn the client away unless the service answers within this many seconds."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = self._context.loop.after(
@@ -238,7 +237,6 @@ class ServiceClient:
         return self._context.interceptor.judge(point, part, body)
 
     def _ask(self, body: bytes) -> bool:
-        """Ask control about a request that needs an approval; return whether it does."""
         if not self._asks():
             return False
         caller = self.service.service, self.host, self.caller_id
@@ -257,7 +255,6 @@ class ServiceClient:
             self._guard(self._exchange.from_client, data)
 
     def _guard(self, feed: Callable[[bytes], None], data: bytes) -> None:
-        """Feed the exchange, and cut a peer that breaks the protocol."""
         try:
             feed(data)
         except PeerError as error:
@@ -266,7 +263,6 @@ class ServiceClient:
         self._advance()
 
     def _advance(self) -> None:
-        """Send the next request, if the client has read everything that was written to it."""
         if not self._live or not self._greeted:
             return
         while self._live and not self._client.backlog:

@@ -16,7 +16,7 @@ from appliance.relay.transport.frames import Batch
 from appliance.relay.transport.memory import HostMemory
 
 APPEARED = 5.0
-"""Seconds after which a publisher no longer counts as new."""
+"""The seconds after which a publisher no longer counts as new."""
 
 SECONDS = 1.0
 SPEECH = 0.25

@@ -148,7 +148,6 @@ class Subscriber:
             self.behind_since = self._loop.clock()
 
     def _limited(self, flow: RateAllowance, batch: Batch) -> Batch | None:
-        """Return the first messages, up to the limit, and report the others as dropped."""
         count = flow.room(batch, batch.messages, self._loop.clock())
         self.missed = count < batch.messages
         if self.missed:

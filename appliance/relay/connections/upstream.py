@@ -36,7 +36,7 @@ _REASON = 1000  # most characters of a reported error; a publisher chooses the t
 
 
 class UpstreamState(Enum):
-    """The next event that a connection to a publisher waits for. WAITING: for the next try, after a failure."""
+    """The event that a connection to a publisher waits for. WAITING: for the next try, after a failure."""
 
     IDLE = auto()
     ASKED = auto()
@@ -57,9 +57,10 @@ class _Attempt:
 
 
 class PublisherConnection(Upstream):
-    """The upstream of one relayed topic; `objection(header)` returns why a publisher is refused (empty: accepted).
+    """The upstream of one relayed topic; `objection(header)` returns why a publisher is refused (empty:
+    accepted).
 
-    `unsettled()`: a reload or a restart is under way, after which subscribers return.
+    `unsettled()`: subscribers may return after a reload or a restart.
     """
 
     def __init__(
@@ -118,7 +119,6 @@ class PublisherConnection(Upstream):
             self._linger = self._loop.after(seconds, self._close_unwanted)
 
     def ask(self) -> None:
-        """Ask control for the publisher's address; repeat the question if no answer comes."""
         self._enter(UpstreamState.ASKED, self._limits.answer_seconds, self.ask)
         self._context.reporter.send(UpstreamWanted(self._topic.key, self._topic.topic))
 
@@ -298,7 +298,6 @@ class PublisherConnection(Upstream):
     def _enter(
         self, state: UpstreamState, seconds: float = 0.0, late: Callable[[], None] | None = None
     ) -> None:
-        """Enter a state, and call `late` if it lasts for more than `seconds`."""
         self.state = state
         if self._timer is not None:
             self._timer.cancel()

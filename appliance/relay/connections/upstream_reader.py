@@ -22,7 +22,7 @@ from appliance.relay.transport.pump import JUDGED, RECEIVED, UNARMED, Left
 from roswire.errors import LimitExceededError, PeerError
 
 Lost = Callable[[str, Violation], None]
-"""Takes the reason why a connection to a publisher cannot go on, and the kind of violation."""
+"""Called with the reason for closing a connection to a publisher, and the kind of violation."""
 
 
 class _State(Enum):
@@ -107,7 +107,6 @@ class UpstreamReader:
             self._receiver.resume(torn)
 
     def close(self) -> None:
-        """Close the connection; what is left is lost."""
         self._state = _State.CLOSED
         if self._pause is not None:
             self._pause.cancel()
@@ -150,7 +149,6 @@ class UpstreamReader:
             self._lost("the publisher closed the connection", "")
 
     def _go_on_behind(self, left: Left) -> None:
-        """Process whole frames further than the pump has done."""
         batch = self._receiver.found(left.size, left.end, left.messages)
         batch.judged, batch.answer = left.judged, left.answer
         if left.kind == JUDGED:
@@ -202,7 +200,6 @@ class UpstreamReader:
             rest = None if batch is None else self._topic.received(batch, self._received_at)
 
     def _leave(self, rest: Batch | None) -> None:
-        """Keep these frames, and all other received data, for the publisher's next turn."""
         if self._state is _State.CLOSED:
             return
         self._rest = rest

@@ -50,7 +50,7 @@ class BatchProgress:
         return turns
 
     def walked(self, position: int, run: int, gone: int) -> None:
-        """Note the messages processed up to `position`; `gone` of them were dropped, the last one just before `run`."""
+        """Note the messages processed up to `position`; `gone` were dropped, the last one just before `run`."""
         if position > self.position:
             self._turns = 1
         self.position, self.run = position, run
@@ -63,7 +63,6 @@ class BatchProgress:
         self.run = following
 
     def replace(self, position: int, following: int, buffer: bytes | bytearray | memoryview) -> None:
-        """Replace the message between these positions by one of another size."""
         if position > self.run:
             self.pieces.append(self.view[self.run : position])
         self.pieces += (_LENGTH.pack(len(buffer)), buffer)

@@ -31,13 +31,11 @@ class FastPathCounts:
         self._clear()
 
     def count_in(self, call: ModuleCall) -> None:
-        """Collect the changes that the pump counts in this call from now on."""
         if self._call is not None:
             self._call.settle()
         self._call = call
 
     def add(self, walked: BatchResult, time: int) -> int:
-        """Count the messages that a walk dropped; return their number."""
         for number, count in enumerate(walked.dropped):
             if count:
                 self._dropped[number] = _more(self._dropped[number], count, time)

@@ -243,7 +243,6 @@ class Interceptor:
             self.keep_all()
 
     def resume(self, name: str) -> frozenset[str]:
-        """Make a monitor release its held topics; return the topics."""
         self.invalidate_prepared()
         if self.monitors is None:
             return frozenset()
@@ -254,7 +253,6 @@ class Interceptor:
         return self.monitors.topics_of(held)
 
     def _guards(self, topic: str, *, begin: bool) -> list[str]:
-        """Return the monitors with a safe message for a topic; with `begin`, have them send it."""
         if self.monitors is None:
             return []
         names = self.monitors.guards(topic)

@@ -60,7 +60,6 @@ class Loader:
 
     @staticmethod
     def load(message: SpecificationsStated, holder_of: Callable[[int], Hashable]) -> Result:
-        """Return the monitors of these specifications, or the errors."""
         try:
             from appliance.relay.monitors import monitor_sets  # noqa: PLC0415  half a second of a small machine
 

@@ -87,7 +87,6 @@ class ObservedMessage:
         return ObservedMessage(None, number, self._head)
 
     def sender(self, source: int) -> MessageSender:
-        """Return the sender, and the message's seq if it has a header."""
         if len(self._head) == HEAD:
             return MessageSender(source, _HEADER.unpack(self._head)[0], SEQ)
         return MessageSender(source)

@@ -1,5 +1,4 @@
-"""Report monitors' actions to the control process: the first event of each kind in a second in full, the others as
-counts.
+"""Report monitors' actions to control: the first event of each kind in a second in full, the others as counts.
 
 Invariants:
 - For each monitor, kind and distinction (the category of a verdict, the text of a log line without its numbers), one
@@ -154,7 +153,7 @@ class Observations:
     ) -> None:
         """Add `count` events, the last of them at this time, and report only their number.
 
-        `first` is the time of the first one, 0 if unknown; `text` is empty if the texts are unknown.
+        `first` is the time of the first event, 0 if unknown; `text` is empty if the texts are unknown.
         """
         repeated = self._repeated(kind, monitor, point, distinction)
         if repeated is None:
@@ -213,7 +212,6 @@ class Observations:
             self._timer = self._loop.after(_FLUSH_SECONDS, self.flush)
 
     def flush(self) -> None:
-        """Send waiting events to control, then the counters."""
         self._timer = None
         while self._reporter.attached and self._waiting:
             events = [self._waiting.popleft() for _ in range(min(_AT_ONCE, len(self._waiting)))]

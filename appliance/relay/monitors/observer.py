@@ -151,7 +151,7 @@ class Observer:
             self._send(judged)
 
     def _judged(self, judged: Outcome, point: ObservationPoint, data: bytes) -> None:
-        """Report the effects of the monitors behind a publisher on its message, which had these bytes."""
+        """Report the effects of a publisher's monitors on its message, which had these bytes."""
         self._report(judged, point)
         if judged.result == "dropped":
             self.dropped(judged, point, memoryview(data))
@@ -235,7 +235,6 @@ class Observer:
     def defect(
         self, error: Exception, point: ObservationPoint, time: int, observed: ObservedMessage | None = None
     ) -> str:
-        """Report an exception that is not a monitor's fault; return its text."""
         text = f"a defect of rosrv, please report it: {type(error).__name__}: {error}"
         self._observations.note(
             f"{self._prefix}fault", "", point, time, text, distinction=type(error).__name__, observed=observed
@@ -255,7 +254,6 @@ class Observer:
         text: str,
         observed: ObservedMessage | None = None,
     ) -> None:
-        """Report that a monitor in shadow mode did not get a message."""
         self._counter(monitor).missed += 1
         self._observations.note(
             f"{self._prefix}missed", monitor, point, time, text, distinction=text, observed=observed
@@ -393,7 +391,6 @@ class Observer:
 
 
 def dropped(body: memoryview, now: int, reason: str) -> Outcome:
-    """Return the outcome for a message that is dropped without a judgement."""
     outcome = Outcome(body, now)
     outcome.result, outcome.reason = "dropped", reason
     return outcome

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet, ShadowCopy
 
 SHARE = 0.2
-"""Seconds of processor time in a second."""
+"""The seconds of processor time in a second."""
 
 _SLICE = 0.002  # seconds of processor time
 _LAST_SLICE = 0.02  # seconds, before other monitors take over their state
@@ -95,7 +95,6 @@ class ShadowMonitors:
     # --- their messages ---
 
     def wait(self, point: ObservationPoint, observed: ObservedMessage | None) -> None:
-        """Queue the copies of a message that is passed on."""
         assert self._monitors is not None  # noqa: S101  they have copied it
         idle = not self.waiting
         for tapped in self._monitors.tapped:

@@ -60,7 +60,7 @@ class _Head(msgspec.Struct, array_like=True):
 
 @dataclass(slots=True)
 class RecoveredState:
-    """The states that earlier processes left, newest last, and why states are lost (by monitor; key "": all).
+    """The states that earlier processes left, newest last, and the reasons for lost ones (by monitor; "": all).
 
     A state of a group has the names of its monitors, the layout of its cells, its base, and newer cells.
     """
@@ -104,7 +104,6 @@ class StateKeeper:
     # --- state that an earlier process left ---
 
     def recovered(self) -> RecoveredState | None:
-        """Return the states that earlier processes left; None if nothing was kept."""
         found = RecoveredState()
         heads = sorted(self._readable(found), key=lambda each: each[0].written)
         for head, sections in heads:
@@ -117,7 +116,7 @@ class StateKeeper:
         return found if heads or found.lost else None
 
     def kept_shift(self) -> int:
-        """Return the shift with which the newest kept state was written, less the present one."""
+        """Return the shift with which the newest kept state was written, minus the present shift."""
         heads = [head for head, _sections in self._readable(RecoveredState())]
         return max(heads, key=lambda head: head.written).shift - self.shift if heads else 0
 
@@ -262,10 +261,11 @@ def state_left(message: StateWanted, keeper: StateKeeper | None) -> StateLeft:
 
 
 def continued(message: SpecificationsStated, keeper: StateKeeper | None, now: int) -> int:
-    """Return what to add to the clock of monitors (`now`) before their first start; the keeper also gets it.
+    """Return the time to add to the clock of monitors (`now`) before their first start; the keeper also gets
+    it.
 
-    After a takeover, the clock continues where the relays of the other appliance stopped it. A relay that replaces
-    another one continues the clock of that one.
+    After a takeover, the clock continues where the relays of the other appliance stopped it. A relay that
+    replaces another one continues its clock.
     """
     shift = 0
     if message.left:

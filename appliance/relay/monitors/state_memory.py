@@ -148,7 +148,6 @@ class _Section:
 
 
 def mapped(descriptor: int, *, writable: bool) -> memoryview:
-    """Map the memory behind a descriptor, and close the descriptor."""
     access = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
     memory = mmap.mmap(descriptor, 0, flags=mmap.MAP_SHARED, prot=access)
     os.close(descriptor)

@@ -169,7 +169,6 @@ class TopicPipeline:
             interceptor.observer.report_line(*said, point=self.point, time=progress.time, observed=observed)
 
     def _prepare(self, monitors: MonitorSet, lane: FastLane) -> tuple[BatchOptions, FastPathCounts]:
-        """Prepare the options and counts of all batches until something changes."""
         observer, point, number = (
             self._interceptor.observer,
             self.point,
@@ -194,7 +193,6 @@ class TopicPipeline:
         return options, counts
 
     def _one_by_one(self, monitors: MonitorSet, progress: BatchProgress, count: int) -> None:
-        """Pass up to `count` messages to the engine, or fewer if the quantum is used up."""
         interceptor, point, now, observer = (
             self._interceptor,
             self.point,

@@ -112,7 +112,6 @@ class Batch:
         return head
 
     def tail(self, count: int) -> "Batch":
-        """Return the last frames, in their own memory."""
         view = self.view[len(self.head(self.messages - count).view) :]
         tail = Batch(
             view if self._owned else memoryview(bytearray(view)), count, None, owned=True, stride=self.stride
@@ -181,7 +180,6 @@ class FrameReceiver:
         self._aside = 0
 
     def buffer(self) -> memoryview:
-        """Return the buffer for the next bytes of the connection."""
         if self._area is not None:
             if self._delivered is not None and self._delivered.kept:
                 self._area = _new_area(self._target)
@@ -254,7 +252,6 @@ class FrameReceiver:
 
     @property
     def unfinished(self) -> int:
-        """Return the number of received bytes of an incomplete large frame."""
         return self._filled
 
     def trim_buffer(self) -> None:
@@ -311,7 +308,6 @@ class FrameReceiver:
         return Batch(buffer[:position], messages, last, owned=owned, stride=stride)
 
     def _begin_area(self, need: int, start: memoryview) -> None:
-        """Continue a frame of `need` bytes in its own area; `start` is the part received so far."""
         area = _new_area(need)
         area[: len(start)] = start
         self._area, self._target, self._filled = area, need, len(start)
@@ -367,7 +363,6 @@ def equal_frames(buffer: memoryview, end: int) -> tuple[int, int]:
 
 
 def last_frame(view: memoryview) -> int:
-    """Return where the last of the whole frames in `view` begins."""
     position = last = 0
     while position < len(view):
         last = position

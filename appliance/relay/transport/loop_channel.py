@@ -13,11 +13,13 @@ from appliance.relay.loop import READ, WRITE, EventLoop, LoopTimer
 class LoopLink:
     """One end of a lifeline or link. `ended(reason)` is called once, when the link fails.
 
-    A message that belongs to another link, or a backlog beyond its limit, ends the link as if the other end had died. A
-    restatement of thousands of messages is carried out one quantum at a time, so that it delays nothing else.
+    A message that belongs to another link, or a backlog beyond its limit, ends the link as if the other end
+    had died. A restatement of thousands of messages is carried out one quantum at a time, so that it delays
+    nothing else.
 
-    If `received` returns True, that message and the messages behind it wait for `go_on`, and nothing more is read until
-    then. Therefore at most one `Channel.receive` of messages waits here, and the other end's backlog has its own limit.
+    If `received` returns True, that message and later ones wait for `go_on`, and nothing more is read until
+    then. Therefore at most one `Channel.receive` of messages waits here, and the other end's backlog has its
+    own limit.
     """
 
     def __init__(
@@ -58,7 +60,6 @@ class LoopLink:
             self._finish()
 
     def go_on(self) -> None:
-        """Carry out the waiting messages, and those that have arrived since."""
         if self._waits:
             self._waits = False
             self._watch()

@@ -27,7 +27,7 @@ from appliance.relay.transport.memory import HostMemory
 Part = Literal["publisher", "subscriber", "topic"]
 
 BURST = 0.5
-"""Seconds' worth of messages that may come at once."""
+"""The burst that may come at once, in seconds of the rate."""
 
 _FILL_SECONDS = 20e-6  # between two fills, for each holder: a limit with many holders is filled less often
 _FEW_FLOWS = 64
@@ -99,7 +99,6 @@ class _Store:
         return self._most / 2 if self._own else self._most
 
     def _give_back(self) -> None:
-        """Move each holder's excess over its room to the common store."""
         room = self._room
         for name, own in self._own.items():
             if own > room:
@@ -170,7 +169,7 @@ class SharedRateLimit:
 
 
 class RateAllowance:
-    """The part of one holder in a limit."""
+    """The allowance of one holder in a limit."""
 
     __slots__ = ("__weakref__", "_flow", "_name")
 
@@ -258,7 +257,6 @@ class PublicationRateLimit:
         return part
 
     def later(self, now: float) -> Batch | None:
-        """Return the waiting message, if it may pass now."""
         waiting = self._waiting
         if waiting is None:
             return None

@@ -124,7 +124,6 @@ class BufferedSocket:
         return self._socket
 
     def close(self) -> None:
-        """Close the socket; waiting bytes are lost."""
         if self._live:
             self._live = False
             self._loop.discard(self._socket)

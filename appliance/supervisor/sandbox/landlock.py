@@ -26,7 +26,7 @@ _READ = _READ_FILE | _READ_DIR
 _PR_SET_NO_NEW_PRIVS = 38
 
 FILES, PORTS, SIGNALS = 1, 4, 6
-"""ABI versions."""
+"""The ABI versions of Landlock that limit files, ports and signals."""
 
 
 class LandlockError(Exception):
@@ -34,7 +34,6 @@ class LandlockError(Exception):
 
 
 def version() -> int:
-    """Return 0 without Landlock, or if it is disabled."""
     return max(system_call(_CREATE_RULESET, None, 0, _ASK_VERSION)[0], 0)
 
 

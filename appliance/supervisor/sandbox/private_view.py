@@ -44,12 +44,12 @@ _REMEDY = (
 
 
 class ViewError(Exception):
-    """The message has the cause and the remedy."""
+    """A view cannot be made; the message has the cause and the remedy."""
 
 
 @dataclass(frozen=True)
 class PrivateView:
-    """Covered folders, and folders of the program and the state directory that are shown.
+    """A view: covered folders, and the shown folders of the program and the state directory.
 
     `owned` are the folders of the program with files that only their owner may read.
     """
@@ -61,7 +61,7 @@ class PrivateView:
 
 
 def program_folders() -> tuple[Path, ...]:
-    """The Python environment, and the packages unless they are in it."""
+    """Return the folders of the Python environment, and of the packages unless they are in it."""
     top, environment = Path(appliance.__file__).resolve().parent.parent, Path(sys.prefix).resolve()
     packages = () if top.is_relative_to(environment) else tuple(top / name for name in _PACKAGES)
     return (environment, *packages)
@@ -89,7 +89,7 @@ def view_of(program: Sequence[Path], state: Path) -> PrivateView | None:
 
 
 def require_view(view: PrivateView | None, *, may_mount: bool) -> PrivateView | None:
-    """Raises `StartError` if this process may not mount the view and the program needs it."""
+    """Return the view. Raises `StartError` if the program needs it and this process may not mount it."""
     if view is None or may_mount:
         return view
     if view.program:
@@ -101,7 +101,7 @@ def require_view(view: PrivateView | None, *, may_mount: bool) -> PrivateView | 
 
 
 def enter(view: PrivateView, account: Account) -> None:
-    """This process must have one thread, and not be `account` yet. Raises `ViewError`."""
+    """Enter the view, in a process with one thread that is not `account` yet. Raises `ViewError`."""
     try:
         _enter(view, account)
     except OSError as error:
@@ -134,7 +134,7 @@ def _closed_above(path: Path) -> Path | None:
 
 
 def _is_open(folder: Path) -> bool:
-    """In our packages, other users must be able to read every file: a pull may have another umask."""
+    """Whether other users can read every file of our packages below a folder: a pull may have another umask."""
     if folder.name not in _PACKAGES:
         return _permits(folder, _ENTER | _READ)
     return all(

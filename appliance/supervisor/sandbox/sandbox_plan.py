@@ -1,4 +1,4 @@
-"""`seccomp` and `landlock` enforce the permissions of a sandbox."""
+"""Define the permissions of a sandbox, which `seccomp` and `landlock` enforce."""
 
 import socket
 from dataclasses import dataclass

@@ -97,11 +97,11 @@ class _Filter:
         self._otherwise = otherwise
 
     def set(self, attribute: int, value: int) -> None:
-        """Skip an attribute that libseccomp or the kernel lacks; the same calls are denied."""
+        """Set an attribute, unless libseccomp or the kernel lacks it; the same calls are denied without it."""
         self._library.seccomp_attr_set(self._context, ctypes.c_int(attribute), ctypes.c_uint32(value))
 
     def add(self, action: int, names: Iterable[str], *comparisons: Comparison) -> None:
-        """The rule applies if all comparisons hold. Calls that this architecture lacks are skipped."""
+        """Add a rule that applies if all comparisons hold. Calls that this architecture lacks are skipped."""
         if action == self._otherwise:
             return
         compared = (_Comparison * len(comparisons))(*(_Comparison(*comparison) for comparison in comparisons))
@@ -123,7 +123,7 @@ class _Filter:
 
 
 def load_filter(sandbox: SandboxPlan) -> None:
-    """The filter includes children, and needs `no_new_privs`. Raises `SeccompError`."""
+    """Load the filter, which includes children and needs `no_new_privs`. Raises `SeccompError`."""
     made = _Filter(_FAIL_ENOSYS if sandbox.allowlist else _ACT_ALLOW)
     made.set(_ATTR_ACT_BADARCH, _ACT_KILL_PROCESS)
     made.set(_ATTR_CTL_SSB, 1)

@@ -100,7 +100,7 @@ def next_timestamp(
 
 
 def _signed_before(last: bytes | None, root: Root) -> Timestamp | None:
-    """Return the last timestamp; None if the present root does not accept it: robots then discard it also."""
+    """Return the last timestamp; None if the present root does not accept it, so that robots also discard it."""
     if last is None:
         return None
     try:

@@ -1,14 +1,14 @@
 """Edit the operator's repository of bundles: delegate groups, add and withdraw bundles, sign, rotate keys.
 
-The repository is a folder on the operator's machine. `metadata/` and `targets/` are what the collector publishes
-(`publish`). `root.json` is what robots trust first. The keys are encrypted files in `keys/`, or anywhere else; the
+The repository is a folder on the operator's machine. The collector publishes `metadata/` and `targets/`
+(`publish`). Robots first trust `root.json`. The keys are encrypted files in `keys/`, or anywhere else; the
 collector never gets them. It gets `timestamp.pem` only.
 
-Roles, by TUF's own guidance: root and targets sign seldom, so their keys are offline. Each group of a site has a
-delegated role with a path pattern of its own, so the holder of its key can sign for no other group. Bundles come from
-operators only, so the snapshot is signed offline together with them, and expires after weeks. Only the timestamp is
-online, because it is signed every few hours: a stolen timestamp key can freeze the fleet until the snapshot expires,
-but it cannot mix versions.
+Roles, by TUF's own guidance: root and targets sign seldom, so their keys are offline. Each group of a site
+has a delegated role with a path pattern of its own, so the holder of its key can sign for no other group.
+Bundles come from operators only, so the snapshot is signed offline together with them, and expires after
+weeks. Only the timestamp is online, because it is signed every few hours: a stolen timestamp key can freeze
+the fleet until the snapshot expires, but it cannot mix versions.
 
 Invariants:
 1. Metadata files are never changed: each new version is a new file. A killed command leaves the former state, and the
@@ -158,8 +158,9 @@ class BundleRepository:
     def rotate(self, role: str) -> None:
         """Replace the key of a role. Raises `RepositoryError`.
 
-        A new root is signed with the old root key and the new one. If the snapshot or timestamp key is replaced, robots
-        discard what the old key signed, so they recover from versions that a thief set too high.
+        A new root is signed with the old root key and the new one. If the snapshot or timestamp key is
+        replaced, robots discard the old key's metadata, so they recover from versions that a thief set too
+        high.
         """
         if role in _TOP:
             before = self._open("root", Root)
@@ -199,7 +200,6 @@ class BundleRepository:
                 yield BundlePath.parse(name), target
 
     def expiries(self) -> dict[str, datetime.datetime]:
-        """Return when each role's metadata expire."""
         found = {
             "root": self._open("root", Root).expires,
             "snapshot": self._open("snapshot", Snapshot).expires,
@@ -272,6 +272,6 @@ class BundleRepository:
         return [BundlePath.parse(name).version for name in listed.targets]
 
     def _last_version(self, site: str, group: str) -> int:
-        """Return the last version that was ever made for a group, also if it was withdrawn."""
+        """Return the last version that was ever made for a group, even if it was withdrawn."""
         names = (path.name.split(".")[1] for path in (self.targets / site / group).glob("*.tar"))
         return max(map(int, names), default=0)

@@ -32,7 +32,7 @@ _LONGEST_REPORT = 16_384
 _MOST_LISTENERS = 2  # event streams of one robot: the old one may still be open when it connects again
 
 Identify = Callable[[Request], Robot | Awaitable[Robot]]
-"""Returns the robot with the client's certificate; raises `HTTPException` for any other caller."""
+"""A function that returns the robot with the client's certificate, or raises `HTTPException` for any other caller."""
 
 
 class EventStreams:
@@ -129,7 +129,7 @@ def robot_routes(service: BundleService, identify: Identify) -> APIRouter:
 
     @router.put(f"/{REPORT}", status_code=204)
     async def keep_report(request: Request, robot: caller) -> None:
-        """Store what the robot reports about itself."""
+        """Store a robot's report about itself."""
         body = await read_body(request, _LONGEST_REPORT)
         try:
             report = msgspec.json.decode(body, type=RobotReport)
@@ -156,7 +156,6 @@ def robot_routes(service: BundleService, identify: Identify) -> APIRouter:
 
 
 def _tagged(request: Request, body: bytes, kind: str) -> Response:
-    """Return a body with its entity tag, or 304 if the client has it."""
     tag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
     headers = {"ETag": tag, "Cache-Control": "no-cache"}
     if request.headers.get("If-None-Match") == tag:
@@ -165,7 +164,6 @@ def _tagged(request: Request, body: bytes, kind: str) -> Response:
 
 
 async def _file(path: Path, kind: str) -> Response:
-    """Return a file whose name determines its content."""
     try:
         return Response(await asyncio.to_thread(path.read_bytes), media_type=kind, headers=_FOREVER)
     except OSError as error:

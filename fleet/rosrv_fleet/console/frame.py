@@ -103,7 +103,6 @@ def link(path: str, label: str, **parameters: str) -> str:
 
 
 def choice(name: str, label: str, options: Iterable[tuple[str, str]], chosen: str) -> str:
-    """Return a selection field of (value, text) options."""
     items = "".join(
         f'<option value="{escape(value)}"{" selected" if value == chosen else ""}>{text(shown)}</option>'
         for value, shown in options
@@ -123,10 +122,8 @@ def ago(seconds: float) -> str:
 
 
 def since(at: float) -> str:
-    """Return how long ago a time (seconds since the epoch) was."""
     return ago(clock.wall() - at)
 
 
 def moment(at: float) -> str:
-    """Return a time (seconds since the epoch) in UTC."""
     return f"{datetime.datetime.fromtimestamp(at, datetime.UTC):%Y-%m-%d %H:%M:%S}"

@@ -78,7 +78,7 @@ def _group(state: dict[str, Any]) -> str:
 
 
 def group_page(service: BundleService, group: RobotGroup, *, may_change: bool) -> str:
-    """Return the page's body of one group; operators get the buttons of what is possible now."""
+    """Return the page's body of one group; operators get the buttons of the possible acts."""
     state = group_state(service, group)
     head = f"<h1>Rollouts of {text(group)}</h1>"
     if state["rollout"] is None:

@@ -32,7 +32,6 @@ _COLUMNS = tuple(
 
 
 def search_page(collector: Collector, viewer: str, asked: Mapping[str, str]) -> str:
-    """Return the page's body, with the result if something is asked."""
     result = _result(collector, viewer, asked) if any(asked.values()) else ""
     return "<h1>Search</h1>" + _form(asked) + result
 

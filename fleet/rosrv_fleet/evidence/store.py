@@ -118,7 +118,7 @@ class EvidenceStore:
     def all(self, robot: str = "") -> list[StoredEvidence]:
         """Return the bundles of a robot (default: of all robots), the latest first. Raises `OSError`.
 
-        One whose description is damaged is missing here, and is logged once.
+        A bundle with a damaged description is left out, and logged once.
         """
         names = {path.name for path in self._folder.iterdir() if _ID.fullmatch(path.name)}
         for name in names - self._known.keys():

@@ -41,10 +41,11 @@ class RobotSeen(msgspec.Struct, frozen=True):
 class HealthGates(msgspec.Struct, frozen=True):
     """When a ring is healthy. Shares are of the ring's robots, times in seconds.
 
-    A ring is taken when `share` of its robots have the bundle in force. It stays so for `healthy_seconds` before the
-    next ring opens. More than `tolerance` unhealthy robots stop the rollout, and so does a ring that is not taken after
-    `ring_seconds`. A robot is unhealthy if it refused the bundle, was silent for `silent_seconds`, has more failing
-    monitors than before, or `denial_factor` times as many denials a minute (and at least `least_denials`).
+    A ring is taken when `share` of its robots have the bundle in force. The next ring opens after
+    `healthy_seconds` in this state. The rollout stops if more than `tolerance` robots are unhealthy, or if a
+    ring is not taken after `ring_seconds`. A robot is unhealthy if it refused the bundle, was silent for
+    `silent_seconds`, has more failing monitors than before, or `denial_factor` times as many denials a minute
+    (and at least `least_denials`).
     """
 
     share: float = 0.95
@@ -173,7 +174,7 @@ def reverted(rollout: BundleRollout, why: str) -> BundleRollout:
 
 
 def resumed(rollout: BundleRollout, seconds: float) -> BundleRollout:
-    """Return a running rollout after `seconds` in which the collector heard no robot: they count for no gate."""
+    """Return a running rollout after `seconds` in which the collector heard no robot, which no gate counts."""
     if rollout.state != "running":
         return rollout
     why = f"the collector heard no robot for {seconds:.0f} s; the time of health begins again"
@@ -182,7 +183,7 @@ def resumed(rollout: BundleRollout, seconds: float) -> BundleRollout:
 
 
 def counts(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> list[dict[str, object]]:
-    """Return each ring with its number of robots, of those with the bundle in force, refusing, and unhealthy ones."""
+    """Return each ring with the numbers of its robots: all, with the bundle in force, refusing, and unhealthy."""
     sick = unhealthy(rollout, robots, now)
     rows: list[dict[str, object]] = []
     for index, ring in enumerate(rollout.terms.rings):
@@ -201,7 +202,6 @@ def counts(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) 
 
 
 def _opened(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> BundleRollout:
-    """Open the next ring, if its signed time has come."""
     index = rollout.ring + 1
     earliest = rollout.terms.signed + rollout.terms.rings[index].after
     if now < earliest:
@@ -228,7 +228,6 @@ def _opened(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float)
 
 
 def unhealthy(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> dict[str, str]:
-    """Return the unhealthy robots of the open rings, each with the reason."""
     found = {}
     for robot, baseline in rollout.baselines.items():
         why = _why(rollout, robots[robot], baseline, now) if robot in robots else ""
@@ -257,7 +256,6 @@ def _why(rollout: BundleRollout, seen: RobotSeen, baseline: Baseline, now: float
 
 
 def _unhealthy_ring(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> str:
-    """Return the problem of an open ring: too many unhealthy robots, or no robots left; empty for none."""
     sick = unhealthy(rollout, robots, now)
     for index in range(rollout.ring + 1):
         members = _members(rollout, robots, index)
@@ -275,7 +273,6 @@ def _why_sick(rollout: BundleRollout, index: int, ill: Sequence[str], size: int,
 
 
 def _not_taken(rollout: BundleRollout, robots: Mapping[str, RobotSeen]) -> str:
-    """Return which open ring has not taken the bundle; empty if all have."""
     for index in range(rollout.ring + 1):
         members = _members(rollout, robots, index)
         taken = sum(robots[robot].in_force == rollout.path for robot in members)

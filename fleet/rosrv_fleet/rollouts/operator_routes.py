@@ -17,14 +17,14 @@ from rosrv_fleet.rollouts.machine import HealthGates
 from rosrv_fleet.rollouts.service import BundleService, RolloutRefusedError
 
 Authorize = Callable[[Request], str | Awaitable[str]]
-"""Returns the name of the operator; raises `HTTPException` if the request is not authorized."""
+"""A function that returns the name of the operator, or raises `HTTPException` if the request is not authorized."""
 
 _DEFAULTS = HealthGates()
 _HISTORY = 20
 
 
 class Gates(BaseModel):
-    """When a ring is healthy; see docs/fleet-bundles.md."""
+    """The health gates of a ring; see docs/fleet-bundles.md."""
 
     model_config = ConfigDict(extra="forbid")
 

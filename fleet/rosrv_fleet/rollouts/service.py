@@ -47,7 +47,7 @@ _Stamp = tuple[tuple[str, int, int], ...]
 
 
 Members = Callable[[], Mapping[str, RobotGroup]]
-"""Returns the group of each enrolled robot that has one. Raises `OSError`."""
+"""A function that returns the group of each enrolled robot that has one. Raises `OSError`."""
 
 
 class RolloutRefusedError(Exception):
@@ -65,7 +65,7 @@ class SelectionListener:
 
 
 class BundleService:
-    """The collector's bundles. `folder` is what the operator publishes; `key` is the file of the timestamp's key."""
+    """The collector's bundles. `folder` has the operator's publication; `key` is the file of the timestamp's key."""
 
     def __init__(
         self,
@@ -135,7 +135,7 @@ class BundleService:
         return chosen if chosen in self._signed() else ""
 
     async def report(self, robot: str, group: RobotGroup, report: RobotReport) -> None:
-        """Store what a robot of a group reports about itself. Raises `RolloutRefusedError` for an invalid report."""
+        """Store the report of a robot of a group. Raises `RolloutRefusedError` for an invalid report."""
         seen = _checked(report, self._clock())
         await asyncio.to_thread(self.store.save_report, robot, group, seen)
         self._arrived[robot] = StoredReport(group, seen)
@@ -295,7 +295,6 @@ class BundleService:
         raise RolloutRefusedError("the rollout has changed in the meantime: look at it, and try again")
 
     async def _publish(self) -> None:
-        """Read the publication if it has changed, and sign a timestamp if one is due."""
         try:
             stamp = await asyncio.to_thread(_stamp, self.folder)
             if stamp != self._stamp or self.publication is None:

@@ -58,7 +58,7 @@ class RolloutStore:
             connection.execute(query, (name, *group, document))
 
     def reports(self) -> dict[str, StoredReport]:
-        """Return the last report of every robot that ever sent one. One that is unreadable is as if never sent."""
+        """Return the last report of every robot that ever sent one, without unreadable ones."""
         query = "SELECT name, site, robot_group, report::text FROM bundle_robot"
         found = {}
         with self._database.writing() as connection:
@@ -141,7 +141,6 @@ class RolloutStore:
         return None if row is None else bytes(row[0])
 
     def save_timestamp(self, version: int, document: bytes) -> None:
-        """Store a timestamp, unless a later one is there."""
         query = """
             INSERT INTO bundle_timestamp (version, document) VALUES (%s, %s)
             ON CONFLICT (one) DO UPDATE SET version = excluded.version, document = excluded.document
