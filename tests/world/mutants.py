@@ -101,7 +101,7 @@ MUTANTS: dict[str, tuple[Any, str, Any]] = {
     "every call is allowed": (CallGate, "decide", _allowed),
     "a decision is not recorded": (Execution, "_recorded", _unrecorded),
     "a strict answer does not wait for its record": (AuditTrail, "durable", _at_once),
-    "a reload is answered before the relay has carried it out": (Enforcement, "carried_out", _at_once),
+    "a reload is answered before the relay has carried it out": (RelayControl, "carried_out", _at_once),
     "a call that began under the old policy is not decided again": (
         Enforcement, "redecide_for", lambda *_given: None,
     ),

@@ -160,7 +160,7 @@ class Node:
         if uri in subscription.known:
             if answer[0] == 1:
                 subscription.ports[uri] = answer[2][2]
-            else:
+            elif uri not in subscription.ports:  # a later request for this URI may have succeeded
                 subscription.known.remove(uri)
 
     async def connect(self) -> None:
@@ -190,6 +190,17 @@ class Node:
             answer = [-1, "no answer"]
         self.world.say(f"{self} setParam {key} {value}: {answer[:2]}")
         self.world.parameter_set(key, known=answer[0] == 1)
+
+    async def get_parameter(self, key: str) -> None:
+        with self.world.reading(key) as possible:
+            try:
+                answer = await self.call(self.world.master_uri, "getParam", key)
+            except LOST:
+                return
+        self.world.say(f"{self} getParam {key}: {answer!r}")
+        value = answer[2] if answer[0] == 1 else None
+        if (answer[0] == 1 or "is not set" in str(answer[1])) and value not in possible:
+            self.world.fail(f"{self} reads {key} as {value!r}, which is not one of {possible}")
 
 
 class RosMaster:
@@ -254,7 +265,9 @@ class RosMaster:
             case "hasParam":
                 return [1, "", last in tree]
             case "getParam":
-                return [1, "", tree[last] if last else tree] if not last or last in tree else [-1, "unset", 0]
+                if last and last not in tree:
+                    return [-1, f"Parameter [{params[1]}] is not set", 0]
+                return [1, "", tree[last] if last else tree]
             case _:
                 raise AssertionError(f"the model of rosmaster does not know {method}")
         return [1, "", 0]

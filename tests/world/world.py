@@ -4,8 +4,8 @@
    allowed decision in the audit log. With `durability: strict`, the record is there before the grant.
 2. After the answer to a reload, the relay has no grant and carries nothing that the policy denies.
 3. Nodes learn no addresses but those of proxy endpoints and of the relay.
-4. No acknowledged change is lost: after a restart of control, the last acknowledged policy is in force, and
-   acknowledged parameters have their values.
+4. No acknowledged change is lost: after a restart of control, or of the whole appliance, the last acknowledged policy
+   is in force, and nodes read the acknowledged values of parameters.
 5. The chain of the audit log verifies at the end, over all lives of control.
 6. A restart of control interrupts no connection that the policy allows.
 7. Once faults have ended, `rosmaster` has exactly the registrations of the registry, and live subscribers are connected
@@ -18,7 +18,7 @@ import logging
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Callable, MutableMapping
+from collections.abc import Callable, Iterator, MutableMapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
@@ -112,6 +112,9 @@ class World:
         self.ordering = 0  # orders under way
         self.parameters: dict[str, set[int | None]] = {key: {None} for key in KEYS}
         self._setting = {key: Setting() for key in KEYS}
+        self._reads: list[
+            tuple[str, set[int | None]]
+        ] = []  # the reads under way, with the values that each may get
         self.strict = self.random.random() < 0.5
         self.appliances = self._make_appliances(folder)
         self.appliance = self.appliances[0]
@@ -247,6 +250,16 @@ class World:
         setting.known |= known
         if setting.known and not setting.under_way:
             self.parameters[key] = setting.values
+
+    @contextlib.contextmanager
+    def reading(self, key: str) -> Iterator[set[int | None]]:
+        """Yield the values that a read may get: all that the parameter may have had since it began."""
+        read = key, set(self.parameters[key])
+        self._reads.append(read)
+        try:
+            yield read[1]
+        finally:
+            self._reads.remove(read)
 
     # --- promises ---
 
@@ -418,7 +431,15 @@ class World:
             setting.under_way += 1
             setting.values.add(value)
             self.parameters[key] = self.parameters[key] | {value}
+            for read, values in self._reads:
+                if read == key:
+                    values.add(value)
             node.process.start(node.set_parameter(key, value))
+
+    def reads_parameter(self) -> None:
+        node = self._living()
+        if node is not None:
+            node.process.start(node.get_parameter(self.random.choice(KEYS)))
 
     def dies(self) -> None:
         node = self._living()
@@ -463,12 +484,18 @@ class World:
         self.say("control is killed")
         self.appliance.kill_control()
 
+    def crashes(self) -> None:
+        """All processes end at once, as when a container is killed."""
+        self.say("the appliance crashes")
+        self.appliance.crash()
+
     # --- the history ---
 
     async def run(self) -> None:
         self.start()
         usual = (
-            self.starts, self.starts, self.changes_its_mind, self.uses_service, self.sets_parameter, self.reloads,
+            self.starts, self.starts, self.changes_its_mind, self.uses_service, self.sets_parameter,
+            self.reads_parameter, self.reloads, self.reloads,
         )  # fmt: skip
         # Few kinds of faults in a history, but often: so they meet one another more often than if all were mixed.
         faults = self.random.sample(self.faults(), self.random.randint(1, 4))
@@ -489,7 +516,7 @@ class World:
     def faults(self) -> list[Callable[[], None]]:
         return [
             self.dies, self.hangs, self.is_cut_off, self.rosmaster_dies, self.rosmaster_breaks_off,
-            self.relay_dies, self.control_dies,
+            self.relay_dies, self.control_dies, self.crashes,
         ]  # fmt: skip
 
     async def settled(self) -> None: ...
