@@ -288,11 +288,9 @@ def _unknown_key(path: KeyPath) -> str:
     if len(path) == 1 and path[0] in _REMOVED:
         return f"{path[0]} is not a section any more: {_REMOVED[path[0]]}"
     known = sorted(_keys_at(Settings, path[:-1]))
-    nearest = difflib.get_close_matches(str(path[-1]), known, n=1, cutoff=0.5)
-    if not nearest:
-        # The key may exist on another level of the file.
-        elsewhere = [_dotted(key) for key in _all_keys(Settings, ()) if key[-1] == path[-1]]
-        nearest = elsewhere[:1]
+    near = functools.partial(difflib.get_close_matches, str(path[-1]), known, n=1)
+    elsewhere = [_dotted(key) for key in _all_keys(Settings, ()) if key[-1] == path[-1]]  # on another level
+    nearest = near(cutoff=0.75) or elsewhere[:1] or near(cutoff=0.5)
     advice = f"did you mean {nearest[0]}?" if nearest else f"known here: {', '.join(known)}"
     return f"unknown key {_dotted(path)}: {advice}"
 

@@ -11,6 +11,7 @@ import typer
 
 from appliance.audit.log.record_format import printable
 from appliance.base.input_files import read_given
+from appliance.base.system_errors import without_number
 
 NO_TOKEN = Path("token")
 _NOT_FOUND = 404
@@ -64,7 +65,7 @@ def answer_to(
         status = error.response.status_code
         reason = f"{status}: {_detail(error.response)}{not_found if status == _NOT_FOUND else ''}"
     except (httpx.HTTPError, OSError, ValueError) as error:
-        reason = str(error)
+        reason = without_number(error)
     typer.echo(f"rosrv-fleet: {printable(reason)}", err=True)
     raise typer.Exit(1)
 

@@ -20,6 +20,7 @@ from urllib.parse import urlsplit
 import httpx
 
 from appliance.base.input_files import read_given_text
+from appliance.base.system_errors import without_number
 from appliance.cli.connection.admin_client import SECONDS, UNKNOWN, AccessDeniedError, NotRunningError
 from appliance.configuration.sections import is_loopback
 from appliance.signing.request_signing import HEADER, proof_of, reading_key, statement
@@ -131,10 +132,12 @@ class RestClient:
                 f"{self.url}: no answer in time; is the appliance running there?{_unknown(method)}"
             ) from None
         except httpx.HTTPError as error:
-            raise NotRunningError(f"{self.url}: the connection broke: {error}{_unknown(method)}") from None
+            raise NotRunningError(
+                f"{self.url}: the connection broke: {without_number(error)}{_unknown(method)}"
+            ) from None
 
     def _why_not_connected(self, error: Exception) -> str:
-        text = str(error)
+        text = without_number(error)
         if "CERTIFICATE_VERIFY_FAILED" in text:
             if "mismatch" in text or "not valid for" in text:
                 return (

@@ -19,6 +19,7 @@ import msgspec
 from appliance.audit.log.record_format import printable
 from appliance.base import clock
 from appliance.base.input_files import path_for_library, read_given
+from appliance.base.system_errors import without_number
 from appliance.signing.own_certificate import untimely
 
 _EXCHANGE_SECONDS = 60.0  # a collector answers late when a thousand robots ask at once
@@ -149,7 +150,7 @@ class CollectorConnection:
             ) as answer:
                 yield answer
         except _FAILURES as error:
-            reason, cause = str(error) or "the connection ended", error.__cause__
+            reason, cause = without_number(error) or "the connection ended", error.__cause__
             if isinstance(error, httpcore.TimeoutException):
                 reason = f"the collector takes more than {self._deadline.seconds:g} s"
             elif isinstance(cause, ssl.SSLCertVerificationError) and cause.verify_code in _UNTIMELY:
