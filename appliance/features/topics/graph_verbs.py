@@ -53,8 +53,11 @@ def list_topics(appliance: Appliance) -> None:
             f"{counted(len(topic.publishers), 'publisher')}, {counted(len(topic.subscribers), 'subscriber')}"
         )
         past = "" if topic.mediated else "  bypasses the appliance"
-        unused = topic.mediated and not topic.subscribers and not rate
-        flow = "not relayed without a subscriber" if unused else f"{rate:.1f} Hz"
-        say_row([f"{topic.name:<{name}}", f"{topic.type:<{kind}}", f"{ends}, {flow}{past}"])
+        say_row([f"{topic.name:<{name}}", f"{topic.type:<{kind}}", f"{ends}, {rate:.1f} Hz{past}"])
+    if any(topic.mediated and not topic.subscribers for topic in topics) and not appliance.as_json:
+        say(
+            "(messages without a subscriber pass the relay only for monitors: 0.0 Hz need not be silence)",
+            "dim",
+        )
     if not topics and not appliance.as_json:
         say("no topic is registered")

@@ -155,7 +155,7 @@ def _described(topic: Topic) -> Iterator[str]:
         else:
             yield f"  subscribed by {printable(node)}, which is not connected to a publisher"
     if topic.mediated and not topic.subscribers:
-        yield "  no node subscribes, so publishers send no messages to the relay"
+        yield "  no node subscribes: messages pass the relay only for monitors, so 0.0 Hz need not be silence"
     if not topic.mediated:
         yield "  its messages bypass the appliance"
 
