@@ -8,6 +8,7 @@ open. Only the result of `connect` shows this; the socket reports no error later
 """
 
 import errno
+import math
 import os
 import resource
 import select
@@ -83,6 +84,11 @@ def scan(address: str, ports: Iterable[int], seconds: float) -> ScanResult:
     finally:
         pool.shutdown(cancel_futures=True)
     return ScanResult(address, tuple(sorted(opened)), refused, silent, untried, obstacle)
+
+
+def longest(ports: int, seconds: float) -> float:
+    """Return the seconds that a scan of the ports takes if none answers."""
+    return math.ceil(ports / _at_once()) * seconds
 
 
 def _at_once() -> int:

@@ -33,7 +33,7 @@ from appliance.audit.log.record import AuditRecord, Severity
 from appliance.audit.log.removal import Remover
 from appliance.audit.log.repetition import summary
 from appliance.audit.log.retention import Retention
-from appliance.audit.log.signatures import RemovalSigner, Signatures, Signer
+from appliance.audit.log.signatures import CheckpointSigner, RemovalSigner, Signatures
 from appliance.base.clock import now, wall_ns
 from appliance.base.engine_thread import Drive, EngineThread
 from appliance.quotas.pool import QuotaClass
@@ -94,7 +94,7 @@ class AuditLog:
         checkpoint_every: int = 1000,
         checkpoint_seconds: float = 60.0,
         fold: FoldSettings | None = None,
-        signer: Signer | None = None,
+        signer: CheckpointSigner | None = None,
         removals: RemovalSigner | None = None,
         retention: Retention | None = None,
         budget: Budget | None = None,

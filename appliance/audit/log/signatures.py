@@ -23,7 +23,7 @@ RemovalSigner = Callable[[int, bytes, bytes], None]
 ASKED_AT_ONCE = 64
 
 
-class Signer(Protocol):
+class CheckpointSigner(Protocol):
     """Requests signatures of checkpoints; the log calls it on its own thread."""
 
     def __call__(self, number: int, text: bytes, *, oldest: bool) -> None:
@@ -63,7 +63,7 @@ def signature_is_valid(public_key: bytes, signature: bytes, text: bytes) -> bool
 class Signatures:
     """The signatures of a log: requests to the signer, and its valid answers."""
 
-    def __init__(self, log: Path, signer: Signer | None) -> None:
+    def __init__(self, log: Path, signer: CheckpointSigner | None) -> None:
         self._pin = pinned_key_path(log)
         self._signer = signer
         self._asked: set[int] = set()

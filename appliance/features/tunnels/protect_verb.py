@@ -22,10 +22,12 @@ from appliance.network import scan as scanner
 from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.namespaces import Namespace, NetworkError
 from appliance.network.scan import ScanResult, addresses_of
+from rosmop.tool.terminal import printable
 
 OPEN_STATUS, ERROR_STATUS = 1, 2
 _SHOWN = 20  # most open ports listed on a terminal
 _MOST_TOLD = 100
+_UNANNOUNCED_SECONDS = 5.0
 
 
 @speaks_with("One JSON object on standard output.")
@@ -162,9 +164,14 @@ class _CheckTarget:
 
 
 def _check(checked: _CheckTarget, running: Appliance) -> None:
-    results = [
-        scanner.scan(address, checked.wanted(), checked.seconds) for address in addresses_of(checked.host)
-    ]
+    wanted, found_addresses = checked.wanted(), addresses_of(checked.host)
+    longest = scanner.longest(len(wanted), checked.seconds) * len(found_addresses)
+    if longest > _UNANNOUNCED_SECONDS:
+        sys.stderr.write(
+            f"rosrv: trying {len(wanted)} ports of {printable(checked.host)}: up to {longest:.0f} s if it does not"
+            " answer\n"
+        )
+    results = [scanner.scan(address, wanted, checked.seconds) for address in found_addresses]
     opened = any(result.open for result in results)
     unknown = not all(result.answered and not result.untried for result in results)
     state: Literal["closed", "open", "unknown"] = "open" if opened else "unknown" if unknown else "closed"
