@@ -1,18 +1,26 @@
-"""List the rights that the stock tools of ROS need before they do what the user asked for. No I/O.
+"""List the rights that the stock tools of ROS need before they do what the user asked for, and replace the numbers of
+their anonymous nodes by a star. No I/O.
 
 A tool on a host without rights is denied one call after the other, and reports only the first one. The calls are
 those that the tools of Debian 12 made with all their verbs that only read.
 """
 
+import re
 from dataclasses import dataclass
 
-from appliance.policy.anonymous_names import key_of
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.rights import Right, rights_of
 
+# The suffixes of rospy (process id and milliseconds) and of roscpp (nanoseconds).
+_ANONYMOUS = re.compile(r"_[0-9]++_[0-9]{10,}+$|_[0-9]{15,}+$")
 _READ = ("/use_sim_time", "/tcp_keepalive")
 _LONGEST = 256  # characters of a tool's own name
 _LOG_LEVEL = ("get_loggers", "set_logger_level")
+
+
+def key_of(name: str) -> str:
+    """The key of `/rostopic_4711_1700000000000` is `/rostopic_*`."""
+    return "/".join(_ANONYMOUS.sub("_*", level) for level in name.split("/"))
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,11 +13,11 @@ from appliance.master.caller import Caller
 from appliance.master.calls.call import Attempt, Table
 from appliance.master.calls.call_execution import Execution, ServedRequest
 from appliance.master.calls.multicall import LIMIT_FAULT, MULTICALL, PARSE_FAULT, Multicall
+from appliance.master.calls.request_peek import method_named
 from appliance.master.endpoints.node_ports import AdvertisedAddresses
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.model import Address, Category
 from appliance.rpc.fair_queue import Bulk, Turns, weigh
-from appliance.rpc.method_name import method_named
 from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import Handler, HttpRequest
 from appliance.telemetry.audit_trail import AuditTrail

@@ -5,6 +5,7 @@ decision on that call: category, resource, claimed name, and key or node. Otherw
 method, if it can be found.
 """
 
+import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -14,7 +15,6 @@ from appliance.master.calls.call_table import MASTER_CALLS
 from appliance.master.calls.multicall import MULTICALL
 from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.policy.model import Category
-from appliance.rpc.method_name import method_named
 from appliance.rpc.server import Peer
 from roswire.errors import PeerError
 from roswire.xmlrpc import Value, XmlRpcLimits, parse_call
@@ -24,6 +24,8 @@ _LIMITS = XmlRpcLimits(body=8192, elements=256, depth=16, string=4096, parts=64)
 _UNKNOWN = "unknown"
 _LONGEST = 200
 _MOST_PARTS = 8
+_BEGINNING = 4096  # the number of bytes that are searched for the name of a method
+_METHOD = re.compile(rb"<methodName>\s*+([^<>&\s]{1,128}+)\s*+</methodName>")
 
 
 class PeekedRequest(NamedTuple):
@@ -64,3 +66,9 @@ def _parts(params: tuple[Value, ...]) -> str:
     names = [str(part.get("methodName"))[:_LONGEST] for part in parts if isinstance(part, dict)]
     more = f" and {len(names) - _MOST_PARTS} more" if len(names) > _MOST_PARTS else ""
     return ", ".join(names[:_MOST_PARTS]) + more
+
+
+def method_named(body: bytes) -> str:
+    """Return the name of the method in the beginning of a body that cannot be parsed; may be empty."""
+    found = _METHOD.search(body, 0, _BEGINNING)
+    return "" if found is None else found[1].decode("utf-8", "replace")
