@@ -1,8 +1,8 @@
 """Print the files that one registerPublisher enters in control, in the order of the first entry, one a line.
 
 A control with a real rosmaster runs in a thread of this program, which is its supervisor and profiles all its threads.
-The callers have an address of their own on the loopback. A file counts if each of some calls enters it, and not by
-`run_always`, so that work of control that goes on without calls does not count.
+The callers have an address of their own on the loopback. A file counts if each of some calls enters it, and not in
+work that goes on without calls (`run_always`).
 
     python -m tests.support.call_path FOLDER    # with a network that is only a loopback
 """
@@ -12,6 +12,8 @@ import socket
 import sys
 import threading
 import xmlrpc.client
+from collections.abc import Awaitable, Callable
+from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -23,6 +25,7 @@ from appliance.audit.log.log_database import reading
 from appliance.base.background import run_always
 from appliance.channel import messages
 from appliance.configuration.settings import Settings
+from appliance.control import process as control_process
 from appliance.control.process import _run as run_control
 from appliance.network import interfaces
 from appliance.network.namespaces import Namespace
@@ -37,8 +40,9 @@ APPLIANCE, HOST = "10.99.0.1", "10.99.0.2"
 POLICY = f"[Nodes]\n/node* = {HOST}\n[Publishers]\n/topic* = {HOST}\n[Subscribers]\n/topic* = {HOST}\n"
 _PORT, _ROSMASTER_PORT = 11311, 11312
 _ROSMASTER = f"http://127.0.0.1:{_ROSMASTER_PORT}"
-_CALLS = 20
+_CALLS = 12
 _TYPE = "std_msgs/String"
+_GOES_ON = ContextVar("_GOES_ON", default=False)
 
 
 class Profiler:
@@ -50,7 +54,7 @@ class Profiler:
 
     def __call__(self, frame: FrameType, event: str, _argument: object) -> None:
         name = frame.f_code.co_filename
-        if self.on and event == "call" and name not in self.entered and not _goes_on(frame):
+        if self.on and event == "call" and name not in self.entered and not _GOES_ON.get():
             self.entered[name] = None
 
     def take(self) -> list[str]:
@@ -62,12 +66,10 @@ class Profiler:
         ]
 
 
-def _goes_on(frame: FrameType | None) -> bool:
-    while frame is not None:
-        if frame.f_code is run_always.__code__:
-            return True
-        frame = frame.f_back
-    return False
+async def _run_always(what: str, work: Callable[[], Awaitable[object]]) -> None:
+    """Mark the work that goes on without calls; tasks and callbacks inherit the mark."""
+    _GOES_ON.set(True)
+    await run_always(what, work)
 
 
 class Control:
@@ -101,6 +103,7 @@ class Control:
         self._lifeline.wait_for(lambda message: isinstance(message, messages.Ready))
 
     def _run(self) -> None:
+        control_process.run_always = _run_always  # type: ignore[attr-defined]  # imported there
         uvloop.run(run_control(self._settings, self._descriptor, self.state / "config.json"))
 
     def _heard(self, message: messages.Message) -> None:
