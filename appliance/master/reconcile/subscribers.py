@@ -67,11 +67,10 @@ class Subscribers:
                 self._state(node, kind, resource)
             return
         self._stated.pop(node, None)
+        self.delivery.drop(node)
         if node.life is Life.REPLACED:
             reason = f"[{node.name}] Reason: new node registered with same name"
             self.delivery.push(node, NodeCall("shutdown", (reason,)))
-        else:
-            self.delivery.drop(node)
 
     def _state(self, node: Incarnation, kind: Kind, resource: str) -> None:
         if kind not in (Kind.SUBSCRIPTION, Kind.PARAMETER) or node.life is not Life.LIVE:
