@@ -1,4 +1,4 @@
-"""Regular expressions read text of users and unknown hosts, so none may take exponential time."""
+"""Regular expressions read text of hosts and of users, so none may take exponential time."""
 
 import importlib
 import re

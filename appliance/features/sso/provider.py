@@ -69,10 +69,7 @@ class Provider:
         return self._endpoints[1]
 
     async def keys(self) -> Sequence[dict[str, Any]]:
-        """Return the keys that the provider serves now, or its last ones while it serves none.
-
-        Raises `ProviderError`.
-        """
+        """Return the keys that the provider serves now, or its last ones. Raises `ProviderError`."""
         now = clock.now()
         try:
             self._keys = now, await self._fetch_keys()

@@ -10,8 +10,8 @@ import pytest
 
 from appliance.channel import messages
 from appliance.master.graph.registry import Kind
-from appliance.store.changes import Encoded, WriteAhead
 from appliance.store.changes import Change as StoredChange
+from appliance.store.changes import Encoded, WriteAhead
 from appliance.store.state_file import PermissionRow
 from tests.support.control_parts import HOST, ControlParts
 from tests.support.examples import examples
