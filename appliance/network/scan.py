@@ -87,7 +87,7 @@ def scan(address: str, ports: Iterable[int], seconds: float) -> ScanResult:
 
 
 def longest(ports: int, seconds: float) -> float:
-    """Return the seconds that a scan of the ports takes if none answers."""
+    """Return the seconds that a scan of this number of ports takes if none answers."""
     return math.ceil(ports / _at_once()) * seconds
 
 

@@ -985,7 +985,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
 
 def _idle(file: str) -> str:
-    return f"{file}: warning: it does nothing, because it has an error; when it is corrected: rosrv monitor load {file}"
+    fix = f"when it is corrected: rosrv monitor load {file}"
+    return f"{file}:1:1: warning: it does nothing, because it has an error; {fix}"
 
 
 def _moment(seconds: float) -> str:

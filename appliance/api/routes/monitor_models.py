@@ -86,3 +86,8 @@ class Replaced(msgspec.Struct, frozen=True, kw_only=True):
         list[str], doc("files that a reload left in force although the folder does not have them")
     ] = []
     confirm_by: RollbackDue = None
+    disabled: Annotated[list[str], doc("loaded monitors that do nothing until they are enabled")] = []
+    shadow: Annotated[list[str], doc("loaded monitors in shadow mode")] = []
+    held: Annotated[
+        dict[str, str], doc("loaded monitors that hold their topics until they are resumed, and why")
+    ] = {}

@@ -1,7 +1,9 @@
+import msgspec
 import pytest
 
 from appliance.api.routes.monitor_judgement import Compiler, findings_of, refusal
-from appliance.channel.answers.monitor_answers import Monitors
+from appliance.api.routes.monitor_models import Replaced
+from appliance.channel.answers.monitor_answers import Monitors, Replacement, Tried
 from tests.support.answers import example
 
 A = "a() { int n; event said() /chatter std_msgs/String '{}' { } ere: said said @match { } }"
@@ -16,6 +18,11 @@ def test_findings_without_a_position_stay_in_the_detail() -> None:
     assert [(one.file, one.line, one.text) for one in problem.findings] == [("a.rv", 1, "odd: 1:2")]
     assert "would also be removed" in problem.detail
     assert findings_of(["nonsense", "a:b:c: error: x"]) == []
+
+
+@pytest.mark.parametrize("answer", [Replacement, Tried])
+def test_the_answer_over_rest_has_every_field_of_a_change(answer: type[msgspec.Struct]) -> None:
+    assert set(answer.__struct_fields__) <= set(Replaced.__struct_fields__)
 
 
 def test_a_monitor_is_described() -> None:
