@@ -39,7 +39,7 @@ class OwnDoors:
         if found is not None:
             return CallerDoor(found, live[found], "")
         if names:
-            return CallerDoor(names[0], None, f"you have no door yet: rosrv door add {names[0]}")
+            return CallerDoor(names[0], None, f"you have no door: rosrv door add {names[0]}")
         if groups is None:
             text = f"no door can have the name {who[:80]}: use a token with the name of a door (a-z, 0-9, _ and -)"
         else:

@@ -81,7 +81,7 @@ def test_a_person_sees_and_drives_the_robot_through_their_own_door(
         began = time.monotonic()
         page = console.go("robot")
         own = page.get_by_role("region", name="Your door")
-        expect(own).to_contain_text("there is no door first: rosrv door add first")
+        expect(own).to_contain_text("you have no door: rosrv door add first")
         own.get_by_role("button", name="Add door first").click()
         own.get_by_role("button", name="Open").click()
         expect(own.get_by_role("img", name="Picture of /camera/compressed")).to_have_attribute("width", "3")
@@ -102,7 +102,7 @@ def test_a_person_sees_and_drives_the_robot_through_their_own_door(
             lambda: appliance.row("door", "list")["clients"][0]["refused"] > 0, "the refusal is counted"
         )
         appliance.rosrv("door", "remove", "first")
-        expect(own).to_contain_text("there is no door first: rosrv door add first")
+        expect(own).to_contain_text("you have no door: rosrv door add first")
 
 
 def drive(page: Page, base: Process) -> None:
