@@ -16,6 +16,7 @@ Invariants:
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeAlias
 
 from roswire.errors import LimitExceededError, ProtocolError
 
@@ -23,6 +24,9 @@ HEADER_LIMIT = 65536
 """The most bytes of a header; the largest message definitions of MoveIt need about half of this."""
 
 MESSAGE_LIMIT = 256 << 20
+
+Body: TypeAlias = bytes | bytearray
+"""The bytes of a message. Nobody changes them: all receivers share them."""
 
 _LENGTH = struct.Struct("<I")
 _ANY_BYTES = frozenset({"message_definition"})

@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any, Protocol
 
 from roswire.errors import RosError
+from roswire.tcpros import Body
 
 BUFFER_BYTES = 1 << 19
 """Half the number of received bytes at which a connection stops reading."""
@@ -33,7 +34,7 @@ class ServiceFailedError(NodeCallError):
 class ByteWriter(Protocol):
     """The part of `asyncio.StreamWriter` that a node uses."""
 
-    def write(self, data: bytes) -> None: ...
+    def write(self, data: Body) -> None: ...
 
     async def drain(self) -> None:
         """Wait until the peer has room for more.
@@ -45,6 +46,16 @@ class ByteWriter(Protocol):
 
 
 Serve = Callable[[asyncio.StreamReader, ByteWriter], Awaitable[None]]
+
+
+class NodeMemory(Protocol):
+    """A memory that a node shares with others."""
+
+    def add(self, size: int) -> None:
+        """Take bytes; return them if `size` is negative."""
+
+    def refusal(self, size: int) -> str:
+        """Return why there is no room for `size` more bytes; empty if there is."""
 
 
 class ListeningServer(Protocol):
@@ -65,6 +76,9 @@ class NodeNetwork(Protocol):
     async def connect(self, host: str, port: int) -> tuple[asyncio.StreamReader, ByteWriter]:
         """Open a connection. Raises `OSError`."""
 
+    async def receive(self, host: str, port: int, receiver: asyncio.BufferedProtocol) -> None:
+        """Connect, and give what the peer sends to `receiver`. Raises `OSError`."""
+
     async def serve(self, serve: Serve) -> ListeningServer:
         """Listen at a free port.
 
@@ -80,6 +94,10 @@ class SourceNetwork:
 
     async def connect(self, host: str, port: int) -> tuple[asyncio.StreamReader, ByteWriter]:
         return await asyncio.open_connection(host, port, local_addr=(self.source, 0), limit=BUFFER_BYTES)
+
+    async def receive(self, host: str, port: int, receiver: asyncio.BufferedProtocol) -> None:
+        loop = asyncio.get_running_loop()
+        await loop.create_connection(lambda: receiver, host, port, local_addr=(self.source, 0))
 
     async def serve(self, serve: Serve) -> ListeningServer:
         server = await asyncio.start_server(serve, self.source, 0, limit=BUFFER_BYTES)

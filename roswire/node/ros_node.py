@@ -21,6 +21,7 @@ from roswire.node.network import (
     ByteWriter,
     ListeningServer,
     MasterDenialError,
+    NodeMemory,
     NodeNetwork,
     OwnedTasks,
 )
@@ -32,7 +33,6 @@ from roswire.node.topics import (
     NodePublication,
     NodeSubscription,
     OwnMemory,
-    QueueMemory,
     Received,
     SendQueues,
 )
@@ -47,8 +47,9 @@ _Kind = Literal["publisher", "subscriber", "service", "parameter"]
 class RosNode:
     """A node; `name` is canonical, `master` is a URI.
 
-    `shut_down` is called with the reason if the master ends the node, for example because another node has
-    its name. `memory` bounds the messages that wait for other nodes; by default, the node has one of its own.
+    `shut_down` is called with the reason if the master ends the node, for example because another node has its name.
+    `memory` bounds the messages that wait for other nodes; by default, the node has one of its own. `skipped()` is
+    called for each message that is dropped because too many large ones come (`NodeLimits.arriving_bytes`).
     """
 
     def __init__(
@@ -59,7 +60,8 @@ class RosNode:
         *,
         limits: NodeLimits,
         shut_down: Callable[[str], None],
-        memory: QueueMemory | None = None,
+        memory: NodeMemory | None = None,
+        skipped: Callable[[], None] = lambda: None,
     ) -> None:
         self.name = name
         self.publishers: dict[str, NodePublication] = {}
@@ -69,7 +71,8 @@ class RosNode:
         self._master: NodeUri = parse_node_uri(master)
         self._network = network
         self._limits = limits
-        self._link = NodeLink(name, network, limits, SendQueues(memory or OwnMemory(limits.queue_bytes)))
+        queues = SendQueues(memory or OwnMemory(limits.queue_bytes))
+        self._link = NodeLink(name, network, limits, queues, OwnMemory(limits.arriving_bytes), skipped)
         self._api = NodeApi(self, master, os.getpid(), shut_down)
         self._tasks = OwnedTasks()
         self._servers: list[ListeningServer] = []

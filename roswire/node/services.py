@@ -1,13 +1,14 @@
 """The services of a node: calls of other nodes' services, and services that it offers."""
 
 import asyncio
+import contextlib
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 
 from roswire.definitions import Definitions
 from roswire.errors import PeerError, ProtocolError
 from roswire.node.network import ByteWriter, PeerUnreachableError, ServiceFailedError
-from roswire.node.tcpros_streams import ANY, exchange_headers, read_frame, refuse
+from roswire.node.tcpros_streams import ANY, exchange_headers, held_frame, refuse
 from roswire.node.topics import NodeLink
 from roswire.tcpros import (
     encode_frame,
@@ -80,11 +81,11 @@ async def _connected(
 
 async def _read_reply(link: NodeLink, reader: asyncio.StreamReader) -> bytes:
     ok = await reader.read(1)
-    body = await read_frame(reader, link.limits.message_bytes)
-    if ok == b"\x01":
-        return body
-    if ok == b"\x00":
-        raise ServiceFailedError(body[:4000].decode("utf-8", "replace"))
+    async with held_frame(reader, link.limits.message_bytes, link.arriving) as body:
+        if ok == b"\x01":
+            return body
+        if ok == b"\x00":
+            raise ServiceFailedError(body[:4000].decode("utf-8", "replace"))
     raise ProtocolError(f"service reply: the first byte is {ok[0]}; it is 1 (success) or 0 (error)")
 
 
@@ -116,10 +117,13 @@ class ServiceServer:
         if header.get("probe") == "1":
             return
         while True:
-            async with asyncio.timeout(_IDLE_SECONDS):
-                request = await read_frame(reader, self._link.limits.message_bytes)
-            writer.write(await self._reply(request))
-            await writer.drain()
+            async with contextlib.AsyncExitStack() as stack:
+                async with asyncio.timeout(_IDLE_SECONDS):
+                    request = await stack.enter_async_context(
+                        held_frame(reader, self._link.limits.message_bytes, self._link.arriving)
+                    )
+                writer.write(await self._reply(request))
+                await writer.drain()
             if header.get("persistent") != "1":
                 return
 

@@ -1,20 +1,22 @@
 """TCPROS on a node's connections: the exchange of headers, with limits of size and time."""
 
 import asyncio
+import contextlib
 import struct
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Mapping
 from dataclasses import dataclass
 
 from roswire.definitions import Definitions
 from roswire.errors import LimitExceededError, ProtocolError
-from roswire.node.network import ByteWriter
+from roswire.node.network import ByteWriter, NodeMemory
 from roswire.tcpros import HEADER_LIMIT, decode_header, encode_header
 
 ANY = "*"
 """The md5sum, or the name, of any type."""
 
 _LENGTH = struct.Struct("<I")
-_READ_BYTES = 1 << 16
+_SMALL_BYTES = 1 << 16  # a frame that is read without asking for memory
+_COPIES = 2  # of a frame that has just come whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +29,7 @@ class NodeLimits:
     header_seconds: float = 10.0
     call_seconds: float = 10.0  # a call of the master or of another node
     queue_bytes: int = 64 << 20  # that wait for all subscribers, unless the node shares a memory with others
+    arriving_bytes: int = 64 << 20  # of all frames of more than some KB that have not come whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,60 +55,30 @@ async def read_frame(reader: asyncio.StreamReader, limit: int) -> bytes:
     `OSError` if the connection ends.
     """
     try:
-        return await reader.readexactly(_size(await reader.readexactly(_LENGTH.size), 0, limit))
+        return await reader.readexactly(await _read_size(reader, limit))
     except asyncio.IncompleteReadError:
         raise _ended() from None
 
 
-class FrameReader:
-    """Reads the frames of one connection: small ones many at once, and large ones without a further copy."""
-
-    def __init__(self, reader: asyncio.StreamReader, limit: int) -> None:
-        self._reader = reader
-        self._limit = limit
-        self._begun = b""
-        self._large = False  # whether the last frame was
-
-    async def next(self) -> list[bytes]:
-        """Return the next frames, at least one. Raises the errors of `read_frame`."""
+@contextlib.asynccontextmanager
+async def held_frame(reader: asyncio.StreamReader, limit: int, memory: NodeMemory) -> AsyncIterator[bytes]:
+    """Read a frame, and hold its memory during the block. Raises what `read_frame` raises, also if there is no room."""
+    try:
+        size = await _read_size(reader, limit)
+        held = _COPIES * size
+        if size > _SMALL_BYTES and (reason := memory.refusal(held)):
+            raise LimitExceededError(f"no memory for a frame of {size} bytes: {reason}")
+        memory.add(held)
         try:
-            if self._large and not self._begun:
-                return [self._noted(await read_frame(self._reader, self._limit))]
-            while not (frames := self._complete()):
-                if len(self._begun) >= _LENGTH.size:
-                    return [await self._rest()]
-                data = await self._reader.read(_READ_BYTES)
-                if not data:
-                    raise _ended()
-                self._begun += data
-            return frames
-        except asyncio.IncompleteReadError:
-            raise _ended() from None
-
-    async def _rest(self) -> bytes:
-        begun, self._begun = self._begun, b""
-        missing = _LENGTH.size + _size(begun, 0, self._limit) - len(begun)
-        return self._noted(begun[_LENGTH.size :] + await self._reader.readexactly(missing))
-
-    def _complete(self) -> list[bytes]:
-        data, begin, frames = self._begun, 0, []
-        while (body := begin + _LENGTH.size) <= len(data):
-            end = body + _size(data, begin, self._limit)
-            if end > len(data):
-                break
-            frames.append(self._noted(data[body:end]))
-            begin = end
-        self._begun = data[begin:]
-        return frames
-
-    def _noted(self, frame: bytes) -> bytes:
-        self._large = len(frame) > _READ_BYTES
-        return frame
+            yield await reader.readexactly(size)
+        finally:
+            memory.add(-held)
+    except asyncio.IncompleteReadError:
+        raise _ended() from None
 
 
-def _size(data: bytes, begin: int, limit: int) -> int:
-    """Return the length that a frame announces. Raises `LimitExceededError`."""
-    (size,) = _LENGTH.unpack_from(data, begin)
+async def _read_size(reader: asyncio.StreamReader, limit: int) -> int:
+    (size,) = _LENGTH.unpack(await reader.readexactly(_LENGTH.size))
     if size > limit:
         raise LimitExceededError(f"frame of {size} bytes; at most {limit} are allowed")
     return int(size)
@@ -124,12 +97,13 @@ async def read_header(reader: asyncio.StreamReader, seconds: float) -> dict[str,
 async def exchange_headers(
     reader: asyncio.StreamReader, writer: ByteWriter, header: Mapping[str, str], seconds: float
 ) -> dict[str, str]:
-    """Send a header and return the answer.
-
-    Raises `ProtocolError` with the peer's reason if it rejects the connection, or `OSError`.
-    """
+    """Returns the answer. Raises what `accepted` raises, or `OSError`."""
     writer.write(encode_header(header))
-    answer = await read_header(reader, seconds)
+    return accepted(await read_header(reader, seconds))
+
+
+def accepted(answer: dict[str, str]) -> dict[str, str]:
+    """Raises `ProtocolError` with the peer's reason if it rejects the connection."""
     if "error" in answer:
         raise ProtocolError(f"the peer rejected the connection: {answer['error'][:1000]}")
     return answer

@@ -8,42 +8,30 @@ import contextlib
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from zlib import crc32
 
 from roswire.errors import LimitExceededError, ProtocolError, RosError
-from roswire.node.network import ByteWriter, NodeNetwork, OwnedTasks
+from roswire.node.network import ByteWriter, NodeMemory, NodeNetwork, OwnedTasks
+from roswire.node.tcpros_receiver import TcprosReceiver
 from roswire.node.tcpros_streams import (
     ANY,
-    FrameReader,
     MessageType,
     NodeLimits,
-    exchange_headers,
-    read_frame,
+    accepted,
     refuse,
 )
 from roswire.node.xmlrpc_http import CALL_LIMITS, call_xmlrpc
-from roswire.tcpros import encode_frame, encode_header
+from roswire.tcpros import HEADER_LIMIT, Body, decode_header, encode_frame, encode_header
 from roswire.uris import parse_node_uri
 
-Received = Callable[[bytes, Mapping[str, str]], None]
-"""A function that takes the bytes of a message, and the connection header of its publisher."""
+Received = Callable[[Body, Mapping[str, str]], None]
+"""Takes the bytes of a message, and the connection header of its publisher."""
 
 _FIRST_PAUSE = (
     0.1  # seconds between two attempts to reach a publisher; the pause doubles up to the second number
 )
 _LONGEST_PAUSE = 5.0
 _OVERHEAD = 64  # bytes that a waiting frame takes besides its own
-_TURN = 64  # messages after which other tasks get a turn, although more have come
-
-
-class QueueMemory(Protocol):
-    """The memory that the send queues of a node share with others."""
-
-    def add(self, size: int) -> None:
-        """Take bytes; return them if `size` is negative."""
-
-    def refusal(self, size: int) -> str:
-        """Return why there is no room for `size` more bytes; empty if there is."""
 
 
 class OwnMemory:
@@ -63,12 +51,17 @@ class OwnMemory:
 
 @dataclass(frozen=True, slots=True)
 class NodeLink:
-    """The name, network and send queues of a node, as its topics and services use them."""
+    """The name, network and send queues of a node, as its topics and services use them.
+
+    Large frames that come take `arriving`. `skipped()` is called for each message that finds no room there.
+    """
 
     name: str
     network: NodeNetwork
     limits: NodeLimits
     queues: "SendQueues"
+    arriving: NodeMemory
+    skipped: Callable[[], None]
 
 
 class NodeSubscription:
@@ -90,7 +83,7 @@ class NodeSubscription:
         self._followed: dict[str, asyncio.Task[None]] = {}
         self._latest: dict[
             str, tuple[int, int]
-        ] = {}  # number and hash of each latched publisher's last message
+        ] = {}  # number and checksum of each latched publisher's last message
 
     def update(self, uris: Sequence[str]) -> None:
         """Connect to the publishers in the list, and drop all others."""
@@ -108,8 +101,8 @@ class NodeSubscription:
         await self._connection.wait()
         return [*self.connected.values()]
 
-    def hear_own(self, body: bytes, header: Mapping[str, str]) -> None:
-        """Hear a message of this node; types other than the wanted one are ignored."""
+    def hear_own(self, body: Body, header: Mapping[str, str]) -> None:
+        """Other types than the wanted one are ignored."""
         if self.wanted.md5sum in (ANY, header["md5sum"]):
             self._received(body, header)
 
@@ -134,27 +127,26 @@ class NodeSubscription:
             pause = min(2 * pause, _LONGEST_PAUSE)
 
     async def _receive(self, uri: str) -> None:
-        async with self._connection_to(uri) as (reader, header):
+        async with self._connection_to(uri) as (receiver, header):
             self.connected[uri] = header
             self._connection.set()
             self.problems.pop(uri, None)
-            frames = FrameReader(reader, self._link.limits.message_bytes)
-            latched, number = header.get("latching") == "1", 0
-            while True:
-                for body in await frames.next():
-                    number += 1
-                    if latched:
-                        self._latest[uri] = number, hash(body)
-                    self._received(body, header)
-                    if number % _TURN == 0:
-                        await asyncio.sleep(0)
+            latched = header.get("latching") == "1"
+
+            def receive(body: Body) -> None:
+                if latched:
+                    self._latest[uri] = self._latest.get(uri, (0, 0))[0] + 1, crc32(body)
+                self._received(body, header)
+
+            await receiver.deliver_to(receive, self._link.limits.message_bytes)
 
     @contextlib.asynccontextmanager
-    async def _connection_to(self, uri: str) -> AsyncIterator[tuple[asyncio.StreamReader, Mapping[str, str]]]:
+    async def _connection_to(self, uri: str) -> AsyncIterator[tuple[TcprosReceiver, Mapping[str, str]]]:
         host, port = await self._request_topic(uri)
         limits = self._link.limits
+        receiver = TcprosReceiver(self._link.arriving, self._link.skipped)
         async with asyncio.timeout(limits.call_seconds):
-            reader, writer = await self._link.network.connect(host, port)
+            await self._link.network.receive(host, port, receiver)
         try:
             fields = {
                 "callerid": self._link.name,
@@ -164,11 +156,13 @@ class NodeSubscription:
                 "message_definition": self.wanted.definition,
                 "tcp_nodelay": "1",
             }
-            header = await exchange_headers(reader, writer, fields, limits.header_seconds)
+            receiver.write(encode_header(fields))
+            async with asyncio.timeout(limits.header_seconds):
+                header = accepted(decode_header(bytes(await receiver.next(HEADER_LIMIT))))
             self._check(uri, header)
-            yield reader, header
+            yield receiver, header
         finally:
-            writer.close()
+            receiver.close()
 
     def repeat(self, received: Received) -> None:
         """Give `received` the last message of each latched publisher, which sends it over a connection of its own.
@@ -183,11 +177,11 @@ class NodeSubscription:
         with contextlib.suppress(RosError, OSError):
             async with (
                 asyncio.timeout(self._link.limits.call_seconds),
-                self._connection_to(uri) as (reader, header),
+                self._connection_to(uri) as (receiver, header),
             ):
-                body = await read_frame(reader, self._link.limits.message_bytes)
+                body = await receiver.next(self._link.limits.message_bytes)
                 latest = self._latest.get(uri)
-                if latest is not None and latest == before and latest[1] == hash(body):
+                if latest is not None and latest == before and latest[1] == crc32(body):
                     received(body, header)
 
     def _check(self, uri: str, header: Mapping[str, str]) -> None:
@@ -339,7 +333,7 @@ class NodePublication:
 class SendQueues:
     """All messages of a node that wait for other nodes. Without room, the longest queue loses its oldest message."""
 
-    def __init__(self, memory: QueueMemory) -> None:
+    def __init__(self, memory: NodeMemory) -> None:
         self.memory = memory
         self.queues: set[_SendQueue] = set()
 

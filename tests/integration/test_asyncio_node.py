@@ -9,6 +9,7 @@ import pytest
 
 from roswire.node import MessageType, NodeLimits, RosNode, ServiceFailedError, ServiceType, SourceNetwork
 from roswire.standard import standard_definitions
+from roswire.tcpros import Body
 from tests.support.nodes import Client, RosSession
 from tests.support.processes import Host
 from tests.support.site import Site
@@ -56,7 +57,7 @@ def string(text: str) -> bytes:
 def test_topics_in_both_directions(site: Site, ros: RosSession, client: Client) -> None:
     async def work() -> None:
         async with node(site) as door:
-            heard: asyncio.Queue[tuple[bytes, str]] = asyncio.Queue()
+            heard: asyncio.Queue[tuple[Body, str]] = asyncio.Queue()
             await door.subscribe(
                 "/chatter", lambda body, header: heard.put_nowait((body, header["message_definition"]))
             )

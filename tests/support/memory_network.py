@@ -4,6 +4,7 @@ import asyncio
 from dataclasses import dataclass, field
 
 from roswire.node.network import ByteWriter, Serve
+from roswire.tcpros import Body
 
 _ROOM = 1 << 16  # bytes after which a reader pauses its peer, twice
 
@@ -39,6 +40,13 @@ class MemoryNetwork:
         task.add_done_callback(self._tasks.discard)
         return near.reader, near
 
+    def feed(self, source: str, address: tuple[str, int], receiver: asyncio.BufferedProtocol) -> None:
+        """Connect, and give what the server sends to `receiver`, as an event loop does."""
+        reader, writer = self.connect(source, address)
+        task = asyncio.ensure_future(_Transport(reader, writer).feed(receiver))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
     async def _serve(self, serve: Serve, end: "MemoryWriter") -> None:
         await serve(end.reader, end)
 
@@ -57,6 +65,11 @@ class MemoryHost:
         await asyncio.sleep(0)
         return self.network.connect(self.source, (host, port))
 
+    async def receive(self, host: str, port: int, receiver: asyncio.BufferedProtocol) -> None:
+        await asyncio.sleep(0)
+        self.network.feed(self.source, (host, port), receiver)
+        await asyncio.sleep(0)
+
     async def serve(self, serve: Serve) -> "MemoryServer":
         return self.network.listen(self.source, serve)
 
@@ -72,6 +85,38 @@ class MemoryServer:
 
     def close(self) -> None:
         self.network.servers.pop(self.address, None)
+
+
+class _Transport(asyncio.Transport):
+    def __init__(self, reader: asyncio.StreamReader, writer: "MemoryWriter") -> None:
+        super().__init__()
+        self._reader, self._writer = reader, writer
+        self._reading = asyncio.Event()
+        self._reading.set()
+
+    async def feed(self, receiver: asyncio.BufferedProtocol) -> None:
+        receiver.connection_made(self)
+        while True:
+            await self._reading.wait()
+            data = await self._reader.read(len(memoryview(receiver.get_buffer(-1))))
+            if not data:
+                receiver.connection_lost(None)
+                return
+            memoryview(receiver.get_buffer(-1))[: len(data)] = data
+            receiver.buffer_updated(len(data))
+
+    def pause_reading(self) -> None:
+        self._reading.clear()
+
+    def resume_reading(self) -> None:
+        self._reading.set()
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        self._writer.write(bytes(data))
+
+    def close(self) -> None:
+        self._reading.set()
+        self._writer.close()
 
 
 class _Reader(asyncio.StreamReader):
@@ -96,7 +141,7 @@ class MemoryWriter:
         self.has_room = asyncio.Event()
         self.has_room.set()
 
-    def write(self, data: bytes) -> None:
+    def write(self, data: Body) -> None:
         if not self.closed and not self.peer.closed:
             self.peer.reader.feed_data(data)
 

@@ -1,8 +1,10 @@
 """Divide the memory of one door among its clients and its node.
 
-A client holds unfinished frames, fragments, frames in execution with their values and messages, and replies
-and messages that wait for it. Two more count as clients: the messages that wait for other nodes, and the
-arguments of calls that wait for answers. Invariants:
+A client holds frames that have not come whole or are being carried out, with the values and messages that are made of
+them, fragments, and replies and messages that wait for it or are being sent. Two more count as clients: the messages
+that wait for other nodes, and the arguments of calls that wait for answers. Large messages that come from other nodes
+have a memory of their own until they are whole (`NodeLimits.arriving_bytes`), so that slow clients keep none from the
+others. Invariants:
 
 1. Each client may hold `least` bytes, whatever the others hold: half of the whole, divided by the most clients.
 2. Beyond `least`, clients share the other half. A client gets no more of it than it leaves for all others.

@@ -18,9 +18,8 @@ from msgspec import Raw
 
 from appliance.base import clock
 from appliance.features.doors.door_memory import ClientMemory
-from appliance.features.doors.door_messages import DoorMessage, RecentEncodings
 from appliance.features.doors.door_parameters import DoorParameters, ParameterClient
-from appliance.features.doors.known_types import KnownTypes
+from appliance.features.doors.known_types import DoorMessage, Encodings, KnownTypes
 from appliance.features.doors.message_writer import MessageWriter, Now
 from appliance.features.doors.requests import (
     AdvertiseTopic,
@@ -50,6 +49,7 @@ from roswire.node import (
 )
 from roswire.node.network import OwnedTasks, PeerUnreachableError
 from roswire.node.tcpros_streams import ANY
+from roswire.tcpros import Body
 
 _SMALL_BYTES = 1 << 16
 """A message of up to this size, such as a stop, is written even if the memory is in use."""
@@ -136,12 +136,12 @@ class DoorNode:
         self._most_topics = most_topics
         self._calls = calls
         self._types = types
-        self._encodings = RecentEncodings(types.learn)
         self._built_in = built_in
         self._publications: dict[str, _Publication] = {}
         self._heard: dict[str, dict[_Subscriber, SubscribeTopic]] = {}
         self._offers: dict[str, _Offer] = {}
         self._parameters = DoorParameters(node)
+        self._encodings = Encodings()
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         self._tasks = OwnedTasks()
 
@@ -298,13 +298,14 @@ class DoorNode:
     def _hear(
         self,
         topic: str,
-        body: bytes,
+        body: Body,
         header: Mapping[str, str],
         receivers: Iterable[_Subscriber] | None = None,
     ) -> None:
         """Give a message to the subscribers of its topic; a client that wants another type is refused."""
-        message = DoorMessage(topic, body, header, clock.wall_ns(), self._encodings)
         clients, kind = self._heard.get(topic, {}), header.get("type", ANY)
+        encodings = self._encodings if len(clients) > 1 else None
+        message = DoorMessage(topic, body, header, clock.wall_ns(), self._types.learn, encodings)
         wrong = []
         for client in clients if receivers is None else receivers:
             request = clients.get(client)

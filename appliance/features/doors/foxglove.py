@@ -6,7 +6,6 @@ the robot. The door has none, does not announce this capability, and answers eac
 """
 
 import struct
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +13,6 @@ from typing import Any
 import msgspec
 from msgspec import UNSET, Raw
 
-from appliance.features.doors.door_messages import DoorMessage
 from appliance.features.doors.foxglove_frames import (
     FOXGLOVE_OPERATION,
     FoxgloveAdvertise,
@@ -32,16 +30,17 @@ from appliance.features.doors.foxglove_frames import (
     channel_fields,
     service_fields,
 )
+from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.requests import (
     AdvertiseTopic,
     CallOfService,
     DoorRequest,
-    Frame,
     Pieces,
     PublishMessage,
     ReadParameters,
     SubscribeParameter,
     SubscribeTopic,
+    TextFrame,
     UnadvertiseTopic,
     UnsubscribeParameter,
     UnsubscribeTopic,
@@ -127,7 +126,7 @@ class Foxglove:
         )
 
     def _tell(self, op: str, **fields: Any) -> None:
-        self.queue.reply(msgspec.json.encode({"op": op} | fields).decode())
+        self.queue.reply(TextFrame(msgspec.json.encode({"op": op} | fields)))
 
     # --- frames of the client ---
 
@@ -327,8 +326,8 @@ class Foxglove:
     def parameter_changed(self, subscribed: str, name: str, value: Value, now: float) -> None:
         """Queue a new value, for which the client may wait as for a message; a deleted parameter has none."""
         row = {"name": name} if value == {} else {"name": name, "value": value}
-        frame = msgspec.json.encode({"op": "parameterValues", "parameters": [row]}).decode()
-        self.queue.put(subscribed, frame, sys.getsizeof(frame), now)
+        frame = TextFrame(msgspec.json.encode({"op": "parameterValues", "parameters": [row]}))
+        self.queue.put(subscribed, frame, len(frame), now)
 
     def ask(self, service: str, _values: Raw) -> str:
         raise _FoxgloveError(f"the client does not offer {service}")
@@ -402,12 +401,12 @@ class Foxglove:
         for number in self._by_topic.get(message.topic, ()):
             self.queue.put(number, message, len(message.body), now)
 
-    def next_frame(self, now: float) -> Frame | Pieces | None:
+    def next_frame(self, now: float) -> bytes | Pieces | None:
         taken = self.queue.take(now)
         if taken is None or taken[0] is None:
             return None if taken is None else taken[1]
         number, message = taken
-        if isinstance(message, str):  # of a parameter
+        if isinstance(message, TextFrame):  # of a parameter
             return message
         return _MESSAGE_DATA.pack(1, number, message.received), message.body
 

@@ -26,6 +26,12 @@ class GivenNetwork:
         connection = await self._socket(port)
         return await asyncio.open_connection(sock=connection, limit=BUFFER_BYTES)
 
+    async def receive(self, host: str, port: int, receiver: asyncio.BufferedProtocol) -> None:
+        """Raises what `connect` raises."""
+        del host
+        connection = await self._socket(port)
+        await asyncio.get_running_loop().create_connection(lambda: receiver, sock=connection)
+
     async def serve(self, serve: Serve) -> ListeningServer:
         listener = await self._socket(0)
         return _Server(await asyncio.start_server(serve, sock=listener, limit=BUFFER_BYTES))

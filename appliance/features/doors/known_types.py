@@ -6,14 +6,76 @@ gave its file, beside the specifications.
 """
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from msgspec import Raw
 
 from appliance.features.doors.values import MessageCodec, ValueLimits
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
+from roswire.tcpros import Body
+
+E = TypeVar("E", Raw, bytes)
+_ENCODING_OVERHEAD = 500  # bytes that a kept encoding takes besides its own and those of its message
 
 _MOST_CHARACTERS = 500_000
-"""The largest size of all kept definitions. A codec takes up to 140 bytes for each character of its definition."""
+"""The size of all kept definitions together. A codec takes up to 140 bytes for each character of its definition."""
+
+
+@dataclass(eq=False)  # a frozen one takes twice as long to make, for each message
+class DoorMessage:
+    """A message that came on a topic, with its publisher's header.
+
+    `received` is the system time in nanoseconds. If several clients get the message, `encodings` keeps what is made of
+    it for a while. Encoding raises `MessageValueError`, or `DefinitionError` if the definition cannot be used.
+    """
+
+    topic: str
+    body: Body
+    header: Mapping[str, str]
+    received: int
+    codec_of: Callable[[Mapping[str, str]], MessageCodec] = field(repr=False)
+    encodings: "Encodings | None" = field(default=None, repr=False)
+
+    @property
+    def json(self) -> Raw:
+        return self._encoded(MessageCodec.json)
+
+    @property
+    def cbor(self) -> bytes:
+        return self._encoded(MessageCodec.cbor)
+
+    def _encoded(self, encode: Callable[[MessageCodec, Body], E]) -> E:
+        if self.encodings is None:
+            return encode(self.codec_of(self.header), self.body)
+        return self.encodings.of(self, encode)
+
+
+class Encodings:
+    """The encodings that were made last, for the other clients of a door: at most `most` bytes with their messages."""
+
+    def __init__(self, most: int = 16 << 20) -> None:
+        self.bytes = 0
+        self._most = most
+        self._kept: dict[tuple[DoorMessage, Any], Any] = {}  # oldest first
+
+    def of(self, message: DoorMessage, encode: Callable[[MessageCodec, Body], E]) -> E:
+        known: E | None = self._kept.get((message, encode))
+        if known is not None:
+            return known
+        made = self._kept[message, encode] = encode(message.codec_of(message.header), message.body)
+        self.bytes += _kept_bytes(message, made)
+        while self.bytes > self._most:
+            oldest, encoding = next(iter(self._kept.items()))
+            del self._kept[oldest]
+            self.bytes -= _kept_bytes(oldest[0], encoding)
+        return made
+
+
+def _kept_bytes(message: DoorMessage, encoding: Raw | bytes) -> int:
+    return len(message.body) + memoryview(encoding).nbytes + _ENCODING_OVERHEAD
 
 
 class KnownTypes:

@@ -15,6 +15,7 @@ import cbor2
 from roswire.definitions import Definitions
 from roswire.errors import PeerError
 from roswire.message_text import PRIMITIVES, Field
+from roswire.tcpros import Body
 
 TYPED_ARRAY_TAGS = {
     "uint16": 69, "uint32": 70, "uint64": 71, "byte": 72, "int8": 72, "int16": 77, "int32": 78, "int64": 79,
@@ -39,12 +40,12 @@ class _Cursor:
 
     __slots__ = ("data", "left", "position")
 
-    def __init__(self, data: bytes, left: int) -> None:
+    def __init__(self, data: Body, left: int) -> None:
         self.data = data
         self.position = 0
         self.left = left
 
-    def take(self, size: int) -> bytes:
+    def take(self, size: int) -> Body:
         end = self.position + size
         if end > len(self.data):
             raise MessageValueError(f"{size} bytes at byte {self.position} of a message of {len(self.data)}")
@@ -74,7 +75,7 @@ class MessageReader:
         self._most_values = most_values
         self._read = _Readers(definitions, typed_arrays=typed_arrays).message(name)
 
-    def read(self, data: bytes) -> dict[str, Any]:
+    def read(self, data: Body) -> dict[str, Any]:
         """Return the values of a message; raises `MessageValueError`."""
         cursor = _Cursor(data, self._most_values)
         try:
@@ -148,7 +149,7 @@ class _Readers:
 
     def _element(self, kind: str) -> _Read:
         if kind == "string":
-            return lambda cursor: cursor.take(cursor.count()).decode("utf-8", "replace")
+            return _text
         if kind in TIME_TYPES:
             return _time(kind)
         return self.message(kind)
@@ -170,6 +171,12 @@ def _scalars(fields: list[Field]) -> _ReadInto:
         cursor.position += whole.size
 
     return read_into
+
+
+def _text(cursor: _Cursor) -> str:
+    text = cursor.take(cursor.count())
+    cursor.charge(len(text) // 8)  # JSON writes up to six bytes for one
+    return text.decode("utf-8", "replace")
 
 
 def _time(kind: str) -> _Read:

@@ -202,6 +202,7 @@ class _Process:
                 limits=NodeLimits(),
                 shut_down=self._shut_down,
                 memory=waiting,
+                skipped=self._skip,
             )
             try:
                 await node.start()
@@ -220,6 +221,9 @@ class _Process:
                 memory,
             )
         self._started.set()
+
+    def _skip(self) -> None:
+        self._totals.dropped += 1
 
     def _shut_down(self, reason: str) -> None:
         self._failure = f"the master ended the node of the door: {reason}"

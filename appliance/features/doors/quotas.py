@@ -18,8 +18,8 @@ DOOR_CONNECTIONS = QuotaRow(
 )
 
 DOOR_BYTES = QuotaRow(
-    thing="bytes that clients of one door hold: frames until they are carried out, and replies and messages that wait"
-    " for a client or another node",
+    thing="bytes that clients of one door hold: frames until they are carried out, replies and messages until they are"
+    " sent to a client or another node",
     bounds=Bounds(whole=256 << 20, host=56 << 20, unknown=0, kept=0),
     at_limit="the oldest messages are dropped; a client with too large a frame, or that does not read its replies, is"
     " disconnected with the reason; values that take too much are refused in words",

@@ -9,6 +9,8 @@ from typing import TypeAlias
 
 import msgspec
 
+from roswire.tcpros import Body
+
 ClientId: TypeAlias = str | int | float | None
 """The id of a client's operation, or None."""
 
@@ -150,7 +152,12 @@ DoorRequest: TypeAlias = (
     | UnsubscribeParameter
 )
 Frame: TypeAlias = str | bytes
-"""A WebSocket message to a client: text or binary."""
+"""A WebSocket message of a client: text or binary."""
 
-Pieces: TypeAlias = tuple[bytes, bytes]
+
+class TextFrame(bytes):
+    """A text message to a client, in UTF-8."""
+
+
+Pieces: TypeAlias = tuple[bytes, Body]
 """The head and the body of a binary WebSocket message to a client: a body is large, and not copied."""

@@ -16,15 +16,14 @@ from typing import Any
 
 from msgspec import Raw
 
-from appliance.features.doors.door_messages import DoorMessage
 from appliance.features.doors.fragments import FragmentStore
+from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.requests import (
     AdvertiseTopic,
     AnswerCall,
     CallOfService,
     ClientId,
     DoorRequest,
-    Frame,
     OfferService,
     Pieces,
     PublishMessage,
@@ -57,7 +56,7 @@ from appliance.features.doors.rosbridge_frames import (
 )
 from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerQueue
-from roswire.errors import PeerError, quoted
+from roswire.errors import LimitExceededError, PeerError, quoted
 from roswire.names import resolve
 from roswire.xmlrpc import Value
 
@@ -362,20 +361,27 @@ class Rosbridge:
         for spelling in self._spellings.get(message.topic, ()):
             self.queue.put(spelling, message, len(message.body), now)
 
-    def next_frame(self, now: float) -> Frame | Pieces | None:
+    def next_frame(self, now: float) -> bytes | Pieces | None:
         taken = self.queue.take(now)
         if taken is None or taken[0] is None:
             return None if taken is None else taken[1]
         spelling, message = taken
         try:
-            return publish_frame(spelling, message, self._subscriptions[spelling].compression)
+            frame = publish_frame(spelling, message, self._subscriptions[spelling].compression)
+            if reason := self.queue.memory.refusal(_size(frame)):
+                raise LimitExceededError(reason)
+            return frame
         except (
             PeerError
-        ) as error:  # the message does not fit its definition, or the definition cannot be used
+        ) as error:  # the message has no room, or does not fit its definition, which may be unusable
             return json_frame({"op": "status", "level": "error", "msg": f"{spelling}: {error}"})
 
     def next_time(self) -> float | None:
         return self.queue.next_time()
+
+
+def _size(frame: bytes | Pieces) -> int:
+    return len(frame) if isinstance(frame, bytes) else sum(map(len, frame))
 
 
 def _one_type(topic: str, use: str, known: str | None, given: str | None) -> str | None:

@@ -10,8 +10,8 @@ import msgspec
 from msgspec import Meta, Raw, Struct
 
 from appliance.features.doors.cbor_frames import json_of_cbor
-from appliance.features.doors.door_messages import DoorMessage
-from appliance.features.doors.requests import ClientId, Frame, Pieces
+from appliance.features.doors.known_types import DoorMessage
+from appliance.features.doors.requests import ClientId, Pieces, TextFrame
 from appliance.features.doors.values import cbor
 from roswire.errors import PeerError, quoted
 
@@ -151,16 +151,21 @@ class Envelope(Struct):
     receiver: Any = None
 
 
-def publish_frame(topic: str, message: DoorMessage, compression: Compression) -> Frame | Pieces:
+def publish_frame(topic: str, message: DoorMessage, compression: Compression) -> TextFrame | Pieces:
     """Return a message for a client; raises `MessageValueError`."""
     if compression == "cbor-raw":
         return _raw_head(topic, message), message.body
     if compression == "cbor":
-        return b"".join((_PUBLISH, cbor(topic), b"\x63msg")), message.cbor
+        return _publish_head(topic) + b"\x63msg", message.cbor
     text = msgspec.json.encode({"op": "publish", "topic": topic, "msg": message.json})
     if compression == "png":
         return json_frame({"op": "png", "data": base64.b64encode(as_png(text)).decode("ascii")})
-    return text.decode()
+    return TextFrame(text)
+
+
+def _publish_head(topic: str) -> bytes:
+    """Return the CBOR of a publication up to its last field."""
+    return b"\xa3\x62op\x67publish\x65topic" + cbor(topic)
 
 
 def _raw_head(topic: str, message: DoorMessage) -> bytes:
@@ -168,8 +173,7 @@ def _raw_head(topic: str, message: DoorMessage) -> bytes:
     secs, nsecs = divmod(message.received, 1_000_000_000)
     return b"".join(
         (
-            _PUBLISH,
-            cbor(topic),
+            _publish_head(topic),
             b"\x63msg\xa3\x64secs\x1a",
             secs.to_bytes(4, "big"),
             b"\x65nsecs\x1a",
@@ -180,8 +184,8 @@ def _raw_head(topic: str, message: DoorMessage) -> bytes:
     )
 
 
-def json_frame(fields: dict[str, Any], reply_to: ClientId = None) -> str:
-    return msgspec.json.encode(fields if reply_to is None else fields | {"id": reply_to}).decode()
+def json_frame(fields: dict[str, Any], reply_to: ClientId = None) -> TextFrame:
+    return TextFrame(msgspec.json.encode(fields if reply_to is None else fields | {"id": reply_to}))
 
 
 def as_png(data: bytes) -> bytes:

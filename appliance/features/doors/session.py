@@ -6,7 +6,8 @@ Rules:
 2. The session carries out the requests of the client in order. While it does so, it does not read; calls of services
    do not hold up later requests.
 3. Frames are sent only as fast as the client reads. In the meantime, its queue keeps the newest messages of each topic,
-   and its requests are carried out: a stop does not wait for pictures.
+   and its requests are carried out: a stop does not wait for pictures. A frame is charged to the client's memory until
+   the connection has room for more.
 4. A client that sends nothing, and does not answer pings, is disconnected: within seconds if it has a will.
 5. Once the session disconnects a client, it carries out no further request, and ends even if the client does not read.
 """
@@ -30,22 +31,23 @@ from websockets.server import ServerProtocol
 from websockets.typing import Subprotocol
 
 from appliance.features.doors.door_memory import ClientMemory, DoorMemory
-from appliance.features.doors.door_messages import DoorMessage
 from appliance.features.doors.door_node import DoorNode
+from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.lookout import Lookout
 from appliance.features.doors.origins import rejection
 from appliance.features.doors.requests import (
     AdvertiseTopic,
     DoorRequest,
-    Frame,
     Pieces,
     PublishMessage,
+    TextFrame,
     UnadvertiseTopic,
 )
 from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerStalledError
 from roswire.errors import LimitExceededError, ProtocolError, RosError
 from roswire.node.network import ByteWriter
+from roswire.tcpros import Body
 from roswire.xmlrpc import Value
 
 _READ_BYTES = 1 << 16
@@ -99,8 +101,8 @@ class ClientProtocol(Protocol):
 
     def message(self, message: DoorMessage, now: float) -> None: ...
 
-    def next_frame(self, now: float) -> Frame | Pieces | None:
-        """Return the next frame that may be sent now, or None."""
+    def next_frame(self, now: float) -> bytes | Pieces | None:
+        """Return the next frame to send now, or None."""
 
     def next_time(self) -> float | None:
         """Return the time at which the next waiting frame may be sent, or None."""
@@ -141,7 +143,8 @@ class DoorSession:
         self._unfinished = 0  # bytes of a frame that has not come whole, as charged to the memory
         self._frame = bytearray()  # the fragments that have come; empty ones take nothing
         self._is_text = False
-        self._pieces: list[bytes] = []  # of frames for the client
+        self._pieces: list[Body] = []  # of frames for the client
+        self._in_flight = 0  # their bytes, also while the connection holds them
         self._wake = asyncio.Event()
         self._over = asyncio.Event()
         self._socket = ServerProtocol(
@@ -364,15 +367,21 @@ class DoorSession:
         """
         size = 0
         while size < _BATCH_BYTES and (frame := self._protocol.next_frame(now)) is not None:
-            opcode = Opcode.TEXT if isinstance(frame, str) else Opcode.BINARY
-            pieces = (frame.encode(),) if isinstance(frame, str) else frame
-            pieces = (pieces,) if isinstance(pieces, bytes) else pieces
+            opcode = Opcode.TEXT if isinstance(frame, TextFrame) else Opcode.BINARY
+            pieces = (frame,) if isinstance(frame, bytes) else frame
             length = sum(map(len, pieces))
+            self.memory.add(length)
+            self._in_flight += length
             if self._socket.extensions:
                 send = self._socket.send_text if opcode is Opcode.TEXT else self._socket.send_binary
                 send(b"".join(pieces))
             else:
-                self._pieces += (frame_head(opcode, length), *pieces)
+                head, *bodies = pieces
+                self._pieces += (
+                    (frame_head(opcode, length) + head, *bodies)
+                    if bodies
+                    else (frame_head(opcode, length), head)
+                )
             size += length
             self.sent += 1
         return size
@@ -388,6 +397,8 @@ class DoorSession:
                 self.sent_bytes += len(data)
                 self._writer.write(data)
         await self._writer.drain()
+        self.memory.add(-self._in_flight)
+        self._in_flight = 0
 
     def disconnect(self, reason: str) -> None:
         self._disconnect(CloseCode.POLICY_VIOLATION, reason)

@@ -6,9 +6,10 @@ from typing import Any
 import cbor2
 import msgspec
 
-from appliance.features.doors.message_reader import MessageReader
+from appliance.features.doors.message_reader import MessageReader, MessageValueError
 from appliance.features.doors.message_writer import MessageWriter
 from roswire.definitions import Definitions
+from roswire.tcpros import Body
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,6 +17,7 @@ class ValueLimits:
     """Upper bounds for one message."""
 
     message_bytes: int = 16 << 20  # of a message that a client makes
+    shown_bytes: int = 32 << 20  # of a message that JSON or CBOR shows
     values: int = 1_000_000  # of a message that JSON or CBOR shows
 
 
@@ -24,17 +26,27 @@ class MessageCodec:
 
     def __init__(self, definitions: Definitions, name: str, limits: ValueLimits) -> None:
         self.name = name
+        self._limits = limits
         self._json = MessageReader(definitions, name, typed_arrays=False, most_values=limits.values)
         self._cbor = MessageReader(definitions, name, typed_arrays=True, most_values=limits.values)
         self.writer = MessageWriter(definitions, name, most_bytes=limits.message_bytes)
 
-    def json(self, data: bytes) -> msgspec.Raw:
+    def json(self, data: Body) -> msgspec.Raw:
         """Return a message as JSON: bytes as base64, NaN and infinity as null. Raises `MessageValueError`."""
+        self._check(data)
         return msgspec.Raw(msgspec.json.encode(self._json.read(data)))
 
-    def cbor_values(self, data: bytes) -> dict[str, Any]:
-        """Return a message as values that `cbor` encodes. Raises `MessageValueError`."""
-        return self._cbor.read(data)
+    def cbor(self, data: Body) -> bytes:
+        """Return a message as CBOR, with typed arrays. Raises `MessageValueError`."""
+        self._check(data)
+        return cbor(self._cbor.read(data))
+
+    def _check(self, data: Body) -> None:
+        if len(data) > self._limits.shown_bytes:
+            raise MessageValueError(
+                f"a message of {len(data)} bytes; as JSON or CBOR at most {self._limits.shown_bytes}: subscribe with"
+                " cbor-raw"
+            )
 
 
 def cbor(values: Any) -> bytes:

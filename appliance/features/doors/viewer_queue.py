@@ -5,7 +5,7 @@ A client that reads slowly loses the oldest messages of its topics, never a repl
 1. At most `message_bytes` of messages wait. If more come, the topic with the most bytes loses its oldest message.
 2. At most `reply_bytes` of replies wait. A client that requests more without reading gets `ViewerStalledError`.
 3. All frames that wait are charged to the client's part of the memory of its door. Without room, the client's oldest
-   messages are dropped, and a reply ends the connection.
+   messages are dropped, or the new one if that is not enough, and a reply ends the connection.
 4. Topics take turns, so that a large topic delays a small one by one message.
 """
 
@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from appliance.features.doors.door_memory import ClientMemory, DoorMemory
-from appliance.features.doors.requests import Frame
 
 _BURST = 1000
 _BURST_BYTES = 256 << 10
@@ -57,13 +56,13 @@ class ViewerQueue(Generic[Key]):
         self.memory = memory or DoorMemory().client()
         self._most_message_bytes = message_bytes
         self._most_reply_bytes = reply_bytes
-        self._replies: deque[Frame] = deque()
+        self._replies: deque[bytes] = deque()
         self._reply_bytes = 0
         self._message_bytes = 0
         self._topics: dict[Key, _Waiting] = {}
         self._turns: OrderedDict[Key, None] = OrderedDict()  # the topics with messages, the next one first
 
-    def reply(self, frame: Frame) -> None:
+    def reply(self, frame: bytes) -> None:
         """Add a reply. Raises `ViewerStalledError`."""
         if self.memory.closed:
             return
@@ -111,11 +110,11 @@ class ViewerQueue(Generic[Key]):
             if now < topic.next_time:
                 return
             topic.next_time = now + topic.interval
-        while self._turns and self.memory.refusal(size + _OVERHEAD):
-            self._drop_from_largest()
-        if self.memory.refusal(size + _OVERHEAD):
+        if self.memory.refusal(size + _OVERHEAD - self._message_bytes):
             self.dropped += 1
             return
+        while self.memory.refusal(size + _OVERHEAD):
+            self._drop_from_largest()
         self.memory.add(size + _OVERHEAD)
         topic.items.append((item, size))
         self._turns.setdefault(key)
@@ -129,7 +128,7 @@ class ViewerQueue(Generic[Key]):
                 break  # the newest message of the topic stays, whatever its size
             self._drop_from_largest()
 
-    def take(self, now: float) -> "tuple[None, Frame] | tuple[Key, Any] | None":
+    def take(self, now: float) -> "tuple[None, bytes] | tuple[Key, Any] | None":
         """Return the next reply (with the key None) or message; None if nothing may be sent now."""
         if self._replies:
             frame = self._replies.popleft()

@@ -1,6 +1,10 @@
 import json
+import re
+import socket
 import ssl
+import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +43,20 @@ read default = site agent
 write default = site
 """
 AGENT = "ws://10.77.0.2:9091"
+MOST_KB = 400 << 10
+LARGE = """
+import rospy
+from std_msgs.msg import String
+rospy.init_node("large")
+publisher, rate = rospy.Publisher("/large", String, queue_size=1), rospy.Rate(3)
+while not rospy.is_shutdown():
+    publisher.publish("x" * 30_000_000)
+    rate.sleep()
+"""
+HANDSHAKE = (
+    b"GET / HTTP/1.1\r\nHost: 10.77.0.2\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +66,19 @@ def appliance(common_lab: Lab) -> Iterator[Appliance]:
     with Appliance(host, policy=POLICY, settings=settings, options=("--api", "10.77.0.2:8443")) as running:
         running.rosrv("door", "add", "agent-1", "--port", "9091", "--from", "10.77.0.10")
         yield running
+
+
+def stuck_client() -> socket.socket:
+    """It reads nothing after the handshake."""
+    client = socket.create_connection(("10.77.0.2", 9091), SECONDS)
+    client.sendall(HANDSHAKE)
+    assert b" 101 " in client.recv(1000)
+    return client
+
+
+def client_frame(**operation: str) -> bytes:
+    text = json.dumps(operation).encode()
+    return bytes([0x81, 0x80 | len(text)]) + bytes(4) + text
 
 
 def on_robot(robot: Host, work: Callable[[], Any]) -> Any:
@@ -134,6 +165,35 @@ def test_a_ticket_opens_the_door_of_a_person_until_it_is_over(
     secret = url.rpartition(".")[2]
     assert appliance.recorded(event="door disconnected", resource="alice")
     assert secret not in json.dumps(appliance.recorded())
+
+
+def test_large_messages_for_clients_that_read_nothing_take_bounded_memory(
+    appliance: Appliance, common_robot: Host, tmp_path: Path
+) -> None:
+    """Each client reads nothing of a message of 30 MB, and wants no other; together, the messages have 600 MB."""
+    program = tmp_path / "large.py"
+    program.write_text(LARGE)
+    with RosSession(appliance.master_uri, tmp_path, common_robot) as ros, ExitStack() as stack:
+        ros.talker("rospy", "/chatter")
+        ros.start(["/usr/bin/python3", str(program)], label="large")
+        eventually(lambda: not appliance.row("door", "list")["trouble"], "the door serves")
+        pid = appliance.pids("door")[-1]
+
+        def work() -> None:
+            for _number in range(20):
+                stuck = stack.enter_context(stuck_client())
+                stuck.sendall(client_frame(op="subscribe", topic="/large", compression="cbor-raw"))
+                threading.Event().wait(1)
+                stuck.sendall(client_frame(op="unsubscribe", topic="/large"))
+            with connect(AGENT) as client:
+                client.send(json.dumps({"op": "subscribe", "topic": "/chatter", "type": "std_msgs/String"}))
+                for _number in range(20):
+                    frame(client, op="publish", topic="/chatter")
+
+        on_robot(common_robot, work)
+        [peak] = re.findall(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
+        assert int(peak) < MOST_KB
+        assert appliance.row("door", "list")["dropped"] > 0
 
 
 def test_doors_survive_a_restart_and_a_removed_one_ends(appliance: Appliance, common_robot: Host) -> None:

@@ -26,7 +26,7 @@ from appliance.features.doors.session import DoorSession, SessionOptions
 from appliance.features.doors.values import ValueLimits
 from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.node import NodeLimits, RosNode
-from roswire.node.topics import QueueMemory
+from roswire.node.network import NodeMemory
 from roswire.standard import standard_definitions
 from tests.support.memory_network import MemoryNetwork, MemoryWriter
 from tests.support.scripted_master import MASTER, ScriptedMaster
@@ -116,7 +116,7 @@ class DoorWorld:
             DOOR[0], partial(connections.serve, self.serve, refused=self.refusals.append), DOOR[1]
         )
 
-    async def robot(self, address: str, name: str, memory: QueueMemory | None = None) -> RosNode:
+    async def robot(self, address: str, name: str, memory: NodeMemory | None = None) -> RosNode:
         node = RosNode(
             name,
             MASTER,

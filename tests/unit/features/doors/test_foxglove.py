@@ -6,12 +6,19 @@ from typing import Any
 import pytest
 
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
-from appliance.features.doors.requests import DoorRequest, PublishMessage, SubscribeTopic, UnsubscribeTopic
+from appliance.features.doors.requests import (
+    DoorRequest,
+    PublishMessage,
+    SubscribeTopic,
+    TextFrame,
+    UnsubscribeTopic,
+)
 from appliance.features.doors.surroundings import DoorSurroundings, SeenTopic, VisibleGraph
 from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.definitions import Definitions
 from roswire.node import MessageType, RosNode, ServiceFailedError, ServiceType
 from roswire.standard import standard_definitions
+from roswire.tcpros import Body
 from tests.support.features.doors.door_world import DoorWorld, WebSocketClient, door_world
 
 pytestmark = pytest.mark.anyio
@@ -77,7 +84,7 @@ async def test_a_viewer_publishes_bytes_and_json() -> None:
     async with door_world() as world:
         robot = await world.robot("10.0.0.3", "/robot")
         sees(world, topics={})
-        heard: list[bytes] = []
+        heard: list[Body] = []
         await robot.subscribe("/text", lambda body, _header: heard.append(body))
         client = await world.client(subprotocols=SUBPROTOCOLS)
         for number, encoding in ((1, "ros1"), (2, "json")):
@@ -173,7 +180,7 @@ async def test_a_stop_does_not_wait_for_reads_of_parameters() -> None:
     async with door_world() as world:
         sees(world, topics={})
         robot, client = await world.robot("10.0.0.3", "/robot"), await world.client(subprotocols=SUBPROTOCOLS)
-        heard: list[bytes] = []
+        heard: list[Body] = []
         await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
         channel = {"id": 7, "topic": "/cmd", "encoding": "ros1", "schemaName": "std_msgs/Bool"}
         client.send({"op": "advertise", "channels": [channel]})
@@ -263,8 +270,8 @@ def received(foxglove: Foxglove, frame: str | bytes) -> list[DoorRequest]:
 
 def text_frame(foxglove: Foxglove) -> str | None:
     frame = foxglove.next_frame(0.0)
-    assert frame is None or isinstance(frame, str)
-    return frame
+    assert frame is None or isinstance(frame, TextFrame)
+    return None if frame is None else frame.decode()
 
 
 def viewer(**limits: int) -> tuple[Foxglove, ViewerQueue[int | str]]:

@@ -1,7 +1,10 @@
+import struct
+from collections.abc import Mapping
+
 import pytest
 
-from appliance.features.doors.known_types import KnownTypes
-from appliance.features.doors.values import ValueLimits
+from appliance.features.doors.known_types import DoorMessage, Encodings, KnownTypes
+from appliance.features.doors.values import MessageCodec, ValueLimits
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.standard import standard_definitions
@@ -74,3 +77,25 @@ def test_the_operators_files_define_types_until_they_change(types: KnownTypes) -
         types.service("own/Add")
     with pytest.raises(DefinitionError, match="does not know this message type"):
         types.message("own/AddRequest")
+
+
+def test_a_message_is_encoded_once_for_all_clients_within_bounds(types: KnownTypes) -> None:
+    given, learned = header("own/Bytes", "uint8[] x"), list[str]()
+
+    def learn(fields: Mapping[str, str]) -> MessageCodec:
+        learned.append(fields["type"])
+        return types.learn(fields)
+
+    def message(size: int) -> DoorMessage:
+        return DoorMessage("/x", struct.pack("<I", size) + bytes(size), given, 0, learn, encodings)
+
+    encodings = Encodings(most=100_000)
+    first = message(10_000)
+    assert bytes(first.json) == bytes(first.json)
+    assert len(learned) == 1
+    assert first.cbor == first.cbor
+    assert len(learned) == 2
+    for size in (10_000, 10_000, 10_000, 50_000, 90_000):
+        assert message(size).json
+        assert encodings.bytes <= 100_000
+    assert first.json and len(learned) == 8  # it is no longer kept

@@ -8,7 +8,7 @@ from typing import Any
 import cbor2
 import pytest
 
-from appliance.features.doors.door_messages import DoorMessage, RecentEncodings
+from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.requests import (
     AdvertiseTopic,
     AnswerCall,
@@ -18,6 +18,7 @@ from appliance.features.doors.requests import (
     OfferService,
     PublishMessage,
     SubscribeTopic,
+    TextFrame,
     UnadvertiseTopic,
     UnsubscribeTopic,
     WithdrawService,
@@ -30,7 +31,6 @@ from roswire.definitions import Definitions
 STRING = MessageCodec(
     Definitions.from_files({"std_msgs/String.msg": "string data"}), "std_msgs/String", ValueLimits()
 )
-ENCODINGS = RecentEncodings(lambda _header: STRING)
 
 
 class Client:
@@ -55,12 +55,12 @@ class Client:
         frames = []
         while (frame := self.rosbridge.next_frame(self.now)) is not None:
             data = b"".join(frame) if isinstance(frame, tuple) else frame
-            frames.append(json.loads(data) if isinstance(data, str) else cbor2.loads(data))
+            frames.append(json.loads(data) if isinstance(data, TextFrame) else cbor2.loads(data))
         return frames
 
     def hears(self, text: str, topic: str = "/chatter") -> None:
         body = struct.pack("<I", len(text)) + text.encode()
-        self.rosbridge.message(DoorMessage(topic, body, {}, 7_000_000_005, ENCODINGS), self.now)
+        self.rosbridge.message(DoorMessage(topic, body, {}, 7_000_000_005, lambda _header: STRING), self.now)
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from appliance.features.doors.origins import rejection
 from appliance.features.doors.quotas import DOOR_BYTES
 from roswire.node import MessageType, RosNode, ServiceFailedError, ServiceType
 from roswire.standard import standard_definitions
+from roswire.tcpros import Body
 from tests.support.features.doors.door_world import DOOR, WebSocketClient, door_world
 
 pytestmark = pytest.mark.anyio
@@ -31,7 +32,7 @@ async def talks(node: RosNode, topic: str, *, latched: bool = False) -> Any:
 async def test_messages_pass_in_both_directions() -> None:
     async with door_world() as world:
         robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
-        heard: list[bytes] = []
+        heard: list[Body] = []
         await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
         publication = await talks(robot, "/state")
         client.send({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String"})
@@ -72,7 +73,7 @@ async def test_each_new_client_of_a_topic_gets_the_last_message_of_latched_publi
 async def test_a_will_is_published_if_the_client_leaves_first(left: bool) -> None:
     async with door_world() as world:
         robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
-        heard: list[bytes] = []
+        heard: list[Body] = []
         await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
         wrong = {"op": "advertise", "topic": "/cmd", "type": "std_msgs/String", "will": {"datum": 1}}
         client.send(wrong)
@@ -90,7 +91,7 @@ async def test_a_will_is_published_if_the_client_leaves_first(left: bool) -> Non
 async def test_a_will_is_published_within_seconds_after_the_network_is_cut() -> None:
     async with door_world() as world:
         robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
-        heard: list[bytes] = []
+        heard: list[Body] = []
         await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
         client.send({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String", "will": {"data": "stop"}})
         await asyncio.sleep(60)
@@ -112,7 +113,7 @@ async def test_a_publication_without_a_grant_is_refused_until_it_is_granted_agai
         del world.master.denials["registerPublisher"]
         await asyncio.sleep(2)
         client.send(publish | {"msg": {"data": "again"}})
-        heard: list[bytes] = []
+        heard: list[Body] = []
         await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
         await asyncio.sleep(1)
         assert heard == [string("again")]
@@ -212,7 +213,7 @@ async def test_a_message_of_the_largest_frame_is_published(kind: str, text: str)
 async def test_without_memory_small_frames_are_carried_out_and_a_large_one_ends_the_connection() -> None:
     async with door_world() as world:
         robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
-        heard: list[bytes] = []
+        heard: list[Body] = []
         await robot.subscribe("/a", lambda body, _header: heard.append(body))
         for memory in world.memories:
             memory.add(DOOR_BYTES.bounds.host)
@@ -262,7 +263,7 @@ async def test_a_client_that_does_not_read_pictures_is_heard_at_once() -> None:
     """Its stop does not wait until the network has taken the pictures."""
     async with door_world() as world:
         robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
-        heard: list[bytes] = []
+        heard: list[Body] = []
         await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
         publication = await talks(robot, "/image")
         client.send({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String"})
@@ -491,6 +492,41 @@ async def test_a_viewer_that_stops_reading_delays_no_other_and_takes_bounded_mem
         assert reading.is_open
 
 
+async def test_a_message_is_charged_until_the_client_has_room_for_it() -> None:
+    async with door_world() as world:
+        publication = await talks(await world.robot("10.0.0.3", "/robot"), "/image")
+        client = await world.client()
+        client.send({"op": "subscribe", "topic": "/image", "compression": "cbor-raw"})
+        await asyncio.sleep(1)
+        client.stop_reading()
+        publication.publish(string("x" * 400_000))
+        await asyncio.sleep(1)
+        memory = world.memories[-1]
+        assert world.queues[0].take(0.0) is None
+        assert 400_000 < memory.held < 410_000
+        await asyncio.sleep(100)  # the client is disconnected
+        assert memory.held == 0
+
+
+async def test_a_message_that_has_no_room_in_its_encoding_is_refused_in_words() -> None:
+    async with door_world() as world:
+        publication = await talks(await world.robot("10.0.0.3", "/robot"), "/image")
+        client = await world.client()
+        client.send({"op": "subscribe", "topic": "/image"})
+        await asyncio.sleep(1)
+        for other in (world.waiting, world.calls):
+            other.add(DOOR_BYTES.bounds.host)
+        for text in ("\x01" * 3_000_000, "small"):
+            publication.publish(string(text))
+            await asyncio.sleep(1)
+        refused, message = await client.next(), await client.next()
+        assert (refused["op"], refused["level"]) == ("status", "error")
+        assert "/image: the client would hold 180" in refused["msg"]
+        assert message["msg"] == {"data": "small"}
+        for other in (world.waiting, world.calls):
+            other.add(-DOOR_BYTES.bounds.host)
+
+
 @pytest.mark.parametrize(
     ("deflate", "frame", "code"),
     [
@@ -547,7 +583,7 @@ async def test_fragments_take_the_memory_of_their_bytes() -> None:
 async def test_a_client_that_is_disconnected_is_heard_no_more_and_leaves_in_time(reads: bool) -> None:
     async with door_world() as world:
         robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
-        heard: list[bytes] = []
+        heard: list[Body] = []
         await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
         publication = await talks(robot, "/image")
         client.send({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String"})

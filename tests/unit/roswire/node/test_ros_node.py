@@ -19,7 +19,7 @@ from roswire.node import (
 from roswire.node.network import ByteWriter
 from roswire.node.tcpros_streams import read_header
 from roswire.node.topics import OwnMemory
-from roswire.tcpros import HeaderParser, encode_frame, encode_header
+from roswire.tcpros import Body, HeaderParser, encode_frame, encode_header
 from roswire.uris import parse_node_uri
 from roswire.xmlrpc import MethodCall, Value, build_fault, build_response
 from tests.support.memory_network import MemoryNetwork
@@ -41,6 +41,10 @@ class Nodes:
         self.master = ScriptedMaster(self.network)
         self.nodes: list[RosNode] = []
         self.ends: list[str] = []
+        self.skipped = 0
+
+    def _skip(self) -> None:
+        self.skipped += 1
 
     async def node(self, address: str, memory: OwnMemory | None = None, **limits: Any) -> RosNode:
         node = RosNode(
@@ -50,6 +54,7 @@ class Nodes:
             limits=NodeLimits(**limits),
             shut_down=self.ends.append,
             memory=memory,
+            skipped=self._skip,
         )
         await node.start()
         self.nodes.append(node)
@@ -77,7 +82,7 @@ async def later(seconds: float = 1.0) -> None:
 async def test_messages_arrive_in_order_with_the_publishers_header() -> None:
     async with nodes() as world:
         talker, listener = await world.node("10.0.0.2"), await world.node("10.0.0.3")
-        heard: list[tuple[bytes, str]] = []
+        heard: list[tuple[Body, str]] = []
         await listener.subscribe("/chatter", lambda body, header: heard.append((body, header["type"])))
         publisher = await talker.advertise("/chatter", STRING, latched=False, queue=10)
         await later()
@@ -94,13 +99,26 @@ async def test_messages_arrive_in_order_with_the_publishers_header() -> None:
             }
 
 
+async def test_too_many_large_messages_are_dropped_and_counted() -> None:
+    async with nodes() as world:
+        talker, listener = await world.node("10.0.0.2"), await world.node("10.0.0.3", arriving_bytes=100_000)
+        heard: list[Body] = []
+        await listener.subscribe("/image", lambda body, _header: heard.append(body))
+        publisher = await talker.advertise("/image", STRING, latched=False, queue=10)
+        await later()
+        for size in (100_001, 3, 100_000):
+            publisher.publish(bytes(size))
+            await later()
+        assert ([*map(len, heard)], world.skipped) == ([3, 100_000], 1)
+
+
 async def test_a_latched_message_reaches_a_late_subscriber() -> None:
     async with nodes() as world:
         talker, listener = await world.node("10.0.0.2"), await world.node("10.0.0.3")
         publisher = await talker.advertise("/map", STRING, latched=True, queue=1)
         publisher.publish(b"old")
         publisher.publish(b"new")
-        heard: list[bytes] = []
+        heard: list[Body] = []
         await listener.subscribe("/map", lambda body, _header: heard.append(body))
         await later()
         assert heard == [b"new"]
@@ -131,7 +149,7 @@ async def test_a_repeated_message_is_neither_lost_nor_doubled(sent: str, heard: 
             connections.append(writer)
 
         world.network.servers[talker.tcpros] = serve
-        received: list[bytes] = []
+        received: list[Body] = []
         await listener.subscribe(publication.topic, lambda body, _header: received.append(body))
         await later()
         first, *rest = sent.split()
@@ -153,9 +171,9 @@ async def test_a_repeated_message_is_neither_lost_nor_doubled(sent: str, heard: 
 async def test_a_node_hears_its_own_topic_without_a_connection() -> None:
     async with nodes() as world:
         node = await world.node("10.0.0.2")
-        heard: list[tuple[str, bytes, str]] = []
+        heard: list[tuple[str, Body, str]] = []
 
-        def hear(body: bytes, header: Any) -> None:
+        def hear(body: Body, header: Any) -> None:
             heard.append((header["topic"], body, header["type"]))
 
         await node.subscribe("/chatter", hear)
@@ -175,14 +193,14 @@ async def test_a_node_hears_its_own_topic_without_a_connection() -> None:
 
 
 @pytest.mark.parametrize(("wait", "heard"), [(0.5, [b"early", b"next"]), (1.5, [])])
-async def test_early_messages_are_replayed_only_for_a_while(wait: float, heard: list[bytes]) -> None:
+async def test_early_messages_are_replayed_only_for_a_while(wait: float, heard: list[Body]) -> None:
     async with nodes() as world:
         talker, listener = await world.node("10.0.0.2"), await world.node("10.0.0.3")
         publisher = await talker.advertise("/cmd_vel", STRING, latched=False, queue=2, replay=1)
         for body in (b"dropped", b"early", b"next"):
             publisher.publish(body)
         await later(wait)
-        got: list[bytes] = []
+        got: list[Body] = []
         await listener.subscribe("/cmd_vel", lambda body, _header: got.append(body))
         await later()
         assert got == heard
@@ -205,7 +223,7 @@ async def test_early_messages_take_no_memory_after_the_replay() -> None:
 async def test_a_slow_subscriber_loses_the_oldest_messages() -> None:
     async with nodes() as world:
         talker, listener = await world.node("10.0.0.2"), await world.node("10.0.0.3")
-        heard: list[bytes] = []
+        heard: list[Body] = []
         await listener.subscribe("/image", lambda body, _header: heard.append(body))
         publisher = await talker.advertise("/image", STRING, latched=False, queue=4)
         await later()
@@ -228,7 +246,7 @@ async def test_queues_share_one_memory_and_a_stalled_subscriber_costs_no_other_a
         memory = OwnMemory(1 << 20)
         talker, listener = await world.node("10.0.0.2", memory), await world.node("10.0.0.3")
         publisher = await talker.advertise("/image", STRING, latched=False, queue=1000)
-        heard: list[bytes] = []
+        heard: list[Body] = []
         await listener.subscribe("/image", lambda body, _header: heard.append(body))
         stalled = [world.network.connect("10.0.0.4", talker.tcpros) for _number in range(5)]
         for _reader, writer in stalled:
@@ -268,7 +286,7 @@ async def test_a_latched_message_without_memory_is_an_error_in_words() -> None:
 async def test_a_subscriber_connects_again_after_the_publisher_breaks_off() -> None:
     async with nodes() as world:
         talker, listener = await world.node("10.0.0.2"), await world.node("10.0.0.3")
-        heard: list[bytes] = []
+        heard: list[Body] = []
         subscriber = await listener.subscribe("/chatter", lambda body, _header: heard.append(body))
         publisher = await talker.advertise("/chatter", STRING, latched=True, queue=1)
         publisher.publish(b"once")
@@ -305,7 +323,7 @@ async def test_an_update_that_overtakes_the_answer_of_the_master_is_kept() -> No
                 world.master.publishers["/chatter"].remove(talker.uri)  # the answer is older than the update
 
         world.master.before_answer = overtake
-        heard: list[bytes] = []
+        heard: list[Body] = []
         await listener.subscribe("/chatter", lambda body, _header: heard.append(body))
         await later()
         assert heard == [b"heard"]

@@ -1,0 +1,156 @@
+"""Receive the frames of one TCPROS connection: small ones many at once, each large one into memory of its own.
+
+The kernel writes a large frame where it stays, so it is never copied. Invariants:
+
+1. A frame of more than `limit` bytes ends the connection as soon as its length is known.
+2. A large frame takes memory only if `memory` has room for all of it. Otherwise, its bytes are read and dropped, and
+   the next frame is received. Its memory is given back immediately before it is delivered: the receiver may take it.
+3. A frame is delivered only while one is wanted: bytes after it wait, and the connection is not read.
+"""
+
+import asyncio
+from collections.abc import Callable
+from typing import cast
+
+from roswire.errors import LimitExceededError
+from roswire.node.network import NodeMemory
+from roswire.tcpros import Body
+
+_SMALL_BYTES = 1 << 14  # it holds few enough messages for the queues of those who get them
+_LENGTH_BYTES = 4
+
+
+class TcprosReceiver(asyncio.BufferedProtocol):
+    """The protocol of one connection. `skipped()` is called for each frame that is dropped."""
+
+    def __init__(self, memory: NodeMemory, skipped: Callable[[], None]) -> None:
+        self._limit = 0
+        self._memory = memory
+        self._skipped = skipped
+        self._transport: asyncio.Transport
+        self._deliver: Callable[[Body], None] | None = None
+        self._small = bytearray(_SMALL_BYTES)
+        self._begun = 0  # bytes of `_small` that are not delivered
+        self._large: bytearray | None = None
+        self._missing = 0  # bytes of the large frame, or of one that is dropped
+        self._ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+
+    async def next(self, limit: int) -> Body:
+        """Return the next frame, of at most `limit` bytes.
+
+        Raises `LimitExceededError`, or `OSError` if the connection ends.
+        """
+        frame: asyncio.Future[Body] = asyncio.get_running_loop().create_future()
+
+        def take(body: Body) -> None:
+            self._deliver = None
+            frame.set_result(body)
+
+        self._begin(take, limit)
+        await asyncio.wait((frame, self._ended), return_when=asyncio.FIRST_COMPLETED)
+        return await (frame if frame.done() else self._end())
+
+    async def deliver_to(self, deliver: Callable[[Body], None], limit: int) -> None:
+        """Deliver frames of at most `limit` bytes until the connection ends. Raises what `next` raises."""
+        self._begin(deliver, limit)
+        await self._end()
+
+    async def _end(self) -> Body:
+        await asyncio.shield(self._ended)
+        raise ConnectionResetError("the peer ended the connection")
+
+    def _begin(self, deliver: Callable[[Body], None], limit: int) -> None:
+        self._deliver, self._limit = deliver, limit
+        self._take_frames()
+        if self._deliver is not None:
+            self._transport.resume_reading()
+
+    def write(self, data: bytes) -> None:
+        self._transport.write(data)
+
+    def close(self) -> None:
+        self._transport.close()
+
+    # --- called by the event loop ---
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast(asyncio.Transport, transport)
+        self._transport.pause_reading()
+
+    def get_buffer(self, _sizehint: int) -> memoryview:
+        if self._large is not None:
+            return memoryview(self._large)[-self._missing :]
+        return memoryview(self._small)[self._begun :]
+
+    def buffer_updated(self, count: int) -> None:
+        if self._large is not None:
+            self._missing -= count
+            if not self._missing:
+                self._finish_large(self._large)
+        else:
+            self._begun += count
+            self._take_frames()
+        if self._deliver is None:
+            self._transport.pause_reading()
+
+    def connection_lost(self, error: Exception | None) -> None:
+        if self._large is not None:
+            self._memory.add(-len(self._large))
+            self._large = None
+        if not self._ended.done():
+            if error is None:
+                self._ended.set_result(None)
+            else:
+                self._ended.set_exception(error)
+                self._ended.exception()  # a caller may wait for it, and need not
+
+    # --- frames ---
+
+    def _take_frames(self) -> None:
+        position, end = 0, self._begun
+        while self._deliver is not None:
+            if self._missing:  # of a frame that is dropped
+                dropped = min(self._missing, end - position)
+                self._missing -= dropped
+                position += dropped
+            body = position + _LENGTH_BYTES
+            if body > end or self._missing:
+                break
+            size = int.from_bytes(self._small[position:body], "little")
+            if size > self._limit:
+                self._refuse(size)
+                return
+            if body + size <= end:
+                position = body + size
+                self._deliver(bytes(memoryview(self._small)[body:position]))
+            elif size > _SMALL_BYTES - _LENGTH_BYTES:
+                position = self._begin_large(size, body, end)
+            else:
+                break
+        self._small[: end - position] = self._small[position:end]
+        self._begun = end - position
+
+    def _begin_large(self, size: int, begin: int, end: int) -> int:
+        """Return the position behind the bytes that are used."""
+        if self._memory.refusal(size):
+            self._skipped()
+            self._missing = size
+            return begin
+        self._memory.add(size)
+        self._large = bytearray(size)
+        self._large[: end - begin] = memoryview(self._small)[begin:end]
+        self._missing = size - (end - begin)
+        return end
+
+    def _finish_large(self, body: bytearray) -> None:
+        self._large = None
+        self._memory.add(-len(body))
+        if self._deliver is not None:
+            self._deliver(body)
+
+    def _refuse(self, size: int) -> None:
+        self._deliver = None
+        self._ended.set_exception(
+            LimitExceededError(f"frame of {size} bytes; at most {self._limit} are allowed")
+        )
+        self._transport.close()
