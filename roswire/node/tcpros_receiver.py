@@ -6,6 +6,7 @@ The kernel writes a large frame where it stays, so it is never copied. Invariant
 2. A large frame takes memory only if `memory` has room for all of it. Otherwise, its bytes are read and dropped, and
    the next frame is received. Its memory is given back immediately before it is delivered: the receiver may take it.
 3. A frame is delivered only while one is wanted: bytes after it wait, and the connection is not read.
+4. After a large frame, and after `_TURN` small ones, other tasks have a turn before the next is delivered.
 """
 
 import asyncio
@@ -16,7 +17,8 @@ from roswire.errors import LimitExceededError
 from roswire.node.network import NodeMemory
 from roswire.tcpros import Body
 
-_SMALL_BYTES = 1 << 14  # it holds few enough messages for the queues of those who get them
+_SMALL_BYTES = 1 << 16
+_TURN = 64  # small frames after which other tasks have a turn
 _LENGTH_BYTES = 4
 
 
@@ -61,14 +63,13 @@ class TcprosReceiver(asyncio.BufferedProtocol):
 
     def _begin(self, deliver: Callable[[Body], None], limit: int) -> None:
         self._deliver, self._limit = deliver, limit
-        self._take_frames()
-        if self._deliver is not None:
-            self._transport.resume_reading()
+        self._go_on()
 
     def write(self, data: bytes) -> None:
         self._transport.write(data)
 
     def close(self) -> None:
+        self._deliver = None
         self._transport.close()
 
     # --- called by the event loop ---
@@ -87,13 +88,13 @@ class TcprosReceiver(asyncio.BufferedProtocol):
             self._missing -= count
             if not self._missing:
                 self._finish_large(self._large)
+                self._pause()
         else:
             self._begun += count
             self._take_frames()
-        if self._deliver is None:
-            self._transport.pause_reading()
 
     def connection_lost(self, error: Exception | None) -> None:
+        self._deliver = None
         if self._large is not None:
             self._memory.add(-len(self._large))
             self._large = None
@@ -106,9 +107,19 @@ class TcprosReceiver(asyncio.BufferedProtocol):
 
     # --- frames ---
 
+    def _pause(self) -> None:
+        self._transport.pause_reading()
+        if self._deliver is not None:
+            asyncio.get_running_loop().call_soon(self._go_on)
+
+    def _go_on(self) -> None:
+        if self._deliver is not None:
+            self._transport.resume_reading()
+            self._take_frames()
+
     def _take_frames(self) -> None:
-        position, end = 0, self._begun
-        while self._deliver is not None:
+        position, end, left = 0, self._begun, _TURN
+        while self._deliver is not None and left:
             if self._missing:  # of a frame that is dropped
                 dropped = min(self._missing, end - position)
                 self._missing -= dropped
@@ -122,6 +133,7 @@ class TcprosReceiver(asyncio.BufferedProtocol):
                 return
             if body + size <= end:
                 position = body + size
+                left -= 1
                 self._deliver(bytes(memoryview(self._small)[body:position]))
             elif size > _SMALL_BYTES - _LENGTH_BYTES:
                 position = self._begin_large(size, body, end)
@@ -129,6 +141,8 @@ class TcprosReceiver(asyncio.BufferedProtocol):
                 break
         self._small[: end - position] = self._small[position:end]
         self._begun = end - position
+        if self._deliver is None or not left:
+            self._pause()
 
     def _begin_large(self, size: int, begin: int, end: int) -> int:
         """Return the position behind the bytes that are used."""

@@ -127,6 +127,35 @@ def test_an_agent_hears_publishes_and_calls_within_its_rights(
     assert denial["host"].startswith("198.19.240.")
 
 
+def test_large_messages_for_clients_that_read_nothing_take_bounded_memory(
+    appliance: Appliance, common_robot: Host, tmp_path: Path
+) -> None:
+    """Each client reads nothing of a message of 30 MB, and wants no other; together, the messages have 600 MB."""
+    program = tmp_path / "large.py"
+    program.write_text(LARGE)
+    with RosSession(appliance.master_uri, tmp_path, common_robot) as ros, ExitStack() as stack:
+        ros.talker("rospy", "/chatter")
+        ros.start(["/usr/bin/python3", str(program)], label="large")
+        eventually(lambda: not appliance.row("door", "list")["trouble"], "the door serves")
+        pid = appliance.pids("door")[-1]
+
+        def work() -> None:
+            for _number in range(20):
+                stuck = stack.enter_context(stuck_client())
+                stuck.sendall(client_frame(op="subscribe", topic="/large", compression="cbor-raw"))
+                threading.Event().wait(1)
+                stuck.sendall(client_frame(op="unsubscribe", topic="/large"))
+            with connect(AGENT) as client:
+                client.send(json.dumps({"op": "subscribe", "topic": "/chatter", "type": "std_msgs/String"}))
+                for _number in range(20):
+                    frame(client, op="publish", topic="/chatter")
+
+        on_robot(common_robot, work)
+        [peak] = re.findall(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
+        assert int(peak) < MOST_KB
+        assert appliance.row("door", "list")["dropped"] > 0
+
+
 def test_a_ticket_opens_the_door_of_a_person_until_it_is_over(
     appliance: Appliance, common_robot: Host, tmp_path: Path
 ) -> None:
@@ -165,35 +194,6 @@ def test_a_ticket_opens_the_door_of_a_person_until_it_is_over(
     secret = url.rpartition(".")[2]
     assert appliance.recorded(event="door disconnected", resource="alice")
     assert secret not in json.dumps(appliance.recorded())
-
-
-def test_large_messages_for_clients_that_read_nothing_take_bounded_memory(
-    appliance: Appliance, common_robot: Host, tmp_path: Path
-) -> None:
-    """Each client reads nothing of a message of 30 MB, and wants no other; together, the messages have 600 MB."""
-    program = tmp_path / "large.py"
-    program.write_text(LARGE)
-    with RosSession(appliance.master_uri, tmp_path, common_robot) as ros, ExitStack() as stack:
-        ros.talker("rospy", "/chatter")
-        ros.start(["/usr/bin/python3", str(program)], label="large")
-        eventually(lambda: not appliance.row("door", "list")["trouble"], "the door serves")
-        pid = appliance.pids("door")[-1]
-
-        def work() -> None:
-            for _number in range(20):
-                stuck = stack.enter_context(stuck_client())
-                stuck.sendall(client_frame(op="subscribe", topic="/large", compression="cbor-raw"))
-                threading.Event().wait(1)
-                stuck.sendall(client_frame(op="unsubscribe", topic="/large"))
-            with connect(AGENT) as client:
-                client.send(json.dumps({"op": "subscribe", "topic": "/chatter", "type": "std_msgs/String"}))
-                for _number in range(20):
-                    frame(client, op="publish", topic="/chatter")
-
-        on_robot(common_robot, work)
-        [peak] = re.findall(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
-        assert int(peak) < MOST_KB
-        assert appliance.row("door", "list")["dropped"] > 0
 
 
 def test_doors_survive_a_restart_and_a_removed_one_ends(appliance: Appliance, common_robot: Host) -> None:

@@ -1,6 +1,7 @@
 """The frames of a connection, cut anywhere."""
 
 import asyncio
+from itertools import pairwise
 from random import Random
 
 import pytest
@@ -58,7 +59,7 @@ class Connection(asyncio.Transport):
 async def test_frames_are_the_same_wherever_the_stream_is_cut(seed: int) -> None:
     """A frame does not wait for the rest of the next one, and frames without room are missing."""
     random = Random(seed)  # noqa: S311  not a secret
-    sizes = [random.choice((0, 1, 3, 200, 5000, 16_379, 16_380, 16_381, 1 << 16, 200_000)) for _ in range(60)]
+    sizes = [random.choice((0, 1, 3, 200, 5000, 65_531, 65_532, 65_533, 1 << 16, 200_000)) for _ in range(60)]
     sent = [random.randbytes(size) for size in sizes]
     stream, ends = b"", []
     for frame in sent:
@@ -72,6 +73,7 @@ async def test_frames_are_the_same_wherever_the_stream_is_cut(seed: int) -> None
         piece = stream[fed : fed + random.choice((1, 3, 5, 100, 70_000, 300_000))]
         fed += len(piece)
         connection.feed(piece)
+        await asyncio.sleep(1)
         whole = [frame for frame, end in zip(sent, ends, strict=True) if end <= fed and len(frame) <= 100_000]
         assert connection.heard == whole
         assert connection.memory.held <= 100_000
@@ -93,19 +95,33 @@ async def test_frames_after_the_wanted_one_wait() -> None:
     listening.cancel()
 
 
+async def test_other_tasks_have_a_turn_between_many_frames() -> None:
+    connection = Connection()
+    listening = connection.listen()
+    await asyncio.sleep(0)
+    connection.feed(encode_frame(b"x") * 1000 + encode_frame(bytes(100_000)) * 2)
+    counts = [0]
+    while len(connection.heard) < 1002:
+        counts.append(len(connection.heard))
+        await asyncio.sleep(0)
+    assert max(after - before for before, after in pairwise(counts)) <= 64
+    listening.cancel()
+
+
 @pytest.mark.parametrize("before", [[], [b"x"], [bytes(100_000)]])
 async def test_a_lying_length_is_refused_before_anything_is_kept(before: list[bytes]) -> None:
     connection = Connection()
     listening = connection.listen()
     await asyncio.sleep(0)
     connection.feed(b"".join(map(encode_frame, before)) + (LIMIT + 1).to_bytes(4, "little"))
+    await asyncio.sleep(1)
     with pytest.raises(LimitExceededError, match=f"frame of {LIMIT + 1} bytes"):
         await listening
     assert (connection.heard, connection.closed, connection.memory.held) == (before, True, 0)
 
 
 @pytest.mark.parametrize(
-    "begun", [b"", b"\x05", b"\x05\0\0\0", b"\x05\0\0\0abc", b"\xff\xff\0\0" + bytes(30_000)]
+    "begun", [b"", b"\x05", b"\x05\0\0\0", b"\x05\0\0\0abc", b"\xff\xff\1\0" + bytes(30_000)]
 )
 async def test_a_connection_that_ends_inside_a_frame_is_an_error(begun: bytes) -> None:
     connection = Connection()
