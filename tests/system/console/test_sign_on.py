@@ -115,7 +115,7 @@ def test_a_group_of_the_provider_opens_console_and_door_until_it_is_taken_away(
     with provider.running():
         again = signed_in("alice")
         expect(again.locator("[data-role]")).to_have_text("viewer")
-        expect(page.get_by_text("Signed out")).to_be_visible()
+        expect(page.get_by_text("The session has ended. Sign in again.")).to_be_visible()
         eventually(lambda: not appliance.row("door", "list")["clients"], appliance.story)
         again.get_by_role("button", name="Sign out").click()
         again.get_by_role("button", name="Sign in with").click()

@@ -2,7 +2,7 @@
 
 import { proof, readingKey } from "./keys.js";
 import { Problem } from "./problem.js";
-import { end, session, unlocked } from "./session.js";
+import { end, PERSON, session, unlocked } from "./session.js";
 import { passive } from "./passive.js";
 
 /**
@@ -44,7 +44,10 @@ export async function send(method, path, { query, json, text, match, token, anon
   }
   if (response.ok) return response;
   const problem = await problemOf(response);
-  if (problem.status === 401 && !token && holder && holder === session.get().current?.token) end(problem.message);
+  const { current } = session.get();
+  if (problem.status === 401 && !token && holder && holder === current?.token) {
+    end(current.name.startsWith(PERSON) ? "The session has ended. Sign in again." : problem.message);
+  }
   if (problem.kind === "standby") passive.update({ active: problem.active });
   throw problem;
 }
